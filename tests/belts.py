@@ -20,31 +20,10 @@ class Belt(vi.AbstractMachine):
     def contacts(self):
         return vi.DryFriction(level, on="V", slip=lambda x: x.V - self.speed)
 
-    @property
-    def cycle(self):
-        return 2 * np.pi
-
-    def section(self, state):
-        return state.V
+    cycle = vi.rising("V", usual=2 * np.pi)
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, -x.Y - 0.1 * x.V)
-
-
-class Observed(Belt):
-    """Also at equal intervals, and with starts."""
-
-    every: jax.Array | float | None = None
-
-    @property
-    def cycle(self):
-        return 2 * np.pi if self.every is None else self.every
-
-    def section(self, state):
-        return state.V if self.every is None else None
-
-    def observed_every(self, interval):
-        return type(self)(self.speed, every=jnp.asarray(interval))
 
     def start(self, *, Y=0.0, V=0.0):
         return vi.OscillatorState(jnp.asarray(Y, float), jnp.asarray(V, float))

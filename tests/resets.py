@@ -28,11 +28,7 @@ class Walker(vi.AbstractMachine):
     ground as it passes the other."""
 
     slope: jax.Array = eqx.field(converter=jnp.asarray)
-    interval: float | None = eqx.field(static=True, default=None)
-
-    @property
-    def cycle(self):
-        return 4.0 if self.interval is None else self.interval
+    cycle = 4.0
 
     @property
     def events(self):
@@ -41,7 +37,7 @@ class Walker(vi.AbstractMachine):
                 lambda machine, s, x: x.between - 2 * x.stance,
                 lambda machine, s, x: legs(-x.stance, x.turning * jnp.cos(2 * x.stance)),
                 when=lambda machine, s, x: x.between < -0.05,
-                ends_cycle=self.interval is None,
+                ends_cycle=True,
                 name="heel strike",
             ),
         )
@@ -59,9 +55,6 @@ class Walker(vi.AbstractMachine):
 
     def step_limit(self, s, x):
         return 0.8
-
-    def observed_every(self, interval):
-        return Walker(self.slope, float(interval))
 
 
 class Sliding(eqx.Module):
@@ -99,7 +92,7 @@ class StickSlip(vi.AbstractMachine):
         )
         return impact, sticks
 
-    def begin(self, s, x):
+    def modes(self, s, x):
         return (jnp.where(x.u > 0, 1.0, 0.0),)
 
     def force(self, s, x):
@@ -184,7 +177,7 @@ class Toggled(vi.AbstractMachine):
     def cycle(self):
         return 10.0
 
-    def begin(self, s, x):
+    def modes(self, s, x):
         return (1.0,)
 
     def field(self, s, x, pull):

@@ -16,12 +16,7 @@ class Wheel(vi.AbstractMachine):
 
     slope: float = 0.08
 
-    @property
-    def cycle(self):
-        return 1.4
-
-    def section(self, state):
-        return state.Y - self.slope - ALPHA
+    cycle = vi.rising(lambda m, z: z.Y - m.slope - ALPHA, usual=1.4)
 
     def renewed(self, state):
         return vi.OscillatorState(state.Y - 2 * ALPHA, jnp.cos(2 * ALPHA) * state.V)
@@ -31,6 +26,3 @@ class Wheel(vi.AbstractMachine):
 
     def start(self):
         return vi.OscillatorState(jnp.array(self.slope - ALPHA), jnp.array(0.5))
-
-    def observed_every(self, interval):
-        return self

@@ -25,10 +25,6 @@ class Shaken(vi.AbstractMachine):
     def cycle(self):
         return 2 * jnp.pi
 
-    @property
-    def period(self):
-        return 2 * jnp.pi / self.frequency
-
     def pace(self, s, state):
         return 1 / self.frequency
 

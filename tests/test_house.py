@@ -82,6 +82,13 @@ def test_each_name_is_listed_once_and_is_that_of_its_package():
         vi_jax.simulat  # noqa: B018
 
 
+def test_a_machine_has_the_members_that_a_user_writes_or_calls():
+    members = [name for name in dir(vi_jax.AbstractMachine) if not name.startswith("_")]
+    assert len(members) <= 20
+    told = " ".join(vi_jax.AbstractMachine.__doc__.split())  # in its table or below
+    assert not [name for name in members if f"`{name}`" not in told and f".{name}(" not in told]
+
+
 def test_what_simulates_loads_nothing_else():
     run = (
         "import sys, vi_jax; vi_jax.simulate; print([name for name in sys.modules if name in {!r}])"

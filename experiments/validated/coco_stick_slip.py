@@ -36,7 +36,7 @@ class Impactor(vi.AbstractMachine):
             modes=lambda *_: (0.0,),
         ),
     )
-    begin = lambda self, s, x: (0.0,)
+    modes = lambda self, s, x: (0.0,)
 
     def field(self, s, x, slides):
         force = (0.57 * jnp.sin(0.92 * s) / (1 - x[0])) ** 2 - 0.04 * x[1] - x[0]

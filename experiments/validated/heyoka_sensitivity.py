@@ -22,10 +22,7 @@ jax.config.update("jax_enable_x64", True)
 # %% A cycle ends where the velocity falls through zero
 class Spring(vi.AbstractMachine):
     stiffness: jax.Array | float
-    cycle: float = 2.0
-
-    def section(self, state):
-        return -state.V
+    cycle = vi.falling("V", usual=2.0)
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -self.stiffness * state.Y)

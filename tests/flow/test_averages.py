@@ -146,7 +146,7 @@ class Switching(vi.AbstractMachine):
     def _other(machine, s, state, mode):
         return (-mode,)
 
-    def begin(self, s, state):
+    def modes(self, s, state):
         return (1.0,)
 
     def field(self, s, state, mode):

@@ -87,14 +87,6 @@ def test_a_body_may_rest_where_anything_may_press_it_on(machine, may):
     assert machine.may_rest() is may
 
 
-class Stopped(vi.machines.Structure):
-    """A structure with a stop besides its `contacts`."""
-
-    @property
-    def stops(self):
-        return (*self.contacts, vi.RigidStop(0.5, 1.0))
-
-
 class Slanted(vi.machines.Structure):
     """With a coordinate that is no sum of displacements."""
 
@@ -104,10 +96,11 @@ class Slanted(vi.machines.Structure):
         return (own._replace(position=lambda x: 2 * own.position(x)),)
 
 
-def test_a_structure_has_the_stops_and_coordinates_of_its_subclass():
+def test_a_structure_has_its_stops_and_the_coordinates_of_its_subclass():
     """x'' + x = 0 from x = 0: the stop at 0.5 = sin(π/6) turns the phase to 5π/6."""
     matrices = {"mass": jnp.ones(1), "stiffness": jnp.ones(1)}
-    machine = Stopped(**matrices, frequency=1.0)
+    stop = vi.RigidStop(0.5, 1.0, at=[1.0])
+    machine = vi.machines.Structure(**matrices, frequency=1.0, contacts=(stop,))
     run = vi.simulate(machine, machine.start(velocity=1.0), 3)
     times = np.pi / 6 + 4 * np.pi / 3 * np.arange(6)
     times = times[times < 6 * np.pi]

@@ -145,7 +145,7 @@ class Furnace(vi.AbstractMachine):
         vi.Reset(lambda m, s, T, on: T[0] - 296, lambda m, s, T, on: T, modes=lambda *_: (0.0,)),
     )
 
-    def begin(self, s, T):
+    def modes(self, s, T):
         return (0.0,)
 
     def field(self, s, T, on):
@@ -328,7 +328,7 @@ def test_a_blow_is_felt_along_any_path_of_contacts():
         ).all()
 
     class Row:
-        stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
+        _stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
 
     orders = jnp.array(list(itertools.permutations(range(6))))
     assert bool(jax.jit(jax.vmap(reached))(orders).all())

@@ -91,18 +91,12 @@ class Wrong(BouncingBall):
     def field(self, s, state):
         return Ball(state.V, jnp.ones(2) if self.kind == "shape" else -self.gravity)
 
-    def section(self, state):
-        if self.kind == "section":
-            return state.Y if state.V > 0 else -state.Y
-        return None
-
 
 @pytest.mark.parametrize(
     ("kind", "stops", "told"),
     [
         ("cycle", (), "`cycle` of a Wrong must be a number"),
         ("shape", (), "`field` of a Wrong must return"),
-        ("section", (), "`section` of a Wrong .* `jnp.where`, not `if`"),
         ("", (0.5,), "`contacts` of a Wrong must be a tuple of contacts"),
         ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
     ],

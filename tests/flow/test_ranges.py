@@ -82,7 +82,6 @@ class Limited(vi.AbstractMachine):
 
     limit: Any
     cycle: Any = 1.0
-    stops: tuple = ()
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -jnp.clip(state.Y, -self.limit, self.limit))

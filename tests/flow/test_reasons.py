@@ -148,7 +148,6 @@ class Damped(vi.AbstractMachine):
     damping: Any
     spring: Any
     cycle: Any = 2 * np.pi
-    stops: tuple = ()
 
     def field(self, s, state):
         force = jnp.cos(s) - self.spring * state.Y - self.damping * state.V

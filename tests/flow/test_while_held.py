@@ -180,7 +180,7 @@ class Eased(vi.AbstractMachine):
     """A body on a floor, pressed on by less and less; the pull that is left is small."""
 
     cycle: float = 2 * np.pi
-    stops: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
+    contacts: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, 1e-5 - jnp.exp(-20 * s))

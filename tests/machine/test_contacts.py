@@ -261,7 +261,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
     swing = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t)
     places = swing + np.outer(speeds, np.sinh(t))
     first = [x[np.argmax(abs(x) > 1)] for x in places]
-    assert machine.outcomes == ("right", "left")
+    assert run.outcomes == ("right", "left")
     np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
     assert bool((run.result == vi.RESULTS.ended).all())
 
@@ -272,7 +272,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
         events = Toppling.events[1]
 
     walled = jax.vmap(lambda u: vi.simulate(Walled(), vi.State(x=0.0, u=u), 4))(speeds)
-    assert Walled().outcomes == ("left", "right")
+    assert walled.outcomes == ("left", "right")
     np.testing.assert_array_equal(walled.outcome, 1 - run.outcome)
     axes = {"start.u": speeds, "amplitude": [0.5]}
     data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)

@@ -176,12 +176,7 @@ class OnABelt(vi.AbstractMachine):
     def contacts(self):
         return on_a_belt(self)
 
-    @property
-    def cycle(self):
-        return 2 * np.pi
-
-    def section(self, state):
-        return state.Y - self.level
+    cycle = vi.rising(lambda m, z: z.Y - m.level, usual=2 * np.pi)
 
     def field(self, s, x):
         zero = jnp.zeros_like(s)

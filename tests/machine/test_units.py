@@ -24,7 +24,7 @@ MACHINES = {
     "pair": (M.ImpactPair(), "place in the box", "a", "a ω", "ω"),
     "free pair": (M.ImpactPair(mass_ratio=0.2), "place in the box", "a", "a ω", "ω"),
     "duffing": (M.Duffing(), "x", "1", "1", "1"),
-    "valve": (M.ReliefValve(interval=1.5), "lift", "1", "1", "1"),
+    "valve": (M.ReliefValve(), "lift", "1", "1", "1"),
     "capsule": (M.Capsule(), "place in the capsule", "F/k", "F/√(k m)", "√(k/m)"),
     "rotor": (M.UnbalancedRotor(gap=1.0), "Y", "m r/M", "m r ω/M", "ω"),
 }

@@ -101,7 +101,7 @@ def test_an_impact_keeps_the_momentum_and_gains_no_energy():
     draw = np.random.default_rng(2).uniform
     for gamma, e, u, v in draw([0.2, 0, 0, -2], [9, 1, 3, 2], (40, 4)):
         capsule = CAPSULE(mass_ratio=gamma, restitution=e)
-        (body,), (stop,) = capsule.coordinates, capsule.stops
+        (body,), (stop, _) = capsule.coordinates, capsule.contacts
         before = capsule.start(place=0.5, speed=u, capsule_speed=v)
         after = body.placed(before, stop.place, stop.rebound(before.speed))
         momenta, energies = [], []

@@ -134,7 +134,7 @@ class Lever(vi.AbstractMachine):
     def coordinates(self):
         return ABOVE_AND_ALONG
 
-    def begin(self, s, state):
+    def modes(self, s, state):
         return (-1.0,)
 
     def field(self, s, z, way):

@@ -89,7 +89,7 @@ def test_undamped_in_resonance_and_with_a_constant_force():
 def test_energy_and_momentum_of_an_impact():
     """A blow takes ½ (1 - k²) m (c·v)², with m = 1/(cᵀM⁻¹c), and acts along c alone."""
     machine, _, _ = machine_and_truth(4, 4, "general")
-    stop, body = machine.stops[2], machine.coordinates[1]
+    stop, body = machine.contacts[2], machine.coordinates[1]
     v = jnp.asarray([0.3, -0.2, 0.5, 0.1])
     state = machine.start(velocity=v)
     new = body.placed(state, body.position(state), stop.rebound(body.velocity(state)))
@@ -151,7 +151,7 @@ def test_both_sides_of_a_gap_are_one_coordinate():
         pressed = dataclasses.replace(machine, static_force=jnp.asarray(force))
         assert (pressed.mirrored(state) is not None) == own_image
     machine = vi.machines.Structure(mass=np.eye(2), stiffness=np.eye(2), contacts=stops)
-    assert [stop.coordinate for stop in machine.stops] == [0, 0, 1]
+    assert [stop.coordinate for stop in machine.contacts] == [0, 0, 1]
     assert machine.mirrored(state) is None
     np.testing.assert_allclose(machine.coordinates[0].mass, 0.5)
 

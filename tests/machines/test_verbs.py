@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.machine import section_in
 
 from differences import some
 from two_bodies import TwoBodies
@@ -89,7 +90,7 @@ def value_of(case):
 
 
 def test_simulate(case, orbit):
-    driven = case.machine.section(orbit.state) is None
+    driven = section_in(case.machine, orbit.state) is None
     run = vi.simulate(
         case.machine, orbit.state, 3, samples=16 if driven else 0, impact_log=8, estimate=True
     )
@@ -122,7 +123,7 @@ def test_lyapunov(case, orbit):
     spectrum = vi.lyapunov(case.machine, orbit.state, cycles=200)
     with np.errstate(divide="ignore"):
         logs = np.log(np.abs(np.asarray(orbit.multipliers)))
-    if case.machine.section(orbit.state) is not None:  # and one along the motion
+    if section_in(case.machine, orbit.state) is not None:  # and one along the motion
         logs[logs.argmin()] = 0.0
     logs = np.sort(logs)[::-1]
     alive = logs > -20  # what is forgotten at once is so to rounding

@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.machine import is_in_range, section_in
 
 import pecking
 
@@ -127,8 +128,8 @@ def test_energy(run, truth):
 
 def test_its_range():
     toy = eqx.tree_at(lambda m: m.sleeve_radius, WOODPECKER(), jnp.asarray(0.002))
-    assert not bool(toy.in_range(toy.start()))
-    assert bool(WOODPECKER().in_range(WOODPECKER().start()))
+    assert not bool(is_in_range(toy, toy.start()))
+    assert bool(is_in_range(WOODPECKER(), WOODPECKER().start()))
 
 
 def test_its_picture():
@@ -164,4 +165,4 @@ def test_its_words():
     state = toy.start(height=-0.02)
     assert (float(toy.renewed(state).height), float(toy.renewed(state).drop)) == (0.0, 0.02)
     by_time = toy.observed_every(0.1)
-    assert by_time.section(state) is None and by_time.renewed(state) is state
+    assert section_in(by_time, state) is None and by_time.renewed(state) is state

@@ -19,8 +19,7 @@ class Walker(resets.Walker):
     def events(self):
         return ()
 
-    def section(self, x):
-        return x.between - 2 * x.stance
+    cycle = vi.rising(lambda m, x: x.between - 2 * x.stance, usual=4.0)
 
     def renewed(self, x):
         return legs(-x.stance, x.turning * jnp.cos(2 * x.stance))
@@ -68,8 +67,7 @@ def test_a_walker_doubles_its_step():
 class Ahead(Belt):
     """Observed where the body is farthest ahead."""
 
-    def section(self, x):
-        return -x.V
+    cycle = vi.falling("V", usual=2 * np.pi)
 
 
 @pytest.mark.slow

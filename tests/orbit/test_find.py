@@ -32,12 +32,7 @@ class VanDerPol(vi.AbstractMachine):
 
     mu: jax.Array
 
-    @property
-    def cycle(self):
-        return 6.6633
-
-    def section(self, state):
-        return jnp.minimum(state.Y, 2 * state.V) - 0.1
+    cycle = vi.rising(lambda m, x: jnp.minimum(x.Y, 2 * x.V) - 0.1, usual=6.6633)
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, self.mu * (1 - state.Y**2) * state.V - state.Y)

@@ -160,12 +160,7 @@ class Limit(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(self.gap, K),)
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    def section(self, x):
-        return x.Y
+    cycle = vi.rising("Y", usual=2 * np.pi)
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, 0.1 * (1 - x.Y**2) * x.V - x.Y)

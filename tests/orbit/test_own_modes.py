@@ -16,7 +16,7 @@ class Flipped(vi.AbstractMachine):
     contacts: tuple = (vi.RigidStop(0.1, 0.8, modes=lambda machine, s, x, m: (-m,)),)
     cycle: float = 2 * np.pi / 2.2
 
-    def begin(self, s, x):
+    def modes(self, s, x):
         return (1.0,)
 
     def field(self, s, x, m):

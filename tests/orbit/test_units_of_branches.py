@@ -56,14 +56,8 @@ class Swinging(vi.AbstractMachine):
     time: float
     growth: float = 0.5
 
-    @property
-    def cycle(self):
-        """About its period."""
-        return 6.3 * self.time
-
-    def section(self, state):
-        """A cycle begins where the position is least."""
-        return state.v
+    # A cycle begins where the position is least.
+    cycle = vi.rising("v", usual=lambda machine: 6.3 * machine.time)
 
     def field(self, s, state):
         """The rates of position and velocity."""

@@ -7,7 +7,7 @@ import pytest
 import vi_jax as vi
 from scipy.optimize import minimize_scalar
 
-from belts import Belt, Observed
+from belts import Belt
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 BLOW = {"components": ["V"], "candidates": 1, "progress": False}
@@ -65,7 +65,7 @@ def test_a_machine_of_ones_own_is_kicked_at_a_phase():
 def test_a_moment_of_a_machine_without_a_drive():
     """A kick that stops sticking and slipping. The least is the distance between its cycle and the
     unstable one of sliding, by SciPy."""
-    belt = Observed(jnp.asarray(1.5))
+    belt = Belt(jnp.asarray(1.5))
     motion = vi.find_orbit(belt, belt.start(Y=-1.2), 1, throw=True)
     options = {"candidates": 1, "directions": 32, "progress": False}
 

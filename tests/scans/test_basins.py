@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from belts import Observed
+from belts import Belt
 
 # Several motions live side by side here; see `experiments/studies/basins_map.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
@@ -97,7 +97,7 @@ def test_the_share_of_steady_sliding_is_the_area_of_its_basin():
     """Of starts in [-2, 2] × [0, 2]: the unstable cycle of sliding encloses 0.30712 of their area,
     by SciPy's ∫ V² dt along it. None fails, though all that slide come to rest."""
     region = {"start.Y": (-2.0, 2.0), "start.V": (0.0, 2.0)}
-    found = vi.basins(Observed(1.5), region, resolution=24, settle=200, progress=False)
+    found = vi.basins(Belt(1.5), region, resolution=24, settle=200, progress=False)
     assert not any(found.irregular.values())
     (share,) = (x.fraction for x in found.attractors if abs(x.sections["Y"][0] - 0.5249) < 1e-3)
     # The boundary cuts some 55 of 24² cells, each off by 0.3 of itself: three such errors.

@@ -147,5 +147,5 @@ def test_one_rest_is_enough():
 
 def test_what_is_renewed_on_its_section_is_not_observed_at_intervals():
     wheel = Wheel()
-    with pytest.raises(ValueError, match="both a `section` and a `renewed`"):
+    with pytest.raises(ValueError, match="both a section and a `renewed`"):
         vi.lyapunov(wheel, wheel.start(), cycles=16)

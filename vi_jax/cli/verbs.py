@@ -18,7 +18,7 @@ from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted
 from ..flow import RESULTS, Run, RunOptions, planned, simulate
-from ..machine import AbstractMachine, is_autonomous
+from ..machine import AbstractMachine, cycles_in_words, is_autonomous
 from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
@@ -263,7 +263,7 @@ def _regimes(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
     kinds, counts = np.unique(period, return_counts=True)
     lines = []
     for i in np.argsort(-counts)[:12]:
-        name = names.get(int(kinds[i])) or f"period {machine.period_of(int(kinds[i]))}"
+        name = names.get(int(kinds[i])) or f"period {cycles_in_words(machine, int(kinds[i]))}"
         lines.append(f"  {name}: {counts[i]:,} ({100 * counts[i] / data['result'].size:.1f} %)")
     return lines + [f"  {len(kinds) - 12} further periods"] * (len(kinds) > 12)
 

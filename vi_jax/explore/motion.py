@@ -15,7 +15,15 @@ from .._messages import so_many
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, Run, chosen, simulate
-from ..machine import AbstractMachine, bare, is_autonomous, unit_of, with_unit
+from ..machine import (
+    AbstractMachine,
+    adopt,
+    bare,
+    cycles_in_words,
+    is_autonomous,
+    unit_of,
+    with_unit,
+)
 from ..orbit import STABILITY, complex_in_words, cycle_map, stability_of
 from ..plot import MotionPath, motion_path
 from ..scans import REGIMES, Regime, lyapunov, taken_along
@@ -140,7 +148,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
         fault="" if bool(run.successful) else str(RESULTS[run.result]),
         places=(np.asarray(places[0]), np.asarray(places[1])),
         quantities={name: float(x) for name, x in numbers.items() if not np.ndim(x)},
-        lasting=scene.period_of(period if period > 0 else _REGIME.longest),
+        lasting=cycles_in_words(scene, period if period > 0 else _REGIME.longest),
         rate=unit_of(scene.units, "rate"),
         window=window,
     )
@@ -157,7 +165,7 @@ def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, 
     position and velocity on its sections."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
-    start = taken_along(scene, scene.adopt(start))
+    start = taken_along(scene, adopt(scene, start))
     run = simulate(scene, start, OBSERVED, settle=settle, impact_log=_MAPPED, **options)
     first = jtu.tree_map(lambda x: x[0], run.sections)
     window = simulate(

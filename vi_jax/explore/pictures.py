@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from ..machine import AbstractMachine, name_in
+from ..machine import AbstractMachine, logged_turn, name_in, stops_of
 from ..plot import BLUE, GREEN, RED, animate
 from .motion import WINDOW, Motion, seen_evenly
 from .subject import SHOWN, Diagram
@@ -103,7 +103,8 @@ class MotionPicture:
 
     def _set_motion(self, motion: Motion, machine: AbstractMachine) -> None:
         lines, path = self._lines, motion.path
-        places = [float(stop.place) for stop in machine.stops if stop.coordinate == 0] or [np.nan]
+        stops = [stop for stop in stops_of(machine) if stop.coordinate == 0]
+        places = [float(stop.place) for stop in stops] or [np.nan]
         lines["course"].set_data(path.cycles, path.Y)
         lines["portrait"].set_data(path.Y, path.V)
         at, across = np.repeat(places, 3), np.tile([0.0, 1.0, np.nan], len(places))
@@ -123,7 +124,7 @@ class MotionPicture:
         elif which == MAPS[1]:
             x, y = motion.impact_phase, motion.impact_speed
             names, note = ["phase of the impact", "speed before it"], "" if x.size else "no impact"
-            self._map.set_xlim(0, float(machine.turn))
+            self._map.set_xlim(0, float(logged_turn(machine)))
             _fit(self._map, y=np.append(y, 0.0))
         else:
             y = motion.frequency_ratio

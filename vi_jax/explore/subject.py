@@ -17,6 +17,7 @@ from ..machine import (
     AbstractMachine,
     Parameters,
     Scene,
+    adopt,
     check_again,
     components,
     in_brackets,
@@ -82,7 +83,7 @@ class Subject:
     def __init__(
         self, machine: AbstractMachine, ranges: Mapping[str, tuple[float, float]] | None = None
     ):
-        self.machine, self.start = machine, machine.adopt(machine.start())
+        self.machine, self.start = machine, adopt(machine, machine.start())
         given = {**getattr(machine, "slider_ranges", {}), **(ranges or {})}
         real = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
         numbers = {name: float(x) for name, x in components(machine).items() if real(x)}
@@ -267,7 +268,7 @@ def _settled(machine: Any, names: tuple[str, ...], rows: Any, start: Any, settle
         here = machine
         for i, name in enumerate(names):
             here = with_leaf(here, name, row[i])
-        run = simulate(here, taken_along(here, here.adopt(start)), CYCLES, settle=settle)
+        run = simulate(here, taken_along(here, adopt(here, start)), CYCLES, settle=settle)
         assert run.y_min is not None and run.impact_speed is not None
         Y, V = (jax.vmap(f)(run.sections)[1:] for f in (here.position, here.velocity))
         return Y, V, run.y_min, run.impact_speed

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Scalar
-from ..machine import guard_of, section_number
+from ..machine import clock_of, guard_of, section_number
 from ._lane import Plan
 from .events import rates
 from .integrals import rate_of_integrals
@@ -46,9 +46,9 @@ class FlowToEvent:
         def event(moving, fixed, rest):
             (smooth, bound), (s, state, _) = self._whole(fixed, rest), moving
             machine = smooth.machine
-            clocked = machine.clock(state) is not None
+            clocked = clock_of(machine, state) is not None
             if clocked and number == section_number(machine):
-                return machine.clock(state) - bound  # which may be that of a part of a cycle
+                return clock_of(machine, state) - bound  # which may be that of a part of a cycle
             return guard_of(machine, number, s, state, smooth.modes, smooth.contact)
 
         return self._pure(event)

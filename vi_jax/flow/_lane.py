@@ -13,10 +13,15 @@ from jaxtyping import Array, Float, UInt32
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
+    clock_of,
     events_of,
     is_autonomous,
+    others_of,
     own_modes,
+    section_in,
     section_number,
+    stops_of,
+    switches_of,
     with_modes,
 )
 from .integrals import TIME, Integrals
@@ -185,11 +190,11 @@ def _written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
 
 def ticks(machine: AbstractMachine, state: State) -> bool:
     """Whether the independent variable itself counts the cycles."""
-    return machine.clock(state) is None and not is_autonomous(machine, state)
+    return clock_of(machine, state) is None and not is_autonomous(machine, state)
 
 
 def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
-    """Whether all cycles have the same duration, `machine.period`."""
+    """Whether all cycles have the same duration (`cycle_time`)."""
     return (
         ticks(machine, state)
         and machine.pace(jnp.zeros_like(machine.position(state)), state) is None
@@ -306,8 +311,8 @@ class Plan(eqx.Module):
 
     def others(self, state: State) -> list[int]:
         """The numbers of the events, besides stops, whose guards are looked at in each step."""
-        last = section_number(self.machine) + (self.machine.section(state) is not None)
-        return list(range(len(self.machine.stops), last))
+        last = section_number(self.machine) + (section_in(self.machine, state) is not None)
+        return list(range(len(stops_of(self.machine)), last))
 
     def from_below(self, state: State) -> list[int]:
         """Those of `others` that happen only once their guard has been below zero (see
@@ -340,7 +345,7 @@ class Plan(eqx.Module):
 
     def clock(self, s: Scalar, state: State) -> Scalar:
         """The reading of what counts the cycles, `s` itself or the machine's clock."""
-        clock = self.machine.clock(state)
+        clock = clock_of(self.machine, state)
         return s if clock is None else clock
 
     def timed(self, state: State) -> bool:
@@ -354,7 +359,7 @@ class Plan(eqx.Module):
     def meets_every_turn(self) -> bool:
         """Whether steps always end on every turning point, since switches and events may be
         there."""
-        return bool(self.machine.switches or self.machine.others)
+        return bool(switches_of(self.machine) or others_of(self.machine))
 
     def meets_turns(self, done: Scalar) -> Flag:
         """Whether steps end on every turning point, for extremes too, or only on those close to a
@@ -393,7 +398,7 @@ class Plan(eqx.Module):
         """The position of coordinate number k while it rests on the stop named by `contact` (see
         `Lane.contact`); `otherwise` while it rests on none."""
         place = otherwise
-        for i, stop in enumerate(self.machine.stops):
+        for i, stop in enumerate(stops_of(self.machine)):
             if stop.coordinate == k:
                 place = jnp.where(contact == to_event(i), stop.place, place)
         return place
@@ -402,7 +407,7 @@ class Plan(eqx.Module):
         """The sign of the direction of coordinate number k away from the stop named by `contact`; 0
         if it rests on none."""
         away = jnp.zeros_like(contact)
-        for i, stop in enumerate(self.machine.stops):
+        for i, stop in enumerate(stops_of(self.machine)):
             if stop.coordinate == k:
                 away = jnp.where(contact == to_event(i), -float(stop.sign), away)
         return away
@@ -410,7 +415,7 @@ class Plan(eqx.Module):
     def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named
         by `contact`; of its first stop if none is."""
-        mine = [(i, stop) for i, stop in enumerate(self.machine.stops) if stop.coordinate == k]
+        mine = [(i, stop) for i, stop in enumerate(stops_of(self.machine)) if stop.coordinate == k]
         (_, first), others = mine[0], mine[1:]
         sign, gap = float(first.sign), first.gap
         for i, stop in others:

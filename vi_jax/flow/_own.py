@@ -24,10 +24,12 @@ from ..machine import (
     AbstractSwitch,
     Coordinate,
     LinearMachine,
+    Mechanical,
     Reset,
     RigidStop,
     SoftStop,
     begin_modes,
+    clock_of,
     event_of,
     events_of,
     field_in,
@@ -35,7 +37,11 @@ from ..machine import (
     is_autonomous,
     like,
     listed,
+    others_of,
+    section_in,
     shown_modes,
+    stops_of,
+    switches_of,
 )
 
 _NO_NUMBERS = (
@@ -78,8 +84,8 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             f"{whose} must return what is like its state, {in_short(state)}, but returned "
             f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
         )
-    with in_words_of(f"`section` of a {type(machine).__name__}"):
-        jax.eval_shape(machine.section, state)
+    with in_words_of(f"`cycle` of a {type(machine).__name__}"):
+        jax.eval_shape(lambda x: section_in(machine, x), state)
 
 
 def rows_of(machine: AbstractMachine) -> str:
@@ -145,7 +151,7 @@ def in_words_of(whose: str) -> Iterator[None]:
 def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
     """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
     `check_field`."""
-    for i, stop in enumerate(machine.stops):
+    for i, stop in enumerate(stops_of(machine)):
         if stop.is_one_number:
             continue
         whose = f"The restitution law of stop {i} of a {type(machine).__name__}"
@@ -181,8 +187,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     if ours or any(isinstance(x, Tracer) for x in leaves):
         return
     try:
-        ticks = machine.clock(start) is None and not is_autonomous(machine, start)
-        if not (ticks or machine.others):
+        ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
+        if not (ticks or others_of(machine)):
             return
         with jax.ensure_compile_time_eval():
             found = jtu.tree_map(np.asarray, _values(machine, start, ticks))
@@ -197,7 +203,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
-        event = machine.others[i]
+        event = others_of(machine)[i]
         _warn_of_guard(kind, int(i), event.name or type(event).__name__)
 
 
@@ -209,12 +215,12 @@ def _values(machine: AbstractMachine, start: State, ticks: bool) -> Any:
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     ends = (zero, cycle) if ticks else ()
     fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in ends] or [(), ()]
-    return cycle, *fields, _guards_below(machine, start, modes) if machine.others else ()
+    return cycle, *fields, _guards_below(machine, start, modes) if others_of(machine) else ()
 
 
 def _guards_below(machine: AbstractMachine, start: State, modes: Scalars) -> Array:
     """Which guards of the machine's events are below zero in some state around the start."""
-    first, last = len(machine.stops) + len(machine.switches), len(events_of(machine)) - 1
+    first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
     zero = jnp.zeros_like(machine.position(start))
     random = np.random.default_rng(0)
     far = np.resize(_FAR, _TRIED)
@@ -263,8 +269,6 @@ _KINDS = {
         (RigidStop, AbstractSwitch),
         "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s",
     ),
-    "stops": (RigidStop, "`RigidStop`s"),
-    "switches": (AbstractSwitch, "`AbstractSwitch`es, as `SoftStop` and `DryFriction` are"),
     "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` and `Switch` are"),
 }
 
@@ -292,7 +296,7 @@ def check_parts(machine: AbstractMachine) -> None:
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
     many = len(machine.coordinates)
-    for i, stop in enumerate(machine.stops):
+    for i, stop in enumerate(stops_of(machine)):
         for part in ("gap", "restitution"):
             shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))
             if shape:
@@ -316,7 +320,7 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop that names no velocity."""
-    if type(machine).coordinate_on is not AbstractMachine.coordinate_on:
+    if isinstance(machine, Mechanical):
         return
     for stop in listed(machine.contacts):
         on = getattr(stop, "on", None)
@@ -335,10 +339,10 @@ def _check_frictions(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for friction on a stop that there is not, or not along it."""
     name = type(machine).__name__
     known = {
-        "stop": ("stop", len(machine.stops)),
+        "stop": ("stop", len(stops_of(machine))),
         "along": ("coordinate", len(machine.coordinates)),
     }
-    for switch in machine.switches:
+    for switch in switches_of(machine):
         if switch.rubs_on is None:
             continue
         for argument, (what, count) in known.items():
@@ -348,7 +352,7 @@ def _check_frictions(machine: AbstractMachine) -> None:
                     f"Argument `{argument}` of a ContactFriction must be the number of a {what} of "
                     f"the {name}, which has {count}, but got {number}."
                 )
-        across = machine.stops[switch.rubs_on].coordinate
+        across = stops_of(machine)[switch.rubs_on].coordinate
         if switch.along == across:  # pyright: ignore[reportAttributeAccessIssue]
             raise ValueError(
                 f"Argument `along` of a ContactFriction must be the number of the coordinate that "
@@ -361,13 +365,13 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
     """**Raises:** `TypeError` for a coordinate or an event whose functions do not return what they
     must; while the loop is traced, and at no cost where it runs."""
     name = type(machine).__name__
-    for k, coordinate in enumerate(machine.coordinates if machine.stops else ()):
+    for k, coordinate in enumerate(machine.coordinates if stops_of(machine) else ()):
         _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
         whose = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
         with in_words_of(whose):
             _check_state(whose, state, jax.eval_shape(coordinate.placed, state, place, velocity))
-    first = len(machine.stops)
+    first = len(stops_of(machine))
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))
 
@@ -390,8 +394,8 @@ def _check_event(
     machine: AbstractMachine, number: int, event: AbstractEvent, at: tuple[Scalar, State, Scalars]
 ) -> None:
     s, state, modes = at
-    switches, name = len(machine.switches), type(machine).__name__
-    i = number - len(machine.stops)
+    switches, name = len(switches_of(machine)), type(machine).__name__
+    i = number - len(stops_of(machine))
     what, i = ("switch", i) if i < switches else ("event", i - switches)
     whose = f"{what} {i} ({event.name or type(event).__name__}) of a {name}"
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates)

@@ -17,7 +17,16 @@ from .._messages import warning_once
 from .._programs import compiled
 from .._types import State
 from ..lanes import elementwise_primitive
-from ..machine import AbstractMachine, bare, modes_of, stated
+from ..machine import (
+    AbstractMachine,
+    as_logged,
+    bare,
+    cycle_time,
+    frequency_ratio,
+    modes_of,
+    outcomes_of,
+    stated,
+)
 from ._lane import Plan, Record
 from .arguments import planned
 from .integrals import TIME, means
@@ -181,7 +190,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     def whole(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
-    period = jnp.broadcast_to(machine.period, (plan.cycles,)).astype(lane.steps.dtype)
+    period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
     duration = None
     if plan.motion:
         duration = period if times is None else per_cycle(times, jnp.sum)
@@ -211,7 +220,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         impact_energy=per_cycle(records.loss, jnp.sum),
         clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
-        frequency_ratio=None if duration is None else machine.frequency_ratio(duration),
+        frequency_ratio=None if duration is None else frequency_ratio(machine, duration),
         samples=dense,
         impact_log=log,
         event_log=_events(plan, records.events) if plan.events else None,
@@ -224,7 +233,8 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         labels=machine.labels,
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
-        outcome=outcome_of(lane.fault) if machine.outcomes else None,
+        outcome=outcome_of(lane.fault) if outcomes_of(machine) else None,
+        outcomes=outcomes_of(machine),
     )
 
 
@@ -245,13 +255,13 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
 def _log(plan: Plan, entries: Any) -> ImpactLog:
     """The first `plan.log` impacts of each cycle, from those of its intervals."""
     phase, speed, stop = _by_cycle(plan, entries, used=2)
-    return ImpactLog(plan.machine.as_logged(phase), speed, _numbers(stop))
+    return ImpactLog(as_logged(plan.machine, phase), speed, _numbers(stop))
 
 
 def _events(plan: Plan, entries: Any) -> EventLog:
     """The first `plan.events` events of each cycle, from those of its intervals."""
     phase, code, number, value = _by_cycle(plan, entries, used=1)
-    return EventLog(plan.machine.as_logged(phase), _numbers(code), _numbers(number), value)
+    return EventLog(as_logged(plan.machine, phase), _numbers(code), _numbers(number), value)
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:

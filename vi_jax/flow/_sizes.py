@@ -10,7 +10,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Scalar, Scalars, State
-from ..machine import AbstractMachine, events_of, guard_of
+from ..machine import AbstractMachine, events_of, guard_of, scales_known
 from ._lane import Plan
 from .smooth import in_modes
 
@@ -30,7 +30,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
     **Arguments:** `s`, `start` and `modes`, in which the motion begins.
     """
-    if machine.scales_known:
+    if scales_known(machine):
         return None
     holding = [x for x in events_of(machine) if x.holds_mode]
     # While something sticks or slides along a surface, its rate tells nothing of its size.

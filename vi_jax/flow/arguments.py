@@ -16,6 +16,7 @@ from .._checks import (
     fits_records,
     instance_of,
     narrow,
+    require_ranges,
     require_real,
     require_session,
     short,
@@ -27,12 +28,18 @@ from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
     Scene,
+    ShaftMachine,
+    adopt,
     bare,
     begin_modes,
     field_in,
+    has_velocity,
+    in_clock,
     is_autonomous,
-    mode_values,
+    may_rest,
+    modes_at_start,
     modes_of,
+    stops_of,
 )
 from ._lane import Plan
 from ._own import check_parts
@@ -59,9 +66,9 @@ def planned(
     method, samples = options.method, options.samples
     assert isinstance(method, AbstractMethod)
     if options.clock is not None:
-        machine = machine.in_clock(options.clock)
+        machine = in_clock(machine, options.clock)
     require_session("machine", machine)
-    own, start = modes_of(start), machine.adopt(bare(start))
+    own, start = modes_of(start), adopt(machine, bare(start))
     start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)
@@ -96,7 +103,7 @@ def planned(
         log_switches=options.log_switches,
         events=options.event_log,
         averages=averages,
-        rests=(machine.may_rest() if rests is None else rests) and bool(machine.stops),
+        rests=(may_rest(machine) if rests is None else rests) and bool(stops_of(machine)),
         backend=lanes.current_backend(),
         settle=_countable(cycles, options.settle, parts, dtype),
         max_steps=jnp.asarray(jnp.inf if most is None else most, dtype),
@@ -114,11 +121,11 @@ def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> 
     them. **Raises:** `ValueError` unless they are as many as the machine's."""
     if own is None:
         return None
-    wanted = jax.eval_shape(lambda x: mode_values(machine.begin(jnp.zeros((), dtype), x)), start)
+    wanted = jax.eval_shape(lambda x: modes_at_start(machine, jnp.zeros((), dtype), x), start)
     if len(own) != len(wanted) or any(jnp.shape(mode) for mode in own):
         raise ValueError(
-            f"Argument `start` must have {len(wanted)} modes, one number each, as many as `begin` "
-            f"of a {type(machine).__name__} returns, but has {tuple(own)}."
+            f"Argument `start` must have {len(wanted)} modes, one number each, as many as a "
+            f"{type(machine).__name__} has, but has {tuple(own)}."
         )
     return tuple(jnp.asarray(mode, dtype) for mode in own)
 
@@ -256,7 +263,7 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             'Contacts name position and velocity by `on=("x", "u")`, and act on `Y` and `V` if '
             "they name none; `position` and `velocity` of a machine pick other numbers."
         ) from None
-    if not shape and not machine.has_velocity(state):
+    if not shape and not has_velocity(machine, state):
         _check_flow(argument, machine, state)
     return shape
 
@@ -277,9 +284,12 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         if numbers is not None and not np.isfinite(numbers).all():
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
-    machine.check_start(start)
+    if isinstance(machine, ShaftMachine):
+        machine.check_start(start)
+    if isinstance(start, eqx.Module):
+        require_ranges(start)
     slack = concrete(rounding(machine, start))
-    for i, stop in enumerate(machine.stops):
+    for i, stop in enumerate(stops_of(machine)):
         gap = concrete(stop.gap)
         Y = concrete(machine.coordinates[stop.coordinate].position(start))
         if Y is None or gap is None or slack is None:

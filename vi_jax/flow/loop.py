@@ -12,7 +12,17 @@ from jaxtyping import Array
 
 from .. import lanes
 from .._types import Flag, Scalar, State
-from ..machine import bare, begin_modes, holds_anywhere, replaced, rubs, struck_modes
+from ..machine import (
+    bare,
+    begin_modes,
+    holds_anywhere,
+    is_in_range,
+    prepared,
+    replaced,
+    rubs,
+    stops_of,
+    struck_modes,
+)
 from ._lane import Lane, Plan, Record, to_event, total
 from ._own import check_events, check_field, check_laws
 from ._sizes import extents_of, sizes_of
@@ -29,11 +39,11 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     machine = plan.machine
     Y = machine.position(start)
     bad = ~jnp.isfinite(total((start, machine.cycle), plan.settle)) | ~jnp.asarray(wanted)
-    bad = bad | ~machine.in_range(start)
+    bad = bad | ~is_in_range(machine, start)
     for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
         bad = bad | jnp.any(jnp.isnan(number))  # infinite is allowed: no limit
     slack = rounding(machine, start)
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
@@ -52,12 +62,12 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
             for x, j, along in zip(here, growth, direction, strict=True)
         )
-        for i, stop in enumerate(machine.stops):
+        for i, stop in enumerate(stops_of(machine)):
             # A little off the stop it would come to rest there: no derivative by the start.
             at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
-        if rubs(machine) or (machine.stops and holds_anywhere(machine)):
+        if rubs(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
@@ -88,7 +98,7 @@ def _rests_on(plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | f
     """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
     be by a force that grows; place and velocity are known to within `slack`."""
     contact = jnp.zeros_like(here.x)
-    for i, stop in enumerate(plan.machine.stops):
+    for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
             pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
             rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
@@ -121,7 +131,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     `plan.kept + 1`: the first holds the state in which recording begins, and no record. States of a
     machine with modes of its own are `HybridState`s.
     """
-    way = plan.machine.prepared()
+    way = prepared(plan.machine)
     own = way.machine is plan.machine
     if not own:
         if plan.noise is not None:

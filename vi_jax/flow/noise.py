@@ -15,7 +15,16 @@ from jaxtyping import Array, UInt32
 from .._checks import concrete, count, require_real
 from .._types import Flag, Scalar, State
 from ..lanes import dependent_results
-from ..machine import AbstractMachine, Prepared, is_autonomous, leaf_names
+from ..machine import (
+    AbstractMachine,
+    Prepared,
+    cycle_time,
+    is_autonomous,
+    leaf_names,
+    others_of,
+    prepared,
+    stops_of,
+)
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks
 from ._own import in_words_of
 
@@ -158,7 +167,7 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
     _check_machine(machine, start)
     amplitudes, functions = _by_leaf(start, noise)
     _check_velocities(machine, start, amplitudes)
-    if noise.functions and machine.prepared().machine is not machine:
+    if noise.functions and prepared(machine).machine is not machine:
         raise ValueError(
             "Argument `noise` must have numbers as amplitudes for a machine that is followed in "
             f"its natural modes, but has functions for a {type(machine).__name__}."
@@ -183,7 +192,7 @@ def _real(amplitude: Any) -> Array:
 def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
     """The time that every cycle takes; `None` if it is not known beforehand."""
     if has_fixed_cycle(machine, start):
-        return machine.period
+        return cycle_time(machine)
     if not ticks(machine, start):
         return None
     # The independent variable is in proportion to time if its pace needs neither it nor the state.
@@ -203,7 +212,7 @@ def _check_machine(machine: AbstractMachine, start: State) -> None:
             "whose cycles end with its drive's; shake one that an event ends at equal intervals, "
             "as `machine.observed_every(interval)`"
         )
-    elif machine.others:
+    elif others_of(machine):
         what = "without resets and other events that its velocities may pass in a jump"
     if what is not None:
         raise ValueError(
@@ -243,7 +252,7 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
         for x, a in zip(leaves, amplitudes, strict=True)
     ]
-    for k in sorted({stop.coordinate for stop in machine.stops}):
+    for k in sorted({stop.coordinate for stop in stops_of(machine)}):
         place = machine.coordinates[k].position
         moved = concrete(jax.jvp(place, (start,), (tree.unflatten(along),))[1])
         if moved is not None and np.any(moved):

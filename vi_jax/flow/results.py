@@ -121,7 +121,7 @@ class Samples(Shown):
     quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
     """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
     modes: tuple[Float[Array, " points"], ...] = ()
-    """The machine's own modes there (see `AbstractMachine.begin`)."""
+    """The machine's own modes there (see `AbstractMachine.modes`)."""
 
 
 # Cycles of which a text tells, and events of each.
@@ -162,7 +162,7 @@ class ImpactLog(Summarized):
     speed: Float[Array, "cycles size"]
     """V⁻, speed of approach just before the impact."""
     stop: Int[Array, "cycles size"]
-    """Index into `machine.stops`."""
+    """Number of the rigid stop."""
 
     def summary(self) -> str:
         """Impacts of the first cycles: where on the clock, on which stop, and how fast."""
@@ -185,8 +185,8 @@ class EventLog(Summarized):
     kind: Int[Array, "cycles size"]
     """What happened: an index into `EVENTS`."""
     number: Int[Array, "cycles size"]
-    """Index into the machine's `stops`; for a mode into its `switches`, for a reset into its
-    `events`."""
+    """Which one: a number among the rigid stops; for a mode among soft stops, frictions and
+    switches; for a reset among the other events."""
     value: Float[Array, "cycles size"]
     """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
     of a reset what its `value` says; NaN for a release."""
@@ -277,10 +277,12 @@ class Run(Summarized):
     units: Stated = eqx.field(static=True, default=())
     """In which units its quantities are, as the machine states it."""
     modes: tuple[Float[Array, " sections"], ...] = ()
-    """The machine's own modes on the sections (see `AbstractMachine.begin`), each (cycles + 1,)."""
+    """The machine's own modes on the sections (see `AbstractMachine.modes`), each (cycles + 1,)."""
     outcome: Int[Array, ""] | None = None
-    """With which outcome an event ended the motion, an index into `machine.outcomes`; -1 if none
-    did, `None` for a machine without outcomes."""
+    """With which outcome an event ended the motion, an index into `outcomes`; -1 if none did,
+    `None` for a machine without outcomes."""
+    outcomes: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the outcomes with which events and stops of the machine end a motion."""
 
     @property
     def successful(self) -> jax.Array:

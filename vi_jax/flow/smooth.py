@@ -22,7 +22,9 @@ from ..machine import (
     held_flow,
     holds_anywhere,
     rubs,
+    scales_known,
     shown_modes,
+    stops_of,
 )
 
 # Thresholds in `s` are for cycles of about 2π, up to so many times shorter or longer: a choice.
@@ -33,7 +35,7 @@ def unit_of(machine: AbstractMachine) -> Scalar | float:
     """A length of `s` by which short ones are judged: 1, or the 2π-th part of a cycle that is much
     shorter or much longer than that."""
     cycle = machine.cycle
-    if machine.scales_known or (isinstance(cycle, float | int) and 1 / _USUAL < cycle < _USUAL):
+    if scales_known(machine) or (isinstance(cycle, float | int) and 1 / _USUAL < cycle < _USUAL):
         return 1.0
     unit = stop_gradient(jnp.asarray(cycle)) / (2 * pi)
     return jnp.where((unit > 1 / _USUAL) & (unit < _USUAL), 1.0, unit)
@@ -60,7 +62,7 @@ class SmoothMachine(eqx.Module):
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
             return flow
-        limited = sorted({stop.coordinate for stop in machine.stops}) if self.contact else []
+        limited = sorted({stop.coordinate for stop in stops_of(machine)}) if self.contact else []
         several = len(limited) > 1 or rubs(machine)
         if several or dry:
             flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
@@ -158,7 +160,7 @@ def rounding(machine: AbstractMachine, state: State) -> Scalar | float:
 def beyond_a_stop(machine: AbstractMachine, state: State) -> Flag:
     """Whether a coordinate is beyond one of its stops by more than rounding."""
     found, slack = jnp.zeros((), bool), rounding(machine, state)
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         place = machine.coordinates[stop.coordinate].position(state)
         found = found | (stop_gradient(stop.beyond(place)) > slack)
     return found

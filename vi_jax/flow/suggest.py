@@ -16,7 +16,7 @@ from jaxtyping import Array
 from .._checks import count, one_of, require
 from .._messages import warning_once
 from .._types import Scalar, State
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, adopt
 from ._simulate import simulate
 from .arguments import check_start, machine_of
 from .fusion import jit
@@ -111,7 +111,7 @@ def suggest_method(
         )
     if start is None:
         start = machine.start()
-    start = machine.adopt(start)
+    start = adopt(machine, start)
     check_start(machine, start)
     bench = _Bench(machine, start, quantity, cycles, lanes)
     best = preset(machine, "reference")

@@ -1,35 +1,25 @@
 """What every verb asks of a machine. A class of your own with these few methods runs like ours."""
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from math import pi
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
 
-from .._checks import in_range, number, require
-from .._types import Flag, Scalar, State
+from .._checks import fields_with, number, require
+from .._types import Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
-from .described import Clocked, Observed, Worded
 from .event import AbstractEvent, AbstractSwitch
-from .own import by_default, declared_modes, derived, is_own, says
+from .own import by_default, derived, is_own, says, stops_of, switches_of
 from .parts import coordinates_in, listed, other_events, stops_in, switches_in
+from .shown import Shown
 from .soft import SoftStop
 from .stop import RigidStop, Wall
-
-
-class Prepared(NamedTuple):
-    """A machine as a run follows it, and states on the way in and out."""
-
-    machine: Any
-    inward: Callable[[State], State]
-    outward: Callable[[State], State]
-
+from .units import PLAIN, unit_in
 
 # What a machine must say, and how.
 _MUST_SAY = {
@@ -38,20 +28,16 @@ _MUST_SAY = {
 }
 
 
-def _as_it_is(state: State) -> State:
-    return state
-
-
 def _position(machine: "AbstractMachine", state: State) -> Scalar:
-    return state.Y if machine.stops or hasattr(state, "Y") else jtu.tree_leaves(state)[0]
+    return state.Y if stops_of(machine) or hasattr(state, "Y") else jtu.tree_leaves(state)[0]
 
 
 def _velocity(machine: "AbstractMachine", state: State) -> Scalar:
-    return state.V if machine.has_velocity(state) else jtu.tree_leaves(state)[:2][-1]
+    return state.V if has_velocity(machine, state) else jtu.tree_leaves(state)[:2][-1]
 
 
 def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> State:
-    if machine.has_velocity(state):
+    if has_velocity(machine, state):
         return eqx.tree_at(lambda x: (x.Y, x.V), state, (Y, V))
     leaves, structure = jtu.tree_flatten(state)
     return jtu.tree_unflatten(structure, [Y, V, *leaves[2:]][-len(leaves) :])
@@ -62,7 +48,7 @@ def _plain(machine: "AbstractMachine") -> Coordinate:
     return Coordinate(*(partial(function, machine) for function in (_position, _velocity, _placed)))
 
 
-class AbstractMachine(Clocked, Observed, Worded):
+class AbstractMachine(Shown):
     """A machine: smooth motion between events, observed cycle by cycle.
 
     Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
@@ -76,41 +62,22 @@ class AbstractMachine(Clocked, Observed, Worded):
     |---|---|
     | `cycle` | the length of a cycle in `s`; or `turn_of`, `rising`, `falling` |
     | `field` | d(state)/ds between contacts and events |
+    | `start` | the default start |
     | `contacts` | rigid and soft stops, dry friction; `()` by default |
     | `events` | switches, resets, other kinds of events; `()` by default |
     | `modes` | discrete modes by name, which events change |
-
-    | motion | meaning |
-    |---|---|
-    | `start`, `adopt` | the default start; starts of other classes |
     | `position`, `velocity`, `placed` | the coordinate of contacts that name none |
-    | `coordinates`, `coordinate_on` | several coordinates by number |
-    | `begin` | modes that depend on the start |
-
-    | observation (`Observed`) | meaning |
-    |---|---|
-    | `section` | a function of the state that ends a cycle where it rises through zero |
-    | `observed_every` | the same machine observed at equal intervals |
+    | `coordinates` | several coordinates by number |
     | `averages` | means over a cycle: a power, a mean force |
     | `quantities` | functions of the state, by name, shown in results |
     | `renewed` | a drift, counted by the cycle |
     | `mirrored` | the symmetry of the machine, for branches |
-    | `at_section`, `observed_later` | another place of the section |
-
-    | clocks and time scales (`Clocked`) | meaning |
-    |---|---|
-    | `clock`, `rewound`, `pace` | another variable than `s` that counts cycles or measures time |
-    | `in_clock`, `phase_at`, … | several clocks to choose from |
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
+    | `pace` | d(time)/ds, if `s` is not time |
+    | `labels`, `units` | words of pictures and messages |
 
-    | words (`Worded`) and limits | meaning |
-    |---|---|
-    | `labels`, `units`, `period_of`, `place_of` | words of pictures and messages |
-    | `in_range`, `check_start`, `alive` | limits, checked before and during a run |
-    | `may_rest` | whether programs contain rest on a stop |
-    | `prepared` | values that are computed once for each run |
-
-    Ready machines, each written in this way, are in `vi_jax.machines`.
+    `machine.observed_every(interval)` is the same machine observed at equal intervals. Ready
+    machines, each written in this way, are in `vi_jax.machines`.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any):
@@ -129,13 +96,18 @@ class AbstractMachine(Clocked, Observed, Worded):
         """
 
     if TYPE_CHECKING:  # a subclass has them as attributes, properties or fields
+        cycle: Any = eqx.field(init=False)
         contacts: Any = eqx.field(init=False)
         events: Any = eqx.field(init=False)
         modes: Any = eqx.field(init=False)
-        stops: Any = eqx.field(init=False)
-        switches: Any = eqx.field(init=False)
         coordinates: Any = eqx.field(init=False)
     else:
+
+        @property
+        @abc.abstractmethod
+        def cycle(self) -> Scalar | float:
+            """Length of one cycle in `s`; where an event ends a cycle, its usual length, by which
+            steps are sized."""
 
         @derived
         def contacts(self) -> Any:
@@ -150,18 +122,10 @@ class AbstractMachine(Clocked, Observed, Worded):
         @derived
         def modes(self) -> Mapping[str, float]:
             """The discrete modes, by name, in which a motion begins. The field receives them after
-            the state, and events change them."""
+            the state, and events change them. A method `modes(s, state)` returns those of a motion
+            that begins in `state`: a number, a tuple or a dictionary. A start that is a
+            `HybridState`, as `Run.last` is, has its own instead."""
             return {}
-
-        @derived
-        def stops(self) -> tuple[RigidStop, ...]:
-            """The rigid stops among the contacts."""
-            return stops_in(self)
-
-        @derived
-        def switches(self) -> tuple[AbstractSwitch, ...]:
-            """The contacts that are no rigid stops, and the switches among the events."""
-            return switches_in(self)
 
         @derived
         def coordinates(self) -> tuple[Coordinate, ...]:
@@ -170,71 +134,15 @@ class AbstractMachine(Clocked, Observed, Worded):
             where none does one, the machine's `position`, `velocity` and `placed`."""
             return coordinates_in(self)
 
-    @property
-    def others(self) -> tuple[AbstractEvent, ...]:
-        """The events that are no switches."""
-        return other_events(self)
+    def start(self) -> State:
+        """The state to begin from where none is given.
 
-    @property
-    def outcomes(self) -> tuple[str, ...]:
-        """The names of the outcomes with which its events and its stops end a motion."""
-        names = (x.ends for x in (*self.switches, *self.others, *self.stops) if x.ends)
-        return tuple(dict.fromkeys(names))
-
-    @by_default
-    def begin(self, s: Scalar, state: State) -> Any:
-        """The discrete modes of a motion that begins in `state`, which the field receives after the
-        state and events change; by default `modes` of the class. A start that is a `HybridState`,
-        as `Run.last` is, has its own instead."""
-        return tuple(declared_modes(self).values())
-
-    def observed_every(self, interval: Any) -> "AbstractMachine":
-        """An autonomous machine observed at equal intervals of `s` instead of on its section."""
-        ends = any(x.ends_cycle for x in (*self.stops, *self.switches, *self.others))
-        if not ends and not has_section(self):
-            raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
-        require("interval", number("interval", interval), low=0.0, open_low=True)
-        return at_intervals(self, interval)
-
-    @by_default
-    def section(self, state: State) -> Scalar | None:
-        """The function that rises through zero at the end of a cycle; `None` if `s`, `clock` or an
-        event ends cycles."""
-        counter = counter_of(self)
-        return counter.section(state) if isinstance(counter, Passing) else None
-
-    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """The longest step that holds at most one extremum of the motion: `cycle`/5, less near a
-        soft stop."""
-        counter = counter_of(self)
-        limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
-        for stop in self.switches:
-            if stop.acts and isinstance(stop, SoftStop):
-                pace, length = self.pace(s, state), stop.longest_step(self, s, state)
-                limit = jnp.minimum(limit, length if pace is None else length / pace)
-        return limit
-
-    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."] | None:
-        """Mean drive speed over cycles of these durations, or `None` where nothing is driven."""
-        return 2 * pi / duration if isinstance(counter_of(self), Turn) else None
-
-    def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
-        """The coordinate that a contact names by its `on`; of a contact that names none the
-        machine's own.
-
-        **Arguments:** `mass`, what acts there, 1 if it is `None`.
+        **Raises:** `ValueError` where this machine has none.
         """
-        if on is not None:
-            return coordinate_by_name(on, mass)
-        methods = ("position", "velocity", "placed")
-        own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
-        return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
-
-    @property
-    def _first(self) -> Coordinate:
-        """What `position`, `velocity` and `placed` are where the machine does not say it by them:
-        the first of its own `coordinates`, if it has some."""
-        return self.coordinates[0] if names_coordinates(self) else _plain(self)
+        raise ValueError(
+            f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
+            "its own."
+        )
 
     @by_default
     def position(self, state: State) -> Scalar:
@@ -255,49 +163,128 @@ class AbstractMachine(Clocked, Observed, Worded):
         """`state` with this position and velocity: how a landing and a rebound are applied."""
         return self._first.placed(state, Y, V)
 
-    def has_velocity(self, state: State) -> bool:
-        """Whether `velocity` is one; it need not be where there is nothing to meet."""
-        own = is_own(type(self).velocity) or names_coordinates(self)
-        return own or bool(self.stops) or hasattr(state, "V")
+    def observed_every(self, interval: Any) -> "AbstractMachine":
+        """An autonomous machine observed at equal intervals of `s` instead of on its section."""
+        if counter_of(self) is None and not any(x.ends_cycle for x in _events_in(self)):
+            raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
+        require("interval", number("interval", interval), low=0.0, open_low=True)
+        return at_intervals(self, interval)
 
-    def start(self) -> State:
-        """The state to begin from where none is given.
+    @by_default
+    def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """`averages(s, state)`: by name, quantities whose means over time are wanted.
 
-        **Raises:** `ValueError` where this machine has none.
+        Each is integrated along with the state, with the method's accuracy, and divided by the
+        time: `Run.averages` of each cycle, `Orbit.averages` and columns of a `Branch` over the
+        period. Impulses of impacts are not included. `units` may have the unit under the same name.
+        As the field, it receives the discrete modes. Nothing is integrated with
+        `record="sections"`."""
+        return {}
+
+    @by_default
+    def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """`quantities(s, state)`: functions of the state, by name, which results contain as well:
+        on sections, in samples, along branches. `s` counts from the section; it is 0 for autonomous
+        machines, and if the state contains the clock."""
+        return {}
+
+    @by_default
+    def renewed(self, state: State) -> State:
+        """The state at the begin of the next cycle, for a number that is counted by the cycle: a
+        drift becomes the progress in the last cycle, and begins again from zero."""
+        return state
+
+    def mirrored(self, state: State) -> State | None:
+        """The image of a state under the symmetry of this machine, of which each motion has an
+        image half a cycle later; `None` without such a symmetry."""
+        return None
+
+    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
+        """The longest step, in which the motion has at most one extremum: `cycle`/5, less near a
+        soft stop."""
+        counter = counter_of(self)
+        limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
+        for stop in switches_of(self):
+            if stop.acts and isinstance(stop, SoftStop):
+                pace, length = self.pace(s, state), stop.longest_step(self, s, state)
+                limit = jnp.minimum(limit, length if pace is None else length / pace)
+        return limit
+
+    def relaxation(self, s: Scalar, state: State) -> Scalar | None:
+        """The shortest time constant (in `s`) of what decays, `None` if nothing does. Explicit
+        Runge–Kutta methods are unstable with much longer steps."""
+        return None
+
+    def pace(self, s: Scalar, state: State) -> Scalar | None:
+        """d(time)/ds; `None` if `s` is the time."""
+        return None
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """The names of position and velocity in pictures, with units."""
+        return PLAIN
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units by name: of `position`, `velocity`, `time`, `rate` (of exponents), `energy`,
+        `power`, and of each parameter and component of the state under its own name. "1" is without
+        unit; the name "" stands for all others. By default those of `labels`, in brackets, and of
+        the fields' metadata."""
+        found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
+        own = {**dict(found), **fields_with(type(self), "unit")}
+        return {x: unit for x, unit in own.items() if unit}
+
+    # The parts as a step asks for them (`stops_of` and the others of `parts`). Machines of this
+    # room that sort them in another way have their own.
+
+    @property
+    def _stops(self) -> tuple[RigidStop, ...]:
+        return stops_in(self)
+
+    @property
+    def _switches(self) -> tuple[AbstractSwitch, ...]:
+        return switches_in(self)
+
+    @property
+    def _others(self) -> tuple[AbstractEvent, ...]:
+        return other_events(self)
+
+    def _section(self, state: State) -> Scalar | None:
+        """See `section_in`."""
+        counter = counter_of(self)
+        return counter.section(self, state) if isinstance(counter, Passing) else None
+
+    def _clock(self, state: State) -> Scalar | None:
+        """See `clock_of`."""
+        return None
+
+    def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
+        """The coordinate that a contact names by its `on`; of a contact that names none the
+        machine's own.
+
+        **Arguments:** `mass`, what acts there, 1 if it is `None`.
         """
-        raise ValueError(
-            f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
-            "its own."
-        )
+        if on is not None:
+            return coordinate_by_name(on, mass)
+        methods = ("position", "velocity", "placed")
+        own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
+        return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
 
-    def prepared(self) -> Prepared:
-        """The machine in the form in which a run follows it: what its numbers alone determine is
-        worked out here, once, and its state may be another one (natural modes); with the ways from
-        its own states to those, and back. By default it is the machine itself."""
-        return Prepared(self, _as_it_is, _as_it_is)
+    @property
+    def _first(self) -> Coordinate:
+        """What `position`, `velocity` and `placed` are where the machine does not say it by them:
+        the first of its own `coordinates`, if it has some."""
+        return self.coordinates[0] if names_coordinates(self) else _plain(self)
 
-    def adopt(self, start: State) -> State:
-        """A start in the form that this machine needs. **Raises:** `TypeError` for another
-        object."""
-        return start
 
-    def may_rest(self) -> bool:
-        """Whether the body can come to rest on a stop, as far as is known; static."""
-        return bool(self.stops)
+def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
+    return (*machine._stops, *machine._switches, *machine._others)
 
-    def alive(self, state: State) -> Flag | None:
-        """Whether the motion can go on: false where the clock of this machine breaks down, as where
-        a crank stops in the phase clock; `None` where it cannot."""
-        return None
 
-    def in_range(self, start: State) -> Flag:
-        """Whether the numbers of this machine, traced ones too, are such that it can be run from
-        `start`; asked once, when a lane begins. By default what its parts say (`ranges`)."""
-        return in_range((self, self.stops, self.switches))
-
-    def check_start(self, start: State) -> None:
-        """Raise a `ValueError` if the concrete `start` cannot be simulated (stops apart)."""
-        return None
+def has_velocity(machine: AbstractMachine, state: State) -> bool:
+    """Whether a machine's `velocity` is one; it need not be where there is nothing to meet."""
+    own = is_own(type(machine).velocity) or names_coordinates(machine)
+    return own or bool(stops_of(machine)) or hasattr(state, "V")
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:
@@ -306,11 +293,6 @@ def names_coordinates(machine: AbstractMachine) -> bool:
         return True
     walls = (x for x in listed(machine.contacts) if isinstance(x, Wall))
     return any(x.on is not None for x in walls)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def has_section(machine: AbstractMachine) -> bool:
-    """Whether a machine has a section, a function of its state that ends its cycles."""
-    return is_own(type(machine).section) or isinstance(counter_of(machine), Passing)
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from .._types import Flag, Machine, Scalar, State
+from .own import stops_of, switches_of
 
 # A pivot smaller than this (its row's begins as 1) is that of a contact whose velocity the others
 # have settled already, as that of the fourth leg of a table: it gets no force. A choice, far above
@@ -108,7 +109,7 @@ def rubbed(
     **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
     impact and after one without friction, whose velocity towards the stop is kept.
     """
-    stop = machine.stops[number]
+    stop = stops_of(machine)[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
     push, drag = push_of(body, before), push_of(along, before)
     gains = shares((body, along), before, (push, drag))
@@ -170,9 +171,9 @@ def held_by(
     **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`, empty
     where nothing is known to rest.
     """
-    limited = sorted({stop.coordinate for stop in machine.stops}) if contact else []
+    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
-    stops, switches = (machine.stops, machine.switches) if contact else ((), ())
+    stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
     frictions = [(i, x) for i, x in enumerate(switches) if x.rubs_on is not None]
     numbers = [*limited, *(x.along for _, x in frictions)]
     each = {k: push_of(coordinates[k], state) for k in numbers}
@@ -203,7 +204,7 @@ def with_dry_friction(
 
     **Arguments:** as `held_by`.
     """
-    for i, friction in enumerate(machine.switches):
+    for i, friction in enumerate(switches_of(machine)):
         if friction.is_dry:
             push, mass = friction.row(machine, s, state)
             held.coordinates.append(friction.as_velocity(machine, s))
@@ -237,6 +238,6 @@ def held_flow(
         force = amounts[row] * mass
         found[i] = force if pace is None else force / pace, None, mass
     for row, (i, friction, at, _) in enumerate(held.rubbing, start=held.first):
-        sign, mass = machine.stops[friction.rubs_on].sign, held.masses[row]
+        sign, mass = stops_of(machine)[friction.rubs_on].sign, held.masses[row]
         found[i] = amounts[row] * mass, -sign * amounts[at] * held.masses[at], mass
     return added(flow, amounts, held.pushes), found

@@ -3,6 +3,7 @@ same machine observed at equal intervals instead."""
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from math import pi
 from typing import Any
 
@@ -21,7 +22,7 @@ class Counter:
     """What counts the cycles of a machine, as its `cycle`: the class has it, an instance has the
     usual length of a cycle instead."""
 
-    def __init__(self, name: str, usual: Any):
+    def __init__(self, name: Any, usual: Any):
         self.name, self.usual = name, usual
 
     def __get__(self, machine: Any, owner: type) -> Any:
@@ -30,7 +31,7 @@ class Counter:
     def length(self, machine: Any) -> Any:
         """The usual length of a cycle, by which steps are sized."""
         if self.usual is not None:
-            return self.usual
+            return self.usual(machine) if callable(self.usual) else self.usual
         raise ValueError(
             f"Argument `usual` must be given to what counts the cycles of a "
             f"{type(machine).__name__}: about how long a cycle takes."
@@ -47,7 +48,7 @@ class Turn(Counter):
     def length(self, machine: Any) -> Any:
         """As long as a turn takes at the speed at which the machine starts."""
         if self.usual is not None:
-            return self.usual
+            return super().length(machine)
         speed = self.speed(machine.start())
         known = None if speed is None else concrete(speed)
         if speed is None or (known is not None and not known.all()):
@@ -97,15 +98,18 @@ class _TurnOver(Reset):
 
 
 class Passing(Counter):
-    """A number of the state whose passing through zero ends a cycle."""
+    """A number of the state, or a function of it, that ends a cycle where it passes through
+    zero."""
 
-    def __init__(self, name: str, sign: float, usual: Any = None):
+    def __init__(self, name: Any, sign: float, usual: Any = None):
         super().__init__(name, usual)
         self.sign = sign
 
-    def section(self, state: State) -> Any:
+    def section(self, machine: Any, state: State) -> Any:
         """The function that rises through zero at the end of a cycle."""
-        return self.sign * component(self.name, state)
+        where: Any = self.name
+        value: Any = where(machine, state) if callable(where) else component(where, state)
+        return value if self.sign > 0 else -value
 
 
 def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
@@ -123,17 +127,17 @@ def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
     return Turn(name, start, usual)
 
 
-def rising(name: str, *, usual: Any) -> Any:
+def rising(name: str | Callable[..., Any], *, usual: Any) -> Any:
     """End the cycles of a machine where a number of its state rises through zero, as its `cycle`:
     `cycle = vi.rising("v", usual=6.3)`.
 
-    **Arguments:** `name`, of the number; `usual`, about how long a cycle takes, by which steps are
-    sized.
+    **Arguments:** `name`, of the number, or a function: `lambda m, z: z.x - m.level`; `usual`,
+    about how long a cycle takes, by which steps are sized: a number, or a function of the machine.
     """
     return Passing(name, 1.0, usual)
 
 
-def falling(name: str, *, usual: Any) -> Any:
+def falling(name: str | Callable[..., Any], *, usual: Any) -> Any:
     """End the cycles of a machine where a number of its state falls through zero; as `rising`."""
     return Passing(name, -1.0, usual)
 
@@ -174,9 +178,6 @@ def _observed_kind(kind: type) -> type:
     def step_limit(self: Any, s: Scalar, state: State) -> Any:
         return jnp.minimum(original(self).step_limit(s, state), self.observed_interval / 5)
 
-    def section(self: Any, state: State) -> None:
-        return None
-
     def parts(name: str) -> property:
         return property(lambda self: tuple(map(_goes_on, getattr(original(self), name))))
 
@@ -187,8 +188,8 @@ def _observed_kind(kind: type) -> type:
         "observed_interval": eqx.field(default=None, kw_only=True),
         "observed_usual": eqx.field(default=None, kw_only=True),
         "step_limit": step_limit,
-        "section": section,
-        **{name: parts(name) for name in ("stops", "switches", "others")},
+        "observed_every": lambda self, interval: original(self).observed_every(interval),
+        **{name: parts(name) for name in ("_stops", "_switches", "_others")},
     }
     if "cycle" not in _fields(kind):
         body["cycle"] = property(lambda self: self.observed_interval)

@@ -207,18 +207,18 @@ class AbstractSwitch(AbstractEvent):
 
 
 class Section(AbstractEvent):
-    """The end of a cycle: where the machine's `section` rises through zero, or what counts its
-    cycles has come to their length."""
+    """The end of a cycle: where the function of `rising` or `falling` passes zero, or what counts
+    its cycles has come to their length."""
 
     word: ClassVar = "section"
     ends_cycle: bool = eqx.field(static=True, kw_only=True, default=True, repr=False)
 
     def guard(self, machine, s, state, *modes):
-        """The machine's `section`, or what is left to a full cycle."""
-        rises = machine.section(state)
+        """That function, or what is left to a full cycle."""
+        rises = machine._section(state)
         if rises is not None:
             return rises
-        clock = machine.clock(state)
+        clock = machine._clock(state)
         return (s if clock is None else clock) - jnp.asarray(machine.cycle, jnp.result_type(s))
 
     def after(self, machine, s, state, *modes):

@@ -10,19 +10,19 @@ from .._types import Machine, Scalar, Scalars, State
 from .contacts import rubbed
 from .event import AbstractEvent, Around, Modes, Section
 from .friction import chosen_together, frictions_in
-from .own import declared_modes
+from .own import declared_modes, others_of, stops_of, switches_of
 
 
 def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
     """All events of a machine, in the order in which they are numbered: its stops, its switches,
     its other events, its section."""
-    return (*machine.stops, *machine.switches, *machine.others, Section())
+    return (*stops_of(machine), *switches_of(machine), *others_of(machine), Section())
 
 
 def is_autonomous(machine: Machine, state: State) -> bool:
     """Whether an event ends the cycles of a machine, instead of its clock."""
     ends = any(event.ends_cycle for event in events_of(machine)[:-1])
-    return ends or machine.section(state) is not None
+    return ends or machine._section(state) is not None
 
 
 def section_number(machine: Machine) -> int:
@@ -108,14 +108,14 @@ def _rubbed(machine: Machine, number: int, s: Scalar, before: State, after: Stat
 
 def rubbing_on(machine: Machine, number: int) -> Any:
     """The friction on stop number `number`, or `None`."""
-    if number >= len(machine.stops):
+    if number >= len(stops_of(machine)):
         return None
-    return next((x for x in machine.switches if x.rubs_on == number), None)
+    return next((x for x in switches_of(machine) if x.rubs_on == number), None)
 
 
 def rubs(machine: Machine) -> bool:
     """Whether there is friction on one of its stops."""
-    return any(x.rubs_on is not None for x in machine.switches)
+    return any(x.rubs_on is not None for x in switches_of(machine))
 
 
 def mode_number(machine: Machine, number: int) -> int:
@@ -147,7 +147,7 @@ def begin_modes(
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own, which are `own` where that is given."""
     held = [event for event in events_of(machine) if event.holds_mode]
-    own = mode_values(machine.begin(s, state)) if own is None else own
+    own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in held), *own]
     modes = settled_modes(modes, s)
     if any(event.sees_around for event in held):  # which looks at the other modes
@@ -185,7 +185,13 @@ def struck_modes(
 
 def holds_anywhere(machine: Machine) -> bool:
     """Whether there is friction that may hold a body wherever that is."""
-    return any(x.is_dry for x in machine.switches)
+    return any(x.is_dry for x in switches_of(machine))
+
+
+def modes_at_start(machine: Machine, s: Scalar, state: State) -> tuple[Any, ...]:
+    """The machine's own modes of a motion that begins in `state`."""
+    modes = machine.modes
+    return mode_values(modes(s, state) if callable(modes) else declared_modes(machine))
 
 
 def mode_values(modes: Any) -> tuple[Any, ...]:

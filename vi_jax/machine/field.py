@@ -8,13 +8,14 @@ import jax.tree_util as jtu
 
 from .._types import Machine, Scalar, Scalars, State
 from .contacts import added
+from .own import switches_of
 from .state import like
 
 
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
     """The modes that a machine's own functions get: all but those of contacts that act by
     themselves. The modes of switches come first, in their order."""
-    hidden = {i for i, x in enumerate(machine.switches) if x.acts}
+    hidden = {i for i, x in enumerate(switches_of(machine)) if x.acts}
     return tuple(mode for i, mode in enumerate(modes) if i not in hidden)
 
 
@@ -24,7 +25,7 @@ def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:
     flow = machine.field(s, state, *shown_modes(machine, modes))
     flow = like(state, flow, f"`field` of a {type(machine).__name__}")
     pace = machine.pace(s, state)
-    for switch, mode in zip(machine.switches, modes, strict=False):
+    for switch, mode in zip(switches_of(machine), modes, strict=False):
         pushed = switch.push_in(machine, s, state, mode) if switch.acts else None
         if pushed is not None:
             amount, push = pushed
@@ -38,7 +39,7 @@ def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int =
 
     **Arguments:** switches before number `first` are in mode +1 or -1.
     """
-    switches = machine.switches
+    switches = switches_of(machine)
     found = [i for i, x in enumerate(switches) if x.blends and i >= first]
     if not found:
         return acting(machine, s, state, modes)

@@ -29,6 +29,7 @@ from .._types import Flag, Machine, Scalar, Scalars, State
 from .contacts import added, forces, gained, held_flow, push_of, shares, way_of
 from .event import AbstractSwitch, Around
 from .field import field_in
+from .own import coordinate_on, stops_of, switches_of
 from .state import with_components
 
 # Of a set of modes that is looked for, a force may point the wrong way by this share of what
@@ -204,13 +205,13 @@ class DryFriction(Friction):
         """The velocity against what it rubs on."""
         if self.slip is not None:
             return jnp.asarray(asked(self.slip, machine, s, state))
-        return machine.coordinate_on(self.on, self.mass).velocity(state)
+        return coordinate_on(machine, self.on, self.mass).velocity(state)
 
     def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
         """How the state changes by as much of the force as changes the slip by one, and the mass
         that the force acts on."""
         if self.push is None:
-            body = machine.coordinate_on(self.on, self.mass)
+            body = coordinate_on(machine, self.on, self.mass)
             push, mass = push_of(body, state), body.mass_at(s, state)
             if self.slip is None:
                 return push, mass
@@ -268,7 +269,7 @@ class DryFriction(Friction):
     def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
         """The state without slip, which vanishes to rounding."""
         if self.slip is None and self.push is None:
-            body = machine.coordinate_on(self.on, self.mass)
+            body = coordinate_on(machine, self.on, self.mass)
             velocity = body.velocity(state)
             return body.placed(state, body.position(state), jnp.zeros_like(velocity))
         slip, (push, _) = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
@@ -333,7 +334,7 @@ class ContactFriction(Friction):
         **Arguments:** as every event's, and `around`, the other modes and who rests where.
         """
         # It vanishes to rounding; and with it what that would give to the velocity on the stop.
-        stop, along = machine.stops[self.stop], machine.coordinates[self.along]
+        stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
         pushes = [push_of(body, state) for body in both]
         stops = [jnp.zeros((), bool) if around is None else self._rests(machine, around), mode != 0]
@@ -345,7 +346,7 @@ class ContactFriction(Friction):
     def _rests(self, machine: Machine, around: Around) -> Flag:
         if not around.contact:
             return jnp.zeros((), bool)
-        return around.contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
+        return around.contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
 
     def held(self, machine, s, state, contact, found):
         """The force that holds a body, the largest that can, the mass that it acts on, and whether
@@ -354,7 +355,7 @@ class ContactFriction(Friction):
         **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
         """
         force, pressing, mass = found
-        here = contact[machine.stops[self.stop].coordinate] == 1.0 + self.stop
+        here = contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
         return force, self.level * pressing, mass, here
 
     def push_in(self, machine, s, state, mode):
@@ -392,7 +393,7 @@ def chosen_together(
     one that does not stick again, with whether that is so.
     """
     places = frictions_in(machine)
-    switches = machine.switches
+    switches = switches_of(machine)
     ways = [switches[i].way(machine, s, state) for i in places]
     slips = [x != 0 for x in ways]
     if released is not None:  # what sticks has no slip but rounding
@@ -421,7 +422,7 @@ def chosen_together(
 
 def frictions_in(machine: Machine) -> list[int]:
     """The places among a machine's switches of its frictions."""
-    return [i for i, x in enumerate(machine.switches) if x.is_dry or x.rubs_on is not None]
+    return [i for i, x in enumerate(switches_of(machine)) if x.is_dry or x.rubs_on is not None]
 
 
 def _consistent(
@@ -434,7 +435,7 @@ def _consistent(
     total, forces = held_flow(machine, flow, s, state, modes, contact)
     good = jnp.ones((), bool)
     for i, slip in zip(places, slips, strict=True):
-        friction, mode = machine.switches[i], modes[i]
+        friction, mode = switches_of(machine)[i], modes[i]
         if i not in forces:  # on a stop where nothing is known to rest
             continue
         force, holds, mass, acts = friction.held(machine, s, state, contact, forces[i])

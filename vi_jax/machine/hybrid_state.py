@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from .._types import Machine, State, Vector
-from .events import mode_values, settled_modes
+from .events import modes_at_start, settled_modes
 from .own import has_own_modes
 from .shown import Shown
 
@@ -16,14 +16,14 @@ from .shown import Shown
 class HybridState(Shown):
     """A state, and the machine's own modes in it: a start that goes on where another motion ended.
 
-    A machine with discrete modes (`AbstractMachine.begin`) is not determined by its state alone.
+    A machine with discrete modes (`AbstractMachine.modes`) is not determined by its state alone.
     `Run.last` and `Orbit.state` of such a machine are of this class. Its components are those of
     `state`: `run.last.Y` is `run.last.state.Y`.
 
     **Arguments:**
 
     - `state`: as the machine's field gets it.
-    - `modes`: the machine's own modes, a tuple like that of its `begin`.
+    - `modes`: the machine's own modes, a tuple in the order of its `modes`.
     """
 
     state: Any
@@ -69,7 +69,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
     def begin(state: State) -> Any:
         zero = jnp.zeros_like(machine.position(state))
-        return settled_modes(mode_values(machine.begin(zero, state)), zero)
+        return settled_modes(modes_at_start(machine, zero, state), zero)
 
     for _ in range(axes):
         begin = jax.vmap(begin)

@@ -1,7 +1,7 @@
 """Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs."""
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._checks import concrete, number
 from .._types import Number, Scalar, State
-from .base import AbstractMachine, Coordinate, Prepared
+from .base import AbstractMachine, Coordinate
 from .modal import Modes, along, harmonic, modal, solved, times, without_row
 from .own import changed
 from .shown import Shown
@@ -27,6 +27,14 @@ class StructureState(Shown):
     """dx/ds, one number for each degree of freedom."""
 
 
+class Prepared(NamedTuple):
+    """A machine as a run follows it, and states on the way in and out."""
+
+    machine: Any
+    inward: Callable[[State], State] = lambda state: state
+    outward: Callable[[State], State] = lambda state: state
+
+
 class _Known(NamedTuple):
     """What a machine with rules of its own is asked for in each step, worked out beforehand."""
 
@@ -38,9 +46,8 @@ class _Known(NamedTuple):
 
 # What a run asks of a machine and the machine in its modes does not take over from a subclass.
 _IN_MODES = (
-    "field", "_accelerated", "switches", "events", "begin", "averages", "section", "renewed",
-    "coordinates", "position", "velocity", "placed", "has_velocity", "cycle", "period", "clock",
-    "rewound", "pace", "as_logged", "step_limit", "relaxation", "alive", "in_range",
+    "field", "_accelerated", "events", "averages", "renewed", "coordinates", "position",
+    "velocity", "placed", "cycle", "pace", "step_limit", "relaxation",
 )  # fmt: skip
 
 
@@ -86,8 +93,7 @@ class LinearMachine(AbstractMachine):
         return jnp.shape(self.mass)[-1]
 
     @property
-    def stops(self) -> tuple[RigidStop, ...]:  # pyright: ignore
-        """The contacts, under the name by which every machine is asked for them."""
+    def _stops(self) -> tuple[RigidStop, ...]:
         return self.contacts
 
     @property
@@ -191,7 +197,7 @@ class LinearMachine(AbstractMachine):
         """The machine in its natural modes, unless a subclass moves, or meets events, by rules of
         its own."""
         if changed(self, LinearMachine, _IN_MODES):
-            return super().prepared()._replace(machine=self._with_known())
+            return Prepared(self._with_known())
         return self.prepared_modes()
 
     def _with_known(self) -> "LinearMachine":

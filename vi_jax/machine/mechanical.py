@@ -173,9 +173,7 @@ class Mechanical(AbstractMachine):
                 h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
         return h
 
-    def coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
-        """A coordinate by its name, or a gap, a function of the coordinates; by default the first
-        coordinate."""
+    def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         return Coordinate(
             functools.partial(_place, self, on),
             functools.partial(_speed, self, on),

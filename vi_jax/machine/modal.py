@@ -91,6 +91,10 @@ class ModalMachine(AbstractMachine):
         return 2 * jnp.pi / self.frequency
 
     @property
+    def _stops(self) -> tuple[RigidStop, ...]:
+        return self.stops
+
+    @property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """The machine's coordinates, read from the modes instead of the displacements."""
         return tuple(along(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
@@ -211,7 +215,7 @@ def modal(machine: Any) -> Modes:
     pace, square = jnp.sqrt(jnp.abs(kappa)), kappa - 0.25 * c * c
     swing = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     made = ModalMachine(
-        stops=tuple(without_row(stop) for stop in machine.stops),
+        stops=tuple(without_row(stop) for stop in machine.contacts),
         frequency=omega,
         stiffness=found.stiffness,
         damping=found.damping,

@@ -4,6 +4,8 @@ import copy
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
+from .._types import Machine, Scalar, State
+
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -62,5 +64,46 @@ def declared_modes(machine: Any) -> Mapping[str, Any]:
 
 
 def has_own_modes(machine: Any) -> bool:
-    """Whether a machine defines discrete modes, by `modes` or by `begin`."""
-    return bool(declared_modes(machine)) or is_own(type(machine).begin)
+    """Whether a machine defines discrete modes."""
+    return bool(declared_modes(machine)) or callable(machine.modes)
+
+
+def stops_of(machine: Machine) -> tuple[Any, ...]:
+    """Return the rigid stops of a machine, in the order in which logs number them."""
+    return machine._stops
+
+
+def switches_of(machine: Machine) -> tuple[Any, ...]:
+    """Return the parts of a machine that have a mode: soft stops, frictions, switches."""
+    return machine._switches
+
+
+def others_of(machine: Machine) -> tuple[Any, ...]:
+    """Return the events of a machine that are no switches."""
+    return machine._others
+
+
+def clock_of(machine: Machine, state: State) -> Scalar | None:
+    """Return the component of the state that counts cycles; `None` where `s` itself does."""
+    return machine._clock(state)
+
+
+def section_in(machine: Machine, state: State) -> Scalar | None:
+    """Return the function that rises through zero at the end of a cycle (see `rising`); `None`
+    where `s`, a clock or an event ends cycles."""
+    return machine._section(state)
+
+
+def outcomes_of(machine: Machine) -> tuple[str, ...]:
+    """Return the names of the outcomes with which events and stops of a machine end a motion."""
+    events = (*switches_of(machine), *others_of(machine), *stops_of(machine))
+    return tuple(dict.fromkeys(x.ends for x in events if x.ends))
+
+
+def coordinate_on(machine: Machine, on: Any, mass: Any = None) -> Any:
+    """Return the coordinate that a contact names by its `on`; of a contact that names none the
+    machine's own.
+
+    **Arguments:** `mass`, which acts there, 1 if it is `None`.
+    """
+    return machine._coordinate_on(on, mass)

@@ -61,7 +61,7 @@ def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
     contacts = listed(machine.contacts)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
-    return tuple(machine.coordinate_on(on, masses.get(on)) for on in _places(contacts))
+    return tuple(machine._coordinate_on(on, masses.get(on)) for on in _places(contacts))
 
 
 def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:

@@ -6,12 +6,12 @@ from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import (
     NOT_NEGATIVE,
+    POSITIVE,
     Range,
     concrete,
     instance_of,
@@ -22,7 +22,7 @@ from .._checks import (
     require_ranges,
     tuple_of,
 )
-from .._types import Flag, Number, Scalar, State
+from .._types import Number, Scalar, State
 from ._drawn import draw_scene
 from .drives import UNITS, AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, SliderCrank
 from .own import changed
@@ -70,7 +70,7 @@ class Scene(ShaftMachine):
         default=(), converter=lambda x: tuple_of("soft_stops", x, SoftStop)
     )
     """Compliant stops; their stiffness in units of the body's own spring."""
-    ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi)}
+    ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi), "room": POSITIVE}
     units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
 
     def __check_init__(self):
@@ -128,23 +128,10 @@ class Scene(ShaftMachine):
         duration = self.drive.duration()
         return 2 * pi if duration is None else duration
 
-    def period_of(self, cycles: int) -> str:
-        """In crank angle: 2π, 4π, …"""
-        return f"{2 * cycles}π"
-
-    def place_of(self, since_section: float, cycles: int) -> str:
-        """A reading of the clock in words, as a crank angle."""
-        return f"crank angle φ = {float(self.phase_at(since_section)):.6g} of {2 * cycles}π"
-
     @property
     def labels(self) -> tuple[str, str]:
         """Position and velocity in the paper's units, the crank radius a and the frequency ω."""
         return "Y = y/a", "V = dY/dτ"
-
-    @property
-    def turn(self) -> float:
-        """2π: impacts are logged by crank angle."""
-        return 2 * pi
 
     def at_section(self, phase: Number) -> "Scene":
         """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
@@ -197,8 +184,11 @@ class Scene(ShaftMachine):
         return {} if timed is None else {self.drive.state: timed}
 
     @property
-    def switches(self) -> tuple[SoftStop, ...]:
-        """The compliant stops, each with contact as its mode."""
+    def _stops(self) -> tuple[RigidStop, ...]:
+        return self.stops
+
+    @property
+    def _switches(self) -> tuple[SoftStop, ...]:
         return self.soft_stops
 
     def field(self, s: Scalar, state: State, *modes: Scalar) -> State:
@@ -231,7 +221,7 @@ class Scene(ShaftMachine):
         """ζ: mean crank speed over cycles of these durations (unit: ω)."""
         speed = self.drive.fixed_speed
         if speed is None:
-            return super().frequency_ratio(duration)
+            return 2 * pi / duration
         return jnp.broadcast_to(speed, duration.shape)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
@@ -278,7 +268,7 @@ class Scene(ShaftMachine):
         return (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
-            and changed(self, Scene, ("field", "pull", "_pushes", "switches")) is None
+            and changed(self, Scene, ("field", "pull", "_pushes", "_switches")) is None
         )
 
     def _may_be_pressed(self, stop: RigidStop) -> bool:
@@ -292,15 +282,10 @@ class Scene(ShaftMachine):
                 return True
         return False
 
-    def in_range(self, start: State) -> Flag:
-        """Whether all parts are in range, there is room between two stops, and the start is not
-        beyond the section."""
-        good = super().in_range(start)
-        return good & (_room(self.stops) > 0) if len(self.stops) == 2 else good
-
-    def alive(self, state: State) -> jax.Array | None:
-        """Whether the crank turns forward, in the phase clock of a motor; `None` for others."""
-        return state.W > 0 if self.is_paced(state) else None
+    @property
+    def room(self) -> Any:
+        """Distance between two stops; `None` with fewer."""
+        return _room(self.stops) if len(self.stops) == 2 else None
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
         """See `plot_sketch`."""

@@ -5,11 +5,11 @@ from math import pi
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import concrete, one_of, state_of_numbers
-from .._types import Flag, Scalar, State
+from .._types import Scalar, State
 from .base import AbstractMachine
 
 Machine = TypeVar("Machine", bound="ShaftMachine")
@@ -68,11 +68,6 @@ class ShaftMachine(AbstractMachine):
         _require_state("start", start, wanted)
         return state_of_numbers("start", start)
 
-    def in_cycle_clock(self: Machine) -> Machine:
-        """In the phase clock: by time the section would be an event of its own, and the angle of
-        the shaft one more state."""
-        return self.in_clock("phase")
-
     def in_cycle_state(self, name: str, state: State) -> State:
         """A state on the section that was made for the time clock, without the angle of the shaft;
         any other as it is.
@@ -91,22 +86,16 @@ class ShaftMachine(AbstractMachine):
             )
         return self.state_type(*list(vars(state).values())[:-1])
 
-    def clock(self, state: State) -> Scalar | None:
-        """The angle of the shaft, where time is the independent variable."""
+    def _clock(self, state: State) -> Scalar | None:
         return state.phase if self.is_timed(state) else None
 
     def rewound(self, state: State) -> State:
         """The state with a full turn taken off the angle."""
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
 
-    def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
-        """ζ: mean speed of the shaft over cycles of these durations (unit: ω)."""
-        return 2 * pi / duration
-
-    def in_range(self, start: State) -> Flag:
-        """Whether all parts are in range, and the start is not beyond the section."""
-        good = super().in_range(start)
-        return good & (start.phase < 2 * pi) if self.is_timed(start) else good
+    def alive(self, state: State) -> jax.Array | None:
+        """Whether the shaft turns forward, in the phase clock; `None` in another."""
+        return state.W > 0 if self.is_paced(state) else None
 
     def check_start(self, start: State) -> None:
         """Raise a `ValueError` if the shaft does not turn forward in the phase clock, or is beyond

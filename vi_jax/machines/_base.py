@@ -1,14 +1,12 @@
 """What the ready machines share: their fields, pairs of stops, and kinds of drive."""
 
-import dataclasses
 from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 
-from .._checks import POSITIVE, REAL, Range, number, optional_real, real, require, require_ranges
+from .._checks import REAL, Range, optional_real, real, require_ranges
 from .._types import Scalar, State
 from ..machine import AbstractMachine, RigidStop
 
@@ -58,51 +56,6 @@ class ForcedMachine(PhaseMachine):
 
     frequency: eqx.AbstractVar[Scalar]
 
-    @property
-    def period(self) -> Scalar:
-        """2π/ω, the time that a cycle takes."""
-        return 2 * pi / self.frequency
-
     def pace(self, s: Scalar, state: State) -> Scalar:
         """dt/ds = 1/ω, the time that a unit of phase takes."""
         return 1 / self.frequency
-
-
-class AutonomousMachine(ReadyMachine):
-    """A machine without a drive, whose independent variable is time. A cycle ends where
-    `event` rises through zero; if `interval` is given (positive), at
-    equal times instead."""
-
-    interval: Any = number_field("interval", None, POSITIVE, "s")
-
-    def event(self, state: State) -> Scalar:
-        """A function of the state that rises through zero once in a cycle."""
-        raise NotImplementedError
-
-    @property
-    def usual(self) -> Scalar | float:
-        """About how long a cycle is: steps are sized by it."""
-        raise NotImplementedError
-
-    @property
-    def cycle(self) -> Scalar | float:
-        """The interval between observations, or the usual time from event to event."""
-        return self.usual if self.interval is None else self.interval
-
-    def section(self, state: State) -> Scalar | None:
-        """The event, unless time ends the cycles."""
-        return self.event(state) if self.interval is None else None
-
-    def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """A fifth of the usual cycle, however rarely it is observed."""
-        if self.interval is None:
-            return self.usual / 5
-        return jnp.minimum(self.usual, self.interval) / 5
-
-    def observed_every(self, interval: Any) -> "AutonomousMachine":
-        """The same machine observed at equal intervals of time, positive.
-
-        **Raises:** `ValueError` for an interval that is not.
-        """
-        require("interval", number("interval", interval), low=0.0, open_low=True)
-        return dataclasses.replace(self, interval=interval)

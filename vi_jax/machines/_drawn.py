@@ -4,6 +4,7 @@ from math import cos, sin
 from typing import Any
 
 from .._types import State
+from ..machine import stops_of
 
 
 def draw_ball(machine: Any, pen: Any, state: State, phase: float) -> None:
@@ -54,7 +55,7 @@ def _supported(machine: Any, pen: Any, place: float) -> float:
     pen.spring((post, 0.23 * size), (back, 0.23 * size))
     pen.damper((post, -0.24 * size), (back, -0.24 * size))
     pen.body(place, width=size)
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         face = float(stop.place) + stop.sign * size / 2
         # Spring and damper pass through a stop on the left.
         slot = 0.0 if stop.sign > 0 else 0.43 * size

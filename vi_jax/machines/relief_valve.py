@@ -4,16 +4,17 @@ from math import pi
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, concrete, number
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
 from .._types import Number, Scalar
-from ..machine import RigidStop, Shown
-from ._base import AutonomousMachine, number_field
+from ..machine import RigidStop, Shown, falling
+from ._base import ReadyMachine, number_field
 
 
 class ValveState(Shown):
     """The valve's body and the vessel under it; without units, as the numbers of `ReliefValve`."""
+
+    ranges: ClassVar = {"pressure": POSITIVE}
 
     lift: Scalar
     """Distance of the body from its seat (without unit)."""
@@ -23,7 +24,7 @@ class ValveState(Shown):
     """Pressure in the vessel above the ambient one; positive."""
 
 
-class ReliefValve(AutonomousMachine):
+class ReliefValve(ReadyMachine):
     """A vessel filled at a steady rate, and the valve that relieves it: a body on a spring that the
     pressure lifts off its seat.
 
@@ -35,8 +36,7 @@ class ReliefValve(AutonomousMachine):
     it at equal times by `observed_every`.
 
     **Arguments:** `flow_rate` q, positive; `damping` κ, `precompression` δ of the spring, both not
-    negative; `compressibility` β, positive; `restitution` r on the seat, in [0, 1]; `interval` of
-    time between observations, positive, for one that is not observed where its lift is greatest.
+    negative; `compressibility` β, positive; `restitution` r on the seat, in [0, 1].
     """
 
     flow_rate: Any = number_field("flow_rate", 3.0, POSITIVE)
@@ -44,6 +44,7 @@ class ReliefValve(AutonomousMachine):
     precompression: Any = number_field("precompression", 10.0, NOT_NEGATIVE)
     compressibility: Any = number_field("compressibility", 20.0, POSITIVE)
     restitution: Any = number_field("restitution", 0.8, SHARE)
+    cycle: ClassVar = falling("speed", usual=pi / 2)  # cycles take between 0.5 and 3 units of time
     labels: ClassVar = ("lift", "speed of opening")  # pyright: ignore
     units: ClassVar = {"": "1"}  # pyright: ignore
 
@@ -52,21 +53,12 @@ class ReliefValve(AutonomousMachine):
         """The seat, below the body."""
         return (RigidStop(0.0, self.restitution, "left", on=("lift", "speed")),)
 
-    @property
-    def usual(self) -> float:
-        """π/2: cycles take between 0.5 and 3 units of time."""
-        return pi / 2
-
     def field(self, s: Scalar, state: ValveState) -> ValveState:
         """d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         leaves = state.lift * jnp.sqrt(state.pressure)
         return ValveState(state.speed, force, self.compressibility * (self.flow_rate - leaves))
-
-    def event(self, state: ValveState) -> Scalar:
-        """The speed of closing, which rises through zero where the lift is greatest."""
-        return -state.speed
 
     def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
         """The shorter time constant: that of the motion, or of the pressure under an open valve."""
@@ -80,15 +72,3 @@ class ReliefValve(AutonomousMachine):
         return ValveState(
             number("lift", lift), number("speed", speed), number("pressure", pressure)
         )
-
-    def in_range(self, start: ValveState) -> Bool[Array, ""]:
-        """As its numbers say, and with a positive pressure."""
-        return super().in_range(start) & (start.pressure > 0)
-
-    def check_start(self, start: ValveState) -> None:
-        """**Raises:** `ValueError` if the pressure is not positive."""
-        pressure = concrete(start.pressure)
-        if pressure is not None and not (pressure > 0).all():
-            raise ValueError(
-                f"Argument `start` must have a positive pressure, but has {pressure.min():g}."
-            )

@@ -5,12 +5,11 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete, number
 from .._types import Number, Scalar, State
-from ..machine import ContactFriction, Coordinate, RigidStop, Shown
-from ._base import AutonomousMachine, number_field
+from ..machine import ContactFriction, Coordinate, RigidStop, Shown, counter_of, rising
+from ._base import ReadyMachine, number_field
 from ._levers import by_levers, dot, response
 from ._woodpecker_drawn import draw_woodpecker
 
@@ -40,7 +39,7 @@ class WoodpeckerState(Shown):
     """How far the sleeve came down in the cycle before (m)."""
 
 
-class Woodpecker(AutonomousMachine):
+class Woodpecker(ReadyMachine):
     """A sleeve with some play on a pole, and a bird on a spring at it that pecks the pole.
 
     The sleeve tilts until its edge jams on the pole by friction; the bird swings on, lifts the edge
@@ -73,7 +72,6 @@ class Woodpecker(AutonomousMachine):
       h_S above; `sleeve_height` h_M, half of the sleeve's; `sleeve_radius` r_M inside, greater than
       `pole_radius` r_O (all in m, positive).
     - `section_angle` (rad), any number that the bird swings through.
-    - `interval` of time between observations (s), positive, for one observed at equal times.
     """
 
     friction: Any = number_field("friction", 0.3, NOT_NEGATIVE)
@@ -98,18 +96,19 @@ class Woodpecker(AutonomousMachine):
         "rate": "1/s", "time": "s", "energy": "J", "power": "W",
     }  # fmt: skip
     labels: ClassVar = ("beak towards the pole (m)", "its speed (m/s)")  # pyright: ignore
+    ranges: ClassVar = {"play": POSITIVE}
     LOWER: ClassVar[int] = 0
     UPPER: ClassVar[int] = 1
     BEAK: ClassVar[int] = 2
 
     def __check_init__(self):
-        super().__check_init__()
         play = concrete(self.play)
         if play is not None and not (play > 0).all():
             raise ValueError(
                 "Argument `sleeve_radius` must be greater than `pole_radius`, but the play between "
                 f"them is {play.min():g} m."
             )
+        super().__check_init__()
 
     @property
     def play(self) -> Scalar:
@@ -164,8 +163,7 @@ class Woodpecker(AutonomousMachine):
         rates = state.speed, state.sleeve_rate, state.bird_rate
         return WoodpeckerState(*rates, y - self.gravity, sleeve, bird, jnp.zeros_like(s))
 
-    @property
-    def usual(self) -> Scalar:
+    def _usual(self) -> Scalar:
         """The period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
         J = J_S + m_S l_G²."""
         inertia = self.bird_inertia + self.bird_mass * self.bird_arm**2
@@ -175,16 +173,13 @@ class Woodpecker(AutonomousMachine):
         """A fifth of the period of the sleeve and the bird in free fall, which swing against each
         other."""
         _, sleeve, bird = response((None, -1, 1), self._inertia())
-        limit = 0.4 * pi / jnp.sqrt(self.stiffness * (bird - sleeve))
-        return limit if self.interval is None else jnp.minimum(limit, self.interval / 5)
+        return 0.4 * pi / jnp.sqrt(self.stiffness * (bird - sleeve))
 
-    def event(self, state: WoodpeckerState) -> Scalar:
-        """How far φS has fallen below the section's."""
-        return self.section_angle - state.bird_angle
+    cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
 
     def renewed(self, state: WoodpeckerState) -> WoodpeckerState:
         """The way down in a cycle is its drop; observed at equal times, the height goes on."""
-        if self.interval is not None:
+        if counter_of(self) is None:
             return state
         at = jnp.zeros_like(state.height)
         return eqx.tree_at(lambda x: (x.height, x.drop), state, (at, -state.height))
@@ -208,10 +203,6 @@ class Woodpecker(AutonomousMachine):
         }  # fmt: skip
         numbers = {name: number(name, value) for name, value in given.items()}
         return WoodpeckerState(**numbers, drop=jnp.zeros_like(numbers["height"]))
-
-    def in_range(self, start: WoodpeckerState) -> Bool[Array, ""]:
-        """As its numbers say, and with play."""
-        return super().in_range(start) & (self.play > 0)
 
     def sketch(self, pen: object, state: WoodpeckerState, phase: float) -> None:
         """Pole, sleeve, spring and bird, as large as they are."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
-from ..machine import AbstractMachine, bare, in_rows, is_autonomous, raveled, with_modes
+from ..machine import AbstractMachine, Scene, bare, in_rows, is_autonomous, raveled, with_modes
 from ._cycle_map import CycleMap, forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
@@ -53,7 +53,7 @@ def moved_from_impacts(
     where the guess's motion is farthest from its impacts, if the machine's section can be moved.
     """
     machine = the_map.machine
-    if machine.observed_later(0.0) is None:
+    if not isinstance(machine, Scene):
         return the_map, guess, jnp.zeros((), jnp.int32)
     run = _run(the_map, guess, impact_log)
     assert run.samples is not None and run.impact_log is not None
@@ -78,7 +78,7 @@ class Impacts(NamedTuple):
     speed: Float[Array, "cycles log"]
     """V⁻ of each."""
     stop: Float[Array, "cycles log"]
-    """Index into `machine.stops` of each."""
+    """Number of the rigid stop of each."""
 
 
 class ObservedArc(NamedTuple):

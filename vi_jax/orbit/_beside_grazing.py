@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from .._programs import compiled
 from ..flow import AbstractMethod, FixedStep, simulate
-from ..machine import with_leaf
+from ..machine import stops_of, with_leaf
 from ._forecast import (
     LOOKED,
     Settled,
@@ -93,7 +93,7 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
     span = np.abs(last).max(axis=(1, 2), initial=0.0, where=np.isfinite(last))
     far = np.where(good & away, periods_in(last, hits, _FAR * span), 0)
     period = np.where(good & ~away, period, -1)
-    rigid = all(touch.number < len(problem.machine.stops) for touch in graze.touches)
+    rigid = all(touch.number < len(stops_of(problem.machine)) for touch in graze.touches)
     counted = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
     whole = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
     return Simulated(period, counted, last, far, whole)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from .._programs import compiled
 from .._types import Scalar, State, Vector
 from ..flow import average_names, quantities_on, quantity_names
-from ..machine import components, in_unit, with_leaf
+from ..machine import components, frequency_ratio, in_unit, with_leaf
 from ..machine import quantity_of as measured
 from ._corrector import Step, jacobian_at
 from ._observed import Observed
@@ -37,7 +37,7 @@ _APART = 1e-6
 def names_of(problem: Shooting) -> tuple[str, ...]:
     """The numbers of a motion that these equations tell, those of the machine's own included."""
     found = ["y_min", "y_max", "clearance", "duration", "multiplier"]
-    if problem.machine.frequency_ratio(jnp.ones(())) is not None:
+    if frequency_ratio(problem.machine, jnp.ones(())) is not None:
         found.append("frequency_ratio")
     if problem.impacts or not problem.follows_events:
         found += ["fastest_impact", "slowest_impact"]
@@ -60,7 +60,7 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
     if name == "multiplier":
         return jnp.abs(seen.multipliers[0])
     if name == "frequency_ratio":
-        ratio = problem.at(x).frequency_ratio(seen.duration / problem.cycles)
+        ratio = frequency_ratio(problem.at(x), seen.duration / problem.cycles)
         return jnp.asarray(ratio, x.dtype)
     if name in ("fastest_impact", "slowest_impact"):
         speeds = _speeds(problem, seen)

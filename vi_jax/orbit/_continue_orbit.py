@@ -10,7 +10,7 @@ import numpy as np
 
 from .._checks import flag, given_number, interval, one_of, short, tuple_of_names
 from ..flow import MethodLike
-from ..machine import check_leaf, leaf
+from ..machine import check_leaf, leaf, may_rest
 from ._conditions import as_held, names_of, rates_at
 from ._corrector import Step, advance, tangent_at
 from ._follow import both_ways, check_walk, rescaled
@@ -93,7 +93,7 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if bool(orbit.rests > 0) or (orbit.machine.may_rest() and lies_on_a_stop(orbit)):
+    if bool(orbit.rests > 0) or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
         problem, x = section_map_of(orbit, parameter, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)

@@ -29,7 +29,20 @@ from ..flow import (
     preset,
     simulate,
 )
-from ..machine import AbstractMachine, HybridState, bare, begun, modes_of, raveled
+from ..machine import (
+    AbstractMachine,
+    HybridState,
+    adopt,
+    at_section,
+    bare,
+    begun,
+    clock_of,
+    in_cycle_clock,
+    in_cycle_state,
+    may_rest,
+    modes_of,
+    raveled,
+)
 
 
 def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
@@ -150,17 +163,17 @@ def cycle_map(
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
-    machine = machine_of(machine).in_cycle_clock()
+    machine = in_cycle_clock(machine_of(machine))
     if section is not None:
         require("section", section)
-        machine = machine.at_section(section)
+        machine = at_section(machine, section)
     method = chosen(machine, method, _usual(machine))
     method.check(machine)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
-    return CycleMap(machine, carried, count("cycles", cycles, least=1), machine.may_rest())
+    return CycleMap(machine, carried, count("cycles", cycles, least=1), may_rest(machine))
 
 
 def _usual(machine: AbstractMachine) -> AbstractMethod:
@@ -173,9 +186,9 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
     """A state as a cycle map needs it, in floating-point arrays of one type, with the machine's own
     modes if it has some; `name` is the argument that messages blame."""
     modes, state = modes_of(state), bare(state)
-    state = machine.adopt(machine.in_cycle_state(name, state))
+    state = adopt(machine, in_cycle_state(machine, name, state))
     check_reals(name, state)
-    if machine.clock(state) is not None:
+    if clock_of(machine, state) is not None:
         raise ValueError(
             "Argument `machine` must count its cycles by its independent variable, but its state "
             "has a clock."

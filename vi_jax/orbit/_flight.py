@@ -19,6 +19,7 @@ from ..machine import (
     SoftStop,
     events_of,
     guard_of,
+    prepared,
     section_number,
 )
 
@@ -112,7 +113,7 @@ class Flight(eqx.Module):
         **Returns:** the state at s1; the time that passed and the integrals; clock and state before
         each of the steps.
         """
-        way = self.machine.prepared()
+        way = prepared(self.machine)
         if way.machine is not self.machine:
             inner = Flight(way.machine, self.modes, self.method, way.inward(self.like))
 

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .._programs import compiled
 from .._types import Scalar, Vector
-from ..machine import AbstractMachine, renews
+from ..machine import AbstractMachine, renews, section_in
 from ._corrector import Step, observe
 from ._flight import section_of
 from ._shooting import Shooting
@@ -46,7 +46,7 @@ def _size(problem: Shooting, x: Vector) -> Scalar:
 def _flow(problem: Shooting, x: Vector, u: Vector) -> tuple[Vector, Array, Scalar, Vector]:
     """Field and section in the state u, each with its derivatives by it."""
     machine = problem.at(x)
-    section, slope = jax.value_and_grad(lambda u: machine.section(problem.unravel(u)))(u)
+    section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
     jacobian = jax.jacfwd(lambda u: _rate(problem, machine, u))(u)
     return _rate(problem, machine, u), jacobian, section, slope
 

@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
 from ..flow import guard_rates
-from ..machine import after_event, events_of, guard_of, jump_of
+from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from ._corrector import tangent_at
 from ._flight import Event, Flight
 from ._shooting import Shooting
@@ -287,7 +287,7 @@ def touch_at(
             f"Argument `point` must be a grazing at which the motion turns, but the "
             f"distance's second derivative is {float(rate):.3g} there."
         )
-    if number < len(problem.machine.stops):
+    if number < len(stops_of(problem.machine)):
         push = fast / (fast @ fast)
         near = u - _SLOW * push
         after = np.asarray(_struck(problem, at, number, leg, s, *map(jnp.asarray, (near, push))))

@@ -29,7 +29,7 @@ class Counted(NamedTuple):
     speed: Float[Array, " log"]
     """V⁻ of each."""
     stop: Int[Array, " log"]
-    """Index into `machine.stops` of each, -1 where there is none."""
+    """Number of the rigid stop of each, -1 where there is none."""
 
 
 class Observed(NamedTuple):

@@ -33,7 +33,13 @@ from ..machine import (
     is_autonomous,
     leaf,
     modes_of,
+    others_of,
+    phase_at,
     renews,
+    scales_known,
+    section_in,
+    stops_of,
+    switches_of,
     with_leaf,
 )
 from ._corrector import Unknowns, off_by
@@ -253,7 +259,7 @@ def sized_by_motion(problem: Shooting) -> bool:
     clock, as a motor's crank, may be slow anywhere."""
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
-    return paced or not machine.scales_known or isinstance(problem.method, ImplicitSteps)
+    return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
 def finer(problem: Shooting, x: Unknowns) -> Shooting | None:
@@ -304,15 +310,16 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     """The events of a motion, with the clock of each since the section, in their order."""
     machine, cycles = orbit.machine, int(orbit.cycles)
     autonomous = is_autonomous(machine, bare(orbit.state))
-    clock = np.asarray(orbit.impact_phase) - float(machine.phase_at(0.0))
+    clock = np.asarray(orbit.impact_phase) - float(phase_at(machine, 0.0))
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
     begins = float(machine.cycle) * np.arange(cycles)
-    others = bool(machine.switches or machine.others or any(e.ends_cycle for e in machine.stops))
+    ends = any(stop.ends_cycle for stop in stops_of(machine))
+    others = bool(switches_of(machine) or others_of(machine) or ends)
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found
-    if machine.section(bare(orbit.state)) is not None or renews(machine):
+    if section_in(machine, bare(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     # What is met with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))

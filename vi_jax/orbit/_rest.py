@@ -34,6 +34,7 @@ from ..machine import (
     leaf,
     modes_of,
     raveled,
+    stops_of,
     with_modes,
 )
 from ._corrector import Step, advance, way
@@ -82,7 +83,7 @@ class SectionMap(Shooting):
         """The state `u`, put on those stops that it is beyond: where the motion rests on its
         section a guess of the state there may be."""
         state = self.unravel(u)
-        for stop in machine.stops:
+        for stop in stops_of(machine):
             body = machine.coordinates[stop.coordinate]
             beyond = stop.beyond(body.position(state)) > 0
             there = body.placed(state, stop.place, body.velocity(state))
@@ -196,7 +197,7 @@ def refined_rest(problem: Shooting, at: Step, scale: np.ndarray) -> Step:
         return speed[where == stop]
 
     assert isinstance(problem, SectionMap)
-    for i, stop in enumerate(problem.at(jnp.asarray(at.x)).stops):
+    for i, stop in enumerate(stops_of(problem.at(jnp.asarray(at.x)))):
         V = speeds(0.0, i)
         k = float(stop.share(jnp.asarray(V[-1]))) if V.size > 1 else 0.0
         if 0 < k < 1:
@@ -453,7 +454,7 @@ def past_section(problem: Shooting, last: Step, scale: np.ndarray) -> Step | Non
     state, rests = problem.unravel(jnp.asarray(x[: problem.states])), _rests(last)
     along = np.zeros(x.size)
     along[-1] = np.copysign(1.0, last.tangent[-1])
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
         if float(stop.beyond(body.position(state))) < -_MEETS * last.seen.length:
             continue

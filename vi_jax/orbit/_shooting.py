@@ -26,10 +26,12 @@ from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
     after_event,
+    cycle_time,
     is_autonomous,
     jump_of,
     mode_number,
     own_modes,
+    stops_of,
     with_leaf,
 )
 from ._flight import Event, Flight, guard_at
@@ -105,7 +107,7 @@ class Shooting(eqx.Module):
     @property
     def impacts(self) -> tuple[int, ...]:
         """Which of the events are impacts."""
-        stops = len(self.machine.stops)
+        stops = len(stops_of(self.machine))
         return tuple(i for i, event in enumerate(self.events) if event.number < stops)
 
     def at(self, x: Vector) -> AbstractMachine:
@@ -299,7 +301,7 @@ class Shooting(eqx.Module):
             nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
             order=jnp.min(order),
             apart=apart(machine, self.events, self.modes, clock, ends - clock, before),
-            duration=time if timed else jnp.asarray(machine.period, x.dtype) * self.cycles,
+            duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
             averages=means(integrals, time),
             largest=jnp.max(largest, axis=0),
         )

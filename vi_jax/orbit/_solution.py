@@ -10,7 +10,7 @@ from jaxtyping import Array
 from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
-from ..machine import with_modes
+from ..machine import frequency_ratio, phase_at, with_modes
 from ._corrector import Step
 from ._observed import Observed
 from ._shooting import Shooting
@@ -83,7 +83,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
     within, speeds, stops, count = _impacts_of(problem, seen, clock, period)
     order = np.argsort(within)
-    since = machine.phase_at(within[order])
+    since = phase_at(machine, within[order])
     duration = jnp.asarray(seen.duration)
     state = jax.tree.map(lambda x: x[0], sections)
     own = problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
@@ -94,7 +94,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,
-        frequency_ratio=machine.frequency_ratio(duration / problem.cycles),
+        frequency_ratio=frequency_ratio(machine, duration / problem.cycles),
         impact_phase=jnp.asarray(since),
         impact_speed=jnp.asarray(speeds[order]),
         impact_stop=jnp.asarray(stops[order]),

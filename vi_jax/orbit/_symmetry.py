@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, stops_of
 from ._flight import Event
 from ._shooting import Shooting
 
@@ -34,7 +34,7 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
 
 
 def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
-    stops = machine.stops
+    stops = stops_of(machine)
     if max(one.number, other.number) < len(stops):  # stops come first among the events
         left, right = stops[one.number], stops[other.number]
         return left.coordinate == right.coordinate and left.sign == -right.sign

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Flag, Scalar, State, Vector
 from ..flow import Rates, SmoothMachine, guard_rates
-from ..machine import events_of, guard_of, happens_at, section_number
+from ..machine import events_of, guard_of, happens_at, has_velocity, section_number, stops_of
 from ._flight import Flight
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step): a choice,
@@ -102,7 +102,7 @@ class _Body(_Guard):
 
     def rate(self, flight, s, u):
         state = flight.unravel(u)
-        if flight.machine.has_velocity(state):
+        if has_velocity(flight.machine, state):
             return flight.machine.coordinates[self.number].velocity(state)
         return super().rate(flight, s, u)
 
@@ -176,12 +176,12 @@ def _turning(
 
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
     rooms = []
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
         rooms.append(_Room(jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(machine)):
-        if number < len(machine.stops) or number == section_number(machine):
+        if number < len(stops_of(machine)) or number == section_number(machine):
             continue
         at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.

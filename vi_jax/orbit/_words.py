@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ..machine import RigidStop, SoftStop
+from ..machine import RigidStop, SoftStop, clock_in_words
 from ._corrector import Step
 from ._flight import Event
 from ._shooting import Shooting
@@ -68,7 +68,7 @@ def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
     """Where within its period a motion is at this reading of its clock, which is counted from the
     section on."""
     period = float(problem.period(jnp.asarray(at.x)))
-    return f"at {problem.machine.place_of(clock % period, problem.cycles)}"
+    return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:

@@ -14,7 +14,14 @@ from .._checks import given_number, one_of
 from .._messages import so_many
 from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names, tidy
-from ..machine import AbstractMachine, components, in_unit, with_units
+from ..machine import (
+    AbstractMachine,
+    components,
+    cycles_in_words,
+    frequency_ratio,
+    in_unit,
+    with_units,
+)
 from ._conditions import Special, held_in_words
 from ._corrector import Step
 from ._locate import between
@@ -210,7 +217,7 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def frequency_ratio(self) -> np.ndarray:
         """ζ: mean speed of the drive, NaN for machines that are not driven."""
-        ratio = self.problem.machine.frequency_ratio(jnp.asarray(self.duration / self.cycles))
+        ratio = frequency_ratio(self.problem.machine, jnp.asarray(self.duration / self.cycles))
         if ratio is None:
             return np.full(len(self.steps), np.nan)
         given = dict(zip(self.names, self.parameters.T, strict=True))
@@ -408,7 +415,7 @@ class Branch(Curve):
     def __str__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
-        period = machine.period_of(self.cycles)
+        period = cycles_in_words(machine, self.cycles)
         span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
         lines = [
             f"Branch of {so_many(len(self.parameter), 'motion')} of period {period} with "

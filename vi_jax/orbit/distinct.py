@@ -9,7 +9,7 @@ import numpy as np
 
 from .._checks import given_number, short
 from .._messages import so_many
-from ..machine import bare, in_rows, state_in_words
+from ..machine import bare, cycles_in_words, in_rows, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
@@ -39,7 +39,7 @@ class Orbits(InWords, list[Orbit]):
 def in_one_line(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
-    period = orbit.machine.period_of(cycles)
+    period = cycles_in_words(orbit.machine, cycles)
     stable = "stable" if bool(orbit.stable) else "unstable"
     where, span = state_in_words(bare(orbit.state), 6, orbit.machine.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 
 from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, so_many
-from ..machine import Stated, Summarized, in_unit, stated
+from ..machine import Stated, Summarized, in_unit, stated, stops_of
 from ._beside_grazing import ASKED, DECADES, Motions, beside_grazing, positions, stretch
 from ._flight import Event
 from ._forecast import (
@@ -264,9 +264,9 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled
 def _called(graze: Graze, number: int) -> str:
     """What is touched, in words."""
     machine = graze.problem.machine
-    if number >= len(machine.stops):
+    if number >= len(stops_of(machine)):
         return Event(number).called(machine)
-    stop = machine.stops[number]
+    stop = stops_of(machine)[number]
     return stop.name or f"{stop.side} stop"
 
 

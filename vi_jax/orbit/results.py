@@ -29,12 +29,14 @@ from ..machine import (
     AbstractMachine,
     Summarized,
     bare,
+    cycles_in_words,
     first_few,
     in_unit,
     is_autonomous,
     name_in,
     plain,
     state_in_words,
+    stops_of,
     summary_table,
     with_units,
 )
@@ -102,7 +104,7 @@ class Orbit(Summarized):
     impact_speed: Float[Array, "... impacts"]
     """V⁻, speed of approach just before each impact, in the machine's unit (of a `Scene` a ω)."""
     impact_stop: Int[Array, "... impacts"]
-    """Index into `machine.stops` of each impact."""
+    """Number of the rigid stop of each impact."""
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
     rests: Int[Array, "..."]
@@ -175,7 +177,7 @@ class Orbit(Summarized):
         """Whether the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
         inside = self.clearance >= 0
-        for stop in self.machine.stops:
+        for stop in stops_of(self.machine):
             if stop.coordinate:
                 continue  # the extremes are those of the first coordinate
             reach = self.y_max if stop.sign > 0 else -self.y_min
@@ -250,7 +252,7 @@ class Orbit(Summarized):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_nearly(self)}"
         count, cycles, units = int(self.impacts), int(self.cycles), self.machine.units
-        period = self.machine.period_of(cycles)
+        period = cycles_in_words(self.machine, cycles)
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
             f"  section: {state_in_words(bare(self.state), 9, units)}",
@@ -261,7 +263,7 @@ class Orbit(Summarized):
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
-                name = self.machine.stops[int(stop)].side
+                name = stops_of(self.machine)[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 lines.append(f"  impact: {name} stop at phase {float(phase):.6f}, V⁻ = {fast}")
         for name, x in self.averages.items():
@@ -305,8 +307,8 @@ def _nearly(orbit: Orbit) -> str:
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
     """Whether a body lies still on a stop on the section."""
-    bodies = ((stop, orbit.machine.coordinates[stop.coordinate]) for stop in orbit.machine.stops)
-    x = bare(orbit.state)
+    x, machine = bare(orbit.state), orbit.machine
+    bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 

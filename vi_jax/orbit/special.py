@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import given_number
+from ..machine import others_of
 from ._across import across_order, across_sliding, without_part
 from ._conditions import alone
 from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
@@ -261,7 +262,7 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
         )
     if point.impact is None and not point.touches:
         return _otherwise(point, across_order, "its events in another order", distance)
-    if old.modes[0] or old.machine.others:
+    if old.modes[0] or others_of(old.machine):
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
             "discrete modes and `events`: find the motion beyond it with `find_orbit`."

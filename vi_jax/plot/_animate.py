@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from .._checks import count, flag, given_number, instance_of
 from ..flow import Run
-from ..machine import AbstractMachine
+from ..machine import AbstractMachine, logged_turn, phase_at, stops_of
 from ..orbit import Orbit
 from .colors import BLUE, RED
 from .motion import counts_by_angle, plot_history
@@ -123,7 +123,7 @@ def _frames(
 
     states = jax.tree_util.tree_map(between, samples.state)
     # The corners of the paths at their impacts, which no samples have.
-    for k in sorted({0, *(stop.coordinate for stop in machine.stops)}):
+    for k in sorted({0, *(stop.coordinate for stop in stops_of(machine))}):
         one = motion_path(run, machine=machine, coordinate=k)
         known = np.isfinite(one.Y)
         Y, V = (np.interp(at, one.cycles[known], x[known]) for x in (one.Y, one.V))
@@ -190,8 +190,8 @@ class MotionAnimation(animation.FuncAnimation):
     def _sketched(self, index: int) -> None:
         machine, frames = self._machine, self._frames
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
-        turn = float(machine.turn)
-        phase = float(machine.phase_at((frames.cycles[index] % 1.0) * turn))
+        turn = float(logged_turn(machine))
+        phase = float(phase_at(machine, (frames.cycles[index] % 1.0) * turn))
         sketch(machine, pen_for(machine, self._above, frames.positions), state, phase)
 
     def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:

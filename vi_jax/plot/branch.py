@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
-from ..machine import in_brackets, name_in, quantity_of, unit_of
+from ..machine import cycles_in_words, in_brackets, name_in, quantity_of, unit_of
 from ..orbit import Boundary, Branch, branch_hits_in_words
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once, thick
@@ -60,7 +60,7 @@ def plot_branch(
         part = slice(start, end)
         ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
     if label is None and legend:
-        period = branch.problem.machine.period_of(branch.cycles)
+        period = cycles_in_words(branch.problem.machine, branch.cycles)
         motion = f"{period}, {branch_hits_in_words(branch)}"
         ax.plot([], [], label=once(ax, motion), **{"ls": "-", **look})
     for word, line, drawn in ((_STABLE, "-", stable.any()), (_UNSTABLE, "--", not stable.all())):

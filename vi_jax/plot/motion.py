@@ -8,7 +8,17 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from .._checks import instance_of
 from ..flow import Run, Samples
-from ..machine import PLAIN, AbstractMachine, SoftStop, in_brackets, name_in, unit_of
+from ..machine import (
+    PLAIN,
+    AbstractMachine,
+    SoftStop,
+    cycles_in_words,
+    in_brackets,
+    name_in,
+    stops_of,
+    switches_of,
+    unit_of,
+)
 from .colors import BLUE, STOP, is_set, once, thick
 from .path import coordinate_of, motion_path
 
@@ -26,7 +36,7 @@ def new_axes(ax: Axes | None) -> Axes:
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
     """Whether a machine states its periods in crank angle, as the paper's does (and none given)."""
-    return machine is None or machine.period_of(1) == "2π"
+    return machine is None or cycles_in_words(machine, 1) == "2π"
 
 
 def plot_history(
@@ -83,10 +93,10 @@ def _draw_stops(
     """Of a coordinate the rigid stops as thick lines, and the soft ones, which the body goes into,
     as thin dashed ones."""
     look = {"color": STOP, "lw": thick(1.8)}
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         if stop.coordinate == coordinate:
             line(float(stop.place), **look, label=once(ax, "stop"))
-    for stop in machine.switches:
+    for stop in switches_of(machine):
         if isinstance(stop, SoftStop) and stop.coordinate == coordinate:
             soft = {"lw": thick(1.2), "ls": "--", "label": once(ax, "soft stop")}
             line(float(stop.place), **look | soft)

@@ -8,7 +8,15 @@ import numpy as np
 
 from .._checks import count, instance_of
 from ..flow import Run, Samples
-from ..machine import AbstractMachine, component, has_component, is_autonomous, number_on
+from ..machine import (
+    AbstractMachine,
+    component,
+    has_component,
+    is_autonomous,
+    logged_turn,
+    number_on,
+    stops_of,
+)
 from ..orbit import Orbit
 
 
@@ -109,18 +117,18 @@ def _with_impacts(
     log = run.impact_log
     assert log is not None
     stop = np.asarray(log.stop)
-    own = [i for i, x in enumerate(machine.stops) if x.coordinate == coordinate]
+    own = [i for i, x in enumerate(stops_of(machine)) if x.coordinate == coordinate]
     logged = np.isin(stop, own)
     cycle, _ = np.nonzero(logged)
     stop = stop[logged]
     if not stop.size:
         return path
-    length = np.full(run.impacts.shape, float(machine.turn))
+    length = np.full(run.impacts.shape, float(logged_turn(machine)))
     if is_autonomous(machine, run.last):  # whose cycles are of several lengths
         length = np.asarray(run.duration)
     at = cycle + np.asarray(log.phase)[logged] / length[cycle]
     speed = np.asarray(log.speed)[logged]
-    hit = [machine.stops[i] for i in stop]
+    hit = [stops_of(machine)[i] for i in stop]
     before = np.array([s.sign for s in hit]) * speed
     after = [float(s.rebound(v)) for s, v in zip(hit, before, strict=True)]
     extra = MotionPath(

@@ -1,6 +1,7 @@
 """Pictures of grids: maps of the regimes of motion, and basins of attraction."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._messages import so_many
-from ..machine import AbstractMachine, by_name, in_brackets, unit_of
+from ..machine import AbstractMachine, by_name, cycles_in_words, in_brackets, unit_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins
 from . import colors as look
 from .branch import axis_name
@@ -73,7 +74,7 @@ def plot_regimes(
         codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
     if "result" in data:
         codes[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
-    word = _word_of(data) if machine is None else machine.period_of
+    word = _word_of(data) if machine is None else partial(cycles_in_words, machine)
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
     present = sorted({int(code) for code in codes.flat}, key=_place)

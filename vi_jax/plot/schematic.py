@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of
 from .._types import State
-from ..machine import AbstractMachine, ShaftMachine, SoftStop
+from ..machine import AbstractMachine, ShaftMachine, SoftStop, adopt, stops_of, switches_of
 from .motion import new_axes
 from .pen import Pen
 
@@ -42,7 +42,7 @@ def plot_sketch(
     **Returns:** the axes.
     """
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
-    state = machine.start() if state is None else machine.adopt(state)
+    state = machine.start() if state is None else adopt(machine, state)
     if phase is None:  # a crank or a rotor is shown turned out of line
         phase = 0.3 * pi if isinstance(machine, ShaftMachine) else 0.0
     ax = new_axes(ax)
@@ -66,8 +66,8 @@ def pen_for(
     machine: AbstractMachine, ax: Axes, positions: np.ndarray, *, labels: bool = False
 ) -> Pen:
     """A pen whose reach holds these positions and the stops."""
-    soft = [switch for switch in machine.switches if isinstance(switch, SoftStop)]
-    stops = [abs(float(stop.place)) for stop in (*machine.stops, *soft)]
+    soft = [switch for switch in switches_of(machine) if isinstance(switch, SoftStop)]
+    stops = [abs(float(stop.place)) for stop in (*stops_of(machine), *soft)]
     reach = max(0.0, *map(float, np.abs(positions).ravel()), *stops) or 1.0
     return Pen(ax, reach=reach, size=0.35 * reach, labels=labels)
 
@@ -80,10 +80,10 @@ def _bodies(machine: AbstractMachine, pen: Pen, state: State) -> None:
         ends = pen.reach + 1.4 * size
         pen.floor(-ends, ends, row - 0.5 * size)
         pen.body(place, row, width=size)
-        for stop in (stop for stop in machine.stops if stop.coordinate == i):
+        for stop in (stop for stop in stops_of(machine) if stop.coordinate == i):
             face = float(stop.place) + stop.sign * size / 2
             pen.wall(face, stop.sign, low=row - 0.5 * size, high=row + 0.8 * size)
-        for stop in (stop for stop in machine.switches if isinstance(stop, SoftStop)):
+        for stop in (stop for stop in switches_of(machine) if isinstance(stop, SoftStop)):
             if stop.coordinate == i:
                 pen.soft_stop(float(stop.place) + stop.sign * size / 2, stop.sign, row)
         pen.mark(0.0, row - 0.5 * size, row + 1.1 * size)

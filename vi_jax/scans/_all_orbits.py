@@ -12,7 +12,7 @@ from .._checks import count, given_number
 from .._messages import in_parts, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
-from ..machine import AbstractMachine, components, with_leaf, with_units
+from ..machine import AbstractMachine, components, cycles_in_words, with_leaf, with_units
 from ..orbit import (
     ORBIT_RESULTS,
     AbstractRootFinder,
@@ -125,7 +125,7 @@ class AllOrbits(InWords):
         longest = max(searched.cycles for searched in self.searched)
         lines = [
             f"{so_many(count, 'periodic motion')} of at most "
-            f"{self.machine.period_of(longest)}, {stable} of them stable"
+            f"{cycles_in_words(self.machine, longest)}, {stable} of them stable"
         ]
         for orbit, found in zip(self.orbits, self.found, strict=True):
             lines.append(f"{in_one_line(orbit)}; found {so_many(found.sum(), 'time')}")
@@ -135,8 +135,8 @@ class AllOrbits(InWords):
             lost = s.starts - s.simulated
             beyond = f" ({lost:,} could not be simulated)" if lost else ""
             line = (
-                f"  {self.machine.period_of(s.cycles)}: {s.converged:,} of {s.starts:,} searches "
-                f"converged{beyond}, on {s.motions}"
+                f"  {cycles_in_words(self.machine, s.cycles)}: {s.converged:,} of {s.starts:,} "
+                f"searches converged{beyond}, on {s.motions}"
             )
             if s.still:
                 line += f", {s.still:,} ended at an equilibrium"

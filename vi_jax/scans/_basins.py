@@ -30,6 +30,7 @@ from ..machine import (
     AbstractMachine,
     attributes,
     components,
+    cycles_in_words,
     state_in_words,
     summary_table,
     unit_of,
@@ -115,7 +116,7 @@ class Basins(NamedTuple):
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in the words of the machine."""
-        return f"{2 * cycles}π" if self.machine is None else self.machine.period_of(cycles)
+        return f"{2 * cycles}π" if self.machine is None else cycles_in_words(self.machine, cycles)
 
     def integrity(self, *, scales: Mapping[str, float] | None = None) -> list[Integrity]:
         """How far the starts of each motion reach: the largest ball of them around the motion, and

@@ -19,7 +19,7 @@ import numpy as np
 
 from .._messages import installed_version
 from ..flow import REASON_NAMES
-from ..machine import AbstractMachine, attributes, leaf, leaf_names, unit_of
+from ..machine import AbstractMachine, attributes, leaf, leaf_names, outcomes_of, unit_of
 from ._shaken import NOISE, START, part_of
 from .grid import LANE, Blocks
 from .program import ScanProgram
@@ -221,8 +221,8 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
         }
     }
     machine, start = program.first(blocks)
-    if machine.outcomes:
-        outcomes = {name: i for i, name in enumerate(machine.outcomes)}
+    if outcomes_of(machine):
+        outcomes = {name: i for i, name in enumerate(outcomes_of(machine))}
         known["outcome"] = {
             "long_name": "outcome with which an event ended the motion",
             **flags({"none": -1} | outcomes),

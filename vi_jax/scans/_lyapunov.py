@@ -36,6 +36,7 @@ from ..machine import (
     Summarized,
     attributes,
     bare,
+    cycle_time,
     in_unit,
     is_autonomous,
     modes_of,
@@ -162,7 +163,7 @@ def lyapunov(
 
     **Returns:** a `Lyapunov`.
 
-    **Raises:** as `simulate`; `ValueError` for a machine with both a `section` and a `renewed`; on
+    **Raises:** as `simulate`; `ValueError` for a machine with both a section and a `renewed`; on
     Ctrl-C, where more than 1024 cycles are observed, `Interrupted`, whose `partial` are the
     exponents by the cycles so far.
     """
@@ -170,7 +171,7 @@ def lyapunov(
     if is_autonomous(machine, bare(start)):
         if renews(machine):
             raise ValueError(
-                "Argument `machine` must not have both a `section` and a `renewed`, as a "
+                "Argument `machine` must not have both a section and a `renewed`, as a "
                 f"{type(machine).__name__} has: at equal intervals it would be renewed there. The "
                 "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
             )
@@ -264,7 +265,7 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         run = simulate(machine, state, window, method=method, rests=rests, record=record)
         duration = run.duration
         if duration is None:
-            duration = jnp.full(window, machine.period, x.dtype)
+            duration = jnp.full(window, cycle_time(machine), x.dtype)
         sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
         integrals = {name: x * duration for name, x in run.averages.items()}
         return sections[1:], (duration, integrals, run.result, modes_of(run.last))

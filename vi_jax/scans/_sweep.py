@@ -34,13 +34,19 @@ from ..machine import (
     AbstractMachine,
     Stated,
     Summarized,
+    adopt,
     bare,
     begun,
     check_again,
     check_leaf,
+    cycles_in_words,
+    frequency_ratio,
+    in_clock,
+    may_rest,
     name_in,
     replaced,
     stated,
+    stops_of,
     unit_of,
     with_leaf,
     with_unit,
@@ -249,13 +255,13 @@ def sweep(
         ends = [with_leaf(machine, parameter, value) for value in {numbers.min(), numbers.max()}]
         for end in ends:
             check_again(end)
-        rests = any(end.may_rest() for end in ends)
+        rests = any(may_rest(end) for end in ends)
     if start is None:
         start = with_leaf(machine, parameter, values[0]).start()
     method = chosen(machine, method)
     if clock is not None:
-        machine = machine.in_clock(clock)
-    start = replaced(start, machine.adopt(bare(start)))
+        machine = in_clock(machine, clock)
+    start = replaced(start, adopt(machine, bare(start)))
     check_reals("start", start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
     if numbers is not None:
@@ -311,7 +317,7 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 def taken_along(machine: AbstractMachine, state: State) -> State:
     """The state, the body taken along by a stop that has come nearer."""
     here = bare(state)
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
         Y = body.position(here)
         beyond = stop.beyond(Y) > 0
@@ -355,14 +361,14 @@ def _sweep(
             y_max=jnp.max(run.y_max),
             period=jnp.where(run.successful, period, REGIMES.failed),
             impacts=jnp.where(run.successful, impacts, jnp.nan),
-            frequency_ratio=here.frequency_ratio(jnp.mean(run.duration)),
+            frequency_ratio=frequency_ratio(here, jnp.mean(run.duration)),
             impact_speed=jnp.max(run.impact_speed),
             sections=sections,
             result=run.result,
             averages=run.mean_averages(),
             labels=machine.labels,
             units=stated(machine),
-            periods=tuple(machine.period_of(n) for n in range(1, cycles // 2 + 1)),
+            periods=tuple(cycles_in_words(machine, n) for n in range(1, cycles // 2 + 1)),
         )
 
     return jax.lax.scan(one, start, values)

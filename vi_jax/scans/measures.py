@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._types import Flag, State
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine, by_default, by_name, components
+from ..machine import AbstractMachine, by_default, by_name, components, frequency_ratio
 from ._lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
@@ -115,7 +115,7 @@ class FrequencyRatio(AbstractMeasure):
     def __call__(self, machine, run):
         """The mean of one lane. **Raises:** `ValueError` for a machine without a drive."""
         assert run.duration is not None
-        ratio = machine.frequency_ratio(jnp.mean(run.duration))
+        ratio = frequency_ratio(machine, jnp.mean(run.duration))
         if ratio is None:
             raise ValueError("Measure `frequency_ratio` needs a machine that is driven.")
         return {"frequency_ratio": ratio}

@@ -32,12 +32,15 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    adopt,
     bare,
     check_again,
     check_name,
     components,
+    in_clock,
     leaf,
     leaf_names,
+    may_rest,
     replaced,
     with_leaf,
 )
@@ -110,7 +113,7 @@ class ScanProgram(eqx.Module):
         assert machine is not None
         machine = self._nudged(machine, MACHINE, nudge)
         if self.options.clock is not None:
-            machine = machine.in_clock(self.options.clock)
+            machine = in_clock(machine, self.options.clock)
         start = self.start
         if start is None:
             start = machine.start()
@@ -296,9 +299,9 @@ class _Known(NamedTuple):
 def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known:
     averages: tuple[str, ...] = ()
     if has_averages(machine):
-        first = machine.start() if start is None else machine.adopt(start)
+        first = machine.start() if start is None else adopt(machine, start)
         averages = average_names(machine, first)
-    return _Known(chosen(machine, method), machine.may_rest(), averages)
+    return _Known(chosen(machine, method), may_rest(machine), averages)
 
 
 def _known_of_made(
@@ -397,11 +400,11 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         machine, start = program.lane(lane)
         check_again(machine)
-        rests = rests or machine.may_rest()
+        rests = rests or may_rest(machine)
         for name in program.derivatives:
             check_leaf_name(machine, start, name, "derivatives", program.shaken)
         program.method.check(machine)
-        start = machine.adopt(start)
+        start = adopt(machine, start)
         check_reals("start", start)
         check_values(machine, start)
         if program.shaken is not None:

@@ -96,6 +96,11 @@ class Compliant(vi.AbstractMachine):
         return vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
 
 
+def is_soft(machine: Any) -> bool:
+    """Whether its stop is a soft one."""
+    return isinstance(machine, Compliant)
+
+
 class Drawn(NamedTuple):
     """A machine whose motion from rest is followed in one of its numbers."""
 

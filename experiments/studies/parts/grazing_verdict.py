@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
-from .grazing_machines import changed, number
+from .grazing_machines import changed, is_soft, number
 
 LANES, SETTLE, WATCHED, LONGEST = 192, 1000, 128, 40
 METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
@@ -59,9 +59,9 @@ def _swept(machine: Any, name: str, values: Any, state: Any) -> tuple[Any, Any, 
         there = changed(machine, name, value)
         run = vi.simulate(
             there, state, WATCHED, settle=SETTLE, method=METHOD,
-            record="motion" if there.switches else "sections",
+            record="motion" if is_soft(there) else "sections",
         )  # fmt: skip
-        hits = run.y_max > there.stop.gap if there.switches else run.impacts
+        hits = run.y_max > there.stop.gap if is_soft(there) else run.impacts
         return jnp.stack(jax.tree.leaves(run.sections), axis=-1)[1:], hits, run.successful
 
     return jax.vmap(one)(values)
@@ -112,10 +112,10 @@ def _period(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
 def _cycled(machine: Any, start: Any) -> tuple[Any, Any]:
     """By how much a motion misses its start after a cycle, and its touches."""
     run = vi.simulate(
-        machine, start, 1, method=METHOD, record="motion" if machine.switches else "sections"
+        machine, start, 1, method=METHOD, record="motion" if is_soft(machine) else "sections"
     )
     ends = jnp.stack(jax.tree.leaves(run.sections))
-    hits = (run.y_max > machine.stop.gap) if machine.switches else run.impacts
+    hits = (run.y_max > machine.stop.gap) if is_soft(machine) else run.impacts
     miss = jnp.abs(ends[:, 1] - ends[:, 0]).max()
     return jnp.where(run.successful, miss, jnp.inf), hits[0]
 
@@ -126,7 +126,7 @@ def _searched(machine: Any, start: Any) -> tuple[Any, Any, Any]:
     """State, touches and whether it was found, of the motion of one cycle near a start."""
     orbit = vi.find_orbit(machine, start, cycles=1, method=METHOD)
     good = (orbit.result == vi.ORBIT_RESULTS.successful) & orbit.admissible
-    hits = (orbit.y_max > machine.stop.gap).astype(int) if machine.switches else orbit.impacts
+    hits = (orbit.y_max > machine.stop.gap).astype(int) if is_soft(machine) else orbit.impacts
     return jnp.stack(jax.tree.leaves(orbit.state)), hits, good
 
 
@@ -136,7 +136,7 @@ def _origin(point: vi.Point) -> np.ndarray:
 
 def _base(point: vi.Point) -> int:
     """Touches in a cycle of the motion that grazes."""
-    return 0 if point.orbit.machine.switches else int(np.asarray(point.orbit.impacts))
+    return 0 if is_soft(point.orbit.machine) else int(np.asarray(point.orbit.impacts))
 
 
 def _beside(point: vi.Point, name: str, offsets: Any, rows: np.ndarray) -> tuple[Any, Any]:
@@ -161,7 +161,7 @@ def folds(point: vi.Point, name: str, lanes: Lanes, seed: int) -> bool:
 def _impacting(point: vi.Point, name: str, lanes: Lanes, seed: int) -> tuple[float, np.ndarray]:
     """A candidate, and its offset: by its own equations; for a soft stop by Newton's method from
     those of many random starts that touch once more and repeat best."""
-    if not point.orbit.machine.switches:
+    if not is_soft(point.orbit.machine):
         for distance in (1e-4, 1e-5, 1e-3):
             with contextlib.suppress(ValueError):
                 orbit = point.switch(distance=distance)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
-from ...machine import AbstractMachine, RigidStop, rubs
+from ...machine import AbstractMachine, RigidStop, rubs, stops_of
 from .._lane import Lane, Plan, select, to_event
 from ..labelled import EventKind
 
@@ -28,7 +28,7 @@ class Blow(NamedTuple):
 
 def is_compound(machine: AbstractMachine) -> bool:
     """Whether several velocities change in an impact, across stops or along them; static."""
-    return len({stop.coordinate for stop in machine.stops}) > 1 or rubs(machine)
+    return len({stop.coordinate for stop in stops_of(machine)}) > 1 or rubs(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -65,12 +65,12 @@ def strike_once(
     **Arguments:** `taken`, whether the step is taken; `landed`, of each stop, by its number,
     whether the step landed on it; `there`, the state in which it did.
     """
-    machine, k = plan.machine, plan.machine.stops[0].coordinate
+    machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
     velocity = body.velocity(there)
     for number, met in landed.items():
-        stop = machine.stops[number]
+        stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound, share = stop.rebound_and_share(approach)
         lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")

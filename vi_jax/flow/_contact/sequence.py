@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
-from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares
+from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares, stops_of
 from .._lane import Lane, Plan, select, to_event
 from ..smooth import rounding
 from .impact import Blow, gains_speed, recorded
@@ -85,13 +85,13 @@ def strike_in_turn(
 
     **Arguments:** as `strike_once`.
     """
-    limited = sorted({stop.coordinate for stop in plan.machine.stops})
+    limited = sorted({stop.coordinate for stop in stops_of(plan.machine)})
     instant = _instant(plan, taken, lane, landed, there, limited)
     zero = jnp.zeros_like(lane.s)
     nothing = tuple(zero for _ in limited)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
     touched = list(nothing)
-    for number, stop in enumerate(plan.machine.stops):
+    for number, stop in enumerate(stops_of(plan.machine)):
         i = limited.index(stop.coordinate)
         touched[i] = jnp.where(landed[number], to_event(number), touched[i])
     first = select(instant.met, there, lane.state)
@@ -127,7 +127,7 @@ def _instant(
     met = jnp.zeros_like(taken)
     coupled = [met for _ in limited]
     touches = {}
-    for number, stop in enumerate(plan.machine.stops):
+    for number, stop in enumerate(stops_of(plan.machine)):
         at, here = limited.index(stop.coordinate), landed[number]
         met, coupled[at] = met | here, coupled[at] | here
         depth = stop_gradient(stop.beyond(bodies[at].position(there)))
@@ -159,7 +159,7 @@ def _coupled(
     of each stop whether its contact is closed; `coupled`, the marks.
     """
     closed = [jnp.zeros((), bool) for _ in limited]
-    for number, stop in enumerate(plan.machine.stops):
+    for number, stop in enumerate(stops_of(plan.machine)):
         i = limited.index(stop.coordinate)
         closed[i] = closed[i] | touches[number]
     size, coupled = len(limited), list(coupled)
@@ -176,7 +176,7 @@ def _coupled(
 def _struck(instant: _Instant, x: _Round) -> _Round:
     """The sequence after its next impacts: those of the contacts that close fastest."""
     plan, lane = instant.plan, x.lane
-    stops, state = plan.machine.stops, lane.state
+    stops, state = stops_of(plan.machine), lane.state
     velocities = [body.velocity(state) for body in instant.bodies]
     closing = _closing(instant, x, velocities)
     fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
@@ -229,7 +229,7 @@ def _each_by_itself(
     on, wanted = [jnp.zeros((), bool) for _ in size], [jnp.zeros_like(V) for V in velocities]
     signs = list(wanted)
     for number, hit in hits.items():
-        stop = instant.plan.machine.stops[number]
+        stop = stops_of(instant.plan.machine)[number]
         i = instant.limited.index(stop.coordinate)
         on[i] = on[i] | hit
         wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
@@ -259,8 +259,8 @@ def _thrown(
     for i, body in enumerate(instant.bodies):
         place = body.position(state)
         for number, hit in hits.items():
-            if machine.stops[number].coordinate == instant.limited[i]:
-                on[i], place = on[i] | hit, jnp.where(hit, machine.stops[number].place, place)
+            if stops_of(machine)[number].coordinate == instant.limited[i]:
+                on[i], place = on[i] | hit, jnp.where(hit, stops_of(machine)[number].place, place)
                 wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
         places.append(place)
     amounts = forces(instant.gains, on, wanted)
@@ -275,7 +275,7 @@ def _thrown(
     for number, hit in hits.items():
         friction = rubbing_on(machine, number)
         if friction is not None:
-            i = instant.limited.index(machine.stops[number].coordinate)
+            i = instant.limited.index(stops_of(machine)[number].coordinate)
             rough = rubbed(machine, number, friction, instant.s, state, new)
             new = select(hit, rough.state, new)
             amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
@@ -292,7 +292,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
     takes part.
     """
     found = {}
-    for number, stop in enumerate(instant.plan.machine.stops):
+    for number, stop in enumerate(stops_of(instant.plan.machine)):
         i = instant.limited.index(stop.coordinate)
         speed = stop.approach(velocities[i])
         size = stop_gradient(speed)

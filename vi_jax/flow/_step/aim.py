@@ -10,7 +10,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin
-from ...machine import events_of, section_number
+from ...machine import clock_of, events_of, section_number, stops_of
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
 from ..events import quintic, to_turn
 from ..methods import Foreseen
@@ -57,7 +57,7 @@ def _foreseen(
 ) -> tuple[list[Passed], list[Course]]:
     """What `first_event` asks about a step of length h along `motion`."""
     machine, courses, ends, paths = plan.machine, [], [], []
-    if plan.motion or machine.stops:
+    if plan.motion or stops_of(machine):
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     if not exact(machine, lane.state):
         shortest = 64 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s))
@@ -71,14 +71,14 @@ def _foreseen(
         ends.append((begin, end))
     guards = []
     for guard in at_stops(plan, ends):
-        stop = machine.stops[guard.number]
+        stop = stops_of(machine)[guard.number]
         curve = partial(paths[stop.coordinate].over, h, stop.sign, stop_gradient(stop.gap))
         over = guard.end.x > 0
         if lane.contact is not None:  # a body at rest is beyond its stop by rounding only
             over = over & (lane.contact[stop.coordinate] == 0)
         guards.append((guard, over, curve))
-    if machine.clock(lane.state) is not None:
-        clock, bound = motion.of(machine.clock), stop_gradient(plan.end(lane.part))
+    if clock_of(machine, lane.state) is not None:
+        clock, bound = motion.of(partial(clock_of, machine)), stop_gradient(plan.end(lane.part))
         begin, end = (x.scaled(1, bound) for x in clock.ends(h))
         guard = Crossing(events_of(machine)[-1], section_number(machine), begin, end, bound)
         guards.append((guard, guard.end.x > 0, partial(clock.over, h, 1, bound)))

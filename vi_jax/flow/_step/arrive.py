@@ -5,7 +5,14 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
-from ...machine import holds_anywhere, section_number, struck_modes
+from ...machine import (
+    holds_anywhere,
+    others_of,
+    section_number,
+    stops_of,
+    struck_modes,
+    switches_of,
+)
 from .._contact.impact import is_compound, strike_once
 from .._contact.rest import Release
 from .._contact.sequence import strike_in_turn
@@ -32,7 +39,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     ).recording(integrals=trial.integrals)  # fmt: skip
     # Y where the step ends, and before the state jumps there, where something may move it.
     here = position(trial.state)
-    places = (here, here) if plan.machine.others else (here,)
+    places = (here, here) if others_of(plan.machine) else (here,)
     way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
     at = Situation(plan, lane, trial, taken, way)
     if trial.crossings:
@@ -102,7 +109,7 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     places = (plan.machine.position(lane.state), *before)
     # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
     # which only derivatives along with the event do not see.
-    fixed = plan.ticks(lane.state) and not plan.machine.switches
+    fixed = plan.ticks(lane.state) and not switches_of(plan.machine)
     return (_at_fixed_clock(at, lane) if fixed else lane), places
 
 
@@ -115,14 +122,14 @@ def _landed(at: Situation, lane: Lane, there: State) -> Lane:
     landed = {c.number: c.landed for c in trial.crossings}
     near = _near(at)
     off: dict[int, Flag] = {}
-    if machine.stops:
+    if stops_of(machine):
         lane = _impact(at, lane, landed, there)
-        for number, stop in enumerate(machine.stops):
+        for number, stop in enumerate(stops_of(machine)):
             if stop.ends_cycle:
                 lane = lane.completing(landed[number])
             lane = with_outcome(machine, stop, lane, landed[number])
-    if machine.stops and machine.others:
-        met = any_of(at.taken, (landed[n] for n in range(len(machine.stops))))
+    if stops_of(machine) and others_of(machine):
+        met = any_of(at.taken, (landed[n] for n in range(len(stops_of(machine)))))
         close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
         # A stop may have changed the modes already.
         lane, off, _ = set_off(plan, lane, met, (there, at.old.modes), {}, close)
@@ -143,7 +150,7 @@ def _near(at: Situation) -> dict[int, Flag]:
     """Of each event that happens from below, whether its guard is at zero to rounding where the
     step landed on another event."""
     plan, trial = at.plan, at.trial
-    numbers = plan.from_below(trial.state) if plan.machine.others else []
+    numbers = plan.from_below(trial.state) if others_of(plan.machine) else []
     found = {}
     eps = float(jnp.finfo(trial.h.dtype).eps)
     for c in trial.crossings:
@@ -185,7 +192,7 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     _, state, integrals = drifted(way.rate, offset, moving, way.fixed, way.rest)
     if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
-        limited = sorted({stop.coordinate for stop in plan.machine.stops})
+        limited = sorted({stop.coordinate for stop in stops_of(plan.machine)})
         walls = {i: contact[i] for i in limited}
         put, _ = stilled(plan, lane.s, state, {i: walls[i] > 0 for i in limited}, walls)
         state = select(walls[k] > 0, put, state)
@@ -224,7 +231,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     in which the stop is met.
     """
     plan, machine, before = at.plan, at.plan.machine, at.old
-    landed = {number: landed[number] for number in range(len(machine.stops))}
+    landed = {number: landed[number] for number in range(len(stops_of(machine)))}
     strike = strike_in_turn if is_compound(machine) else strike_once
     lane, blows = strike(plan, at.taken, lane, landed, there)
     met = any_of(at.taken, landed.values())
@@ -244,7 +251,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     if modes and not is_compound(machine):
         for number, here in landed.items():
             given = machine, lane.s, there, lane.state, modes
-            modes = select(here, machine.stops[number].modes_after(*given), modes)
+            modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # What friction has to hold depends on who rests now.
         new = struck_modes(machine, lane.s, lane.state, modes, contact=contact)
@@ -270,7 +277,7 @@ def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
     tops = [_top(trial, k, at.way) for k in range(len(trial.paths))]
     reached = jnp.where(trial.paths[0].at_turn, tops[0], places[0])
     if clearance is not None:
-        for stop in plan.machine.stops:
+        for stop in stops_of(plan.machine):
             k = stop.coordinate
             short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
             room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)

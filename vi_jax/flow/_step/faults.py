@@ -4,7 +4,16 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
-from ...machine import AbstractMachine, events_of, guard_of
+from ...machine import (
+    AbstractMachine,
+    events_of,
+    guard_of,
+    is_alive,
+    others_of,
+    outcomes_of,
+    stops_of,
+    switches_of,
+)
 from .._lane import FREE, Lane, Plan, to_event, total
 from ..events import guard_rates
 from ..results import code
@@ -30,7 +39,7 @@ def faults(
     """
     impacts, broken = new.record.impacts, code("not_finite")
     many = impacts > _MANY
-    if plan.machine.alive(trial.state) is not None:
+    if is_alive(plan.machine, trial.state) is not None:
         # A clock that breaks down makes the steps shrink to nothing.
         broken = code("stalled")
     ends = [
@@ -54,14 +63,14 @@ def faults(
 def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     """The reason of a lane that has aimed too often, by what it aimed at."""
     machine, reason = plan.machine, code("unresolved")
-    if plan.motion or machine.stops:
+    if plan.motion or stops_of(machine):
         reason = jnp.where(target < FREE, code("turn_unresolved"), reason)
-    first = len(machine.stops)
-    if machine.switches:
+    first = len(stops_of(machine))
+    if switches_of(machine):
         others = target >= to_event(first)
         reason = jnp.where(others, code("switch_unresolved"), reason)
-    if machine.others:
-        others = target >= to_event(first + len(machine.switches))
+    if others_of(machine):
+        others = target >= to_event(first + len(switches_of(machine)))
         reason = jnp.where(others, code("reset_unresolved"), reason)
     if not plan.ticks(lane.state):
         ends = target == plan.to_section
@@ -71,11 +80,11 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
 
 def may_end(machine: AbstractMachine) -> bool:
     """Whether an event may end a lane; static."""
-    laws = any(not stop.is_one_number for stop in machine.stops)
+    laws = any(not stop.is_one_number for stop in stops_of(machine))
     slides = any(event.may_slide for event in events_of(machine))
-    several = bool(machine.stops) and (len(machine.coordinates) > 1 or bool(machine.others))
-    chain = len(machine.switches) + len(machine.others) > 1
-    return laws or slides or several or chain or bool(machine.outcomes)
+    several = bool(stops_of(machine)) and (len(machine.coordinates) > 1 or bool(others_of(machine)))
+    chain = len(switches_of(machine)) + len(others_of(machine)) > 1
+    return laws or slides or several or chain or bool(outcomes_of(machine))
 
 
 def comes_back(

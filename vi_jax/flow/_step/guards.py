@@ -10,7 +10,15 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin_flag
-from ...machine import AbstractEvent, events_of, guard_of, section_number, sides_of
+from ...machine import (
+    AbstractEvent,
+    clock_of,
+    events_of,
+    guard_of,
+    section_number,
+    sides_of,
+    stops_of,
+)
 from .._lane import Lane, Plan, select, to_event
 from ..events import Rates, guard_rates, landing
 from ..smooth import SmoothMachine, exact
@@ -118,7 +126,7 @@ def _rounding(scale: Scalar) -> Scalar:
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
     """The stops as a step sees them, from the rates of each coordinate where it begins and ends."""
     found = []
-    for i, stop in enumerate(plan.machine.stops):
+    for i, stop in enumerate(stops_of(plan.machine)):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
         scale = plan.extent(stop.coordinate) + jnp.abs(stop.gap)
         found.append(Crossing(stop, i, begin, end, scale, stop.coordinate))
@@ -180,9 +188,9 @@ def _others(
             begin, end = select(greater, (side.begin, side.end), (begin, end))
         crossing = Crossing(event, number, begin, end, scale)
         found.append(crossing._replace(sides=tuple(sides)) if number in seen.events else crossing)
-    if machine.clock(lane.state) is not None:
+    if clock_of(machine, lane.state) is not None:
         number, bound = section_number(machine), plan.end(lane.part)
-        begin, end = ends(lambda _, x: jnp.asarray(machine.clock(x)) - bound)
+        begin, end = ends(lambda _, x: jnp.asarray(clock_of(machine, x)) - bound)
         found.append(Crossing(events_of(machine)[number], number, begin, end, bound))
     return found, tuple(below)
 

@@ -15,8 +15,13 @@ from ...machine import (
     events_of,
     guard_of,
     happens_at,
+    has_velocity,
     mode_number,
+    others_of,
+    outcomes_of,
     section_number,
+    stops_of,
+    switches_of,
     value_of,
 )
 from .. import results
@@ -125,7 +130,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
         here = turns[number] if when is None else turns[number] & when
         its_state, its_modes = after_event(*met, contact)
         its_modes = select(here, its_modes, modes_before)
-        its_number = number - len(machine.stops)
+        its_number = number - len(stops_of(machine))
         if event.holds_mode:
             slides = comes_back(machine, number, its_modes, lane.s, its_state)
             lane = lane.ended(turns[number], slides, "sliding")
@@ -133,7 +138,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
         else:
             jumps = jumps | here
             its_kind, its_value = EventKind.reset, value_of(*met)
-            its_number = its_number - len(machine.switches)
+            its_number = its_number - len(switches_of(machine))
         if event.ends_cycle:
             lane = lane.completing(here)
         lane = with_outcome(machine, event, lane, here)
@@ -152,7 +157,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
     lane = let_go(plan, lane, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)
-    if machine.others:
+    if others_of(machine):
         lane, off, near = set_off(plan, lane, happens, before, turns, near)
     due = [jnp.where(turns[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
     for i, number in enumerate(numbers):
@@ -169,7 +174,7 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
     """The lane, its lane ended where an event happened that ends the motion."""
     if not event.ends:
         return lane
-    outcome = results.with_outcome(machine.outcomes.index(event.ends))
+    outcome = results.with_outcome(outcomes_of(machine).index(event.ends))
     return lane.ended(here, jnp.ones_like(here), outcome)
 
 
@@ -205,7 +210,7 @@ def let_go(
         return lane
     old, modes_before = before
     freed, direction = list(contact), list(lane.direction)
-    for k in sorted({stop.coordinate for stop in machine.stops}):
+    for k in sorted({stop.coordinate for stop in stops_of(machine)}):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = holding(machine, modes, contact, but=k)
@@ -230,12 +235,12 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
     **Arguments:** `lane`, with state and modes behind the event; whether an event `happens`, and
     whether one that may move the state, as it `jumps`; `old`, the state before.
     """
-    if plan.machine.stops and plan.machine.others:
+    if stops_of(plan.machine) and others_of(plan.machine):
         lane = lane.ended(jumps, beyond_a_stop(plan.machine, lane.state), "bad_reset")
         lane = lane._replace(contact=unheld(plan, lane, jumps, old))
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
-    when = jumps if plan.machine.has_velocity(lane.state) else happens
-    if plan.machine.others or when is happens:
+    when = jumps if has_velocity(plan.machine, lane.state) else happens
+    if others_of(plan.machine) or when is happens:
         lane = lane._replace(direction=_directions(plan, lane, when, old))
     return lane
 
@@ -276,7 +281,7 @@ def _directions(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
     found, new = list(lane.direction), lane.state
     smooth = holding(plan.machine, lane.modes, lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
-        after, known = coordinate.velocity(new), plan.machine.has_velocity(new)
+        after, known = coordinate.velocity(new), has_velocity(plan.machine, new)
         if not known or after is not coordinate.velocity(old):
             here = rates(smooth.field, coordinate.position, lane.s, new)
             # The second number of a state without velocities may be anything.

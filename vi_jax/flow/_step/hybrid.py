@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin_flag
-from ...machine import SoftStop, struck_modes
+from ...machine import SoftStop, rewound, section_in, stops_of, struck_modes, switches_of
 from .._lane import FREE, Lane, Plan, Record, select, to_event
 from ..integrals import TIME, carried
 from ..noise import kicked
@@ -52,7 +52,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
     there, completed = arrive(plan, lane, trial, taken)
-    if plan.machine.section(lane.state) is not None:
+    if section_in(plan.machine, lane.state) is not None:
         completed = completed | taken & _stands_on_section(plan, lane, there)
     reached = completed = pin_flag(completed, lane.s)
     if plan.noise is not None:
@@ -84,7 +84,7 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
     """
     if not plan.others(lane.state):
         return length
-    short = taken & (lane.target >= to_event(len(plan.machine.stops)))
+    short = taken & (lane.target >= to_event(len(stops_of(plan.machine))))
     for c in trial.crossings:
         if c.sudden is not None:
             short = short & ~c.landed
@@ -106,7 +106,7 @@ def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:
     for before, after in zip(old, new, strict=True):
         still = still & jnp.all(jnp.abs(after - before) <= slack * (1 + jnp.abs(before)))
         size = size + jnp.max(jnp.abs(after))
-    guard = jnp.asarray(plan.machine.section(stop_gradient(there.state)))
+    guard = jnp.asarray(section_in(plan.machine, stop_gradient(there.state)))
     return still & (jnp.abs(guard) <= slack * size)
 
 
@@ -123,7 +123,7 @@ def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scala
         turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
     if not plan.ticks(state):
-        state = select(turned, plan.machine.rewound(state), state)
+        state = select(turned, rewound(plan.machine, state), state)
     lane = there._replace(s=jnp.where(turned, 0.0, there.s), state=state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
@@ -179,4 +179,4 @@ def shaken(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
 def _may_change_modes(plan: Plan) -> bool:
     """Whether a jump of velocities may put a switch into another mode: all but adhesive soft stops,
     which know a body's place alone."""
-    return any(not (isinstance(x, SoftStop) and x.adhesive) for x in plan.machine.switches)
+    return any(not (isinstance(x, SoftStop) and x.adhesive) for x in switches_of(plan.machine))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars
-from ...machine import RigidStop, horner
+from ...machine import RigidStop, horner, stops_of
 from .._lane import Lane, Plan, select, to_event, to_turn_of
 from ..events import Rates, highest, rising_root, slope
 from .guards import Crossing
@@ -118,7 +118,7 @@ def _through_a_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Fla
     through = jnp.zeros_like(lane.s, bool)
     for guard, over, _ in guards:
         if guard.coordinate == k:
-            sign = plan.machine.stops[guard.number].sign
+            sign = stops_of(plan.machine)[guard.number].sign
             through = through | over & (lane.direction[k] == sign)
     return through
 
@@ -166,7 +166,7 @@ def _has_to_be_met(
     close = plan.meets_turns(lane.done)
     if plan.meets_every_turn:
         return close
-    for stop in plan.machine.stops:
+    for stop in stops_of(plan.machine):
         if stop.coordinate == k:
             close = close | (depth(stop) > -margin * plan.extent(k))
     return close

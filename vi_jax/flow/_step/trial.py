@@ -8,6 +8,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
+from ...machine import is_alive, stops_of
 from .._contact.rest import Release, release
 from .._flow_to_event import FlowToEvent
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
@@ -127,7 +128,7 @@ def attempt(
     bodies = range(len(machine.coordinates))
     alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
     ends: list[tuple[Rates, Rates]] = []
-    if plan.motion or machine.stops:
+    if plan.motion or stops_of(machine):
         for one, body in zip(alone, machine.coordinates, strict=True):
             begin = rates(one.field, body.position, lane.s, lane.state)
             ends.append((begin, rates(one.field, body.position, s1, new)))
@@ -135,7 +136,7 @@ def attempt(
     of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
-    alive = machine.alive(new)
+    alive = is_alive(machine, new)
     if alive is not None:
         good = good & alive
     if method.adaptive:
@@ -202,10 +203,10 @@ def _path(
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
     if plan.others(lane.state):
         # Such an event may be a turning point as well.
-        aimed = aimed | (lane.target >= to_event(len(plan.machine.stops)))
+        aimed = aimed | (lane.target >= to_event(len(stops_of(plan.machine))))
     at_turn = good & aimed & met
     leaves, surge, pull = None, None, None
-    limited = any(stop.coordinate == k for stop in plan.machine.stops)
+    limited = any(stop.coordinate == k for stop in stops_of(plan.machine))
     if lane.contact is not None and limited:
         leaves = release(plan, lane, k, begin, end, good, h)
         surge = (

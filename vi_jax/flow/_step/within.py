@@ -17,7 +17,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from ..._types import Flag, Scalar, State
-from ...machine import AbstractMachine, RigidStop, events_of, sides_of
+from ...machine import AbstractMachine, RigidStop, events_of, sides_of, stops_of
 from .._lane import Lane, Plan, any_of
 from ..events import Rates, rates
 from ..methods import Foreseen, Stage
@@ -61,7 +61,7 @@ def events_looked_at(plan: Plan, state: State) -> list[int]:
     machine, events, stops = plan.machine, events_of(plan.machine), []
     if not exact(machine, state):
         known = [is_affine(x.position, state) for x in machine.coordinates]
-        stops = [i for i, stop in enumerate(machine.stops) if not known[stop.coordinate]]
+        stops = [i for i, stop in enumerate(stops_of(machine)) if not known[stop.coordinate]]
     others = [number for number in plan.others(state) if events[number].looked_at_within]
     return [*stops, *others]
 
@@ -111,7 +111,7 @@ def within(
     if not stages:
         return Within({}, {}, {})
     machine, around = plan.machine, (lane.modes, lane.contact or ())
-    limited = sorted({stop.coordinate for stop in machine.stops}) if plan.rests else []
+    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if plan.rests else []
     contacts: Any = lane.contact
     looked_at = events_looked_at(plan, lane.state)
 
@@ -128,7 +128,7 @@ def within(
             free = jnp.where(slow[k], -lane.direction[k] * here.v, -1.0)
             forces[k] = jnp.where(contact > 0, plan.away(k, contact) * here.a, free)
         for number in looked_at:
-            if number < len(machine.stops):
+            if number < len(stops_of(machine)):
                 events[number] = (_distance(machine, lane, number, state),)
             else:
                 events[number] = sides_of(machine, number, s, state, *around)
@@ -158,7 +158,7 @@ def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scala
     both."""
     begin, end = ends
     slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
-    stops = [stop for stop in plan.machine.stops if stop.coordinate == k]
+    stops = [stop for stop in stops_of(plan.machine) if stop.coordinate == k]
     return slow & any_of(slow, (_reaches(x, begin, h) & _reaches(x, end, h) for x in stops))
 
 
@@ -169,7 +169,7 @@ def _reaches(stop: RigidStop, here: Rates, h: Scalar) -> Flag:
 
 def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
     """How far a coordinate is beyond one of its stops; -1 of one that rests."""
-    stop = machine.stops[number]
+    stop = stops_of(machine)[number]
     beyond = stop.beyond(machine.coordinates[stop.coordinate].position(state))
     if lane.contact is None:
         return beyond

@@ -9,7 +9,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
-from ...machine import ModalMachine, forces, horner
+from ...machine import ModalMachine, forces, horner, stops_of
 
 # The series of a matrix exponential is summed over lengths in which things change by twice
 # themselves at most, until its terms are below this share of a rounding: that is 24 of them, with
@@ -83,7 +83,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     sway = machine.swing_time * (v + 0.5 * machine.damping * y)
     free = jnp.sqrt(y * y + sway * sway)
     length = jnp.asarray(jnp.inf, q.dtype)
-    for stop in machine.stops:
+    for stop in stops_of(machine):
         row = machine.rows[stop.coordinate]
         part = jnp.abs(row) * free
         reach, pull = jnp.sum(part), jnp.dot(machine.stiffness, part)
@@ -225,7 +225,7 @@ def _by_series(
 def _holding(machine: ModalMachine, contact: Scalars) -> Any:
     """What is left of an acceleration where bodies rest on stops: as much of each contact's push as
     keeps its velocity is added."""
-    limited = sorted({stop.coordinate for stop in machine.stops}) if contact else []
+    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     if not limited:
         return lambda pull: pull
     rows, pushes = ([x[k] for k in limited] for x in (machine.rows, machine.pushes))

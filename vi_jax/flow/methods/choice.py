@@ -1,7 +1,7 @@
 """Which method moves a machine: one that is given, a preset by its name, or the default."""
 
 from ..._checks import one_of
-from ...machine import AbstractMachine
+from ...machine import AbstractMachine, scales_known
 from .base import AbstractMethod
 from .exact import ExactFlight
 from .runge_kutta import Adaptive, FixedStep
@@ -46,7 +46,7 @@ def _named(machine: AbstractMachine | None, name: str, argument: str) -> Abstrac
     steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
     if machine is not None and _flies(machine):
         return ExactFlight()
-    if machine is None or machine.scales_known:
+    if machine is None or scales_known(machine):
         return FixedStep(steps_per_cycle=steps)
     return Adaptive(rtol=tolerance, steps_per_cycle=10 if name == "reference" else 5)
 

@@ -22,7 +22,9 @@ from ...machine import (
     Scene,
     changed,
     horner,
+    phase_at,
     sincos,
+    switches_of,
 )
 from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
@@ -105,7 +107,7 @@ class ExactFlight(AbstractMethod):
             return _linear(smooth, s0, s1, state, beside)
         zeta, xi, in_phase = _numbers(machine)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
-        phase = machine.phase_at(s0 if in_phase else zeta * s0)
+        phase = phase_at(machine, s0 if in_phase else zeta * s0)
 
         def along(share: float | None) -> OscillatorState:
             part = tau if share is None else share * tau
@@ -179,8 +181,8 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
                 f"`{base.__name__}` with its own equations, but a `{type(part).__name__}` has "
                 f"another `{own}`"
             )
-    if machine.switches:
-        return f"machine without soft stops, but it has {len(machine.switches)}"
+    if switches_of(machine):
+        return f"machine without soft stops, but it has {len(switches_of(machine))}"
     return None
 
 
@@ -192,8 +194,8 @@ def _lack_of_linear(machine: AbstractMachine) -> str | None:
         own = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
         if own is not None:
             return f"linear machine as its matrices say, but a `{name}` has another `{own}`"
-    if machine.switches:
-        return f"machine without switches, but it has {len(machine.switches)}"
+    if switches_of(machine):
+        return f"machine without switches, but it has {len(switches_of(machine))}"
     return None
 
 

@@ -14,6 +14,7 @@ from jax.lax import stop_gradient
 
 from ..._checks import count, require
 from ..._types import Scalar, State
+from ...machine import switches_of
 from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
 from . import _series as power_series
@@ -130,7 +131,7 @@ class Taylor(AbstractMethod):
 
     def check(self, machine):
         """**Raises:** `ValueError` for a soft stop whose force has no series at first touch."""
-        for i, switch in enumerate(machine.switches):
+        for i, switch in enumerate(switches_of(machine)):
             if not switch.analytic:
                 raise ValueError(
                     f"Method `Taylor` cannot carry switch {i}, {type(switch).__name__}: at first "

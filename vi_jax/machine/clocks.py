@@ -1,0 +1,145 @@
+"""What only some machines of the library define, asked of any: several clocks, words of a crank
+angle, another form for a run."""
+
+from math import pi
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from .._checks import in_range
+from .._messages import so_many
+from .._types import Flag, Machine, Number, Scalar, State
+from .cycles import Turn, counter_of
+from .linear import LinearMachine, Prepared
+from .own import clock_of, stops_of, switches_of
+from .scene import Scene
+from .shaft import ShaftMachine
+
+
+def in_clock(machine: Machine, clock: str) -> Machine:
+    """Return the same machine with another independent variable.
+
+    **Raises:** `ValueError` for a machine with one clock.
+    """
+    if isinstance(machine, ShaftMachine):
+        return machine.in_clock(clock)
+    raise ValueError(
+        f"Argument `clock` must be left out for a {type(machine).__name__}, which has its own "
+        f"clock, but got {clock!r}."
+    )
+
+
+def in_cycle_clock(machine: Machine) -> Machine:
+    """Return the same machine with what counts its cycles as its independent variable: by time the
+    section would be an event, and the angle of a shaft one more state."""
+    return machine.in_clock("phase") if isinstance(machine, ShaftMachine) else machine
+
+
+def at_section(machine: Machine, phase: Number) -> Machine:
+    """Return the same machine observed elsewhere in its cycle.
+
+    **Raises:** `ValueError` for a machine whose section cannot be moved.
+    """
+    if isinstance(machine, Scene):
+        return machine.at_section(phase)
+    raise ValueError(
+        f"Argument `section` must be left out for a {type(machine).__name__}, which has its own "
+        f"section, but got {phase!r}."
+    )
+
+
+def phase_at(machine: Machine, since_section: Number) -> Any:
+    """Return the reading of the clock so much after the section: a crank angle may begin elsewhere
+    than at 0."""
+    return machine.phase_at(since_section) if isinstance(machine, Scene) else since_section
+
+
+def adopt(machine: Machine, start: State) -> State:
+    """Return a start in the form that a machine needs.
+
+    **Raises:** `TypeError` for another object.
+    """
+    return machine.adopt(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
+
+
+def in_cycle_state(machine: Machine, name: str, state: State) -> State:
+    """Return a state on the section, made for any clock of a machine, as the machine of
+    `in_cycle_clock` needs it; `name` is the argument that messages blame."""
+    if isinstance(machine, ShaftMachine | LinearMachine):
+        return machine.in_cycle_state(name, state)
+    return state
+
+
+def rewound(machine: Machine, state: State) -> State:
+    """Return the state with its clock set back by one cycle."""
+    return machine.rewound(state) if isinstance(machine, ShaftMachine) else state
+
+
+def cycle_time(machine: Machine) -> Scalar | float:
+    """Return the duration of a cycle, where it is fixed."""
+    return machine.period if isinstance(machine, Scene) else machine.cycle
+
+
+def logged_turn(machine: Machine) -> Scalar | float:
+    """Return the length of a cycle as an impact log counts it."""
+    return 2 * pi if isinstance(machine, Scene) else machine.cycle
+
+
+def as_logged(machine: Machine, clock: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return what an impact log contains for a reading of what counts the cycles."""
+    return machine.as_logged(clock) if isinstance(machine, Scene) else clock
+
+
+def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
+    """Return the mean speed of the drive over cycles of these durations; `None` without one."""
+    if isinstance(machine, Scene):
+        return machine.frequency_ratio(duration)
+    turns = isinstance(machine, ShaftMachine) or isinstance(counter_of(machine), Turn)
+    return 2 * pi / duration if turns else None
+
+
+def cycles_in_words(machine: Machine, cycles: int) -> str:
+    """Return a duration of so many cycles in words: 2 cycles, or 4π."""
+    return f"{2 * cycles}π" if isinstance(machine, Scene) else so_many(cycles, "cycle")
+
+
+def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
+    """Return a reading of the clock within a motion of so many cycles in words."""
+    if isinstance(machine, Scene):
+        angle = float(machine.phase_at(since_section))
+        return f"crank angle φ = {angle:.6g} of {2 * cycles}π"
+    words = so_many(cycles, "cycle")
+    return f"clock {since_section:.6g} after its section (motion of {words})"
+
+
+def scales_known(machine: Machine) -> bool:
+    """Whether the usual number of fixed steps in a cycle is known to be enough: not with soft
+    stops, whose contacts may be much briefer than a cycle; static."""
+    return isinstance(machine, Scene) and not machine.soft_stops
+
+
+def is_alive(machine: Machine, state: State) -> Flag | None:
+    """Return whether the motion can go on: false where a crank stops in the phase clock; `None`
+    where no clock can break down."""
+    return machine.alive(state) if isinstance(machine, ShaftMachine) else None
+
+
+def may_rest(machine: Machine) -> bool:
+    """Whether a body can come to rest on a stop, as far as is known; static."""
+    return machine.may_rest() if isinstance(machine, Scene) else bool(stops_of(machine))
+
+
+def is_in_range(machine: Machine, start: State) -> Flag:
+    """Whether the numbers of a machine and of its start, traced ones too, are in their ranges, and
+    the start is not beyond its section."""
+    good = in_range((machine, stops_of(machine), switches_of(machine), start))
+    clock = clock_of(machine, start)
+    return good if clock is None else good & (clock < machine.cycle)
+
+
+def prepared(machine: Machine) -> Prepared:
+    """Return a machine in the form in which a run follows it (natural modes), and the ways from its
+    own states to those, and back."""
+    if isinstance(machine, LinearMachine):
+        return machine.prepared()
+    return Prepared(machine)
