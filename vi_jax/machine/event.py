@@ -130,7 +130,8 @@ class AbstractSwitch(AbstractEvent):
 
     Within a step the mode is constant, so that what a method integrates is smooth; the step ends
     where the guard rises through zero, and there the mode changes. That is how a method keeps its
-    order across a kink, and how a body can stick.
+    order across a kink, and how a body can stick. `after` returns the state and the mode; it may
+    correct the state by rounding (a velocity set to zero where it vanishes), no more.
 
     A hump of the guard within one step is seen if the guard is as smooth as the machine's first
     coordinate; shorter ones are passed by, as by every method of steps (`step_limit` bounds them).
@@ -166,17 +167,6 @@ class AbstractSwitch(AbstractEvent):
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The mode of a motion that begins in `state`."""
 
-    @abc.abstractmethod
-    def guard(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
-        """The function that rises through zero at the end of this mode."""
-
-    @abc.abstractmethod
-    def after(
-        self, machine: Machine, s: Scalar, state: State, mode: Scalar
-    ) -> tuple[State, Scalar]:
-        """State and mode after the event. The state may be corrected by what is below rounding
-        (a velocity set to zero where it vanishes), and must not jump."""
-
     def jump(self, machine, s, state, mode):
         """The state as it is: a switch changes a mode, not the state."""
         return state
@@ -199,11 +189,6 @@ class AbstractSwitch(AbstractEvent):
         """The push of a switch that `acts`, and how much of it there is, by time; `None` for a
         force that is found with others."""
         raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
-
-    def contribution(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
-        """The term that the switch adds to the machine's field in this mode, if it has one: a soft
-        stop the acceleration of its coordinate, dry friction the force on the rubbing body."""
-        raise NotImplementedError(f"A {type(self).__name__} has no `contribution`.")
 
 
 class Section(AbstractEvent):

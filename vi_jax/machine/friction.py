@@ -87,11 +87,8 @@ class Friction(AbstractSwitch):
         return self.way(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The mode after an impact or another jump: the way that the body slips, or would begin to.
-
-        **Arguments:** as every event's, and `around`, what else acts; `None` if that is not known
-        yet.
-        """
+        """The mode after an impact or another jump: the way that the body slips, or would begin
+        to."""
         slips = self.way(machine, s, state)
         if not self.is_known(around):
             return slips
@@ -99,17 +96,11 @@ class Friction(AbstractSwitch):
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The slip coming to zero; or the force coming to what friction can hold. Nothing happens
-        where a body does not rest on the stop that it rubs on.
-
-        **Arguments:** as every event's, and `around`, the other modes and who rests where.
-        """
+        where a body does not rest on the stop that it rubs on."""
         return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
 
     def sides(self, machine, s, state, mode, *, around: Around | None = None):
-        """The guard for a force forward and for one backward.
-
-        **Arguments:** as `guard`.
-        """
+        """The guard for a force forward and for one backward."""
         slows = -mode * self.speed_of_slip(machine, s, state)
         if not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
@@ -201,8 +192,7 @@ class DryFriction(Friction):
         """True: it may hold a body anywhere."""
         return True
 
-    def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """The velocity against what it rubs on."""
+    def speed_of_slip(self, machine, s, state):
         if self.slip is not None:
             return jnp.asarray(asked(self.slip, machine, s, state))
         return coordinate_on(machine, self.on, self.mass).velocity(state)
@@ -230,14 +220,7 @@ class DryFriction(Friction):
 
         return _Slip(velocity)
 
-    def held(
-        self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
-    ) -> tuple[Any, Any, Any, Any]:
-        """The force that holds a body, the largest that can, the mass that it acts on, and whether
-        it acts at all.
-
-        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
-        """
+    def held(self, machine, s, state, contact, found):
         force, _, mass = found
         return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
 
@@ -259,10 +242,6 @@ class DryFriction(Friction):
         return -mode * self.sliding(machine, s, state, mode) / mass, push
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """Sticking, or sliding the way the force pulls.
-
-        **Arguments:** as every event's, and `around`, the other modes and who rests where.
-        """
         new = self.stopped(machine, s, state)
         return new, self._from_rest(machine, s, new, around, mode != 0)
 
@@ -325,38 +304,27 @@ class ContactFriction(Friction):
         return around is not None and bool(around.contact)
 
     def speed_of_slip(self, machine, s, state):
-        """The velocity along the stop."""
         return machine.coordinates[self.along].velocity(state)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """Sticking, or slipping the way the force pulls.
-
-        **Arguments:** as every event's, and `around`, the other modes and who rests where.
-        """
         # It vanishes to rounding; and with it what that would give to the velocity on the stop.
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
         pushes = [push_of(body, state) for body in both]
-        stops = [jnp.zeros((), bool) if around is None else self._rests(machine, around), mode != 0]
+        stops = [self._rests(machine, () if around is None else around.contact), mode != 0]
         wanted = [-body.velocity(state) for body in both]
         amounts = forces(shares(both, state, pushes), stops, wanted)
         state = added(state, amounts, pushes)
         return state, self._from_rest(machine, s, state, around, mode != 0)
 
-    def _rests(self, machine: Machine, around: Around) -> Flag:
-        if not around.contact:
+    def _rests(self, machine: Machine, contact: Scalars) -> Flag:
+        if not contact:
             return jnp.zeros((), bool)
-        return around.contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
+        return contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
 
     def held(self, machine, s, state, contact, found):
-        """The force that holds a body, the largest that can, the mass that it acts on, and whether
-        the body rests on the stop.
-
-        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
-        """
         force, pressing, mass = found
-        here = contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
-        return force, self.level * pressing, mass, here
+        return force, self.level * pressing, mass, self._rests(machine, contact)
 
     def push_in(self, machine, s, state, mode):
         """`None`: the force is found with that which presses on the stop (`held_flow`)."""

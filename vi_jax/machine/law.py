@@ -74,10 +74,7 @@ class PowerLaw(AbstractContactLaw):
         return stiffness * power(depth, p) + resist
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """The pull over δ^((p-1)/2), which is smooth at first touch.
-
-        **Arguments:** as `AbstractContactLaw.pulls`.
-        """
+        """The pull over δ^((p-1)/2), which is smooth at first touch."""
         root = power(depth, 0.5 * (self.exponent + 1))
         pull = -stiffness * root - damping * jnp.sqrt(stiffness) * rate
         flat = power(depth, 0.5 * (self.exponent - 1))
@@ -99,10 +96,7 @@ class HuntCrossley(AbstractContactLaw):
         return spring + damping * spring * rate
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """The pull over the spring's force, without prestress: that vanishes at first touch.
-
-        **Arguments:** as `AbstractContactLaw.pulls`.
-        """
+        """The pull over the spring's force, without prestress: that vanishes at first touch."""
         if prestress is None:
             return -(1 + damping * rate)
         return super().pulls(stiffness, damping, prestress, depth, rate)

@@ -84,7 +84,17 @@ class Scene(ShaftMachine):
         for stop in self.soft_stops:
             if not isinstance(stop, SoftStop):
                 raise TypeError(f"Argument `soft_stops` must hold `SoftStop`s, but holds {stop!r}.")
-        _check_room(self.stops)
+        if len(self.stops) > 2 or len({stop.side for stop in self.stops}) != len(self.stops):
+            raise ValueError(
+                "Argument `stops` must hold at most one stop on each side, but holds "
+                f"{[stop.side for stop in self.stops]}."
+            )
+        room = None if self.room is None else concrete(self.room)
+        if room is not None and not (room > 0).all():
+            raise ValueError(
+                "Argument `stops` must leave room between the two stops (gaps adding up to more "
+                f"than 0), but their gaps add up to {room.min():g}."
+            )
         require_ranges(self)
 
     @classmethod
@@ -284,32 +294,13 @@ class Scene(ShaftMachine):
 
     @property
     def room(self) -> Any:
-        """Distance between two stops; `None` with fewer."""
-        return _room(self.stops) if len(self.stops) == 2 else None
+        """Distance between two stops, of known gaps a known one; `None` with fewer."""
+        if len(self.stops) < 2:
+            return None
+        gaps: list[Any] = [concrete(stop.gap) for stop in self.stops]
+        one, other = [stop.gap for stop in self.stops] if any(x is None for x in gaps) else gaps
+        return one + other
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
         """See `plot_sketch`."""
         draw_scene(self, pen, state, phase)
-
-
-def _check_room(stops: tuple[RigidStop, ...]) -> None:
-    if len(stops) > 2 or len({stop.side for stop in stops}) != len(stops):
-        raise ValueError(
-            "Argument `stops` must hold at most one stop on each side, but holds "
-            f"{[stop.side for stop in stops]}."
-        )
-    if len(stops) == 2:
-        room = concrete(_room(stops))
-        if room is not None and not (room > 0).all():
-            raise ValueError(
-                "Argument `stops` must leave room between the two stops (gaps adding up to more "
-                f"than 0), but their gaps add up to {room.min():g}."
-            )
-
-
-def _room(stops: tuple[RigidStop, ...]) -> Any:
-    """Distance between two stops; of known gaps a known one, inside of `jit` too."""
-    one, other = (concrete(stop.gap) for stop in stops)
-    if one is None or other is None:
-        return stops[0].gap + stops[1].gap
-    return one + other

@@ -53,11 +53,7 @@ class Switch(AbstractSwitch):
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
         """The mode after an impact or another jump: the sign of the function; 0 on a surface that
-        both fields point at.
-
-        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
-        modes.
-        """
+        both fields point at."""
         side = self.begin(machine, s, state)
         if around is None:
             return side
@@ -68,11 +64,7 @@ class Switch(AbstractSwitch):
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
         """The function, falling from above or rising from below; while the motion slides, that
-        field which is the first to point away.
-
-        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
-        modes.
-        """
+        field which is the first to point away."""
         value = -mode * self.function(machine, s, state)
         if around is None:
             return value
@@ -80,10 +72,7 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, jnp.maximum(up, -down), value)
 
     def sides(self, machine, s, state, mode, *, around: Around | None = None):
-        """The guard; of a motion that slides the two of which it is the greater.
-
-        **Arguments:** as `guard`.
-        """
+        """The guard; of a motion that slides the two of which it is the greater."""
         value = -mode * self.function(machine, s, state)
         if around is None:
             return (value,)
@@ -91,11 +80,7 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, up, value), jnp.where(mode == 0, -down, value)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """On the other side, or along the surface.
-
-        **Arguments:** as every event's, and `around`, given to a switch that slides: the other
-        modes.
-        """
+        """On the other side, or along the surface."""
         if around is None:
             return state, -mode
         up, down = self._rates(machine, s, state, around)

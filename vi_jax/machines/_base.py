@@ -1,6 +1,7 @@
 """What the ready machines share: their fields, pairs of stops, and kinds of drive."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Callable, Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -8,7 +9,7 @@ import equinox as eqx
 
 from .._checks import REAL, Range, optional_real, real, require_ranges
 from .._types import Scalar, State
-from ..machine import AbstractMachine, RigidStop
+from ..machine import AbstractMachine, Coordinate, RigidStop
 
 
 def number_field(name: str, default: float | None, allowed: Range = REAL, unit: str = "") -> Any:
@@ -19,10 +20,23 @@ def number_field(name: str, default: float | None, allowed: Range = REAL, unit: 
     return eqx.field(kw_only=True, default=default, converter=converter, metadata=about)
 
 
-def stops_at(gap: Scalar, restitution: Scalar, *, two_sided: bool = True) -> tuple[RigidStop, ...]:
+def stops_at(
+    gap: Scalar, restitution: Scalar, *, two_sided: bool = True, **others: Any
+) -> tuple[RigidStop, ...]:
     """Equal stops at this distance from zero: on the right, and if two-sided then on the left."""
     sides = ("right", "left") if two_sided else ("right",)
-    return tuple(RigidStop(gap, restitution, side) for side in sides)
+    return tuple(RigidStop(gap, restitution, side, **others) for side in sides)
+
+
+def relative_to(other: str, gained: Callable[[Scalar], Scalar], mass: Scalar) -> Coordinate:
+    """The `place` and `speed` of a body as seen from another one, of which `other` is the speed.
+    That speed is `gained` from what an impact takes from the first; `mass`, the reduced one."""
+
+    def placed(x: Any, Y: Scalar, V: Scalar) -> Any:
+        there = getattr(x, other) + gained(x.speed - V)
+        return dataclasses.replace(x, place=Y, speed=V, **{other: there})
+
+    return Coordinate(lambda x: x.place, lambda x: x.speed, placed, mass)
 
 
 class ReadyMachine(AbstractMachine):

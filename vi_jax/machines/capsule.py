@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
 from .._types import Number, Scalar, State
-from ..machine import DryFriction, RigidStop, Shown
-from ._base import ForcedMachine, number_field
+from ..machine import Coordinate, DryFriction, RigidStop, Shown
+from ._base import ForcedMachine, number_field, relative_to
 
 
 class CapsuleState(Shown):
@@ -70,22 +70,24 @@ class Capsule(ForcedMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, DryFriction]:
-        """The stop in the capsule, on the right of the mass, and the ground under the capsule.
-
-        Impacts act on the reduced mass (unit: m), and a force on the capsule moves it against the
-        mass as well.
-        """
-        reduced = self.mass_ratio / (1 + self.mass_ratio)
+        """The stop in the capsule, on the right of the mass, and the ground under the capsule, of
+        which a force moves the capsule against the mass as well."""
         faster = 1 / self.mass_ratio
         return (
-            RigidStop(self.gap, self.restitution, mass=reduced),
+            RigidStop(self.gap, self.restitution),
             DryFriction(
                 self.friction,
                 static_ratio=self.static_ratio,
-                slip=_speed_on_ground,
+                slip=lambda x: x.capsule_speed,
                 push={"capsule_speed": faster, "speed": -faster},
             ),
         )
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The mass as seen from the capsule; impacts act on the reduced mass (unit: m)."""
+        both = 1 + self.mass_ratio
+        return (relative_to("capsule_speed", lambda x: x / both, self.mass_ratio / both),)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
@@ -122,21 +124,3 @@ class Capsule(ForcedMachine):
         given = number("place", place), number("speed", speed)
         capsule = number("capsule_speed", capsule_speed)
         return CapsuleState(*given, capsule, jnp.zeros_like(capsule), jnp.zeros_like(capsule))
-
-    def position(self, state: CapsuleState) -> Scalar:
-        """The place of the mass in the capsule."""
-        return state.place
-
-    def velocity(self, state: CapsuleState) -> Scalar:
-        """Speed of the mass relative to the capsule."""
-        return state.speed
-
-    def placed(self, state: CapsuleState, Y: Scalar, V: Scalar) -> CapsuleState:
-        """The mass at this place with this relative speed; what the capsule gains or loses by it
-        keeps the momentum of both."""
-        gained = (state.speed - V) / (1 + self.mass_ratio)
-        return CapsuleState(Y, V, state.capsule_speed + gained, state.travel, state.progress)
-
-
-def _speed_on_ground(state: CapsuleState) -> Scalar:
-    return state.capsule_speed

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, Shown
-from ._base import PhaseMachine, number_field, stops_at
+from ._base import PhaseMachine, number_field, relative_to, stops_at
 from ._drawn import draw_pair
 
 
@@ -73,7 +73,7 @@ class ImpactPair(PhaseMachine):
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
         """Both walls, the right one first."""
-        return stops_at(self.half_gap, self.restitution)
+        return stops_at(self.half_gap, self.restitution, on=("place", "speed"))
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -82,7 +82,7 @@ class ImpactPair(PhaseMachine):
         if self.mass_ratio is None:
             return super().coordinates
         reduced = self.mass_ratio / (1 + self.mass_ratio)
-        return (Coordinate(self.position, self.velocity, self.placed, reduced),)
+        return (relative_to("box_speed", lambda x: reduced * x, reduced),)
 
     @property
     def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
@@ -113,22 +113,6 @@ class ImpactPair(PhaseMachine):
         if self.mass_ratio is None:
             return PairState(*ball)
         return FreePairState(*ball, number("box", box), number("box_speed", box_speed))
-
-    def position(self, state: State) -> Scalar:
-        """The place of the ball in the box."""
-        return state.place
-
-    def velocity(self, state: State) -> Scalar:
-        """Speed of the ball relative to the box."""
-        return state.speed
-
-    def placed(self, state: State, Y: Scalar, V: Scalar) -> Any:
-        """The ball at this place with this relative speed; what the box gains or loses by it keeps
-        the momentum of both."""
-        if self.mass_ratio is None:
-            return PairState(Y, V)
-        share = self.mass_ratio / (1 + self.mass_ratio)
-        return FreePairState(Y, V, state.box, state.box_speed - share * (V - state.speed))
 
     def mirrored(self, state: State) -> Any:
         """Left and right exchanged, half a cycle later."""
