@@ -60,6 +60,7 @@ from .machine import TimedMotorState as TimedMotorState
 from .machine import falling as falling
 from .machine import rising as rising
 from .machine import turn_of as turn_of
+from .machine import wrap_angles as wrap_angles
 from .orbit import ORBIT_RESULTS as ORBIT_RESULTS
 from .orbit import SCENARIOS as SCENARIOS
 from .orbit import STABILITY as STABILITY

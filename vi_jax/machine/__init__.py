@@ -2,6 +2,9 @@
 
 from ..lanes import horner as horner
 from ..lanes import sincos as sincos
+from .angles import angles_in as angles_in
+from .angles import nearest_images as nearest_images
+from .angles import wrap_angles as wrap_angles
 from .base import AbstractMachine as AbstractMachine
 from .base import has_velocity as has_velocity
 from .base import names_coordinates as names_coordinates

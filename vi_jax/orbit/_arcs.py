@@ -11,11 +11,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
 from ..flow import Run, simulate
-from ..machine import AbstractMachine, Scene, bare, in_rows, is_autonomous, raveled, with_modes
+from ..machine import (
+    AbstractMachine,
+    Scene,
+    bare,
+    in_rows,
+    is_autonomous,
+    nearest_images,
+    raveled,
+    with_modes,
+)
 from ._cycle_map import CycleMap, forward_jacobian
 from ._neutral import neutral
 from ._root import shooting_matrix
@@ -150,10 +160,13 @@ def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Arra
     return jnp.concatenate(all_of_them)
 
 
-def error_of(seen: ObservedArc, x: Float[Array, "arcs states"]) -> tuple[Scalar, Flag]:
+def error_of(
+    angles: np.ndarray | None, seen: ObservedArc, x: Float[Array, "arcs states"]
+) -> tuple[Scalar, Flag]:
     """The largest component of Newton's next step from the arcs' starts `x`, and whether the motion
     drifts: most of what it lacks to be periodic is what no other start would change."""
-    missing = seen.states[:, -1, -1] - jnp.roll(x, -1, axis=0)
+    after = jnp.roll(x, -1, axis=0)
+    missing = nearest_images(angles, seen.states[:, -1, -1], after) - after
     missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
     lost = neutral(ahead)
     error = jnp.max(jnp.abs(jnp.linalg.solve(ahead + lost.filled, missing)))

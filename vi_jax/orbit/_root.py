@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._types import State, Vector
 from ..flow import simulate
-from ..machine import in_rows, raveled
+from ..machine import angles_in, bare, in_rows, nearest_images, raveled
 from ._cycle_map import CycleMap
 from ._neutral import least
 from .root_finders import AbstractRootFinder, Found, find_root
@@ -27,7 +27,8 @@ def _missing(
 ) -> Float[Array, "arcs states"]:
     """F: what each arc lacks to end where the next one begins; after the last comes the first."""
     ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
-    return ends - jnp.roll(arcs, -1, axis=0)
+    angles, after = angles_in(arc.machine, bare(unravel(arcs[0]))), jnp.roll(arcs, -1, axis=0)
+    return nearest_images(angles, ends, after) - after
 
 
 @eqx.filter_custom_jvp

@@ -26,10 +26,12 @@ from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
     after_event,
+    angles_in,
     cycle_time,
     is_autonomous,
     jump_of,
     mode_number,
+    nearest_images,
     own_modes,
     stops_of,
     with_leaf,
@@ -247,7 +249,9 @@ class Shooting(eqx.Module):
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
         arrived, away = jax.vmap(arrive)(legs, clock, ends, states)
-        return jnp.concatenate([(arrived - jnp.roll(states, -1, axis=0)).ravel(), away.ravel()])
+        after = jnp.roll(states, -1, axis=0)
+        arrived = nearest_images(angles_in(machine, self.like), arrived, after)
+        return jnp.concatenate([(arrived - after).ravel(), away.ravel()])
 
     def observe(self, x: Vector) -> Observed:
         """Multipliers, extremes and the distances to grazing of a solution `x`.

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._checks import given_number, short
 from .._messages import so_many
-from ..machine import bare, cycles_in_words, in_rows, state_in_words
+from ..machine import angles_in, bare, cycles_in_words, in_rows, nearest_images, state_in_words
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
@@ -84,9 +84,10 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
         found = in_one_row(orbits.successful)
         flat = jtu.tree_map(in_one_row, orbits)
         sections, cycles = np.asarray(in_rows(flat.sections, 2)), flat.cycles
+        angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))
         for i in np.flatnonzero(found):
             path = sections[i, : cycles[i]]
-            j = _known(paths, path, tolerance)
+            j = _known(paths, path, tolerance, angles)
             if j == len(paths):
                 paths.append(path)
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
@@ -97,11 +98,14 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     return Orbits(chosen[j] for j in order), table
 
 
-def _known(paths: list[np.ndarray], path: np.ndarray, tolerance: float) -> int:
+def _known(
+    paths: list[np.ndarray], path: np.ndarray, tolerance: float, angles: np.ndarray | None
+) -> int:
     """Which of the known motions one is, by its sections from whichever of them on; else how many
     there are."""
     for j, other in enumerate(paths):
         if len(other) == len(path):
-            if distance(path[0], other, unit_of(other)).min() <= tolerance:
+            here = nearest_images(angles, path[0], other)
+            if distance(here, other, unit_of(other)).min() <= tolerance:
                 return j
     return len(paths)

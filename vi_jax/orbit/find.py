@@ -18,11 +18,13 @@ from ..flow import MethodLike, check_leaves, in_modes, means, shape_of
 from ..machine import (
     AbstractMachine,
     HybridState,
+    angles_in,
     bare,
     begin_modes,
     frequency_ratio,
     is_autonomous,
     modes_of,
+    nearest_images,
     phase_at,
     raveled,
     replaced,
@@ -172,7 +174,8 @@ def _judged(
     x, unravel = root.x, raveled(start)[1]
     seen = jax.vmap(lambda x: observe_arc(arc, unravel(x), impact_log))(x)
     jacobians = by_the_first_state(seen.jacobians)
-    error, drifts = error_of(seen, x)
+    angles = angles_in(machine, bare(guess))
+    error, drifts = error_of(angles, seen, x)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
     # Back on the section asked for, of which the last one met is the guess's.
@@ -183,7 +186,7 @@ def _judged(
         modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
         told = jnp.concatenate([sections, modes], axis=1)
     unit = jax.lax.stop_gradient(root.unit)
-    least = _least_period(told, error, unit)
+    least = _least_period(told, error, unit, angles)
     again = _comes_back(start, seen)
     monodromy = jacobians[least - 1]
     within = jnp.arange(cycles) < least
@@ -254,14 +257,17 @@ def _at_section(guess: State, section: Array, modes: Array | None) -> State:
     return state if modes is None else HybridState(state, tuple(modes))
 
 
-def _least_period(sections: Float[Array, "cycles states"], error: Array, unit: Array) -> Array:
+def _least_period(
+    sections: Float[Array, "cycles states"], error: Array, unit: Array, angles: np.ndarray | None
+) -> Array:
     """The fewest cycles after which the sections repeat."""
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
     slack = jnp.maximum(_slack(sections.dtype), 100 * error / unit)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
-            same = jnp.all(distance(jnp.roll(sections, -m, axis=0), sections, unit) <= slack)
+            later = nearest_images(angles, jnp.roll(sections, -m, axis=0), sections)
+            same = jnp.all(distance(later, sections, unit) <= slack)
             least = jnp.where(same, m, least)
     return least
 

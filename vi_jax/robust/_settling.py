@@ -16,7 +16,16 @@ from .._messages import Tell, silent
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool
-from ..machine import AbstractMachine, bare, begin_modes, field_in, in_rows, is_autonomous
+from ..machine import (
+    AbstractMachine,
+    angles_in,
+    bare,
+    begin_modes,
+    field_in,
+    in_rows,
+    is_autonomous,
+    nearest_images,
+)
 from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit, unit_of
 
 Row = Float[np.ndarray, " _"]
@@ -83,7 +92,9 @@ class Settling:
 
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
         """How far section states lie from the motion's nearest one, see `orbit.distance`."""
-        return distance(rows[:, None], self.motion, self.unit).min(axis=1)
+        angles = angles_in(self.the_map.machine, self.like)
+        near = nearest_images(angles, rows[:, None], self.motion)
+        return distance(near, self.motion, self.unit).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""

@@ -28,9 +28,11 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    angles_in,
     attributes,
     components,
     cycles_in_words,
+    nearest_images,
     state_in_words,
     summary_table,
     unit_of,
@@ -356,7 +358,7 @@ def sorted_out(
             [np.asarray(x)[1 : cycles + 1] for x in components(run.sections, 1).values()], axis=1
         )
 
-    label, motions = _labelled(data, names, apart, sections)
+    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin))
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
@@ -497,6 +499,7 @@ def _labelled(
     names: list[str],
     apart: float,
     followed: Callable[[np.ndarray, int], np.ndarray],
+    angles: np.ndarray | None,
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """A label for each lane, and the section states (period, components) of each motion, that of
     the most lanes first.
@@ -519,7 +522,8 @@ def _labelled(
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
         for j, motion in enumerate(motions):
-            if len(motion) == p and distance(motion, state).min() <= apart:
+            near = nearest_images(angles, motion, state)
+            if len(motion) == p and distance(near, state).min() <= apart:
                 of_cell[i] = j
                 break
         else:

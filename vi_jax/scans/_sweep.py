@@ -35,6 +35,7 @@ from ..machine import (
     Stated,
     Summarized,
     adopt,
+    angles_in,
     bare,
     begun,
     check_again,
@@ -351,8 +352,9 @@ def _sweep(
         assert run.y_min is not None and run.y_max is not None
         assert run.impact_speed is not None and run.duration is not None
         period = least_period(
-            sections, run.impacts, longest=cycles // 2, tolerance=tolerance, wander=method.wander
-        )
+            sections, run.impacts, longest=cycles // 2, tolerance=tolerance, wander=method.wander,
+            angles=angles_in(here, bare(state)),
+        )  # fmt: skip
         impacts = impacts_of(run.impacts.astype(value.dtype), period)
         return onward, Sweep(
             parameter=parameter,

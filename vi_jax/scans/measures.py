@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._types import Flag, State
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine, by_default, by_name, components, frequency_ratio
+from ..machine import AbstractMachine, angles_in, by_default, by_name, components, frequency_ratio
 from ._lyapunov import lyapunov
 from .regime import CODES, REGIMES, flags, impacts_of, least_period
 
@@ -296,9 +296,10 @@ class Regime(AbstractMeasure):
     def __call__(self, machine, run):
         """Period and impacts of one lane; whether it is chaotic is left to `refine`."""
         sections = {name: x[1:] for name, x in by_name(run.sections).items()}
+        angles = angles_in(machine, jtu.tree_map(lambda x: x[0], run.sections))
         period = least_period(
             sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
-            wander=self.wander,
+            wander=self.wander, angles=angles,
         )  # fmt: skip
         return {
             "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),

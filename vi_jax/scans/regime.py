@@ -6,10 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar, State
-from ..machine import in_rows
+from ..machine import in_rows, nearest_images
 
 Number = Scalar | float
 
@@ -56,6 +57,7 @@ def least_period(
     longest: int,
     tolerance: Number | None = None,
     wander: Number = 0.0,
+    angles: np.ndarray | None = None,
 ) -> Int[Array, ""]:
     """The fewest drive cycles after which a motion repeats, its impacts too, or
     `REGIMES.unsettled`.
@@ -70,7 +72,7 @@ def least_period(
     `longest` of them; the impacts of the cycle that ends at each; the longest period looked for;
     how far sections a period apart may differ (relative to 1 + |state|), by default 1e-6 or, if
     that is more, ten times what they wander by; what the sections of a motion that repeats wander
-    by under its method (`AbstractMethod.wander`).
+    by under its method (`AbstractMethod.wander`); which of their numbers are angles (`angles_in`).
     """
     states = in_rows(sections).T
     if tolerance is None:
@@ -78,11 +80,13 @@ def least_period(
     rows = jnp.concatenate([states, impacts[None].astype(states.dtype)])
     size = states.shape[1] - longest
     last = rows[:, longest:]
+    angles = None if angles is None else np.append(angles, False)
     scale = 1 + jnp.abs(last[:-1])
 
     def compared(_, p):
         before = jax.lax.dynamic_slice_in_dim(rows, longest - p, size, axis=1)
-        apart = jnp.abs(last - before)
+        now = last if angles is None else nearest_images(angles, last.T, before.T).T
+        apart = jnp.abs(now - before)
         return _, jnp.where(jnp.any(apart[-1] > 0), jnp.inf, jnp.max(apart[:-1] / scale))
 
     periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
