@@ -1,5 +1,6 @@
 """Points of codimension two of oscillators with a stop, beside closed forms and SciPy."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -62,6 +63,81 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     meets = the(other, "resonant-grazing")
     np.testing.assert_allclose(meets.parameters, [grazes(MEETS), MEETS], atol=1e-10)
     assert meets.detail.endswith("with one impact in 1 period")
+
+
+@pytest.mark.parametrize(
+    ("to", "frequency", "force", "speed"),
+    [
+        ("fold", 0.799, 0.362836201981, 0.124087344853),
+        ("period-doubling", 0.81, 0.347533397412, 0.065303943337),
+    ],
+)
+def test_curves_that_leave_a_resonant_grazing(to, frequency, force, speed):
+    """Of the motion with one impact in two periods (Ghosh and Simpson, arXiv 2510.16218); the
+    numbers are those of a shooting code with 40 digits."""
+    machine = vi.machines.Duffing(
+        amplitude=0.36, frequency=0.79, damping=0.04, gap=1.0, restitution=0.9, two_sided=False
+    )
+    bounds = ((0.78, 0.85), (0.25, 0.45))
+    point = grazing_of(machine, "frequency", bounds[0])
+    resonant = the(vi.boundary(point, parameter="amplitude", bounds=bounds), "resonant-grazing")
+    wanted = 0.7998399840, 0.361673852989
+    np.testing.assert_allclose(resonant.parameters, wanted, atol=1e-10)
+    curve = vi.boundary(resonant.switch(to), parameter="amplitude", bounds=bounds)
+    assert curve.kind == to and curve.cycles == 2
+    (orbit,) = curve.at(frequency)
+    assert float(orbit.machine.amplitude) == pytest.approx(force, abs=1e-11)
+    assert float(orbit.impact_speed[0]) == pytest.approx(speed, abs=1e-10)
+    ends = [at for at in curve.special if at.kind == "grazing" and "is lost" in at.detail]
+    np.testing.assert_allclose(ends[0].parameters, wanted, atol=1e-9)
+    with pytest.raises(ValueError, match="`to` must be one of 'fold', 'period-doubling'"):
+        resonant.switch("grazing")
+
+
+class Two(vi.Mechanical):
+    """Two masses on springs, the first one shaken and with a stop at 1."""
+
+    q = ("x", "y")
+    mass = (1.0, 0.5)
+    amplitude: float = 0.01
+    frequency: float = 1.05
+
+    @property
+    def cycle(self):
+        return 2 * np.pi / self.frequency
+
+    @property
+    def contacts(self):
+        return (vi.RigidStop(1.0, 0.8, on="x"),)
+
+    def force(self, t, q, v):
+        """Of springs and dampers, and the drive."""
+        pull = 0.3 * (q.y - q.x) + 0.05 * (v.y - v.x)
+        drive = self.amplitude * jnp.cos(self.frequency * t)
+        return {"x": pull - q.x - 0.1 * v.x + drive, "y": -pull}
+
+
+def test_folds_and_doublings_of_a_larger_machine_begin_apart():
+    """With four numbers in the state they leave the curve of grazings at points of their own, at
+    which the curves end that begin with a slow impact."""
+    bounds = ((0.001, 20.0), (0.93, 1.13))
+    point = grazing_of(Two(), "amplitude", bounds[0])
+    grazings = vi.boundary(point, parameter="frequency", bounds=bounds)
+    resonant = [point for point in grazings.special if point.kind == "resonant-grazing"]
+    found = sorted((point.parameters[1], point.detail) for point in resonant)
+    assert [detail.replace("a curve of ", "") for _, detail in found] == [
+        "folds begins of the motion with one impact in 2 periods",
+        "period doublings begins of the motion with one impact in 1 period",
+        "folds begins of the motion with one impact in 3 periods",
+    ]
+    for point in resonant:
+        to = "fold" if "folds" in point.detail else "period-doubling"
+        curve = vi.boundary(point.switch(to), parameter="frequency", bounds=bounds)
+        off = [np.abs(at.parameters - point.parameters).max() for at in curve.special]
+        assert curve.kind == to and min(off) < 1e-7
+        other = "fold" if to == "period-doubling" else "period-doubling"
+        with pytest.raises(ValueError, match=f"No {other} of a motion with one impact"):
+            point.switch(other)
 
 
 def test_a_fold_that_touches_the_stop():

@@ -253,6 +253,17 @@ def exchange_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> Exchange
     return Exchange(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * scale[:-2]))
 
 
+class Apart(AbstractCondition):
+    """The unknowns have a given component."""
+
+    row: Float[Array, " unknowns"]
+    value: Scalar
+
+    def missing(self, problem, x, seen):
+        """Its difference from that value."""
+        return self.row @ x - self.value
+
+
 class Special(AbstractCondition):
     """The condition that a motion is special.
 
@@ -267,6 +278,8 @@ class Special(AbstractCondition):
     impact: int | None = eqx.field(static=True)
     """The event that grazes; `None` at a touch, and where nothing grazes."""
     exchange: Exchange | None = None
+    speed: Scalar | float = 0.0
+    """V⁻ of that impact, for motions beside a grazing."""
 
     def exchanged(self, problem, x, missing):
         """Where branches cross, one of the equations is exchanged."""
@@ -275,7 +288,11 @@ class Special(AbstractCondition):
     def missing(self, problem, x, seen):
         """The determinant, V⁻ or the clearance."""
         if self.kind in TOUCHING:
-            return seen.nearest.room if self.impact is None else seen.approach[self.impact]
+            return (
+                seen.nearest.room
+                if self.impact is None
+                else seen.approach[self.impact] - self.speed
+            )
         matrix = compound(seen.monodromy) if self.kind == TORUS else seen.monodromy
         sign = 1 if self.kind == DOUBLING else -1
         identity = jnp.eye(matrix.shape[0], dtype=x.dtype)

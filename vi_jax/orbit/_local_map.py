@@ -343,6 +343,24 @@ class LocalMap(eqx.Module):
             found.append(self.gradients[0] @ u)
         return np.array(found)
 
+    def passages(self, n: int) -> np.ndarray:
+        """What one impact of depth one in n periods leaves of the distance at the passages between
+        its impacts, which must be positive: ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1."""
+        u, found = np.linalg.matrix_power(self.matrix, n), []
+        u = np.linalg.solve(np.eye(len(u)) - u, self.kicks[0])
+        for _ in range(n):
+            u = self.matrix @ u
+            found.append(self.gradients[0] @ u)
+        return np.array(found[:-1]) - found[-1]
+
+    def resonance(self, n: int, sign: int) -> float:
+        """Zero where a curve of folds (`sign` 1) or doublings (-1) of the motion with one impact in
+        n periods leaves the curve of grazings: ∂h adj(±I - Nⁿ) Nⁿ kick. With two numbers in the
+        state that is eₙ."""
+        power, unit = np.linalg.matrix_power(self.matrix, n), sign * np.eye(len(self.matrix))
+        kicked = np.outer(power @ self.kicks[0], self.gradients[0])
+        return float(np.linalg.det(unit - power + kicked) - np.linalg.det(unit - power))
+
 
 class Section(NamedTuple):
     """The section of the smooth motion, beside the place where it grazes first."""

@@ -62,7 +62,7 @@ from ._words import (
 )
 from .floquet import NEUTRAL
 from .results import Orbit
-from .special import Point, point_at
+from .special import Point, further_of, point_at
 
 # These thresholds are choices; where one was measured, the comment gives the figure.
 # What lies before the place where a branch springs is looked for on so much of the way there.
@@ -253,8 +253,8 @@ class MotionTable(Table):
         detail = "the branch springs from a motion of half the period"
         scale = half.scale(self.scale[-1])
         point = point_at(half, step, scale, DOUBLING, detail, springs=True)
-        further = np.asarray(at.x)[-2 : -len(self.problem.parameters) - 1 : -1]
-        return at, dataclasses.replace(point, parameters=np.append(point.parameters, further))
+        further = further_of(self.problem, at, self.scale)
+        return at, dataclasses.replace(point, further=further)
 
     def passed(self, here: Step, last: Step) -> Passed:
         """The bifurcations between two points, the extremes and the zeros of what is watched, in

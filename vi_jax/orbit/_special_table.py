@@ -29,12 +29,12 @@ from ._closing import Closing
 from ._conditions import Special
 from ._corrector import Step, advance, apart_from_image, jacobian_at, way
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
-from ._local_map import graze_at
+from ._local_map import LocalMap, graze_at
 from ._locate import BESIDE, MOST, between, crossing
 from ._motion_table import room
 from ._observed import ROUNDING
 from ._shooting import Shooting
-from ._surgery import repeated
+from ._surgery import repeated, several
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import (
     AT_CODIMENSION_TWO,
@@ -55,7 +55,7 @@ from ._words import (
     TORUS,
     TOUCHING,
 )
-from .special import Point, doubled, point_at
+from .special import Point, point_at
 
 # The thresholds here are choices.
 # A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
@@ -66,8 +66,11 @@ _ZERO, _ENTRY = 1e-6, 1e-4
 # accelerations of up to 50.
 _SAME_TURN = 10.0
 
+# What begins at a resonant grazing of a machine with more than two numbers in its state.
+_BEGINS = {1: "a curve of folds begins", -1: "a curve of period doublings begins"}
+
 # Motions that graze are looked at over so many periods.
-_PERIODS = 3
+PERIODS = 3
 
 # Of the first and of the second parameter.
 Intervals = tuple[tuple[float, float], tuple[float, float]]
@@ -201,8 +204,8 @@ def points_of(
 ) -> list[Point]:  # fmt: skip
     """The points of codimension two on a curve, in its order."""
 
-    def point(kind: str, step: Step, more: str = "", **fields: Any) -> Point:
-        detail = None if kind == GRAZING else AT_CODIMENSION_TWO[kind] + more
+    def point(kind: str, step: Step, detail: str | None = None, **fields: Any) -> Point:
+        detail = detail or AT_CODIMENSION_TWO.get(kind)
         return point_at(problem, step, scale, kind, detail, curve=condition.kind, **fields)
 
     found: list[tuple[float, Point]] = []
@@ -220,9 +223,8 @@ def points_of(
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
         with contextlib.suppress(ValueError):  # the local map is not known
-            for place, step, n in _resonances(problem, condition, steps, scale):
-                more = f" of the motion with one impact in {so_many(n, 'period')}"
-                found.append((place, point(RESONANT, step, more, impact=condition.impact)))
+            for place, step, what in _resonances(problem, condition, steps, scale):
+                found.append((place, point(RESONANT, step, what, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
 
 
@@ -250,7 +252,7 @@ def _grazes(step: Step) -> int | None:
     approach = np.asarray(step.seen.approach)
     # An impact that is lost comes with a turn near the stop: of a speed v at a distance of about
     # v². Where a stop is touched the impacts keep their speed.
-    touches = _SAME_TURN * np.sqrt(abs(room(step)))
+    touches = max(_SAME_TURN * np.sqrt(abs(room(step))), _ZERO)
     if approach.size and approach.min() < touches * step.seen.fastest:
         return int(np.argmin(approach))
     return None
@@ -258,32 +260,32 @@ def _grazes(step: Step) -> int | None:
 
 def _resonances(
     problem: Shooting, condition: Special, steps: list[Step], scale: np.ndarray
-) -> list[tuple[float, Step, int]]:
-    """The resonant grazings of a curve, in its order: after which step, with the fraction of the
-    way to the next one, the point, and which entry of the local map vanishes there, those
-    before it being positive.
+) -> Iterator[tuple[float, Step, str]]:
+    """The resonant grazings of a curve: after which step, with the fraction of the way to the next
+    one, the point, and what begins there.
 
     **Raises:** `ValueError` where the local map is not known (see `grazing`).
     """
 
-    def entries(step: Step, number: int) -> np.ndarray:
-        point = point_at(problem, step, scale, GRAZING, "", condition.impact)
-        return graze_at(point).map.entries(number)
+    def local(step: Step) -> LocalMap:
+        return graze_at(point_at(problem, step, scale, GRAZING, "", condition.impact)).map
 
-    found, known = [], [entries(step, _PERIODS) for step in steps]
-    for (i, (here, new)), n in itertools.product(
-        enumerate(itertools.pairwise(steps)), range(_PERIODS)
-    ):
-        before, after = known[i][n], known[i + 1][n]
-        if not before * after < 0:
-            continue
-        step = between(problem, here, new, scale, lambda s, n=n: float(entries(s, n + 1)[n]))
-        if step is None or not bool(step.good):
-            continue
-        at, size = entries(step, n + 1), max(abs(before), abs(after))
-        if abs(at[n]) <= _ENTRY * size and not (at[:n] < _ENTRY * size).any():
-            found.append((_place(i, here, step, new, scale), step, n + 1))
-    return found
+    known = [local(step) for step in steps]
+    both = problem.states == 2  # folds and doublings begin at the same point
+    for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
+        what = AT_CODIMENSION_TWO[RESONANT] if both else _BEGINS[sign]
+        what += f" of the motion with one impact in {so_many(n, 'period')}"
+        test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
+        values = [each.resonance(n, sign) for each in known]
+        for i, (before, after) in enumerate(itertools.pairwise(values)):
+            if not before * after < 0:
+                continue
+            step = between(problem, steps[i], steps[i + 1], scale, test)
+            if step is None or not bool(step.good):
+                continue
+            small = _ENTRY * max(abs(before), abs(after))
+            if abs(test(step)) <= small and (local(step).passages(n) >= small).all():
+                yield _place(i, steps[i], step, steps[i + 1], scale), step, what
 
 
 def _place(i: int, here: Step, at: Step, new: Step, scale: np.ndarray) -> float:
@@ -388,7 +390,7 @@ def _cubic(bare: Shooting, *, twice: bool) -> Test:
     their second and third derivatives (Kuznetsov, Elements of Applied Bifurcation Theory, 2004,
     section 5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
     """
-    whole = doubled(bare) if twice else bare
+    whole = several(bare, 2) if twice else bare
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
         x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)

@@ -41,13 +41,23 @@ def _alike(events: tuple[Event, ...], cycles: int) -> bool:
     return events[:half] == tuple(event.later(-(cycles // 2)) for event in events[half:])
 
 
-def repeated(problem: Shooting, x: np.ndarray | Array, twice: Shooting) -> np.ndarray:
-    """The unknowns of a motion that is gone through twice, as those of the problem `twice`."""
+def several(old: Shooting, n: int) -> Shooting:
+    """The equations of a motion that is gone through n times."""
+    events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
+    return dataclasses.replace(
+        old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),
+        steps=n * old.steps,
+    )  # fmt: skip
+
+
+def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndarray:
+    """The unknowns of a motion that is gone through several times, as those of `new`."""
     clock, states = (np.asarray(a) for a in problem.parts(jnp.asarray(x)))
-    turn = float(problem.period(jnp.asarray(x)))
+    turn, n = float(problem.period(jnp.asarray(x))), new.cycles // problem.cycles
     if problem.events:
-        clock, states = np.append(clock, clock + turn), np.concatenate([states, states])
-    return np.asarray(twice.pack(clock, states, x[-len(problem.parameters) :], 2 * turn))
+        clock = (clock + turn * np.arange(n)[:, None]).ravel()
+        states = np.tile(states, (n, 1))
+    return np.asarray(new.pack(clock, states, x[-len(problem.parameters) :], n * turn))
 
 
 def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooting, Step]:

@@ -22,6 +22,9 @@ from ._flight import Flight
 # since what is left enters the height in second order and is taken off.
 _TURNED = 1e-3
 
+# A guard is zero within this share of its largest modulus along a flight: a choice.
+_ROUNDED = 1e-12
+
 
 class Nearest(NamedTuple):
     """The turning point that is nearest to an event which does not happen there."""
@@ -189,7 +192,9 @@ def _turning(
         facing = at.turns & (at.before > 0) & away
         if event.from_below:  # it touches nothing where it has not been below zero
             value = jax.vmap(partial(_Guard(number).at, flight))(places, states)
-            facing = facing & at.happens & (jax.lax.cummin(value) < 0)
+            # Right behind the event itself it is zero, to rounding of either sign.
+            below = -_ROUNDED * jnp.max(jnp.abs(value))
+            facing = facing & at.happens & (jax.lax.cummin(value) < below)
         rooms.append(_Room(jnp.where(facing, -at.height, jnp.inf), at.place))
     return bodies, rooms
 

@@ -1,0 +1,308 @@
+"""What begins at a special point: motions of other branches, and other curves in two parameters."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..machine import others_of
+from ._across import across_order, across_sliding, without_part
+from ._conditions import AbstractCondition, Apart, Special
+from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
+from ._flight import Event
+from ._local_map import graze_at
+from ._locate import located
+from ._motion_table import tests_of
+from ._shooting import Shooting
+from ._sliding import SLIDING
+from ._solution import orbit_of
+from ._special_table import PERIODS
+from ._surgery import repeated, several, without_events
+from ._words import (
+    CROSSING,
+    DOUBLING,
+    FLIP,
+    FOLD,
+    GRAZING,
+    RESONANCE_1,
+    RESONANCE_2,
+    RESONANCE_3,
+    RESONANCE_4,
+    RESONANT,
+    SYMMETRY,
+    TORUS,
+)
+from .results import Orbit
+from .special import Point, point_at
+
+_ORBIT = "orbit"
+
+
+def _along(point: Point, distance: float) -> Orbit:
+    """A motion at this distance from a special point, on the branch that its own equations are
+    of."""
+    x = np.asarray(point.step.x)
+    tangent = tangent_at(point.problem, x, point.scale)
+    step = advance(point.problem, x, tangent, point.scale, distance)
+    return _found(point.problem, step, "half the period", distance)
+
+
+def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
+    """The motion at a step. **Raises:** `ValueError` if the corrector found none there."""
+    if not bool(step.good):
+        raise ValueError(f"No motion of {what} was found at distance {distance:g}; try another.")
+    return orbit_of(problem, step)
+
+
+def _doubled(point: Point, distance: float) -> Orbit:
+    """A motion of twice the period, along what the multiplier -1 makes possible, or of half of it
+    where the branch springs from one."""
+    if point.springs:
+        return _along(point, distance)
+    old, new = point.problem, several(point.problem, 2)
+    x = np.asarray(point.step.x)
+    count = len(old.parameters)
+    twice = repeated(old, x, new)
+    scale = new.scale(point.scale[-count:])
+    jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
+    # Without the parameter's column the equations have one null vector here: that of -1.
+    tangent = np.zeros(len(twice))
+    tangent[:-count] = np.linalg.svd(jacobian[:, :-count])[2][-1]
+    step = advance(new, twice, tangent, scale, distance)
+    return _found(new, step, "twice the period", distance)
+
+
+def _crossed(point: Point, distance: float) -> Orbit:
+    """A motion of the branch that crosses here."""
+    problem, x = point.problem, np.asarray(point.step.x)
+    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * point.scale
+    # Here the equations have two null vectors: one leads along this branch, the other off it.
+    plane = np.linalg.svd(jacobian)[2][-2:]
+    along = np.asarray(point.step.tangent)
+    along = plane.T @ (plane @ along)
+    off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
+    off = off / np.linalg.norm(off)
+    step = advance(problem, x, off, point.scale, distance)
+    return _found(problem, step, "the other branch", distance)
+
+
+def _held_otherwise(point: Point, distance: float) -> Orbit:
+    """The motion on the other side of a sliding bifurcation."""
+    found = without_part(point.problem, point.step, point.scale, distance)
+    if found is not None:
+        return orbit_of(*found)
+    what = "another number of times of sticking or sliding"
+    return _otherwise(point, across_sliding, what, distance)
+
+
+def _otherwise(
+    point: Point, across: Callable[..., Orbit | None], what: str, distance: float
+) -> Orbit:
+    """The motion that `across` finds. **Raises:** `ValueError` if it finds none.
+
+    **Arguments:** what the motion has that the branch has not, in words.
+    """
+    found = across(point.problem, point.step, point.scale, distance)
+    if found is None:
+        raise ValueError(
+            f"No motion with {what} was found at distance {distance:g} from this {point.kind}. "
+            "Try another distance."
+        )
+    return found
+
+
+def _beyond_grazing(point: Point, distance: float) -> Orbit:
+    """The motion with the grazing impact less, or with the touch as an impact more."""
+    old, step = point.problem, point.step
+    if not old.follows_events:
+        raise ValueError(
+            "`switch` at a grazing needs a motion without rest on a stop, but this one rests: find "
+            "the motion beyond it with `find_orbit`."
+        )
+    if point.impact is None and not point.touches:
+        return _otherwise(point, across_order, "its events in another order", distance)
+    _check_plain(old)
+    if point.impact is not None and old.events[point.impact].cycle is not None:
+        raise ValueError(
+            "`switch` needs an impact that grazes, but here the section of the machine is touched: "
+            "beyond it the motion has another number of cycles. Find it with `find_orbit`."
+        )
+    if point.impact is not None:
+        new, start = without_events(old, np.asarray(step.x), point.lost)
+    else:
+        nearest = step.seen.nearest
+        touch = int(nearest.event), float(nearest.clock)
+        new, start = _with_touch(old, np.asarray(step.x), *touch)
+    scale = new.scale(point.scale[-1:])
+    tangent = tangent_at(new, start, scale)
+    for sense in (1.0, -1.0):
+        found = advance(new, start, sense * tangent, scale, distance)
+        inside = found.seen.nearest.room > 0 and min(found.seen.approach, default=1.0) > 0
+        if bool(found.good) and inside:
+            return orbit_of(new, found)
+    raise ValueError(
+        "Beyond this grazing there is no admissible motion with "
+        f"{len(new.impacts)} impacts at distance {distance:g}."
+    )
+
+
+def _check_plain(problem: Shooting) -> None:
+    """**Raises:** `ValueError` unless rigid stops are all that the machine has."""
+    if problem.modes[0] or others_of(problem.machine):
+        raise ValueError(
+            "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
+            "discrete modes and `events`: find the motion beyond it with `find_orbit`."
+        )
+
+
+def _with_touch(
+    old: Shooting, x: np.ndarray, number: int, touch: float
+) -> tuple[Shooting, np.ndarray]:
+    """The equations of a motion at a touch, which is an event there, and their unknowns.
+
+    **Arguments:** the equations of the motion, without modes, and their solution; the number of the
+    event, and its clock.
+    """
+    at, events = jnp.asarray(x), list(old.events)
+    clock, states = (np.asarray(a) for a in old.parts(at))
+    period = float(old.period(at))
+    leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
+    there = state_at(old, at, jnp.asarray(leg), jnp.asarray(touch))
+    u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(number)
+    if not events:
+        clock, states, events = np.array([touch]), u, [hit]
+    else:
+        clock, states = np.append(clock, touch), np.append(states, u, axis=0)
+        order = np.argsort(np.mod(clock, period))
+        clock, states = np.mod(clock, period)[order], states[order]
+        events = [[*events, hit][i] for i in order]
+    new = dataclasses.replace(old, events=tuple(events), modes=((),) * len(events))
+    return new, np.asarray(new.pack(clock, states, x[-1:], period))
+
+
+def _as_kind(kind: str, point: Point, distance: float) -> Point:
+    """The motion at a point of a boundary as a special point of another kind."""
+    impact = point.impact if kind == GRAZING else None
+    found = point_at(point.problem, point.step, point.scale, kind, impact=impact)
+    return dataclasses.replace(found, further=point.further)
+
+
+def _in_two(
+    point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
+) -> tuple[Shooting, np.ndarray, np.ndarray]:
+    """The equations of motions beside a point of a boundary in its two parameters and under a
+    condition, the unknowns, and their sizes.
+
+    **Arguments:** the point; equations and unknowns in the first parameter.
+    """
+    ((name, (value, size)),) = point.further.items()
+    two = dataclasses.replace(
+        problem, parameters=(name, *problem.parameters), conditions=(condition,)
+    )
+    return two, np.insert(x, -1, value), problem.scale([size, point.scale[-1]])
+
+
+def _of_periods(n: int, point: Point, distance: float) -> Orbit:
+    """A motion of n periods beside one with multipliers exp(±2πi/n).
+
+    The derivative of n periods is the identity in a plane. Each direction in it leads to such
+    motions, at some values of both parameters.
+    """
+    new = several(point.problem, n)
+    x = repeated(point.problem, np.asarray(point.step.x), new)
+    scale = new.scale(point.scale[-1:])
+    plane = np.linalg.svd((np.asarray(jacobian_at(new, jnp.asarray(x))) * scale)[:, :-1])[2][-2:]
+    row = jnp.asarray(np.append(plane[0] / scale[:-1], [0.0, 0.0]))
+    apart = Apart(row, jnp.asarray(float(row[:-2] @ x[:-1]) + distance))
+    two, begin, sizes = _in_two(point, new, x, apart)
+    begin = begin + distance * np.append(plane[0], [0.0, 0.0]) * sizes
+    step = advance(two, begin, np.append(plane[1], [0.0, 0.0]), sizes, 0.0)
+    return _found(two, step, f"{n} times the period", distance)
+
+
+# The first step along a curve is this share of the distance, each further one twice as long as the
+# one before, so many at most. With half the speed, what is found lies half as far off, within this.
+# A resonance is zero to this share of the kick. Choices.
+_FIRST, _LOOKED, _HALF, _RESONANT = 1e-3, 16, (0.35, 0.65), 1e-5
+
+
+def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
+    """A fold or a doubling of the motion with one impact, beside a resonant grazing."""
+    graze, sign = graze_at(dataclasses.replace(point, kind=GRAZING)), -1 if kind == DOUBLING else 1
+    problem, local, touch = graze.problem, graze.map, graze.touches[0]
+    _check_plain(problem)
+    sizes = np.asarray(problem.sizes)[1:]
+
+    def deep(n: int) -> float:
+        """As deep as this an impact is, if what is left of its kick n periods later is as large."""
+        left = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
+        return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(left / sizes))
+
+    periods = range(1, PERIODS + 1)
+    n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * deep(n)), 1)
+    fast = min(point.step.seen.fastest, np.sqrt(2 * touch.rate) * deep(n))
+    long = several(problem, n)
+    new, x = _with_touch(long, repeated(problem, graze.x, long), touch.number, touch.clock)
+    impact = int(np.argmin(np.abs(np.asarray(new.parts(jnp.asarray(x))[0]) - touch.clock)))
+
+    def found(share: float) -> tuple[Shooting, np.ndarray, Step | None, float]:
+        slow = Special(GRAZING, impact, speed=jnp.asarray(share * distance * fast))
+        two, begin, scale = _in_two(point, new, x, slow)
+        at = _changes(two, begin, scale, distance, CROSSING if kind == FOLD else kind)
+        return two, scale, at, np.nan if at is None else float(at.x[-2] - begin[-2])
+
+    (two, scale, at, off), (*_, half) = found(1.0), found(0.5)
+    if at is not None and _HALF[0] < half / off < _HALF[1] and at.seen.admissible(range(new.legs)):
+        return point_at(two, at, scale, kind)
+    raise ValueError(
+        f"No {kind} of a motion with one impact was found at distance {distance:g} from this "
+        "resonant grazing. Try a shorter distance."
+    )
+
+
+def _changes(
+    two: Shooting, x: np.ndarray, scale: np.ndarray, distance: float, test: str
+) -> Step | None:
+    """Where a test changes its sign along the motions whose impact has a given low speed, a curve
+    in both parameters; the place next to that of the resonance.
+
+    **Arguments:** the equations; about the solution at the resonance; the sizes of the unknowns.
+    """
+    begin = advance(two, x, np.eye(len(x))[-2], scale, 0.0)
+    heads = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
+    value = lambda step: tests_of(step)[test]
+    for i, side in itertools.product(range(_LOOKED), (0, 1)):
+        here = heads[side]
+        step = advance(two, here.x, here.tangent, scale, _FIRST * distance * 2**i)
+        if bool(step.good) and value(here) * value(step) < 0:
+            return located(two, here, step, scale, value)
+        heads[side] = step if bool(step.good) else here
+    return None
+
+
+# What can be switched at, by the kind of the boundary (`None` of a branch) and that of the point;
+# and what begins there, by its kind.
+BEGINS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] = {
+    (None, DOUBLING): {_ORBIT: _doubled},
+    (None, GRAZING): {_ORBIT: _beyond_grazing},
+    (None, CROSSING): {_ORBIT: _crossed},
+    (None, SYMMETRY): {_ORBIT: _crossed},
+    **{(None, kind): {_ORBIT: _held_otherwise} for kind in SLIDING},
+    **{
+        (curve, kind): {to: partial(_as_kind, to)}
+        for curve, kind, to in (
+            (FOLD, FLIP, DOUBLING), (FOLD, RESONANCE_1, TORUS), (FOLD, GRAZING, GRAZING),
+            (DOUBLING, FLIP, FOLD), (DOUBLING, RESONANCE_2, TORUS), (DOUBLING, GRAZING, GRAZING),
+            (TORUS, RESONANCE_1, FOLD), (TORUS, RESONANCE_2, DOUBLING), (TORUS, GRAZING, GRAZING),
+            (GRAZING, FOLD, FOLD), (GRAZING, DOUBLING, DOUBLING), (GRAZING, SYMMETRY, SYMMETRY),
+        )
+    },
+    (TORUS, RESONANCE_3): {_ORBIT: partial(_of_periods, 3)},
+    (TORUS, RESONANCE_4): {_ORBIT: partial(_of_periods, 4)},
+    (GRAZING, RESONANT): {to: partial(_beside_resonance, to) for to in (FOLD, DOUBLING)},
+}  # fmt: skip
