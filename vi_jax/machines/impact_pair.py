@@ -23,15 +23,11 @@ class PairState(Shown):
     """Speed of the ball relative to the box (unit: a ω)."""
 
 
-class FreePairState(Shown):
+class FreePairState(PairState):
     """The ball in its box, and the box."""
 
-    units: ClassVar = {"place": "a", "speed": "a ω", "box": "a", "box_speed": "a ω"}
+    units: ClassVar = {**PairState.units, "box": "a", "box_speed": "a ω"}
 
-    place: Scalar
-    """Place of the ball, from the middle of the box (unit: a)."""
-    speed: Scalar
-    """Speed of the ball relative to the box (unit: a ω)."""
     box: Scalar
     """Place of the box (unit: a)."""
     box_speed: Scalar
