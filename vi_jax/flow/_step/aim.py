@@ -227,8 +227,9 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
         courses.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
-        found = crests(plan, sides, trial.shares, h)
-        rises = [(good & x & y, at) for (x, at), y in zip(found, below, strict=True)]
+        below = [good & x for x in below]
+        found = crests(plan, sides, below, trial.shares, h)
+        rises = [(x & y, at) for (x, at), y in zip(found, below, strict=True)]
     return _Seen(guards, courses, humps, rises, twice)
 
 

@@ -13,6 +13,7 @@ from ..._types import Flag, Scalar, Scalars
 from .._lane import Lane, Plan
 from .guards import Crossing, Side
 from .trial import Path
+from .within import may_be_above
 
 # A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
@@ -58,13 +59,13 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
 
 
 def crests(
-    plan: Plan, sides: list[Side], shares: tuple[float, ...], h: Scalar
+    plan: Plan, sides: list[Side], below: list[Flag], shares: tuple[float, ...], h: Scalar
 ) -> list[tuple[Flag, Scalar]]:
     """Return of functions that end a step below zero whether each may have been positive within
     it, and the first place where.
 
-    **Arguments:** `sides`, the functions; `shares`, the places of the stages; `h`, the length of
-    the step.
+    **Arguments:** `sides`, the functions; `below`, whether they end so, without which nothing is
+    asked of one; `shares`, the places of the stages; `h`, the length of the step.
     """
     ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
     values = [stop_gradient(x.within) for x in sides]
@@ -72,10 +73,8 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
     doubtful = jnp.zeros_like(h, bool)
-    for (x0, _, x1, _), inner, zero in zip(ends, values, slack, strict=True):
-        greatest = jnp.maximum(jnp.maximum(x0, x1), jnp.max(inner))
-        least = jnp.minimum(jnp.minimum(x0, x1), jnp.min(inner))
-        doubtful = doubtful | (2 * greatest - least > zero)
+    for (x0, v0, x1, v1), inner, zero, ends_below in zip(ends, values, slack, below, strict=True):
+        doubtful = doubtful | ends_below & may_be_above((x0, v0), (x1, v1), inner, shares, zero)
     none = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
     above, place = jax.lax.cond(doubtful, lambda x: jax.vmap(find)(*x), lambda _: none, stacked)
     return [(above[n], place[n]) for n in range(len(sides))]

@@ -7,6 +7,7 @@ integral over the step counts in its error, and `hidden.crests` tells where they
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -120,42 +121,67 @@ def within(
 
     slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
 
-    def guards(place):
-        s, state = place
-        forces, events = {}, {}
+    def pulls(s: Scalar, state: State) -> dict[int, Scalar]:
+        found = {}
         for k in limited:
-            contact, here = contacts[k], moves(k, s, state)
+            here, rests = moves(k, s, state), contacts[k] > 0
             free = jnp.where(slow[k], -lane.direction[k] * here.v, -1.0)
-            forces[k] = jnp.where(contact > 0, plan.away(k, contact) * here.a, free)
+            found[k] = jnp.where(rests, plan.away(k, contacts[k]) * here.a, free)
+        return found
+
+    def guards(s: Scalar, state: State) -> dict[int, tuple[Scalar, ...]]:
+        found = {}
         for number in looked_at:
             if number < len(stops_of(machine)):
-                events[number] = (_distance(machine, lane, number, state),)
+                found[number] = (_distance(machine, lane, number, state),)
             else:
-                events[number] = sides_of(machine, number, s, state, *around)
-        return forces, events
+                found[number] = sides_of(machine, number, s, state, *around)
+        return found
 
     places = stop_gradient([(x.s, x.state) for x in stages])
     places = jtu.tree_map(lambda *x: jnp.stack(x), *places)
+    forces = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
+    if limited:
+        asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
+        forces = jax.lax.cond(asked, lambda x: _at_each(pulls, x), lambda _: forces, places)
+    return Within(forces, _at_each(guards, places) if looked_at else {}, slow)
 
-    # A loop, not written out: it is compiled once for all stages. On a GPU a turn of it is a kernel
-    # of its own, and all stages side by side took 0.7 of the time (H200, 100,000 lanes).
-    def at_each(places):
-        if jax.default_backend() != "cpu":
-            return jax.vmap(lambda x: stop_gradient(guards(x)))(places)
-        return jax.lax.scan(lambda c, x: (c, stop_gradient(guards(x))), None, places)[1]
 
-    if looked_at:
-        return Within(*at_each(places), slow)
-    none = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
-    any_of_them = functools.reduce(jnp.logical_or, [(contacts[k] > 0) | slow[k] for k in limited])
-    forces, _ = jax.lax.cond(any_of_them, at_each, lambda _: (none, {}), places)
-    return Within(forces, {}, slow)
+def _at_each(guards: Callable[[Scalar, State], dict], places: tuple[Array, State]) -> dict:
+    """Functions of s and the state at all stages.
+
+    A loop, not written out: it is compiled once for all stages. On a GPU a turn of it is a kernel
+    of its own, and all stages side by side took 0.7 of the time (H200, 100,000 lanes).
+    """
+    if jax.default_backend() != "cpu":
+        return jax.vmap(lambda x: stop_gradient(guards(*x)))(places)
+    return jax.lax.scan(lambda c, x: (c, stop_gradient(guards(*x))), None, places)[1]
+
+
+def may_be_above(
+    begin: Sequence[Scalar], end: Sequence[Scalar], inner: Array, shares: Sequence[float],
+    zero: Scalar | float,
+) -> Flag:  # fmt: skip
+    """Whether a function may be above zero within a step, at a glance.
+
+    The top of a parabola between two places is above both by at most an eighth of what it falls to
+    the next place; half of that is granted here. Where the function falls at the begin of the step,
+    or rises at its end, it has no top there.
+
+    **Arguments:** `begin`, `end`, its value and slope there; `inner`, its values at stages, and
+    their places as `shares` of the step; `zero`, what counts as zero.
+    """
+    (x0, v0), (x1, v1) = begin, end
+    seen = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
+    apart = 0.5 * jnp.abs(seen[1:] - seen[:-1])
+    within = jnp.any(seen[1:-1] + jnp.maximum(apart[1:], apart[:-1]) > zero)
+    return within | (v0 > 0) & (x0 + apart[0] > zero) | (v1 < 0) & (x1 + apart[-1] > zero)
 
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:
     """Whether a body may turn twice within a step and touch a stop in between, as one that has just
-    left it: slow where the step begins, going the same way where it ends, and close to the stop at
-    both."""
+    left it: slow where the step begins, going the same way where it ends, and as close to the stop
+    at both as it may get in this time."""
     begin, end = ends
     slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
     stops = [stop for stop in stops_of(plan.machine) if stop.coordinate == k]
@@ -163,8 +189,9 @@ def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scala
 
 
 def _reaches(stop: RigidStop, here: Rates, h: Scalar) -> Flag:
-    """Whether a body may get to a stop in the time h, before or after."""
-    return -stop.beyond(here.x) <= (jnp.abs(here.v) + jnp.abs(here.a) * h) * h
+    """Whether a body may get to a stop in the time h, before or after, if its acceleration stays
+    that large."""
+    return -stop.beyond(here.x) <= (jnp.abs(here.v) + 0.5 * jnp.abs(here.a) * h) * h
 
 
 def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
