@@ -104,9 +104,15 @@ class Friction(AbstractSwitch):
         slows = -mode * self.speed_of_slip(machine, s, state)
         if not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
-        pull, most, acts = self._balance(machine, s, state, around, mode)
-        both = (jnp.where(mode == 0, way * pull - most, slows) for way in (1.0, -1.0))
-        return tuple(x if self.is_dry else jnp.where(acts, x, -1.0) for x in both)
+
+        def forces() -> tuple[Scalar, Scalar, Any]:
+            pull, most, acts = self._balance(machine, s, state, around, mode)
+            return pull - most, -pull - most, acts
+
+        if self.is_dry:  # of a body that slips no force is asked
+            return jax.lax.cond(mode == 0, lambda: forces()[:2], lambda: (slows, slows))
+        *both, acts = forces()
+        return tuple(jnp.where(acts, jnp.where(mode == 0, x, slows), -1.0) for x in both)
 
     def _balance(
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
