@@ -43,15 +43,6 @@ from .special import Point, point_at
 _ORBIT = "orbit"
 
 
-def _along(point: Point, distance: float) -> Orbit:
-    """A motion at this distance from a special point, on the branch that its own equations are
-    of."""
-    x = np.asarray(point.step.x)
-    tangent = tangent_at(point.problem, x, point.scale)
-    step = advance(point.problem, x, tangent, point.scale, distance)
-    return _found(point.problem, step, "half the period", distance)
-
-
 def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
     """The motion at a step. **Raises:** `ValueError` if the corrector found none there."""
     if not bool(step.good):
@@ -59,21 +50,24 @@ def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
     return orbit_of(problem, step)
 
 
+def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray, np.ndarray]:
+    """The equations of a motion that is gone through n times, the unknowns and their sizes, and the
+    right singular vectors of the derivative by all but the parameter."""
+    new = several(point.problem, n)
+    x, scale = repeated(point.problem, point.step.x, new), new.scale(point.scale[-1:])
+    jacobian = np.asarray(jacobian_at(new, jnp.asarray(x))) * scale
+    return new, x, scale, np.linalg.svd(jacobian[:, :-1])[2]
+
+
 def _doubled(point: Point, distance: float) -> Orbit:
     """A motion of twice the period, along what the multiplier -1 makes possible, or of half of it
     where the branch springs from one."""
     if point.springs:
-        return _along(point, distance)
-    old, new = point.problem, several(point.problem, 2)
-    x = np.asarray(point.step.x)
-    count = len(old.parameters)
-    twice = repeated(old, x, new)
-    scale = new.scale(point.scale[-count:])
-    jacobian = np.asarray(jacobian_at(new, jnp.asarray(twice))) * scale
-    # Without the parameter's column the equations have one null vector here: that of -1.
-    tangent = np.zeros(len(twice))
-    tangent[:-count] = np.linalg.svd(jacobian[:, :-count])[2][-1]
-    step = advance(new, twice, tangent, scale, distance)
+        problem, x, scale = point.problem, np.asarray(point.step.x), point.scale
+        step = advance(problem, x, tangent_at(problem, x, scale), scale, distance)
+        return _found(problem, step, "half the period", distance)
+    new, x, scale, vectors = _repeated(point, 2)
+    step = advance(new, x, np.append(vectors[-1], 0.0), scale, distance)
     return _found(new, step, "twice the period", distance)
 
 
@@ -83,11 +77,9 @@ def _crossed(point: Point, distance: float) -> Orbit:
     jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * point.scale
     # Here the equations have two null vectors: one leads along this branch, the other off it.
     plane = np.linalg.svd(jacobian)[2][-2:]
-    along = np.asarray(point.step.tangent)
-    along = plane.T @ (plane @ along)
+    along = plane.T @ (plane @ point.step.tangent)
     off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
-    off = off / np.linalg.norm(off)
-    step = advance(problem, x, off, point.scale, distance)
+    step = advance(problem, x, off / np.linalg.norm(off), point.scale, distance)
     return _found(problem, step, "the other branch", distance)
 
 
@@ -213,15 +205,12 @@ def _of_periods(n: int, point: Point, distance: float) -> Orbit:
     The derivative of n periods is the identity in a plane. Each direction in it leads to such
     motions, at some values of both parameters.
     """
-    new = several(point.problem, n)
-    x = repeated(point.problem, np.asarray(point.step.x), new)
-    scale = new.scale(point.scale[-1:])
-    plane = np.linalg.svd((np.asarray(jacobian_at(new, jnp.asarray(x))) * scale)[:, :-1])[2][-2:]
-    row = jnp.asarray(np.append(plane[0] / scale[:-1], [0.0, 0.0]))
-    apart = Apart(row, jnp.asarray(float(row[:-2] @ x[:-1]) + distance))
+    new, x, scale, vectors = _repeated(point, n)
+    second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
+    row = first[:-1] / scale
+    apart = Apart(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
     two, begin, sizes = _in_two(point, new, x, apart)
-    begin = begin + distance * np.append(plane[0], [0.0, 0.0]) * sizes
-    step = advance(two, begin, np.append(plane[1], [0.0, 0.0]), sizes, 0.0)
+    step = advance(two, begin + distance * first * sizes, second, sizes, 0.0)
     return _found(two, step, f"{n} times the period", distance)
 
 

@@ -25,7 +25,7 @@ from ..machine import (
 from ._conditions import Special, held_in_words
 from ._corrector import Step
 from ._locate import between
-from ._observed import Observed
+from ._observed import Counted, Observed
 from ._shooting import Shooting
 from ._solution import orbit_at, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
@@ -266,24 +266,25 @@ class Curve(InWords, abc.ABC):
     @property
     def _speeds(self) -> list[np.ndarray]:
         """V⁻ of each impact, at each point."""
-        counted = [step.seen.counted for step in self.steps]
-        if counted and counted[0] is not None:
-            return [np.asarray(c.speed)[np.asarray(c.stop) >= 0] for c in counted]
+        if self._counted:
+            return [np.asarray(c.speed)[np.asarray(c.stop) >= 0] for c in self._counted]
         return list(self.impact_speed)
+
+    @property
+    def _counted(self) -> list[Counted]:
+        """Of motions that rest, the impacts and rests."""
+        return [c for c in (step.seen.counted for step in self.steps) if c is not None]
 
     @property
     def impacts(self) -> np.ndarray:
         """Number of impacts in the period, at each point."""
-        counted = [step.seen.counted for step in self.steps]
-        if counted and counted[0] is not None:
-            return np.array([int(c.impacts) for c in counted])
-        return np.full(len(self.steps), self.impact_speed.shape[1])
+        none = len(self.problem.impacts)
+        return np.array([int(c.impacts) for c in self._counted] or [none] * len(self.steps))
 
     @property
     def rests(self) -> np.ndarray:
         """Times that a body comes to rest on a stop in the period, at each point."""
-        counted = [step.seen.counted for step in self.steps]
-        return np.array([0 if c is None else int(c.rests) for c in counted])
+        return np.array([int(c.rests) for c in self._counted] or [0] * len(self.steps))
 
     @cached_property
     def sections(self) -> dict[str, np.ndarray]:
