@@ -61,12 +61,18 @@ class Friction(AbstractSwitch):
     @abc.abstractmethod
     def held(
         self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
-    ) -> tuple[Any, Any, Any, Any]:
-        """The force that holds a body, the largest that can, the mass that it acts on, and whether
-        it acts at all.
+    ) -> tuple[Any, Any, Any]:
+        """The force that holds a body, the largest that can, and the mass that it acts on.
 
         **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
         """
+
+    def touches(self, machine: Machine, contact: Scalars) -> Flag:
+        """Whether the body is on what it rubs on.
+
+        **Arguments:** `contact` as in `Around`.
+        """
+        return jnp.ones((), bool)
 
     def is_known(self, around: Around | None) -> bool:
         """Whether it is known what else acts on the body."""
@@ -102,31 +108,30 @@ class Friction(AbstractSwitch):
     def sides(self, machine, s, state, mode, *, around: Around | None = None):
         """The guard for a force forward and for one backward."""
         slows = -mode * self.speed_of_slip(machine, s, state)
-        if not self.is_known(around):
+        if around is None or not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
+        touches = self.touches(machine, around.contact)
 
-        def forces() -> tuple[Scalar, Scalar, Any]:
-            pull, most, acts = self._balance(machine, s, state, around, mode)
-            return pull - most, -pull - most, acts
+        def forces() -> tuple[Scalar, Scalar]:
+            pull, most = self._balance(machine, s, state, around, mode)
+            return pull - most, -pull - most
 
-        if self.is_dry:  # of a body that slips no force is asked
-            return jax.lax.cond(mode == 0, lambda: forces()[:2], lambda: (slows, slows))
-        *both, acts = forces()
-        return tuple(jnp.where(acts, jnp.where(mode == 0, x, slows), -1.0) for x in both)
+        # Of a body that slips, or does not touch, no force is asked.
+        free = jnp.where(touches, slows, -1.0)
+        return jax.lax.cond((mode == 0) & touches, forces, lambda: (free, free))
 
     def _balance(
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
-    ) -> tuple[Any, Any, Any]:
-        """The force that friction balances on a body that sticks, the largest that it can, and
-        whether it acts.
+    ) -> tuple[Any, Any]:
+        """The force that friction balances on a body that sticks, and the largest that it can.
 
         **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
         """
         modes = around.instead(mode)
         flow = field_in(machine, s, state, modes)
         found = held_flow(machine, flow, s, state, modes, around.contact)[1][around.own]
-        force, most, _, acts = self.held(machine, s, state, around.contact, found)
-        return -force, most, acts
+        force, most, _ = self.held(machine, s, state, around.contact, found)
+        return -force, most
 
     def _from_rest(
         self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
@@ -138,9 +143,8 @@ class Friction(AbstractSwitch):
         """
         if not self.is_known(around):
             return jnp.zeros_like(s)
-        pull, most, acts = self._balance(machine, s, state, around, jnp.zeros_like(s))
-        holds = sticks & (jnp.abs(pull) <= most)
-        holds = holds if self.is_dry else holds | ~acts
+        pull, most = self._balance(machine, s, state, around, jnp.zeros_like(s))
+        holds = sticks & (jnp.abs(pull) <= most) | ~self.touches(machine, around.contact)
         return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
 
 
@@ -228,7 +232,7 @@ class DryFriction(Friction):
 
     def held(self, machine, s, state, contact, found):
         force, _, mass = found
-        return force, self.sticking(machine, s, state), mass, jnp.ones((), bool)
+        return force, self.sticking(machine, s, state), mass
 
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """The size of friction on a body that slides forward or backward; in mode 0 on one that
@@ -317,20 +321,20 @@ class ContactFriction(Friction):
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
         pushes = [push_of(body, state) for body in both]
-        stops = [self._rests(machine, () if around is None else around.contact), mode != 0]
+        stops = [self.touches(machine, () if around is None else around.contact), mode != 0]
         wanted = [-body.velocity(state) for body in both]
         amounts = forces(shares(both, state, pushes), stops, wanted)
         state = added(state, amounts, pushes)
         return state, self._from_rest(machine, s, state, around, mode != 0)
 
-    def _rests(self, machine: Machine, contact: Scalars) -> Flag:
+    def touches(self, machine, contact):
         if not contact:
             return jnp.zeros((), bool)
         return contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
 
     def held(self, machine, s, state, contact, found):
         force, pressing, mass = found
-        return force, self.level * pressing, mass, self._rests(machine, contact)
+        return force, self.level * pressing, mass
 
     def push_in(self, machine, s, state, mode):
         """`None`: the force is found with that which presses on the stop (`held_flow`)."""
@@ -412,11 +416,12 @@ def _consistent(
         friction, mode = switches_of(machine)[i], modes[i]
         if i not in forces:  # on a stop where nothing is known to rest
             continue
-        force, holds, mass, acts = friction.held(machine, s, state, contact, forces[i])
+        force, holds, mass = friction.held(machine, s, state, contact, forces[i])
         rate = friction.slip_rate(machine, s, state, total)
         stays = jnp.abs(force) <= holds
         if released is not None and released[0] == i:
             stays = stays & ~released[1]
         goes = mode * rate * mass >= -_STILL * holds
-        good = good & (slip | ~acts | jnp.where(mode == 0, stays, goes))
+        touches = friction.touches(machine, contact)
+        good = good & (slip | ~touches | jnp.where(mode == 0, stays, goes))
     return good
