@@ -95,10 +95,8 @@ def test_a_branch_says_that_its_motions_rest(branch):
     drawn, *_ = vi.plot_branch(branch).get_legend().get_texts()
     assert drawn.get_text() == "2π, rest on a stop"
     (lost,) = branch.special  # from which nothing goes on
-    with pytest.raises(ValueError, match="at a rest of a branch"):
+    with pytest.raises(ValueError, match="nothing to return at a rest"):
         lost.switch()
-    with pytest.raises(ValueError, match=r"but is a rest\. Such a point is found value by value"):
-        vi.boundary(lost, parameter="stops.0.gap", bounds=((0.6, 0.8), (0.2, 0.4)))
 
 
 @pytest.mark.slow
@@ -130,10 +128,11 @@ def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
     assert branch.ends == ("grazing", "bounds")
     point = branch.special[0]
     assert point.parameter == pytest.approx(-float(orbit.y_min), abs=1e-10)
-    with pytest.raises(ValueError, match="this one rests"):
-        point.switch()
-    with pytest.raises(ValueError, match="these rest"):
-        vi.boundary(point, parameter=ZETA, bounds=((1.5, 2.6), (0.5, 0.8)))
+    beyond = point.switch()  # strikes it
+    again = vi.simulate(beyond.machine, beyond.state, 1, impact_log=64)
+    assert 1 in again.impact_log.stop[0] and again.rests[0] == beyond.rests == 1
+    last = [float(again.last.Y), float(again.last.V)]
+    np.testing.assert_allclose([float(beyond.state.Y), float(beyond.state.V)], last, atol=1e-9)
     with pytest.raises(ValueError, match="without rest on a stop"):
         vi.grazing(point)
 
@@ -279,7 +278,8 @@ def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
     assert branch.ends == ("grazing", "grazing")
     np.testing.assert_allclose([p.parameter for p in branch.special], wanted, atol=1e-10)
     soft = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.0, 0.45))
-    assert soft.ends == ("bounds", "bounds") and soft.parameter[0] == 0.0
+    assert soft.ends == ("bounds", "bounds")
+    assert soft.parameter[0] == pytest.approx(0.0, abs=1e-12)
 
 
 def listing(orbit, count):

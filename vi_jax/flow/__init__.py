@@ -25,6 +25,7 @@ from .integrals import Integrals as Integrals
 from .integrals import carried as carried
 from .integrals import elapsed as elapsed
 from .integrals import means as means
+from .labelled import EventKind as EventKind
 from .labelled import batch_names as batch_names
 from .labelled import present as present
 from .labelled import states as states

@@ -45,7 +45,8 @@ def boundary(
     Pseudo-arclength on the orbit's equations together with the condition that makes the point
     special: det(M - I) = 0 for a fold or where branches cross, det(M + I) = 0 for a period
     doubling, two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a
-    clearance of zero for a grazing. Host-side: not to be traced.
+    clearance of zero for a grazing, a chatter that ends at the release or a least force of zero for
+    a rest. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -57,7 +58,7 @@ def boundary(
       their intervals.
 
     **Returns:** a `Boundary`, whose `special` are its points of codimension two. It ends where the
-    motion ceases to be one (another impact grazes).
+    motion ceases to be one (another impact grazes, another rest is lost).
 
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
@@ -92,13 +93,8 @@ def _check_point(point: Point) -> None:
     if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, CROSSING, *TOUCHING):
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
-            "symmetry breaking, a branch point, or a grazing or sliding bifurcation at which "
-            f"something is touched, but is {one(point.kind)}. {_INSTEAD}"
-        )
-    if not point.problem.follows_events:
-        raise ValueError(
-            "Argument `point` must belong to motions without rest on a stop, but these rest, and "
-            "are followed in one parameter only."
+            "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "
+            f"bifurcation at which something is touched, but is {one(point.kind)}. {_INSTEAD}"
         )
     if point.kind in TOUCHING and not point.touches:
         touched = point.kind in (ADDING_SLIDING, GRAZING_SLIDING)

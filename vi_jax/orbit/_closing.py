@@ -119,7 +119,7 @@ class Closing:
 def observed_otherwise(problem: Shooting, x: np.ndarray) -> list[np.ndarray]:
     """The unknowns of the same motion with others of its events as the first, or without events
     from its other sections on."""
-    if problem.autonomous or not problem.follows_events:
+    if problem.autonomous:
         return []
     at, found = jnp.asarray(x), []
     parameters, period = x[-len(problem.parameters) :], float(problem.period(at))

@@ -24,7 +24,7 @@ from ..machine import quantity_of as measured
 from ._corrector import Step, jacobian_at
 from ._observed import Observed
 from ._shooting import Shooting
-from ._words import DOUBLING, TORUS, TOUCHING
+from ._words import DOUBLING, REST, TORUS, TOUCHING
 from .floquet import compound
 
 _SECTION = "section_"
@@ -39,7 +39,7 @@ def names_of(problem: Shooting) -> tuple[str, ...]:
     found = ["y_min", "y_max", "clearance", "duration", "multiplier"]
     if frequency_ratio(problem.machine, jnp.ones(())) is not None:
         found.append("frequency_ratio")
-    if problem.impacts or not problem.follows_events:
+    if problem.impacts:
         found += ["fastest_impact", "slowest_impact"]
     found += average_names(problem.machine, problem.like)
     own = (*components(problem.like), *quantity_names(problem.machine, problem.like))
@@ -76,8 +76,6 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
 
 def _speeds(problem: Shooting, seen: Observed) -> Array:
     """V⁻ of each impact; NaN where there is none."""
-    if seen.counted is not None:
-        return seen.counted.speed
     return seen.approach[np.asarray(problem.impacts, int)]
 
 
@@ -109,6 +107,11 @@ def rates_at(
 
 class AbstractCondition(eqx.Module):
     """An equation more for a motion."""
+
+    @property
+    def observes(self) -> bool:
+        """Whether it is an equation of what is observed of the motion."""
+        return True
 
     @abc.abstractmethod
     def missing(self, problem: Shooting, x: Vector, seen: Observed) -> Scalar:
@@ -271,7 +274,8 @@ class Special(AbstractCondition):
     det(M + I) = 0 at a period doubling, and where a pair of multipliers leaves the unit circle that
     the product of two is 1, det(M₂ - I) = 0 with the compound matrix M₂ (see `compound`). M has
     poles where an impact grazes, which the speeds of approach take away. At a grazing the condition
-    is V⁻ = 0 of the impact that is lost, or a clearance of zero.
+    is V⁻ = 0 of the impact that is lost, or a clearance of zero; where a rest is lost that its
+    chatter takes until the release (`escape`), or that the force on the body is zero.
     """
 
     kind: str = eqx.field(static=True)
@@ -281,12 +285,19 @@ class Special(AbstractCondition):
     speed: Scalar | float = 0.0
     """V⁻ of that impact, for motions beside a grazing."""
 
+    @property
+    def observes(self) -> bool:
+        """False where a rest is lost."""
+        return self.kind != REST
+
     def exchanged(self, problem, x, missing):
         """Where branches cross, one of the equations is exchanged."""
         return missing if self.exchange is None else self.exchange.instead(problem, missing, x)
 
     def missing(self, problem, x, seen):
         """The determinant, V⁻ or the clearance."""
+        if self.kind == REST:
+            return problem.rest_lost(x, self.impact)
         if self.kind in TOUCHING:
             return (
                 seen.nearest.room

@@ -16,7 +16,7 @@ from ._corrector import Step, advance, tangent_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
 from ._problem import check_parameter, problem_of, sized, steps_of
-from ._rest import section_map_of
+from ._rest_legs import legs_of
 from ._shooting import Shooting
 from .curve import Branch
 from .floquet import NEUTRAL
@@ -46,10 +46,10 @@ def continue_orbit(
     """Follow a periodic motion in one number of its machine, both ways, through folds.
 
     Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Special
-    points are located to rounding. A motion that rests on a stop for a part of its period is
-    followed as a fixed point of the section map, and ends where a rest is gained or lost. The
-    branch also ends at a lost impact or a touched stop (`special[i].switch()` continues with the
-    other impacts). Host-side: not to be traced; one compiled program for each number of impacts.
+    points are located to rounding. A branch of motions that rest on a stop ends if the chatter
+    would take until the release, or if the force on the body vanishes. Each branch also ends at a
+    lost impact or a touched stop (`special[i].switch()` continues with the other impacts).
+    Host-side: not to be traced; one compiled program for each number of impacts.
 
     **Arguments:**
 
@@ -82,9 +82,9 @@ def continue_orbit(
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` if the orbit was not found, rests on a stop on its section, does not
-    list all its impacts, or lies outside the bounds, or if the name is unknown; on Ctrl-C
-    `Interrupted`, whose `partial` is the branch so far.
+    **Raises:** `ValueError` if the orbit was not found, rests on a stop of a machine with switches,
+    `events` or a section, does not list all its impacts, or lies outside the bounds, or if the name
+    is unknown; on Ctrl-C `Interrupted`, whose `partial` is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)
@@ -94,7 +94,7 @@ def continue_orbit(
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
     if bool(orbit.rests > 0) or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
-        problem, x = section_map_of(orbit, parameter, method)
+        problem, x = legs_of(orbit, parameter, bounds, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
@@ -176,10 +176,9 @@ def _freed(
     wide = dataclasses.replace(
         problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
     )
-    if problem.follows_events:
-        corners = wide.corners(ranges)
-        steps = max(problem.steps, steps_of(problem.method, corners, problem.like, problem.cycles))
-        wide = dataclasses.replace(wide, steps=steps)
+    corners = wide.corners(ranges)
+    steps = max(problem.steps, steps_of(problem.method, corners, problem.like, problem.cycles))
+    wide = dataclasses.replace(wide, steps=steps)
     return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
 
 

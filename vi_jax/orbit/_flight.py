@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .. import lanes
 from .._types import Scalar, Scalars, State, Vector
-from ..flow import TIME, AbstractMethod, Integrals, SmoothMachine, carried, elapsed, in_modes
+from ..flow import TIME, AbstractMethod, Integrals, SmoothMachine, carried, elapsed, guard_rates
 from ..machine import (
     AbstractEvent,
     AbstractMachine,
@@ -21,7 +21,10 @@ from ..machine import (
     guard_of,
     prepared,
     section_number,
+    stops_of,
 )
+
+LANDS, LEAVES = "lands", "leaves"
 
 
 class Event(NamedTuple):
@@ -31,6 +34,9 @@ class Event(NamedTuple):
     """Its place among the machine's events, in the order of `events_of(machine)`."""
     cycle: int | None = None
     """The number, from 0, of the cycle of the period that begins with it; `None` if none does."""
+    use: str = ""
+    """Of a stop: `LANDS` where the chatter begins that ends in a rest, `LEAVES` where the rest
+    ends; otherwise empty."""
 
     def called(self, machine: AbstractMachine) -> str:
         """What messages call it: its name, or its kind and place among the machine's events of
@@ -55,17 +61,33 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
     return Event(section_number(machine), cycle)
 
 
-def guard_at(
-    machine: AbstractMachine, event: Event, s: Scalar, state: State, modes: tuple[Array, ...]
-) -> Scalar:
-    """The guard of an event in the course of a motion, zero there and rising.
+def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
+    """The guard of an event in the course of a motion, zero there and rising; of a release the
+    force that pulls the body off its stop.
 
-    **Arguments:** `s`, the clock since the beginning of the period; `state` and `modes`, those
-    before the event.
+    **Arguments:** `before`, the flight that ends there; `s`, the clock since the beginning of the
+    period; `state`, that before the event.
     """
+    if event.use == LEAVES:
+        return -force_on(before, event.number, s, state)
     if event.cycle is not None:
-        s = s - jnp.asarray(machine.cycle, s.dtype) * (event.cycle - 1)
-    return guard_of(machine, event.number, s, state, modes)
+        s = s - jnp.asarray(before.machine.cycle, s.dtype) * (event.cycle - 1)
+    return guard_of(before.machine, event.number, s, state, before.modes)
+
+
+def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
+    """The acceleration by s towards stop number `number` of the body on it, if that were free: the
+    force that presses it on, per unit of mass."""
+    stop = stops_of(flight.machine)[number]
+    field = flight.letting_go(stop.coordinate).smooth.field
+    return guard_rates(field, partial(stop.guard, flight.machine), s, state).a
+
+
+def on_stop(machine: AbstractMachine, number: int, state: State) -> State:
+    """The state with its body at rest on stop number `number`."""
+    stop = stops_of(machine)[number]
+    body = machine.coordinates[stop.coordinate]
+    return body.placed(state, stop.place, jnp.zeros_like(body.velocity(state)))
 
 
 class Flight(eqx.Module):
@@ -77,11 +99,22 @@ class Flight(eqx.Module):
     method: AbstractMethod
     like: State
     """A state, for its structure."""
+    contact: Scalars = ()
+    """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty if none does."""
 
     @property
     def smooth(self) -> SmoothMachine:
-        """The machine in its modes."""
-        return in_modes(self.machine, self.modes)
+        """The machine in its modes, with the bodies held that rest."""
+        return SmoothMachine(self.machine, self.modes, self.contact)
+
+    def holding(self, contact: Scalars) -> "Flight":
+        """The same with these contacts."""
+        return Flight(self.machine, self.modes, self.method, self.like, contact)
+
+    def letting_go(self, coordinate: int) -> "Flight":
+        """The same with the body of this coordinate free."""
+        others = (0.0 * x if k == coordinate else x for k, x in enumerate(self.contact))
+        return self.holding(tuple(others) if len(self.contact) > 1 else ())
 
     def unravel(self, u: Vector) -> State:
         """A state from its vector."""
@@ -95,6 +128,11 @@ class Flight(eqx.Module):
         smooth, state = self.smooth, self.unravel(u)
         beside = carried(smooth, s0, state, passed)
         new, after, _ = self.method.step(smooth, s0, s1, state, beside)
+        for number, stop in enumerate(stops_of(self.machine) if self.contact else ()):
+            # A closed form of the flight leaves out what holds the body.
+            rests = self.contact[stop.coordinate] == 1.0 + number
+            put = on_stop(self.machine, number, new)
+            new = jax.tree.map(partial(jnp.where, rests), put, new)
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
@@ -115,7 +153,8 @@ class Flight(eqx.Module):
         """
         way = prepared(self.machine)
         if way.machine is not self.machine:
-            inner = Flight(way.machine, self.modes, self.method, way.inward(self.like))
+            inward = way.inward(self.like)
+            inner = Flight(way.machine, self.modes, self.method, inward, self.contact)
 
             def outward(u: Vector) -> Vector:
                 return ravel_pytree(way.outward(inner.unravel(u)))[0]

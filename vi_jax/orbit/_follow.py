@@ -110,10 +110,6 @@ class Table(abc.ABC):
         """What happens between two points without ending the curve, in its order."""
         return []
 
-    def beyond(self, last: Step) -> Step | None:
-        """A point of the curve beyond a place where the corrector has no answer, if there is."""
-        return None
-
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further."""
         return Ending(steps[-1], STALLED)
@@ -199,11 +195,6 @@ class _Walk:
                 length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
                 if length >= _SHORTEST * max_step:
                     continue
-                beyond = self.table.beyond(here)
-                if beyond is not None:
-                    self.steps.append(beyond)
-                    length, failed, steady, points = step, 0, 0, points + 1
-                    continue
                 ending = self._stalled(here)
             elif ending is None or ending.last is not here:
                 last = new if ending is None else ending.until or ending.last
@@ -283,7 +274,7 @@ class _Walk:
         """Whether the flights get more steps from here on, where only the motion tells how many
         they need."""
         table = self.table
-        if not (table.problem.follows_events and sized_by_motion(table.problem)):
+        if not sized_by_motion(table.problem):
             return False
         off = off_by(table.problem, new.x)
         if off > max(_COARSE, 10 * self._vain):  # it is rounding what more steps do not change

@@ -430,7 +430,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
             "Argument `point` must be a grazing at which something is touched, but is "
             f"{one(point.kind)}: {point.detail}."
         )
-    if not point.problem.follows_events:
+    if point.problem.landings:
         raise ValueError(
             "Argument `point` must be a grazing of a motion without rest on a stop, but this one "
             "rests."

@@ -10,7 +10,9 @@
 | a switch goes into another mode | 1 or -1 | the same |
 | two events come together | time between them | `grazing` |
 | the cycle shrinks to rest | the rate of the section at the equilibrium | `hopf` |
-| a rest, or an impact between rests, is gained or lost | their numbers | `rest`, `grazing` |
+| a chatter takes until the release | how much less it takes | `rest` |
+| a stop is about to let go of a body within a rest | the least force | `rest` |
+| a flight between two rests vanishes | its length | `rest` |
 | two halves of the period become alike, or images | their difference | `period-doubling`, … |
 | it comes back to where it was | distance to the plane across it | `closed` |
 
@@ -29,17 +31,17 @@ import numpy as np
 
 from ._closing import Closing
 from ._conditions import alone, overtaken, rates_at
-from ._corrector import Step, apart_from_image, way
+from ._corrector import Step, advance, apart_from_image, way
+from ._flight import LANDS, LEAVES
 from ._flight import Event as MotionEvent
 from ._follow import Ending, Event, Table, bounds_of
 from ._hopf import hopf_between, size_of
 from ._locate import BESIDE, crossing
 from ._observed import ROUNDING
-from ._rest import BETWEEN_RESTS, past_section, sequence_rows, touched_beside
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, refined
 from ._solution import orbit_of
-from ._surgery import halves, origin
+from ._surgery import halves, origin, without_events
 from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
 from ._words import (
     ANEW,
@@ -52,6 +54,8 @@ from ._words import (
     HELD_FOLD,
     HOPF,
     REORDERED,
+    REST,
+    RESTS,
     SYMMETRY,
     TORUS,
     TURN,
@@ -86,6 +90,9 @@ _LONG = 4.0
 # its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations.
 # Steps no longer than the second are rounding.
 _ASIDE, _TINY = 0.9, 1e-6
+
+# A flight between two rests is over at once if it is this brief (a cycle is 2π).
+_BRIEF = 1e-3
 
 # A multiplier this close to where its test is zero passes there; else it is a pole of the
 # determinant, or a real pair μ, 1/μ.
@@ -132,19 +139,6 @@ class MotionTable(Table):
             self.size = size_of(self.problem, x)
         return new._replace(good=np.asarray(size_of(self.problem, new.x) > _STILL * self.size))
 
-    def beyond(self, last: Step) -> Step | None:
-        """The motion beyond a place where one that rests meets a stop on its section."""
-        return past_section(self.problem, last, self.scale)
-
-    def stalled(self, steps: list[Step]) -> Ending:
-        """How a branch ends that the corrector follows no further: of motions that rest at a
-        grazing, perhaps, from which both of its branches lead back."""
-        last, problem = steps[-1], self.problem
-        touch = None if problem.follows_events else touched_beside(problem, last, self.scale)
-        if touch is None:
-            return super().stalled(steps)
-        return Ending(touch, GRAZING, self._point(GRAZING, touch, BETWEEN_RESTS))
-
     def ends(self, here: Step, new: Step) -> list[Event]:
         """The rows for a step between two points."""
         rows = bounds_of(self)
@@ -154,8 +148,6 @@ class MotionTable(Table):
             ahead = lambda step: -overtaken(self.problem, step)
             rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
         rows += self._lost(here)
-        if here.seen.counted is not None:
-            rows += sequence_rows(self.problem, here, self.scale, self._named)
         return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
@@ -168,6 +160,22 @@ class MotionTable(Table):
     def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
         """The end of a branch at a special point."""
         return Ending(at, kind, self._point(kind, at, detail, impact))
+
+    def _divided(self, at: Step) -> Ending:
+        """The end where a stop is about to let go of a body within its rest."""
+        place = place_in_words(self.problem, at, float(at.seen.pull.clock))
+        return self._named(REST, at, RESTS[LEAVES].format(place=place))
+
+    def _merged(self, at: Step, release: int) -> Point:
+        """The point where two rests become one, of the motion without the flight between them."""
+        both = [release, (release + 1) % self.problem.legs]
+        clock = float(self.problem.parts(jnp.asarray(at.x))[0][release])
+        detail = RESTS[REORDERED].format(place=place_in_words(self.problem, at, clock))
+        old, at, scale = alone(self.problem, at, self.scale)
+        new, x = without_events(old, np.asarray(at.x), both)
+        along = np.eye(x.size)[-1]
+        scale = new.scale(scale[-1:])
+        return point_at(new, advance(new, x, along, scale, 0.0), scale, REST, detail)
 
     def _not_too_long(self, here: Step) -> Callable[[Step], float]:
         """How far an autonomous motion is from being longer than its steps, as many as ever,
@@ -188,6 +196,11 @@ class MotionTable(Table):
         # Of events that are together all along the rounding is left out.
         together = ROUNDING * self.problem.radian
         off = 0.0 if here.seen.apart > together else together
+        for i, event in enumerate(self.problem.landings):
+            lost = partial(self._named, REST, detail=RESTS[LANDS], impact=event)
+            yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
+        if self.problem.rests:
+            yield Event(pulled, self._divided)
         anew, reordered = (partial(self._ended, here, other=kind) for kind in (ANEW, REORDERED))
         yield Event(room, partial(self._ended, here))
         yield Event(lambda step: float(step.seen.order), anew)
@@ -201,6 +214,9 @@ class MotionTable(Table):
         **Arguments:** the point before, and the place; the number of the event that is lost; or
         what else happens, by its name in `DETAILS`.
         """
+        flight = _brief_flight(self.problem, at)
+        if flight is not None:
+            return Ending(at, REST, self._merged(at, flight))
         change = change_at(self.problem, at)
         if change is not None:
             at = refined(self.problem, at, change)
@@ -394,9 +410,28 @@ class MotionTable(Table):
         return float(np.linalg.norm(self._images(step)))
 
 
+def _brief_flight(problem: Shooting, at: Step) -> int | None:
+    """The release after which a body lands on the same stop at once; `None` if there is none."""
+    if not problem.landings:
+        return None
+    x = jnp.asarray(at.x)
+    clock = problem.parts(x)[0]
+    lengths = np.asarray(problem.ends(clock, problem.period(x)) - clock)
+    first = int(np.argmin(lengths))
+    this, after = (problem.events[i % problem.legs] for i in (first, first + 1))
+    lands = this.use == LEAVES and after == this._replace(use=LANDS)
+    return first if lands and lengths[first] < _BRIEF * problem.radian else None
+
+
 def room(step: Step) -> float:
     """The clearance, as a share of how far the body goes; of motions without a turn 1."""
     return float(np.clip(step.seen.nearest.room / step.seen.length, -1.0, 1.0))
+
+
+def pulled(step: Step) -> float:
+    """The least force on a body within its rest, as a share of what moves it; at most 1."""
+    unit = step.seen.length * (2 * np.pi / float(step.seen.duration)) ** 2
+    return float(np.clip(step.seen.pull.room / unit, -1.0, 1.0))
 
 
 # How many multipliers cross the unit circle where each test changes its sign.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Complex, Float
 
 from .._types import Scalar, State
 from ..machine import AbstractMachine, events_of, guard_of, section_number
@@ -15,21 +15,6 @@ from ._turns import Nearest
 # A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred
 # times the corrector's tolerance.
 ROUNDING = 1e-9
-
-
-class Counted(NamedTuple):
-    """The impacts and rests of a motion whose events are found by the simulator."""
-
-    impacts: Int[Array, ""]
-    """Their number in the period, hops of a chatter included."""
-    rests: Int[Array, ""]
-    """Times that a body came to rest on a stop."""
-    clock: Float[Array, " log"]
-    """Clock of each impact since the section; NaN where there is none."""
-    speed: Float[Array, " log"]
-    """V⁻ of each."""
-    stop: Int[Array, " log"]
-    """Number of the rigid stop of each, -1 where there is none."""
 
 
 class Observed(NamedTuple):
@@ -47,6 +32,8 @@ class Observed(NamedTuple):
     y_max: Scalar
     nearest: Nearest
     """Of all its turning points; its `room` is the clearance."""
+    pull: Nearest
+    """Where the force on a body that rests has its least turn; that force is its `room`."""
     order: Scalar
     """1 where each switch goes into the mode that is its next one here, else -1."""
     apart: Scalar
@@ -57,8 +44,8 @@ class Observed(NamedTuple):
     """The machine's own, over the period."""
     largest: Float[Array, " states"]
     """The largest modulus of each number of the state over the period; NaN where not known."""
-    counted: Counted | None = None
-    """Of a motion that is a fixed point of the section map: its impacts and rests."""
+    escape: Float[Array, " landings"] | None = None
+    """χ of each chatter that ends in a rest: negative as long as it does before its release."""
 
     @property
     def length(self) -> float:
@@ -84,6 +71,7 @@ def apart(
     machine: AbstractMachine,
     events: tuple[Event, ...],
     modes: tuple[tuple[float, ...], ...],
+    contacts: tuple[tuple[float, ...], ...],
     clock: Float[Array, " legs"],
     lengths: Float[Array, " legs"],
     states: list[State],
@@ -92,8 +80,9 @@ def apart(
     each other, or the least distance, where one is met, of those that are not met there. Negative
     where the motion is none of the machine's.
 
-    **Arguments:** `events` in their order; of each, `modes` of the flight that it begins, its
-    `clock`, in `lengths` the time to the next one, in `states` the state just before it.
+    **Arguments:** `events` in their order; of each, `modes` and `contacts` of the flight that
+    it begins, its `clock`, in `lengths` the time to the next one, in `states` the state just before
+    it.
     """
     least = jnp.asarray(jnp.inf, clock.dtype)
     for i, event in enumerate(events):
@@ -101,6 +90,8 @@ def apart(
         before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
         for number, other in enumerate(events_of(machine)):
             if number == event.number or number == section_number(machine):
+                continue
+            if 1.0 + number in contacts[i - 1]:
                 continue
             room = -guard_of(machine, number, clock[i], states[i], before)
             if other.from_below:  # beyond it the motion may be, until it comes from below again

@@ -240,18 +240,19 @@ def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
 def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:
     """**Raises:** `ValueError` for an event that another one sets off, or the clock as it begins
     anew: its guard is not zero there, so that the equations have no place for it."""
-    machine, before = blank.machine, 0.0
+    machine, last = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
-        if abs(place - before) <= _SAME_INSTANT and event.cycle is None:
+        if abs(place - last) <= _SAME_INSTANT and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(way.states[i])), way.modes[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
-            if abs(float(guard_at(machine, event, jnp.asarray(place), state, modes))) > _OFF_ZERO:
+            before = Flight(machine, modes, blank.method, blank.like)
+            if abs(float(guard_at(before, event, jnp.asarray(place), state))) > _OFF_ZERO:
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
                     f"{event.called(machine)} does, with another event or as a cycle begins. Let "
                     "one event do what two do at one instant; begin cycles where nothing jumps."
                 )
-        before = place
+        last = place
 
 
 def sized_by_motion(problem: Shooting) -> bool:

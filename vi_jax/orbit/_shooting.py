@@ -9,8 +9,9 @@ motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from math import ceil
 from typing import Any
 
 import equinox as eqx
@@ -36,10 +37,14 @@ from ..machine import (
     stops_of,
     with_leaf,
 )
-from ._flight import Event, Flight, guard_at
+from ._chatter import Hops, escape, hopped
+from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from ._observed import Observed, apart
-from ._turns import turns_of
+from ._turns import pull_of, turns_of
 from .floquet import multipliers_of
+
+# A hop has the steps of this share of a cycle: the longest one of a chatter (see `legs_of`).
+_HOP = 0.2
 
 # The number of a leg, which may be traced.
 Leg = int | Array
@@ -78,6 +83,10 @@ class Shooting(eqx.Module):
     sizes: Array | None = None
     """How large the clock and each number of the state are along the motion, (1 + states,): the
     scales by which differences between motions are judged; 1 if not given."""
+    slow: Array | None = None
+    """The hop of a chatter with a slower rebound (by the clock) is its last one."""
+    held: tuple[float, ...] = eqx.field(static=True, default=())
+    """Of a motion that rests all the time the contact of each coordinate (see `Flight.contact`)."""
     conditions: tuple[Any, ...] = ()
     """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
 
@@ -102,15 +111,34 @@ class Shooting(eqx.Module):
         return is_autonomous(self.machine, self.like)
 
     @property
-    def follows_events(self) -> bool:
-        """Whether the events are given, and in that order."""
-        return True
-
-    @property
     def impacts(self) -> tuple[int, ...]:
         """Which of the events are impacts."""
         stops = len(stops_of(self.machine))
-        return tuple(i for i, event in enumerate(self.events) if event.number < stops)
+        events = enumerate(self.events)
+        return tuple(i for i, event in events if event.number < stops and event.use != LEAVES)
+
+    @property
+    def landings(self) -> tuple[int, ...]:
+        """Which of the events begin a chatter that ends in a rest."""
+        return tuple(i for i, event in enumerate(self.events) if event.use == LANDS)
+
+    @property
+    def rests(self) -> bool:
+        """Whether a body rests for a part of the motion, or all the time."""
+        return bool(self.landings or self.held)
+
+    @property
+    def contacts(self) -> tuple[tuple[float, ...], ...]:
+        """Of each leg the contact of each coordinate (`Flight.contact`); empty without rests."""
+        if not self.landings:
+            return (self.held,) * self.legs
+        held, found = [0.0] * len(self.machine.coordinates), []
+        for event in 2 * self.events:
+            if event.use:
+                stop = stops_of(self.machine)[event.number]
+                held[stop.coordinate] = 1.0 + event.number if event.use == LANDS else 0.0
+            found.append(tuple(held))
+        return tuple(found[self.legs :])
 
     def at(self, x: Vector) -> AbstractMachine:
         """The machine with the parameters of `x`."""
@@ -199,6 +227,8 @@ class Shooting(eqx.Module):
         """R(u), the state after the event that begins a leg."""
 
         def new(event, s, u):
+            if event.use == LEAVES:
+                return u
             state, modes = self.unravel(u), self.modes_in(leg - 1)
             return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
 
@@ -207,8 +237,10 @@ class Shooting(eqx.Module):
     def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """g(s, u), which is zero at the event that begins a leg, and rises there."""
 
+        before = self.flight(machine, leg - 1)
+
         def value(event, s, u):
-            return guard_at(machine, event, s, self.unravel(u), self.modes_in(leg - 1))
+            return guard_at(before, event, s, self.unravel(u))
 
         return self._each(leg, value, s, u)
 
@@ -217,15 +249,62 @@ class Shooting(eqx.Module):
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
-        """The flight of a leg."""
-        return Flight(machine, self.modes_in(leg), self.method, self.like)
+        """The flight of a leg; behind the hops of a chatter, if it begins with one."""
+        flight = Flight(machine, self.modes_in(leg), self.method, self.like)
+        return flight.holding(self._contact(self.contacts, leg)) if self.rests else flight
+
+    def departing(self, machine: AbstractMachine, leg: Leg) -> Flight:
+        """The flight of a leg right behind the event that begins it."""
+        if not self.landings:
+            return self.flight(machine, leg)
+        first = [self.contacts[i - (i in self.landings)] for i in range(self.legs)]
+        return self.flight(machine, leg).holding(self._contact(first, leg))
+
+    def _contact(self, contacts: Sequence[tuple[float, ...]], leg: Leg) -> tuple[Array, ...]:
+        return tuple(jnp.asarray(contacts, jnp.result_type(float))[leg])
+
+    def flown(
+        self, machine: AbstractMachine, leg: Leg, begin: Hops, s: Scalar,
+        averages: tuple[str, ...] = (),
+    ) -> Any:  # fmt: skip
+        """The flight of a leg behind its chatter, to clock `s`, as `Flight.fly` returns it."""
+        flight, u = self.flight(machine, leg), begin.u
+        for number, lands in self._landing(leg):
+            put = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
+            u = jnp.where(lands, put, u)
+        end, passed, path = flight.fly(begin.s, s, u, self.steps, averages)
+        if self.landings:
+            passed = {name: x + begin.passed[name] for name, x in passed.items()}
+        return end, passed, path
+
+    def _landing(self, leg: Leg) -> list[tuple[int, Array]]:
+        """The stops on which bodies come to rest, and whether one does on each in this leg."""
+        numbers = [event.number if event.use == LANDS else -1 for event in self.events]
+        numbers = numbers or [int(x) - 1 for x in self.held]
+        return [(n, jnp.asarray(numbers)[leg] == n) for n in sorted(set(numbers) - {-1})]
+
+    def hopped(
+        self, machine: AbstractMachine, leg: Leg, s: Scalar, until: Scalar, u: Vector,
+        averages: tuple[str, ...] = (),
+    ) -> Hops:  # fmt: skip
+        """The last impact before a clock of the chatter with which a leg begins; else its begin.
+
+        **Arguments:** the clock of its first event, and a later one; the state behind that event.
+        """
+        hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
+        for number, lands in self._landing(leg) if self.events else ():
+            assert self.slow is not None
+            free, begin = self.departing(machine, leg), hops._replace(over=~lands)
+            steps = max(2, ceil(_HOP * self.steps / self.cycles))
+            hops = hopped(free, number, begin, slow=self.slow, until=until, steps=steps)
+        return hops
 
     def residual(self, x: Vector) -> Vector:
         """The left sides of the motion's equations, then those of the conditions."""
         missing = self.lacks(x)
         if not self.conditions:
             return missing
-        seen = self.observe(x)
+        seen = self.observe(x) if any(c.observes for c in self.conditions) else None
         for condition in self.conditions:
             missing = condition.exchanged(self, x, missing)
         more = [condition.missing(self, x, seen) for condition in self.conditions]
@@ -240,8 +319,8 @@ class Shooting(eqx.Module):
         clock, states = self.parts(x)
 
         def arrive(leg, s0, s1, u):
-            after = self.after(machine, leg, s0, u)
-            end, _, _ = self.flight(machine, leg).fly(s0, s1, after, self.steps)
+            begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
+            end, _, _ = self.flown(machine, leg, begin, s1)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype)
             return end, self.guard(machine, leg, s0, u)[None]
@@ -265,12 +344,12 @@ class Shooting(eqx.Module):
 
         def follow(leg, s0, s1, u):
             def end(u):
-                flight = self.flight(machine, leg)
-                end, passed, path = flight.fly(s0, s1, u, self.steps, averages)
-                return end, (passed, path)
+                begin = self.hopped(machine, leg, s0, s1, u, averages)
+                end, passed, path = self.flown(machine, leg, begin, s1, averages)
+                return end, (passed, path, begin)
 
             after = self.after(machine, leg, s0, u)
-            carried, (passed, path) = jax.jacfwd(end, has_aux=True)(after)
+            carried, (passed, path, begin) = jax.jacfwd(end, has_aux=True)(after)
             approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
             if self.events:
                 saltation, rises = self.saltation(machine, leg, s0, u)
@@ -278,21 +357,28 @@ class Shooting(eqx.Module):
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
             turns = turns_of(
-                self.flight(machine, leg), path[0], path[1], (s1 - s0) / self.steps,
+                self.flight(machine, leg), path[0], path[1], (s1 - begin.s) / self.steps,
                 closed=not self.events,
             )  # fmt: skip
             largest = jnp.max(jnp.abs(path[1]), axis=0)
-            return carried, passed, approach, order, turns, places, largest
+            return carried, passed, approach, order, turns, places, largest, begin
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
         found = jax.vmap(follow)(legs, clock, ends, states)
-        carried, passed, approach, order, turns, places, largest = found
+        carried, passed, approach, order, turns, places, largest, begin = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
+        period = ends[-1] - clock[0]
+        escapes = (
+            self._escape(
+                machine, i, jax.tree.map(lambda a, i=i: a[i], begin), clock, states, period
+            )
+            for i in self.landings
+        )
         Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
-        nearest = jnp.argmin(turns.nearest.room)
+        nearest, pulled = jnp.argmin(turns.nearest.room), jnp.argmin(turns.pull.room)
         integrals = jax.tree.map(jnp.sum, passed)
         time = integrals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
@@ -303,12 +389,47 @@ class Shooting(eqx.Module):
             y_min=jnp.minimum(jnp.min(Y), jnp.min(turns.low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(turns.high)),
             nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
+            pull=jax.tree.map(lambda x: x[pulled], turns.pull),
             order=jnp.min(order),
-            apart=apart(machine, self.events, self.modes, clock, ends - clock, before),
+            apart=apart(
+                machine, self.events, self.modes, self.contacts, clock, ends - clock, before
+            ),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
             averages=means(integrals, time),
             largest=jnp.max(largest, axis=0),
+            escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
+
+    def _escape(
+        self, machine: AbstractMachine, i: int, last: Hops, clock: Array, states: Array,
+        period: Scalar,
+    ) -> Scalar:  # fmt: skip
+        """χ of the chatter that begins with event number i (see `_chatter.escape`)."""
+        landing, later = self.events[i], (*range(i + 1, self.legs), *range(i))
+        j = next(j for j in later if self.events[j] == landing._replace(use=LEAVES))
+        s = clock[j] + (period if j < i else 0.0)
+        return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
+
+    def rest_lost(self, x: Vector, landing: int | None) -> Scalar:
+        """χ of the chatter that begins with this event; without its number the least force on a
+        body within its rest, at a turn. Zero where a rest is lost."""
+        machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
+        ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
+
+        def chatter(i: int) -> Hops:
+            after = self.after(machine, i, clock[i], states[i]) if self.events else states[i]
+            return self.hopped(machine, i, clock[i], ends[i], after)
+
+        if landing is not None:
+            return self._escape(machine, landing, chatter(landing), clock, states, period)
+        for i, contact in enumerate(self.contacts):
+            if any(contact):
+                begin = chatter(i)
+                places, path = self.flown(machine, i, begin, ends[i])[2]
+                h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
+                pull = pull_of(flight, places, path, h, closed=not self.events)
+                least = jnp.minimum(least, pull.room)
+        return least
 
     def saltation(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector
@@ -319,12 +440,14 @@ class Shooting(eqx.Module):
         The jump is differentiated where the body is, not put on its stop first (`jump_of`): it is
         ∇g that says what comes of the time of the event.
         """
-        old, new = (self.flight(machine, x).smooth for x in (leg - 1, leg))
+        old, new = self.flight(machine, leg - 1).smooth, self.departing(machine, leg).smooth
 
         def field(machine, u):
             return ravel_pytree(machine.field(s, self.unravel(u)))[0]
 
         def jumped(event, u):
+            if event.use == LEAVES:
+                return u
             state, modes = self.unravel(u), self.modes_in(leg - 1)
             return ravel_pytree(jump_of(machine, event.number, s, state, modes))[0]
 
@@ -341,6 +464,8 @@ class Shooting(eqx.Module):
         rate = gained + jnp.dot(slope, before)
 
         def met(event, u, rate):
+            if event.use == LEAVES:
+                return rate
             return event.of(machine).speed(machine, self.unravel(u), rate)
 
         approach = self._each(leg, met, u, rate)
@@ -364,5 +489,12 @@ class Shooting(eqx.Module):
         """The state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)
-        u = self.after(machine, leg, clock[leg], states[leg])
-        return self.unravel(self.flight(machine, leg).fly(clock[leg], s, u, self.steps)[0])
+        s0, s1 = clock[leg], self.ends(clock, self.period(x))[leg]
+        u = self.after(machine, leg, s0, states[leg])
+        begin = self.hopped(machine, leg, s0, s1, u)
+        end = self.flown(machine, leg, begin, s)[0]
+        if self.landings:
+            last = self.hopped(machine, leg, s0, s, u)
+            within = self.departing(machine, leg).fly(last.s, s, last.u, self.steps)[0]
+            end = jnp.where(s < begin.s, within, end)
+        return self.unravel(end)

@@ -1,20 +1,37 @@
 """A solution of an orbit's equations as data."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 from .._checks import count
 from .._programs import compiled
 from .._types import Scalar, State
+from ..flow import simulate
 from ..machine import frequency_ratio, phase_at, with_modes
 from ._corrector import Step
-from ._observed import Observed
 from ._shooting import Shooting
 from .results import ORBIT_RESULTS, Orbit
+
+# Impacts of a cycle that are listed, hops of a chatter included: a choice. Others are counted only.
+_LISTED = 32
+
+
+class Counted(NamedTuple):
+    """The impacts of a motion that rests, as the simulator finds them."""
+
+    impacts: Int[Array, ""]
+    """Their number in the period, hops of a chatter included."""
+    clock: Float[Array, " log"]
+    """Clock of each impact since the section; NaN where there is none."""
+    speed: Float[Array, " log"]
+    """V⁻ of each."""
+    stop: Int[Array, " log"]
+    """Number of the rigid stop of each, -1 where there is none."""
 
 
 @compiled
@@ -51,20 +68,47 @@ def _legs_of_sections(problem: Shooting, x: Array) -> tuple[np.ndarray, np.ndarr
     return legs, places
 
 
+def counted_of(problem: Shooting, step: Step, state: State | None = None) -> Counted:
+    """The impacts of a motion that rests.
+
+    **Arguments:** its state on the section, if that is known.
+    """
+    x = jnp.asarray(step.x)
+    if state is None:
+        state = jax.tree.map(lambda x: x[0], sections_of(problem, x)[0])
+    return jax.tree.map(np.asarray, _simulated(problem, x, state))
+
+
+@compiled
+def _simulated(problem: Shooting, x: Array, state: State) -> Counted:
+    machine, cycles = problem.at(x), problem.cycles
+    run = simulate(machine, state, cycles, method=problem.method, impact_log=_LISTED, rests=True)
+    log = run.impact_log
+    assert log is not None
+    begins = jnp.asarray(machine.cycle, x.dtype) * jnp.arange(cycles)
+    clock = (log.phase + begins[:, None]).ravel()
+    return Counted(jnp.sum(run.impacts), clock, log.speed.ravel(), log.stop.ravel())
+
+
 def _impacts_of(
-    problem: Shooting, seen: Observed, clock: np.ndarray, period: float
+    problem: Shooting, step: Step, clock: np.ndarray, period: float, state: State
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Clock within the period, V⁻ and stop of each impact that is listed, and their number."""
-    if seen.counted is not None:
-        listed, count = np.asarray(seen.counted.stop) >= 0, int(seen.counted.impacts)
+    if problem.landings:
+        counted = counted_of(problem, step, state)
+        listed = np.asarray(counted.stop) >= 0
         clock, speed, stop = (
-            np.asarray(a)[listed]
-            for a in (seen.counted.clock, seen.counted.speed, seen.counted.stop)
+            np.asarray(a)[listed] for a in (counted.clock, counted.speed, counted.stop)
         )
-        return clock, speed, stop.astype(np.int32), count
+        return clock, speed, stop.astype(np.int32), int(counted.impacts)
     impacts = np.asarray(problem.impacts, int)
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
-    return np.mod(clock[impacts], period), np.asarray(seen.approach)[impacts], stops, len(impacts)
+    return (
+        np.mod(clock[impacts], period),
+        np.asarray(step.seen.approach)[impacts],
+        stops,
+        len(impacts),
+    )
 
 
 def orbit_at(problem: Shooting, steps: Sequence[Step], index: int) -> Orbit:
@@ -81,11 +125,11 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     sections, residual = sections_of(problem, x)
     admissible = seen.admissible(range(len(problem.events)))
     # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
-    within, speeds, stops, count = _impacts_of(problem, seen, clock, period)
+    state = jax.tree.map(lambda x: x[0], sections)
+    within, speeds, stops, count = _impacts_of(problem, step, clock, period, state)
     order = np.argsort(within)
     since = phase_at(machine, within[order])
     duration = jnp.asarray(seen.duration)
-    state = jax.tree.map(lambda x: x[0], sections)
     own = problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
     return Orbit(
         machine=machine,
@@ -99,7 +143,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         impact_speed=jnp.asarray(speeds[order]),
         impact_stop=jnp.asarray(stops[order]),
         impacts=jnp.asarray(count, jnp.int32),
-        rests=jnp.asarray(0 if seen.counted is None else seen.counted.rests, jnp.int32),
+        rests=jnp.asarray(len(problem.landings), jnp.int32),
         y_min=jnp.asarray(seen.y_min),
         y_max=jnp.asarray(seen.y_max),
         clearance=jnp.asarray(seen.nearest.room),

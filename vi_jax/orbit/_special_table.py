@@ -4,6 +4,7 @@
 |---|---|---|
 | a bound is reached | distance of the parameter | `bounds` |
 | another impact is lost, a stop touched | V⁻, least distance at a turn | `grazing` |
+| another chatter takes until the release | how much less it takes | `rest` |
 | a pair of multipliers becomes real | 1 ∓ the cosine of its angle | `resonance-1:1`, `-1:2` |
 | the motion becomes its own image | its difference from that | `symmetry-breaking` |
 | it comes back to where it was | distance to the plane across it | `closed` |
@@ -31,7 +32,7 @@ from ._corrector import Step, advance, apart_from_image, jacobian_at, way
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
 from ._locate import BESIDE, MOST, between, crossing
-from ._motion_table import room
+from ._motion_table import pulled, room
 from ._observed import ROUNDING
 from ._shooting import Shooting
 from ._surgery import repeated, several
@@ -51,6 +52,7 @@ from ._words import (
     RESONANCE_3,
     RESONANCE_4,
     RESONANT,
+    REST,
     SYMMETRY,
     TORUS,
     TOUCHING,
@@ -115,12 +117,18 @@ class SpecialTable(Table):
         """Where an impact beside the one that grazes is lost, or a stop is touched."""
         kind, grazes = self.condition.kind, self.condition.impact
         # At a grazing the body turns on the stop, to rounding.
-        if kind not in TOUCHING or grazes is not None:
+        if kind not in TOUCHING or kind == REST or grazes is not None:
             yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
+        if self.problem.rests and (kind != REST or grazes is not None):
+            yield Event(pulled, lambda at: Ending(at, REST), noise=ROUNDING)
+        for i, event in enumerate(self.problem.landings):
+            if kind != REST or event != grazes:
+                lost = lambda step, i=i: -float(step.seen.escape[i])
+                yield Event(lost, lambda at: Ending(at, REST), noise=ROUNDING)
         fastest = here.seen.fastest
         for i in range(len(here.seen.approach)):
             # In a symmetric motion another impact grazes as well, to rounding.
-            if i == grazes:
+            if i == grazes and kind != REST:
                 continue
             test = lambda step, i=i: float(step.seen.approach[i]) / fastest
             lost = partial(self._singular, here, test)

@@ -111,10 +111,10 @@ def _otherwise(
 def _beyond_grazing(point: Point, distance: float) -> Orbit:
     """The motion with the grazing impact less, or with the touch as an impact more."""
     old, step = point.problem, point.step
-    if not old.follows_events:
+    if point.impact is not None and old.events[point.impact].use:
         raise ValueError(
-            "`switch` at a grazing needs a motion without rest on a stop, but this one rests: find "
-            "the motion beyond it with `find_orbit`."
+            "`switch` at a grazing needs an impact of a motion in flight, but here a rest begins "
+            "or ends with it: find the motion beyond it with `find_orbit`."
         )
     if point.impact is None and not point.touches:
         return _otherwise(point, across_order, "its events in another order", distance)

@@ -23,8 +23,6 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
     odd number of cycles can be.
     """
     events, half = problem.events, len(problem.events) // 2
-    if not problem.follows_events:
-        return False
     if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
         return False
     if any(machine.mirrored(problem.like) is None for machine in machines):
@@ -35,6 +33,8 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
 
 def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
     stops = stops_of(machine)
+    if one.use != other.use:
+        return False
     if max(one.number, other.number) < len(stops):  # stops come first among the events
         left, right = stops[one.number], stops[other.number]
         return left.coordinate == right.coordinate and left.sign == -right.sign

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Flag, Scalar, State, Vector
 from ..flow import Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, has_velocity, section_number, stops_of
-from ._flight import Flight
+from ._flight import Flight, force_on
 
 # Newton's method has met a turn if it ends this close to it (as a share of the step): a choice,
 # since what is left enters the height in second order and is taken off.
@@ -46,6 +46,8 @@ class Turns(NamedTuple):
     high: Scalar
     """The greatest; -infinite if there is none."""
     nearest: Nearest
+    pull: Nearest
+    """Of the forces on bodies that rest, as `pull_of`."""
 
 
 class _Found(NamedTuple):
@@ -113,6 +115,17 @@ class _Body(_Guard):
         return jnp.ones((), bool)
 
 
+class _Pull(_Guard):
+    """Something that may turn along a flight: the force that pulls a body off the stop of this
+    number, on which it rests."""
+
+    def value(self, flight, s, state):
+        return -force_on(flight, self.number, s, state)
+
+    def happens(self, flight, s, u, length):
+        return jnp.ones((), bool)
+
+
 class _Room(NamedTuple):
     """How near a flight comes to one of the machine's events at its turns, one for each step."""
 
@@ -141,7 +154,8 @@ def turns_of(
         room = jnp.minimum(room, values[least])
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return Turns(low, high, Nearest(room, touch, touched))
+    pull = pull_of(flight, places, states, h, closed=closed)
+    return Turns(low, high, Nearest(room, touch, touched), pull)
 
 
 def rooms_of(
@@ -164,24 +178,15 @@ def _turning(
     **Arguments:** as `turns_of`.
     """
     machine, begin = flight.machine, places[0]
-    # The end of the last step is the next event: its velocity is that of a further step.
-    last = flight.once(_stepped, (places[-1], h, states[-1]))
-
-    def found(watched: _Guard) -> _Found:
-        v = jax.vmap(partial(watched.rate, flight))(places, states)
-        # What turns on the section itself does so at the begin or at the end, whatever the sign of
-        # the rounding that its rate consists of there: so that sign has to be one.
-        end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
-        v1 = jnp.concatenate([v[1:], end[None]])
-        return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(
-            places, states, v, v1
-        )
-
+    found = partial(_turns_in, flight, places, states, h, closed)
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
     rooms = []
     for stop in stops_of(machine):
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
+        if flight.contact:  # one that is let go of begins to move with velocity zero
+            free = flight.contact[stop.coordinate] == 0
+            facing = facing & free & (at.place > begin + _TURNED * h)
         rooms.append(_Room(jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(machine)):
         if number < len(stops_of(machine)) or number == section_number(machine):
@@ -197,6 +202,41 @@ def _turning(
             facing = facing & at.happens & (jax.lax.cummin(value) < below)
         rooms.append(_Room(jnp.where(facing, -at.height, jnp.inf), at.place))
     return bodies, rooms
+
+
+def _turns_in(
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
+    h: Scalar, closed: bool, watched: _Guard,
+) -> _Found:  # fmt: skip
+    """The turning points of one function along a flight."""
+    # The end of the last step is the next event: its velocity is that of a further step.
+    last = flight.once(_stepped, (places[-1], h, states[-1]))
+    v = jax.vmap(partial(watched.rate, flight))(places, states)
+    # What turns on the section itself does so at the begin or at the end, whatever the sign of
+    # the rounding that its rate consists of there: so that sign has to be one.
+    end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
+    v1 = jnp.concatenate([v[1:], end[None]])
+    return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
+
+
+def pull_of(
+    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
+    h: Scalar, *, closed: bool,
+) -> Nearest:  # fmt: skip
+    """Where the force on a body that rests has its least turn, as if that were a distance.
+
+    **Arguments:** as `turns_of`.
+    """
+    least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
+    for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
+        at = _turns_in(flight, places, states, h, closed, _Pull(number))
+        rests = flight.contact[stop.coordinate] == 1.0 + number
+        force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
+        i = jnp.argmin(force)
+        other = Nearest(force[i], at.place[i], jnp.full((), float(number), h.dtype))
+        less = other.room < least.room
+        least = jax.tree.map(lambda a, b, less=less: jnp.where(less, a, b), other, least)
+    return least
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:

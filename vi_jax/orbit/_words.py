@@ -5,7 +5,7 @@ import numpy as np
 
 from ..machine import RigidStop, SoftStop, clock_in_words
 from ._corrector import Step
-from ._flight import Event
+from ._flight import LANDS, LEAVES, Event
 from ._shooting import Shooting
 from ._sliding import SLIDING
 
@@ -20,7 +20,7 @@ RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
 RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 
 # Kinds at which something is touched: by a flight, or by a body that is only just held.
-TOUCHING = (GRAZING, *SLIDING)
+TOUCHING = (GRAZING, REST, *SLIDING)
 
 # What else a motion may end at than a lost event or a touch; and a turn that a branch makes where
 # it leaves another one to both sides.
@@ -37,6 +37,13 @@ DETAILS = {
     TURNS: "a multiplier touches 1: this branch leaves another one to both sides",
     REORDERED: "two of its events fall together, and come in another order beyond",
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
+}
+
+# What is said of a rest, by the event or the change that it is lost with.
+RESTS = {
+    LANDS: "a rest on a stop is lost: its chatter takes until the stop lets go",
+    LEAVES: "a rest on a stop is divided {place}, where the force on the body falls to zero",
+    REORDERED: "two rests on a stop become one: the body leaves it {place} no longer",
 }
 
 # What is said of a point of codimension two.

@@ -25,9 +25,9 @@ from ..machine import (
 from ._conditions import Special, held_in_words
 from ._corrector import Step
 from ._locate import between
-from ._observed import Counted, Observed
+from ._observed import Observed
 from ._shooting import Shooting
-from ._solution import orbit_at, orbit_of, sections_of
+from ._solution import Counted, counted_of, orbit_at, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
 from .floquet import stability_of
@@ -194,14 +194,14 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def impact_phase(self) -> np.ndarray:
         """Clock of each impact since the section, in the machine's units (of a `Scene` the crank
-        angle in radians); (points, impacts). Without columns for motions that rest on a stop, whose
-        impacts differ in number: `orbit(i)` lists them."""
+        angle in radians); (points, impacts). Of a chatter that ends in a rest only the first one:
+        `orbit(i)` lists all."""
         return np.stack([step.x[list(self.problem.impacts)] for step in self.steps])
 
     @cached_property
     def impact_speed(self) -> np.ndarray:
-        """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts), or
-        without columns as `impact_phase`."""
+        """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts),
+        as in `impact_phase`."""
         return self._each(lambda seen: seen.approach[list(self.problem.impacts)])
 
     @cached_property
@@ -270,10 +270,11 @@ class Curve(InWords, abc.ABC):
             return [np.asarray(c.speed)[np.asarray(c.stop) >= 0] for c in self._counted]
         return list(self.impact_speed)
 
-    @property
+    @cached_property
     def _counted(self) -> list[Counted]:
-        """Of motions that rest, the impacts and rests."""
-        return [c for c in (step.seen.counted for step in self.steps) if c is not None]
+        """The impacts of each motion, if they rest."""
+        rest = self.problem.landings
+        return [counted_of(self.problem, step) for step in self.steps] if rest else []
 
     @property
     def impacts(self) -> np.ndarray:
@@ -284,7 +285,7 @@ class Curve(InWords, abc.ABC):
     @property
     def rests(self) -> np.ndarray:
         """Times that a body comes to rest on a stop in the period, at each point."""
-        return np.array([int(c.rests) for c in self._counted] or [0] * len(self.steps))
+        return np.full(len(self.steps), len(self.problem.landings))
 
     @cached_property
     def sections(self) -> dict[str, np.ndarray]:
@@ -388,7 +389,7 @@ class Branch(Curve):
     It ends on each side at the "bounds", by "grazing" (an impact is lost or a stop touched), one of
     the four sliding bifurcations ("crossing-sliding", …; see `Point.kind`), "period-doubling" (it
     springs there from a motion of half its period), "symmetry-breaking" (from a symmetric one),
-    "hopf" (it shrinks to rest), "rest" (a rest on a stop is gained or lost), "closed" (it has come
+    "hopf" (it shrinks to rest), "rest" (a rest on a stop is lost or divided), "closed" (it has come
     back to its first point, which is its last one as well: an isola), "multiplier" (another becomes
     as large as the one that is held, or those of a held complex pair turn real), "stalled" (the
     corrector finds no motion further on, however close), "max_points", "interrupted", "long" (an
@@ -433,11 +434,11 @@ class Boundary(Curve):
     """A curve in two parameters along which an orbit bifurcates: host arrays with one row for each
     point, in their order, in the machine's units (see `AbstractMachine.units`).
 
-    It ends on each side at the "bounds", by "grazing" (an impact more or less), "closed" (it has
-    come back to its first point, which is its last one as well), of a curve of Neimark–Sacker
-    points by "resonance-1:1" and "resonance-1:2" (the two multipliers become real), of a curve of
-    motions without symmetry by "symmetry-breaking" (they become symmetric), "stalled",
-    "max_points", "interrupted"."""
+    It ends on each side at the "bounds", by "grazing" (an impact more or less), "rest" (a rest more
+    or less), "closed" (it has come back to its first point, which is its last one as well), of a
+    curve of Neimark–Sacker points by "resonance-1:1" and "resonance-1:2" (the two multipliers
+    become real), of a curve of motions without symmetry by "symmetry-breaking" (they become
+    symmetric), "stalled", "max_points", "interrupted"."""
 
     @property
     def condition(self) -> Special:
@@ -485,6 +486,6 @@ class Boundary(Curve):
 
 def branch_hits_in_words(branch: Branch) -> str:
     """The impacts of a branch's motions, or that they rest, as their impacts differ in number."""
-    if branch.rests.any():
+    if branch.problem.rests:
         return "rest on a stop"
     return so_many(branch.impact_speed.shape[1], "impact")

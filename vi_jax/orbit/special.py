@@ -17,6 +17,7 @@ from ._solution import orbit_of
 from ._words import (
     DETAILS,
     GRAZING,
+    REST,
     grazing_in_words,
     one,
 )
@@ -34,11 +35,11 @@ class Point(InWords):
     """On a branch "fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking"
     (where motions that are their own image under the symmetry of their machine meet some that are
     not), "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a
-    stop is gained or lost), "crossing-sliding", "grazing-sliding", "switching-sliding" or
-    "adding-sliding" (a part in which a switch is held on its surface, as by dry friction, vanishes
-    or appears; see the `detail`), "extremum" (of a `quantity` that was asked for), "watched" (a
-    `quantity` that is watched passes zero), or "turn" (the parameter turns back where others are
-    free; no multiplier need be 1).
+    stop is lost, divided, or joined to another one), "crossing-sliding", "grazing-sliding",
+    "switching-sliding" or "adding-sliding" (a part in which a switch is held on its surface, as by
+    dry friction, vanishes or appears; see the `detail`), "extremum" (of a `quantity` that was asked
+    for), "watched" (a `quantity` that is watched passes zero), or "turn" (the parameter turns back
+    where others are free; no multiplier need be 1).
 
     On a boundary "cusp" (two curves of folds meet and end), "degenerate-doubling" or
     "degenerate-symmetry-breaking" (the motions that begin there do so on the other side beyond),
@@ -90,7 +91,7 @@ class Point(InWords):
     def touches(self) -> bool:
         """Whether at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
         bifurcation a surface, by a motion without the part that vanishes there."""
-        lost = self.impact is not None and self.kind not in SLIDING
+        lost = self.kind == REST or (self.impact is not None and self.kind not in SLIDING)
         seen = self.step.seen
         # A stop's room is a length; that of a switch a velocity or, while it is held, a force.
         orders = (0,) if self.kind == GRAZING else (1, 2)

@@ -1,0 +1,115 @@
+"""Where a rest on a stop is lost or divided, followed in two parameters."""
+
+import numpy as np
+import pytest
+import vi_jax as vi
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from two_coupled import Coupled, settled
+
+pytestmark = pytest.mark.slow
+
+ZETA = "drive.frequency_ratio"
+
+
+def found(machine, start, cycles=40):
+    last = vi.simulate(machine, start, 1, settle=cycles).last
+    return vi.find_orbit(machine, last, impact_log=64, throw=True)
+
+
+def test_a_lost_rest_of_one_body():
+    """Beside flights in 60 digits at the place and at the ends of both curves, and beside
+    simulations in between."""
+    scene = vi.Scene.ideal(frequency_ratio=0.6, restitution=0.5, gap=0.0, damping_ratio=0.05)
+    branch = vi.continue_orbit(found(scene, scene.start(Y=0.0)), parameter=ZETA, bounds=(0.5, 0.8))
+    (point,) = branch.special
+    assert point.kind == "rest" and point.parameter == pytest.approx(0.65836157060536189, abs=1e-11)
+    curves = [
+        vi.boundary(point, parameter=name, bounds=((0.3, 1.2), between))
+        for name, between in (("stops.0.restitution", (0.3, 0.7)), ("stops.0.gap", (-0.2, 0.1)))
+    ]
+    assert all(curve.ends == ("bounds", "bounds") for curve in curves)
+    ends = [curves[0].parameters[0, 0], curves[0].parameters[-1, 0]]
+    np.testing.assert_allclose(ends, [0.952471322875, 0.44400204982114795], atol=1e-11)
+    ends = [curves[1].parameters[0, 0], curves[1].parameters[-1, 0]]
+    np.testing.assert_allclose(ends, [0.78727209495956652, 0.60897630686131181], atol=5e-11)
+    for curve, name in zip(curves, ("restitution", "gap"), strict=True):
+        zeta, other = curve.parameters[len(curve.parameters) // 3]
+        numbers = {"restitution": 0.5, "gap": 0.0, "damping_ratio": 0.05, name: other}
+        assert rest_beside(
+            lambda zeta, numbers=numbers: vi.Scene.ideal(frequency_ratio=zeta, **numbers), zeta
+        ) == [1, 0]
+
+
+def rest_beside(machine_at, value, by=1e-6):
+    """The rests in a cycle of settled simulations on both sides of a value."""
+    rests = []
+    for there in (value - by, value + by):
+        machine = machine_at(there)
+        run = vi.simulate(machine, start_of(machine), 1, settle=100)
+        rests.append(int(run.rests[0]))
+    return rests
+
+
+def start_of(machine):
+    if isinstance(machine, vi.Scene):
+        return machine.start(Y=float(machine.stops[0].gap) - 0.5)
+    return machine.start()
+
+
+def on_curve(curve, value):
+    """First parameters of a curve where it has this second one, by a spline in its arclength."""
+    scaled = curve.parameters / np.ptp(curve.parameters, axis=0)
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(scaled, axis=0), axis=1)))
+    both = CubicSpline(along, curve.parameters)
+    off = lambda s: both(s)[1] - value
+    places = np.flatnonzero(np.diff(np.sign(curve.parameters[:, 1] - value)))
+    return [float(both(brentq(off, along[i], along[i + 1]))[0]) for i in places]
+
+
+def test_a_rest_that_is_divided():
+    """Two bodies. The place, the curve and the multipliers are those of a shooting code with exact
+    hops; on both sides of the curve simulations count the rests."""
+    finer = vi.FixedStep(vi.Verner9(), steps_per_cycle=50)
+    bounds = (0.34, 0.355)
+    branch = vi.continue_orbit(settled(Coupled()), parameter="omega", bounds=bounds, method=finer)
+    assert branch.ends == ("rest", "rest") and (branch.rests == 1).all()
+    point = branch.special[0]
+    assert "divided" in point.detail
+    assert point.parameter == pytest.approx(0.34710711379082, abs=1e-11)
+    multipliers = branch.at(0.35)[0].multipliers
+    np.testing.assert_allclose(multipliers, [-0.4504246148, -0.2437666313, 0, 0], atol=1e-8)
+    bounds = ((0.33, 0.37), (0.44, 0.525))
+    curve = vi.boundary(point, parameter="restitution", bounds=bounds)
+    for k, omega in ((0.45, 0.3471331079), (0.5205758665, 0.3477575235)):
+        assert on_curve(curve, k)[0] == pytest.approx(omega, abs=1e-8)
+    omega, k = curve.parameters[-3]
+    rests = [int(settled(Coupled(omega + by, k)).rests) for by in (-1e-4, 1e-4)]
+    assert rests == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("machine", "parameter", "bounds"),
+    [
+        (vi.machines.BouncingBall(acceleration=1.3, restitution=0.4), "acceleration", (1.2, 2.0)),
+        (vi.machines.ImpactPair(half_gap=0.1, restitution=0.5), "half_gap", (0.08, 0.4)),
+    ],
+)
+def test_a_ball_on_its_table_and_gears_that_rattle(machine, parameter, bounds):
+    """Beside simulations on both sides of the curves."""
+    start = start_of(machine)
+    orbit = vi.find_orbit(
+        machine, vi.simulate(machine, start, 1, settle=60).last, impact_log=64, throw=True
+    )
+    point = vi.continue_orbit(orbit, parameter=parameter, bounds=bounds).special[-1]
+    assert point.kind == "rest"
+    curve = vi.boundary(point, parameter="restitution", bounds=(bounds, (0.35, 0.55)))
+    for i in (2, -3):
+        value, k = curve.parameters[i]
+
+        def machine_at(value, k=k):
+            return type(machine)(**{parameter: value, "restitution": k})
+
+        rests = rest_beside(machine_at, value)
+        assert rests[0] == int(orbit.rests) and rests[1] < rests[0]

@@ -1,0 +1,192 @@
+"""The chatter with which a body comes to rest on a stop, and where its rest is lost.
+
+The hops of a chatter are followed one by one, until one is so slow that the body may be put on its
+stop without rebound: the error of the state is of third order in that speed.
+
+The body rests as long as its chatter ends before the stop lets go of it. Near that limit the hops
+are a map with a saddle: of τ, the time left until the release, and ξ = u/(β τ²), with the speed u
+of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest, those
+above it escape (`escape`).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jax.lax import stop_gradient
+
+from .._types import Flag, Scalar, State, Vector
+from ..flow import TIME, Integrals, Rates, guard_rates
+from ..machine import RigidStop, push_of, stops_of
+from ._flight import Flight, force_on
+
+# Hops of a chatter at most, and corrections of the landing of each: choices. With restitution 0.95
+# there are 180 hops until a rebound has 1e-4 of the first speed.
+_HOPS, _CORRECTIONS = 400, 7
+
+# A landing is corrected until a correction is less than this share of the hop: the next one would
+# be its square, and what the derivatives are off by is of the order of the last one.
+_CLOSE = 1e-9
+
+# A landing is found if what is missing is less than this share of the hop's height.
+_LANDED = 1e-6
+
+
+class Hops(NamedTuple):
+    """A chatter on its way, right after an impact."""
+
+    s: Scalar
+    u: Vector
+    passed: Integrals
+    over: Flag
+    """Whether there is no next impact, or it comes too late."""
+
+
+def hopped(
+    free: Flight, number: int, begin: Hops, *, slow: Scalar, until: Scalar, steps: int
+) -> Hops:
+    """The last impact of a chatter whose rebound is faster than `slow`, or the first one of which
+    it is not.
+
+    **Arguments:** the flight with the body free; the number of its stop; `begin`, the first impact;
+    `slow`, a speed by the clock; a clock beyond which no impact is wanted; the steps of a hop.
+    """
+    stop = stops_of(free.machine)[number]
+    averages = tuple(name for name in begin.passed if name != TIME)
+
+    def rates(s: Scalar, u: Vector) -> Rates:
+        return _rates(free, stop, s, u)
+
+    def going(carry: tuple[Hops, int]) -> Flag:
+        hops, count = carry
+        here = rates(hops.s, hops.u)
+        return ~hops.over & ((-here.v > slow) | (here.a < 0)) & (count < _HOPS)
+
+    def hop(carry: tuple[Hops, int]) -> tuple[Hops, int]:
+        hops, count = carry
+        first = _duration(free, stop, hops.s, hops.u)
+
+        def off(carry):
+            length, move, count = carry
+            close = jnp.abs(move) <= _CLOSE * jnp.abs(length)
+            return ~hops.over & ~close & (count < _CORRECTIONS)
+
+        def corrected(carry):
+            length, _, count = carry
+            there, _, _ = free.fly(hops.s, hops.s + length, hops.u, steps)
+            here = rates(hops.s + length, there)
+            move = here.x / jnp.where(here.v == 0, 1.0, here.v)
+            return length - move, move, count + 1
+
+        length, *_ = jax.lax.while_loop(off, corrected, (first, jnp.full_like(first, jnp.inf), 0))
+        u, more, _ = free.fly(hops.s, hops.s + length, hops.u, steps, averages)
+        passed = {name: x + more[name] for name, x in hops.passed.items()}
+        s, here = hops.s + length, rates(hops.s + length, u)
+        height = jnp.abs(length * rates(hops.s, hops.u).v)
+        lands = (length > 0) & (here.v > 0) & (jnp.abs(here.x) < _LANDED * height) & (s < until)
+        rebound, _ = stop.after(free.machine, s, free.unravel(u), *free.modes)
+        new = Hops(s, ravel_pytree(rebound)[0], passed, ~lands)
+        old = hops._replace(over=~lands)
+        return jax.tree.map(lambda a, b: jnp.where(lands, a, b), new, old), count + 1
+
+    return jax.lax.while_loop(going, hop, (begin, 0))[0]
+
+
+def _rates(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Rates:
+    """How far a body is beyond its stop, and the first two derivatives by s, if it is free."""
+    guard = partial(stop.guard, free.machine)
+    return guard_rates(free.smooth.field, guard, s, free.unravel(u))
+
+
+def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
+    """About how long a hop takes: the force grows evenly."""
+    s, u = stop_gradient((s, u))
+    field = free.smooth.field
+
+    def force(s, state):
+        return guard_rates(field, partial(stop.guard, free.machine), s, state).a
+
+    state, here = free.unravel(u), _rates(free, stop, s, u)
+    rise = jax.jvp(force, (s, state), (jnp.ones_like(s), field(s, state)))[1]
+    root = jnp.sqrt(jnp.maximum(0.25 * here.a**2 - 2 * rise * here.v / 3, 0.0))
+    slower, faster = root - 0.5 * here.a, root + 0.5 * here.a
+    pressed = -2 * here.v / jnp.where(faster > 0, faster, 1.0)
+    drawn = 3 * slower / jnp.where(rise > 0, rise, 1.0)
+    return stop_gradient(jnp.where(here.a > 0, pressed, drawn))
+
+
+def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scalar:
+    """How far the last impact of a chatter is above the stable manifold of the hops: negative where
+    the body comes to rest. That is ln(ξ/ξ of the manifold), which grows from hop to hop as τ^-q
+    with q close to 5/3, and is taken times τ^(5/3): so it depends little on the number of hops.
+
+    **Arguments:** the flight in which the body rests; the number of its stop; the last impact;
+    clock and state of the release.
+    """
+    machine, state, field = held.machine, held.unravel(u), held.smooth.field
+    stop = stops_of(machine)[number]
+    body = machine.coordinates[stop.coordinate]
+
+    def force(s, state):
+        return force_on(held, number, s, state)
+
+    def along(function):
+        return lambda s, state: jax.jvp(function, (s, state), (jnp.ones_like(s), field(s, state)))[
+            1
+        ]
+
+    first = along(force)
+    second = along(first)
+    beta, mu, nu = -first(s, state), second(s, state), -along(second)(s, state)
+    left, free = s - hops.s, held.letting_go(stop.coordinate)
+    speed = -_rates(free, stop, hops.s, hops.u).v
+    # By y' of the distance y from the stop, along what an impact changes.
+    push = push_of(body, state)
+
+    def leaves(state: State) -> Scalar:
+        return -_rates(free, stop, s, ravel_pytree(state)[0]).v
+
+    unit = jax.jvp(leaves, (state,), (push,))[1]
+    push = jax.tree.map(lambda x: x / unit, push)
+    c = jax.jvp(lambda x: force(s, x), (state,), (push,))[1]
+    bend = jax.jvp(lambda x: free.smooth.field(s, x), (state,), (push,))[1]
+    p = jax.jvp(lambda x: force(s, x), (state,), (bend,))[1] + c**2
+    after = stop.approach(-body.velocity(held.unravel(hops.u)))
+    share, slope = jax.jvp(stop.share, (after,), (jnp.ones_like(after),))
+    before = after / jnp.where(share > 0, share, 1.0)
+    share, slope = jax.jvp(stop.share, (before,), (jnp.ones_like(after),))
+    k, k1 = share - slope * before, slope * jnp.abs(unit)
+    xi = speed / (beta * left**2)
+    limit = _manifold(k, left, mu / beta, nu / beta, c, p, beta * k1)
+    safe = jnp.where((share > 0) & (xi > 0), xi, 1.0)
+    above = jnp.log(safe / limit) * (left**2) ** (5 / 6)
+    return jnp.where(share > 0, above, -jnp.inf)
+
+
+def _manifold(
+    k: Scalar, left: Scalar, M: Scalar, N: Scalar, c: Scalar, p: Scalar, k1: Scalar
+) -> Scalar:
+    """ξ on the stable manifold of the hops.
+
+    **Arguments:** the restitution at low speeds; the time left until the release; D²F/β and
+    -D³F/β along the rest, with the force F; its derivative by the speed from the stop; that by the
+    place and by what follows the speed; β times the derivative of the restitution by the speed.
+    """
+    s = 1 - stop_gradient(k) ** 0.6
+
+    def corrected(_, s):
+        off, slope = (3 - s) * (1 - s) ** 2 - k * (3 - 2 * s), 3 * s**2 - 10 * s + 7
+        return s + off / (slope - 2 * k)
+
+    s = jax.lax.fori_loop(0, 6, corrected, s)
+    G = 8 * s**4 - 49 * s**3 + 119 * s**2 - 140 * s + 70
+    A = (
+        45 * (s - 1) * (s - 2) ** 2 * M**2 + 18 * G * M * c + 48 * G * N
+        - (16 * s**4 + 27 * s**3 - 387 * s**2 + 720 * s - 360) * c**2
+        + 16 * s**2 * (16 * s**2 - 63 * s + 63) * p
+        - 160 * (2 * s - 3) ** 4 * k1 / ((s - 1) * (s - 3))
+    ) / (960 * (4 * s**4 - 24 * s**3 + 57 * s**2 - 66 * s + 33))  # fmt: skip
+    more = left * (3 * M + c) / 8 + left**2 * A
+    return s * (3 - s) / 6 * (1 + jnp.maximum(more, -0.9))

@@ -1,0 +1,179 @@
+"""The equations of a motion that rests, from event to event, made from one that was found."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .._programs import compiled
+from ..flow import EventKind, MethodLike, RunOptions, simulate, simulate_pool
+from ..machine import (
+    AbstractMachine,
+    bare,
+    in_rows,
+    is_autonomous,
+    leaf,
+    modes_of,
+    others_of,
+    raveled,
+    stops_of,
+    switches_of,
+    with_leaf,
+)
+from ._flight import LANDS, LEAVES, Event
+from ._problem import fixed_step_method, sized, steps_of
+from ._shooting import Shooting
+from .results import Orbit
+
+# A hop is the last one if its rebound is slower than this share of the motion's speed: its error of
+# third order is rounding then, and its landing is still known to a millionth of its duration.
+_SLOW = 1e-4
+
+# Events of a cycle that are looked at, and of a period that are followed: choices.
+_LOGGED, _MOST = 512, 24
+
+# The state before an event is taken so much earlier (as a share of a cycle): a choice, far above
+# rounding, within what is corrected.
+_EARLIER = 1e-7
+
+# A hop that takes longer than this part of a cycle is none of a chatter: as steps of a simulation.
+_SHORT = 5
+
+_INSTEAD = (
+    "Find such motions value by value: `find_orbit` with another parameter, from this motion."
+)
+
+# A body this close to its stop (relative to 1 + its place) is on it: a choice.
+_ON = 1e-9
+
+Placed = tuple[float, Event]
+
+
+def legs_of(
+    orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
+) -> tuple[Shooting, np.ndarray]:
+    """The equations of a motion that rests on stops, and the unknowns that it gives.
+
+    **Arguments:** as `problem_of`.
+
+    **Raises:** `ValueError` of a machine with switches, modes or events, or whose cycles an event
+    ends; where bodies chatter together.
+    """
+    machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
+    flying = fixed_step_method(method, orbit.method, machine)
+    listed = switches_of(machine) or others_of(machine) or modes_of(orbit.state)
+    if listed or is_autonomous(machine, state):
+        raise ValueError(
+            f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has switches, "
+            f"modes, `events` or a section, so that it cannot be followed. {_INSTEAD}"
+        )
+    events = _grouped(_logged(orbit), float(machine.cycle), float(machine.cycle) * cycles)
+    if events is None or len(events) > _MOST:
+        raise ValueError(
+            "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
+            f"but several of its bodies chatter together. {_INSTEAD}"
+        )
+    corners = [with_leaf(machine, parameter, end) for end in bounds]
+    problem = Shooting(
+        machine, flying, state, cycles, tuple(event for _, event in events),
+        ((),) * max(1, len(events)), steps_of(flying, corners, state, cycles), (parameter,),
+    )  # fmt: skip
+    if not events:
+        x = np.append(np.asarray(raveled(orbit.state)[0]), float(leaf(machine, parameter)))
+        return sized(dataclasses.replace(problem, held=_contact(machine, state)), x), x
+    clock = np.array([place for place, _ in events])
+    rows = _before(orbit, clock - _EARLIER * float(machine.cycle))
+    x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
+    problem = sized(problem, x)
+    speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
+    return dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed)), x
+
+
+def _before(orbit: Orbit, clocks: np.ndarray) -> np.ndarray:
+    """The states of a motion at some clocks since its section, (clocks, states)."""
+    cycle, found = float(orbit.machine.cycle), []
+    sections = np.asarray(in_rows(orbit.sections, 1))
+    for clock in clocks:
+        whole = int(np.floor(clock / cycle))
+        row = jnp.asarray(sections[whole % len(sections)])
+        place = jnp.asarray(clock - whole * cycle)
+        found.append(_state_at(orbit.machine, orbit.method, bare(orbit.state), row, place))
+    return np.stack(found)
+
+
+@compiled
+def _state_at(machine, method, like, row, clock):
+    """The state at a clock within the cycle that begins in the state of a row."""
+    unravel = ravel_pytree(like)[1]
+    options = RunOptions(method=method, record="sections", rests=True, until=clock)
+    run = simulate_pool(lambda u: (machine, unravel(u)), row[None], 1, options)
+    return in_rows(run.sections, 2)[0, -1]
+
+
+def _contact(machine: AbstractMachine, state: Any) -> tuple[float, ...]:
+    """Of each coordinate, 1 + i if it is on stop number i, else 0."""
+    contact = [0.0] * len(machine.coordinates)
+    for i, stop in enumerate(stops_of(machine)):
+        place = machine.coordinates[stop.coordinate].position(state)
+        if abs(float(stop.beyond(place))) < _ON * (1 + abs(float(place))):
+            contact[stop.coordinate] = 1.0 + i
+    return tuple(contact)
+
+
+def _logged(orbit: Orbit) -> list[tuple[float, int, int]]:
+    """Clock since the section, kind and stop of each event of a motion."""
+    machine, cycle = orbit.machine, float(orbit.machine.cycle)
+    log = simulate(
+        machine, orbit.state, int(orbit.cycles), method=orbit.method, event_log=_LOGGED, rests=True
+    ).event_log
+    assert log is not None
+    kind, number = np.asarray(log.kind), np.asarray(log.number)
+    clock = np.asarray(log.phase)
+    places = zip(*np.nonzero(kind >= 0), strict=True)
+    return [(n * cycle + clock[n, j], int(kind[n, j]), int(number[n, j])) for n, j in places]
+
+
+def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> list[Placed] | None:
+    """The events of a period that begins with a release, without the hops of its chatters; none of
+    a motion that rests all the time; `None` where a rest has no impact before it.
+
+    **Arguments:** as `_logged` returns; the length of a cycle, and of the period.
+    """
+    for number in {n for *_, n in log}:
+        # A body that its stop lets go of on the section itself begins the motion as one in flight.
+        kinds = [kind for _, kind, n in log if n == number]
+        rests = [kind for kind in kinds if kind != EventKind.impact]
+        lands = kinds[0] == EventKind.impact and bool(rests)
+        if lands and rests[0] == rests[-1] == EventKind.rest:
+            log = [(0.0, int(EventKind.release), number), *log]
+    first = next((i for i, (_, kind, _) in enumerate(log) if kind == EventKind.release), None)
+    if first is None:
+        return None if log else []
+    later = [(clock + period, kind, number) for clock, kind, number in log[:first]]
+    log, found = log[first:] + later, []
+    resting = {number for number in {n for *_, n in log} if _is_held(log, number)}
+    for clock, kind, number in log:
+        if kind == EventKind.impact:
+            found.append((clock, Event(number)))
+        elif kind == EventKind.release:
+            found.append((clock, Event(number, use=LEAVES)))
+            resting.discard(number)
+        elif number not in resting:  # else it begins on its stop in the section
+            resting.add(number)
+            begin = len(found)
+            while begin and found[begin - 1][1] == Event(number):
+                if begin < len(found) and found[begin][0] - found[begin - 1][0] > cycle / _SHORT:
+                    break
+                begin -= 1
+            if begin == len(found):
+                return None
+            found[begin:] = [(found[begin][0], Event(number, use=LANDS))]
+    return found
+
+
+def _is_held(log: list[tuple[float, int, int]], number: int) -> bool:
+    """Whether a body rests on a stop before the first of some events."""
+    kinds = [kind for _, kind, n in log if n == number and kind != EventKind.impact]
+    return bool(kinds) and kinds[0] == EventKind.release
