@@ -154,6 +154,11 @@ class NoCycle(vi.AbstractMachine):
         return vi.OscillatorState(x.V, -x.Y)
 
 
+class Unlisted(NoCycle):
+    cycle = 1.0
+    stops = (vi.RigidStop(2.0, 0.5),)
+
+
 def basins_of(**options):
     return vi.basins(Machine(), {"start.Y": (0.0, 1.0)}, **options)
 
@@ -174,6 +179,7 @@ class Assigns(Machine):
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
         (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),
+        (lambda: Unlisted(), "must list its contacts as `contacts`"),
         (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),
         (lambda: basins_of(resolutions=9), "`basins` has no argument `resolutions`; near names: r"),
         (lambda: basins_of(cycles=9), "`cycles` is not to be given to `basins`"),

@@ -28,6 +28,16 @@ _MUST_SAY = {
 }
 
 
+def _unlisted(kind: type) -> str | None:
+    """The name under which a class that lists neither contacts nor events has one, as `stops`."""
+    fields = getattr(kind, "__dataclass_fields__", {})
+    if any(name in fields or hasattr(kind, name) for name in ("contacts", "events")):
+        return None
+    values = ((name, x) for base in kind.__mro__ for name, x in vars(base).items())
+    parts = ((name, x if isinstance(x, tuple | list) else (x,)) for name, x in values)
+    return next((name for name, x in parts if any(isinstance(y, AbstractEvent) for y in x)), None)
+
+
 def _position(machine: "AbstractMachine", state: State) -> Scalar:
     return state.Y if stops_of(machine) or hasattr(state, "Y") else jtu.tree_leaves(state)[0]
 
@@ -86,6 +96,12 @@ class AbstractMachine(Shown):
             name = next((x for x in _MUST_SAY if x in missing), min(missing))
             how = f": {_MUST_SAY[name]}" if name in _MUST_SAY else ""
             raise TypeError(f"A machine must have `{name}`, but `{cls.__name__}` has none{how}.")
+        lost = _unlisted(cls)
+        if lost is not None:
+            raise TypeError(
+                f"A machine must list its contacts as `contacts` and its events as `events`, but "
+                f"`{cls.__name__}` has only `{lost}`."
+            )
         return super().__new__(cls, *args, **kwargs)
 
     @abc.abstractmethod
