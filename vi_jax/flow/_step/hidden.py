@@ -13,7 +13,7 @@ from ..._types import Flag, Scalar, Scalars
 from .._lane import Lane, Plan
 from .guards import Crossing, Side
 from .trial import Path
-from .within import may_be_above
+from .within import for_each, may_be_above
 
 # A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
 _BRIEF = 1e-3
@@ -72,11 +72,21 @@ def crests(
     slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
-    doubtful = jnp.zeros_like(h, bool)
-    for (x0, v0, x1, v1), inner, zero, ends_below in zip(ends, values, slack, below, strict=True):
-        doubtful = doubtful | ends_below & may_be_above((x0, v0), (x1, v1), inner, shares, zero)
-    none = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
-    above, place = jax.lax.cond(doubtful, lambda x: jax.vmap(find)(*x), lambda _: none, stacked)
+    given = zip(ends, values, slack, below, strict=True)
+    doubtful = jnp.stack([
+        ends_below & may_be_above(x[:2], x[2:], inner, shares, zero)
+        for x, inner, zero, ends_below in given
+    ])  # fmt: skip
+
+    def one(flag: Flag, side: tuple) -> tuple[Flag, Scalar]:
+        none = jnp.zeros((), bool), jnp.zeros_like(h)
+        return jax.lax.cond(flag, lambda x: find(*x), lambda _: none, side)
+
+    nowhere = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
+    asked = doubtful, stacked
+    above, place = jax.lax.cond(
+        jnp.any(doubtful), lambda x: for_each(one, x), lambda _: nowhere, asked
+    )
     return [(above[n], place[n]) for n in range(len(sides))]
 
 
