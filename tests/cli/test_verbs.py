@@ -37,6 +37,13 @@ class Body(vi.AbstractMachine):
 class Started(Body):
     def start(self):
         return vi.OscillatorState(0.2, 0.1)
+
+
+class Named(Body):
+    def field(self, s, z):
+        return dict(x=z.u, u=jnp.cos(self.omega * s) - z.x - 0.1 * z.u)
+
+    contacts: tuple = (vi.RigidStop(1.0, 0.7, on=("x", "u")),)
 """
 
 BODY = """
@@ -185,6 +192,7 @@ def test_orbit_and_its_branch(run):
         ('machine = "mine.py:Started"\n[start]\nY = 0.3\n', "1 cycle"),
         ('machine = "mine:Body"\n[start]\nclass = "vi_jax:OscillatorState"\nY = 0\nV = 0\n',
          "1 cycle"),
+        ('machine = "mine:Named"\n[start]\nx = 0.0\nu = 0\n', "1 cycle"),
     ],
 )  # fmt: skip
 def test_machines_of_ones_own(run, here, monkeypatch, head, period):
@@ -198,7 +206,7 @@ def test_machines_of_ones_own(run, here, monkeypatch, head, period):
     said = run("simulate", 'machine = "mine.py:Body"\n' + BODY, 2)
     assert said.count("\n") == 1 and "`start` must be given for a Body" in said
     said = run("simulate", 'machine = "mine.py:Body"\n[start]\nY = 1\n' + BODY, 2)
-    assert said.count("\n") == 1 and "[start] needs the `class` of a state" in said
+    assert said.count("\n") == 1 and "State(Y=1)" in said
 
 
 def test_machines_with_integers_flags_and_arrays_and_without_a_drive(run):

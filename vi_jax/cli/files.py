@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..machine import AbstractMachine, check_name, leaf_names, with_leaf
+from ..machine import AbstractMachine, State, check_name, leaf_names, with_leaf
 from ..machines.named import InputError, check_keys
 
 
@@ -34,14 +34,12 @@ def errors_in(place: str) -> Iterator[None]:
 
 
 def start_of(machine: AbstractMachine, table: Any) -> Any:
-    """Return a state of the machine from `[start]`: by the arguments of its `start`, or from its
-    start with these numbers in place of its own. **Raises:** `InputError`."""
+    """Return a state of the machine from `[start]`: by the arguments of its `start`, from its start
+    with these numbers in place of its own, or of these alone. **Raises:** `InputError`."""
     if not isinstance(table, dict):
         return table
     if type(machine).start is AbstractMachine.start:
-        raise InputError(
-            f"[start] needs the `class` of a state, because {type(machine).__name__} has no `start`"
-        )
+        return State(**table)
     parameters = inspect.signature(machine.start).parameters
     with errors_in("[start]"):
         if parameters:

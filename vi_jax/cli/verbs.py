@@ -18,7 +18,7 @@ from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted
 from ..flow import RESULTS, Run, RunOptions, planned, simulate
-from ..machine import AbstractMachine, cycles_in_words, is_autonomous
+from ..machine import AbstractMachine, check_leaf, cycles_in_words, is_autonomous
 from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
@@ -72,15 +72,17 @@ class Verb(NamedTuple):
 def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
     """Do what a file asks of a verb. **Raises:** `InputError`."""
     before, thing = [], machine
-    if verb == "continue":
-        found = do("orbit", machine, {"orbit": {}, **tables})
-        if not found.good:
-            return found
-        before, thing = found.lines, found.result
     what, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
     if not isinstance(table, dict):
         raise InputError(f"missing table {place}, which says what to do")
     what.check(table, place)
+    if verb == "continue":  # its parameter is looked at before the orbit is sought
+        with errors_in(place):
+            check_leaf(machine, table.get("parameter", ""))
+        found = do("orbit", machine, {"orbit": {}, **tables})
+        if not found.good:
+            return found
+        before, thing = found.lines, found.result
     begin = "guess" if verb == "orbit" else "start"
     shared = {begin: tables.get("start"), "method": tables.get("method")}
     table = {key: x for key, x in shared.items() if x is not None and key in what.keys()} | table
@@ -275,9 +277,12 @@ def _basins(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     return Found([str(found)], table, draw, bool((found.data["result"] == 0).any()))
 
 
-def _orbit(machine: AbstractMachine, options: dict[str, Any]) -> Found:
+def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0) -> Found:
     guess = options.pop("guess", None)
-    found = find_orbit(machine, machine.start() if guess is None else guess, **options)
+    guess = machine.start() if guess is None else guess
+    if settle:
+        guess = simulate(machine, guess, 1, settle=settle, method=options.get("method")).last
+    found = find_orbit(machine, guess, **options)
     if not bool(found.successful):
         return Found([str(found)], good=False)
     draw = lambda figure: plot.plot_phase_portrait(
@@ -297,6 +302,6 @@ VERBS: Mapping[str, Verb] = {
     "sweep": Verb("one number changed step by step", sweep, _sweep, ("up_and_down", "y")),
     "scan": Verb("every combination of the values on the axes", scan, _scan),
     "basins": Verb("which start settles on which motion", basins, _basins),
-    "orbit": Verb("a periodic motion", find_orbit, _orbit),
+    "orbit": Verb("a periodic motion", find_orbit, _orbit, ("settle",)),
     "continue": Verb("the branch of the motion of [orbit]", continue_orbit, _continue, ("y",)),
 }

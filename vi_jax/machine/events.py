@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, Scalars, State
@@ -146,6 +147,7 @@ def begin_modes(
 ) -> Modes:
     """The modes of a motion that begins in `state`: those that events hold, in their order, then
     the machine's own, which are `own` where that is given."""
+    state = jtu.tree_map(jnp.asarray, state)  # a start may hold Python's numbers
     held = [event for event in events_of(machine) if event.holds_mode]
     own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in held), *own]

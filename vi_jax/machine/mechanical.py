@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine
@@ -284,15 +285,16 @@ def matrix_of(given: Any, names: Sequence[str], whose: str) -> Matrix:
         given = [given[x] for x in names]
     elif isinstance(given, Named):
         given = [getattr(given, x) for x in names]
-    if n == 1 and _is_number(given):
-        return [[given]]
-    rows = list(given)
+    rows = [given] if n == 1 and _is_number(given) else list(given)
     if len(rows) != n:
         raise ValueError(
             f"`mass` of a {whose} must be one for each of its {n} coordinates, or {n} rows, but "
             f"has {len(rows)}."
         )
     if all(map(_is_number, rows)):
+        known = [x for x in map(concrete, rows) if x is not None]
+        if any(x <= 0 for x in known):
+            raise ValueError(f"`mass` of a {whose} must be positive, but has {min(known):g}.")
         return [[rows[i] if i == j else 0.0 for j in range(n)] for i in range(n)]
     return [[row[j] for j in range(n)] for row in rows]
 

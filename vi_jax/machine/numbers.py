@@ -110,13 +110,20 @@ def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
     """`name`, if the machine has such a number, or such an array, whose numbers are called
     `name[i]`."""
     names = leaf_names(tree)
-    return name if name in names else check_name(list(components(tree)), name, argument)
+    return name if name in names else check_name(list(components(tree)), name, argument, tree)
 
 
-def check_name(names: list[str], name: str, argument: str) -> str:
-    """`name`, if it is among the names of numbers. **Raises:** as `leaf`."""
+def check_name(names: list[str], name: str, argument: str, machine: object = None) -> str:
+    """`name`, if it is among the names of numbers of a machine, or another tree. **Raises:** as
+    `leaf`."""
     if name in names:
         return name
+    untyped = getattr(type(machine), str(name), None)
+    if isinstance(untyped, int | float):
+        raise ValueError(
+            f"Argument `{argument}` must be a number of the machine, which {name!r} is once it has "
+            f"a type in the class: `{name}: float = {untyped!r}`."
+        )
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
     ending = [other for other in names if str(name).split(".")[-1] in other]
     near = list(dict.fromkeys(ending + near))

@@ -364,8 +364,9 @@ def check_leaf_name(
     if own in leaf_names(tree):
         return
     check_name(
-        [*components(machine), *(START + n for n in components(bare(start)))], name, argument
-    )
+        [*components(machine), *(START + n for n in components(bare(start)))], name, argument,
+        machine,
+    )  # fmt: skip
 
 
 def _corners(blocks: Blocks) -> np.ndarray:
