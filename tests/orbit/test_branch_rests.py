@@ -1,7 +1,7 @@
 """Branches of motions that rest on a stop for a part of their period."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -314,3 +314,85 @@ def test_a_motion_at_rest_on_its_section():
     moving = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2, throw=True)
     with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
         vi.continue_orbit(listing(moving, 0), parameter=ZETA, bounds=(0.5, 1.9))
+
+
+class Pair4(NamedTuple):
+    x: Any
+    u: Any
+    z: Any
+    v: Any
+
+
+class Busy(vi.AbstractMachine):
+    """x'' + 0.1 x' + x + 2 (x - z) = cos(ωt + 2.6), x ≤ d, with a harder spring far from the stop
+    and a brake there, which notes that it has acted until x comes back; and z'' + 0.1 z' + z/2 +
+    2 (z - x) = 0 with dry friction."""
+
+    omega: Any = 0.35
+    restitution: Any = 0.4
+    gap: Any = -0.4
+    level: Any = 0.1
+    modes = {"braked": 0.0}  # noqa: RUF012
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    @property
+    def contacts(self):
+        stop = vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
+        return stop, vi.DryFriction(self.level, on="v")
+
+    @property
+    def events(self):
+        def braking(machine, s, q, *modes):
+            return q._replace(u=jnp.where(q.u < 0, 0.9, 1.0) * q.u)
+
+        def noting(machine, s, q, *modes):
+            return {"braked": jnp.where(q.u < 0, 1.0, 0.0)}
+
+        far = lambda machine, s, q, *modes: q.x - machine.gap + 0.25
+        brake = vi.Reset(far, direction="both", reset=braking, modes=noting)
+        return vi.Switch(lambda machine, s, q: q.x - machine.gap + 0.1), brake
+
+    def field(self, s, q, side, braked):
+        pull = 2.0 * (q.x - q.z) + jnp.where(side < 0, 0.5 * (q.x - self.gap + 0.1), 0.0)
+        push = jnp.cos(self.omega * s + 2.6) - q.x - 0.1 * q.u - 0.1 * braked
+        return Pair4(q.u, push - pull, q.v, 2.0 * (q.x - q.z) - 0.1 * q.v - 0.5 * q.z)
+
+
+@pytest.mark.slow
+def test_a_rest_beside_friction_a_switch_and_a_reset():
+    """Each happens in every cycle, and the friction sticks. Beside settled simulations, and
+    differences of the simulated map."""
+
+    def after(omega, start, settle=0):
+        return vi.simulate(Busy(omega=omega), start, 1, settle=settle, event_log=64)
+
+    start = Pair4(*map(jnp.asarray, (-0.5, 0.0, 0.0, 0.0)))
+    run = after(jnp.asarray(0.35), start, 80)
+    kinds = run.event_log.kind
+    assert all((kinds == kind).any(axis=1).all() for kind in range(len(vi.EVENTS)))
+    orbit = vi.find_orbit(Busy(), run.last, impact_log=64, throw=True)
+    branch = vi.continue_orbit(
+        orbit, parameter="omega", bounds=(0.348, 0.352), step=0.5, max_step=0.5
+    )
+    assert branch.ends == ("bounds", "bounds") and (branch.rests == 1).all()
+    for i in (0, -1):
+        there = branch.orbit(i)
+        omega, (x, unravel) = there.machine.omega, ravel_pytree(there.state.state)
+        settled = after(omega, there.state, 80)
+        assert settled.rests.tolist() == [1] and branch.impacts[i] == settled.impacts.sum()
+        np.testing.assert_allclose(x, ravel_pytree(settled.last.state)[0], atol=1e-9)
+
+        def mapped(x, omega=omega, unravel=unravel, there=there):
+            start = dataclasses.replace(there.state, state=unravel(x))
+            return np.asarray(ravel_pytree(after(omega, start).last.state)[0])
+
+        h = 1e-4
+        differences = [(mapped(x + h * e) - mapped(x - h * e)) / (2 * h) for e in np.eye(4)]
+        expected = np.linalg.eigvals(np.stack(differences, axis=-1))
+        assert np.abs(expected).max() > 0.01
+        np.testing.assert_allclose(
+            branch.multipliers[i].real, sorted(expected.real, key=lambda m: -abs(m)), atol=1e-6
+        )

@@ -117,6 +117,19 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
     return stop_gradient(jnp.where(here.a > 0, pressed, drawn))
 
 
+def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
+    """About how long a chatter goes on after an impact: under the force that there is; infinite
+    where that pulls the body off.
+
+    **Arguments:** the flight with the body free; the number of its stop; the impact.
+    """
+    stop = stops_of(free.machine)[number]
+    here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
+    share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))
+    slows = (1 - share) * here.a
+    return jnp.where(slows > 0, -2 * here.v / jnp.where(slows > 0, slows, 1.0), jnp.inf)
+
+
 def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scalar:
     """How far the last impact of a chatter is above the stable manifold of the hops: negative where
     the body comes to rest. That is ln(ξ/ξ of the manifold), which grows from hop to hop as τ^-q

@@ -82,9 +82,10 @@ def continue_orbit(
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` if the orbit was not found, rests on a stop of a machine with switches,
-    `events` or a section, does not list all its impacts, or lies outside the bounds, or if the name
-    is unknown; on Ctrl-C `Interrupted`, whose `partial` is the branch so far.
+    **Raises:** `ValueError` if the orbit was not found, rests on a stop of a machine with a
+    section, `renewed` or friction on a stop, does not list all its impacts, or lies outside the
+    bounds, or if the name is unknown; on Ctrl-C `Interrupted`, whose `partial` is the branch so
+    far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)

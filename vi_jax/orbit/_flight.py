@@ -72,7 +72,7 @@ def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
         return -force_on(before, event.number, s, state)
     if event.cycle is not None:
         s = s - jnp.asarray(before.machine.cycle, s.dtype) * (event.cycle - 1)
-    return guard_of(before.machine, event.number, s, state, before.modes)
+    return guard_of(before.machine, event.number, s, state, before.modes, before.contact)
 
 
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:

@@ -87,13 +87,16 @@ def apart(
     least = jnp.asarray(jnp.inf, clock.dtype)
     for i, event in enumerate(events):
         least = jnp.minimum(least, lengths[i])
-        before = tuple(jnp.asarray(mode, clock.dtype) for mode in modes[i - 1])
+        before, contact = (
+            tuple(jnp.asarray(mode, clock.dtype) for mode in each[i - 1])
+            for each in (modes, contacts)
+        )
         for number, other in enumerate(events_of(machine)):
             if number == event.number or number == section_number(machine):
                 continue
             if 1.0 + number in contacts[i - 1]:
                 continue
-            room = -guard_of(machine, number, clock[i], states[i], before)
+            room = -guard_of(machine, number, clock[i], states[i], before, contact)
             if other.from_below:  # beyond it the motion may be, until it comes from below again
                 room = jnp.where(room > 0, room, jnp.inf)
             least = jnp.minimum(least, room)

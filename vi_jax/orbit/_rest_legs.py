@@ -8,19 +8,23 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
-from ..flow import EventKind, MethodLike, RunOptions, simulate, simulate_pool
+from ..flow import EventKind, MethodLike, Run, RunOptions, simulate, simulate_pool
 from ..machine import (
     AbstractMachine,
+    after_event,
     bare,
+    begin_modes,
     in_rows,
     is_autonomous,
     leaf,
     modes_of,
-    others_of,
     raveled,
+    renews,
+    rubs,
     stops_of,
     switches_of,
     with_leaf,
+    with_modes,
 )
 from ._flight import LANDS, LEAVES, Event
 from ._problem import fixed_step_method, sized, steps_of
@@ -58,86 +62,113 @@ def legs_of(
 
     **Arguments:** as `problem_of`.
 
-    **Raises:** `ValueError` of a machine with switches, modes or events, or whose cycles an event
-    ends; where bodies chatter together.
+    **Raises:** `ValueError` of a machine with friction on a stop, or whose cycles an event ends or
+    begin anew; where bodies chatter together, or a switch changes with each hop.
     """
     machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
-    listed = switches_of(machine) or others_of(machine) or modes_of(orbit.state)
-    if listed or is_autonomous(machine, state):
+    if is_autonomous(machine, state) or renews(machine) or rubs(machine):
         raise ValueError(
-            f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has switches, "
-            f"modes, `events` or a section, so that it cannot be followed. {_INSTEAD}"
+            f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has a section, "
+            f"`renewed` or friction on a stop, so that it cannot be followed. {_INSTEAD}"
         )
-    events = _grouped(_logged(orbit), float(machine.cycle), float(machine.cycle) * cycles)
+    run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
+    events = _grouped(_logged(machine, run), float(machine.cycle), float(machine.cycle) * cycles)
     if events is None or len(events) > _MOST:
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
-            f"but several of its bodies chatter together. {_INSTEAD}"
+            "in whose last hops no switch changes, but several bodies chatter together or a switch "
+            f"changes. {_INSTEAD}"
         )
     corners = [with_leaf(machine, parameter, end) for end in bounds]
     problem = Shooting(
         machine, flying, state, cycles, tuple(event for _, event in events),
         ((),) * max(1, len(events)), steps_of(flying, corners, state, cycles), (parameter,),
     )  # fmt: skip
-    if not events:
-        x = np.append(np.asarray(raveled(orbit.state)[0]), float(leaf(machine, parameter)))
-        return sized(dataclasses.replace(problem, held=_contact(machine, state)), x), x
+    problem = dataclasses.replace(problem, held=_contact(machine, state, problem.events))
     clock = np.array([place for place, _ in events])
-    rows = _before(orbit, clock - _EARLIER * float(machine.cycle))
+    rows = _before(orbit, run, clock - _EARLIER * float(machine.cycle))
+    problem = dataclasses.replace(problem, modes=_modes(problem, orbit.state, clock, rows))
+    rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
     problem = sized(problem, x)
+    if not problem.landings:
+        return problem, x
     speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
     return dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed)), x
 
 
-def _before(orbit: Orbit, clocks: np.ndarray) -> np.ndarray:
+def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
     """The states of a motion at some clocks since its section, (clocks, states)."""
     cycle, found = float(orbit.machine.cycle), []
     sections = np.asarray(in_rows(orbit.sections, 1))
     for clock in clocks:
         whole = int(np.floor(clock / cycle))
-        row = jnp.asarray(sections[whole % len(sections)])
+        n = whole % len(sections)
+        row, own = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
         place = jnp.asarray(clock - whole * cycle)
-        found.append(_state_at(orbit.machine, orbit.method, bare(orbit.state), row, place))
-    return np.stack(found)
+        found.append(_state_at(orbit.machine, orbit.method, bare(orbit.state), row, own, place))
+    return np.reshape(found, (len(clocks), sections.shape[1]))
 
 
 @compiled
-def _state_at(machine, method, like, row, clock):
-    """The state at a clock within the cycle that begins in the state of a row."""
+def _state_at(machine, method, like, row, own, clock):
+    """The state at a clock within the cycle that begins in the state of a row, in these modes of
+    the machine's own."""
     unravel = ravel_pytree(like)[1]
     options = RunOptions(method=method, record="sections", rests=True, until=clock)
-    run = simulate_pool(lambda u: (machine, unravel(u)), row[None], 1, options)
-    return in_rows(run.sections, 2)[0, -1]
+    start = lambda u: (machine, with_modes(unravel(u), own))
+    return in_rows(simulate_pool(start, row[None], 1, options).sections, 2)[0, -1]
 
 
-def _contact(machine: AbstractMachine, state: Any) -> tuple[float, ...]:
-    """Of each coordinate, 1 + i if it is on stop number i, else 0."""
-    contact = [0.0] * len(machine.coordinates)
-    for i, stop in enumerate(stops_of(machine)):
+def _modes(
+    problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray
+) -> tuple[tuple[float, ...], ...]:
+    """The machine's modes in each leg.
+
+    **Arguments:** the equations; the state on the section; clock and state of each event.
+    """
+    machine, start = problem.machine, jnp.zeros(())
+    modes = begin_modes(machine, start, bare(state), modes_of(state))
+    found = [modes] * problem.legs
+    first = int(np.searchsorted(clocks, float(problem.cycles * machine.cycle)))
+    for i in [*range(first, len(clocks)), *range(first)]:
+        event, before = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
+        if event.use != LEAVES:
+            s, contact = jnp.asarray(clocks[i]), problem.flight(machine, i - 1).contact
+            modes = after_event(machine, event.number, s, before, modes, contact)[1]
+        found[i] = modes
+    return tuple(tuple(float(mode) for mode in modes) for modes in found)
+
+
+def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) -> tuple[float, ...]:
+    """Of each coordinate, 1 + i if it is on stop number i without landing or leaving, else 0."""
+    contact, stops = [0.0] * len(machine.coordinates), stops_of(machine)
+    moves = {stops[event.number].coordinate for event in events if event.use}
+    for i, stop in enumerate(stops):
         place = machine.coordinates[stop.coordinate].position(state)
-        if abs(float(stop.beyond(place))) < _ON * (1 + abs(float(place))):
+        on = abs(float(stop.beyond(place))) < _ON * (1 + abs(float(place)))
+        if on and stop.coordinate not in moves:
             contact[stop.coordinate] = 1.0 + i
     return tuple(contact)
 
 
-def _logged(orbit: Orbit) -> list[tuple[float, int, int]]:
-    """Clock since the section, kind and stop of each event of a motion."""
-    machine, cycle = orbit.machine, float(orbit.machine.cycle)
-    log = simulate(
-        machine, orbit.state, int(orbit.cycles), method=orbit.method, event_log=_LOGGED, rests=True
-    ).event_log
+def _logged(machine: AbstractMachine, run: Run) -> list[tuple[float, int, int]]:
+    """Clock since the section, kind and number among all events of each event of a motion."""
+    log, cycle = run.event_log, float(machine.cycle)
     assert log is not None
-    kind, number = np.asarray(log.kind), np.asarray(log.number)
-    clock = np.asarray(log.phase)
+    kind, number, clock = np.asarray(log.kind), np.asarray(log.number), np.asarray(log.phase)
+    stops, switches = len(stops_of(machine)), len(switches_of(machine))
+    number = number + np.select(
+        [kind == EventKind.mode, kind == EventKind.reset], [stops, stops + switches], 0
+    )
     places = zip(*np.nonzero(kind >= 0), strict=True)
     return [(n * cycle + clock[n, j], int(kind[n, j]), int(number[n, j])) for n, j in places]
 
 
 def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> list[Placed] | None:
-    """The events of a period that begins with a release, without the hops of its chatters; none of
-    a motion that rests all the time; `None` where a rest has no impact before it.
+    """The events of a period that begins with a release, if there is one, without the hops of its
+    chatters; `None` where a rest has no impact before it.
 
     **Arguments:** as `_logged` returns; the length of a cycle, and of the period.
     """
@@ -150,12 +181,13 @@ def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> 
             log = [(0.0, int(EventKind.release), number), *log]
     first = next((i for i, (_, kind, _) in enumerate(log) if kind == EventKind.release), None)
     if first is None:
-        return None if log else []
+        rests = any(kind == EventKind.rest for _, kind, _ in log)
+        return None if rests else [(clock, Event(number)) for clock, _, number in log]
     later = [(clock + period, kind, number) for clock, kind, number in log[:first]]
     log, found = log[first:] + later, []
     resting = {number for number in {n for *_, n in log} if _is_held(log, number)}
     for clock, kind, number in log:
-        if kind == EventKind.impact:
+        if kind not in (EventKind.rest, EventKind.release):
             found.append((clock, Event(number)))
         elif kind == EventKind.release:
             found.append((clock, Event(number, use=LEAVES)))

@@ -10,7 +10,7 @@ motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import partial, reduce
 from math import ceil
 from typing import Any
 
@@ -37,7 +37,7 @@ from ..machine import (
     stops_of,
     with_leaf,
 )
-from ._chatter import Hops, escape, hopped
+from ._chatter import Hops, escape, hopped, remaining
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from ._observed import Observed, apart
 from ._turns import pull_of, turns_of
@@ -86,7 +86,8 @@ class Shooting(eqx.Module):
     slow: Array | None = None
     """The hop of a chatter with a slower rebound (by the clock) is its last one."""
     held: tuple[float, ...] = eqx.field(static=True, default=())
-    """Of a motion that rests all the time the contact of each coordinate (see `Flight.contact`)."""
+    """Of each coordinate that rests all the time its contact (see `Flight.contact`), of others 0;
+    empty if nothing rests."""
     conditions: tuple[Any, ...] = ()
     """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
 
@@ -132,7 +133,7 @@ class Shooting(eqx.Module):
         """Of each leg the contact of each coordinate (`Flight.contact`); empty without rests."""
         if not self.landings:
             return (self.held,) * self.legs
-        held, found = [0.0] * len(self.machine.coordinates), []
+        held, found = list(self.held) or [0.0] * len(self.machine.coordinates), []
         for event in 2 * self.events:
             if event.use:
                 stop = stops_of(self.machine)[event.number]
@@ -229,8 +230,9 @@ class Shooting(eqx.Module):
         def new(event, s, u):
             if event.use == LEAVES:
                 return u
-            state, modes = self.unravel(u), self.modes_in(leg - 1)
-            return ravel_pytree(after_event(machine, event.number, s, state, modes)[0])[0]
+            before, state = self.flight(machine, leg - 1), self.unravel(u)
+            new = after_event(machine, event.number, s, state, before.modes, before.contact)[0]
+            return ravel_pytree(new)[0]
 
         return self._each(leg, new, s, u) if self.events else u
 
@@ -371,14 +373,14 @@ class Shooting(eqx.Module):
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
         period = ends[-1] - clock[0]
-        escapes = (
-            self._escape(
-                machine, i, jax.tree.map(lambda a, i=i: a[i], begin), clock, states, period
-            )
-            for i in self.landings
-        )
+        last = {i: jax.tree.map(lambda a, i=i: a[i], begin) for i in self.landings}
+        escapes = (self._escape(machine, i, last[i], clock, states, period) for i in last)
+        left = (self._left(machine, i, last[i], ends[i]) for i in last)
         Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
         nearest, pulled = jnp.argmin(turns.nearest.room), jnp.argmin(turns.pull.room)
+        order_of_events = apart(
+            machine, self.events, self.modes, self.contacts, clock, ends - clock, before
+        )
         integrals = jax.tree.map(jnp.sum, passed)
         time = integrals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
@@ -391,14 +393,20 @@ class Shooting(eqx.Module):
             nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
             pull=jax.tree.map(lambda x: x[pulled], turns.pull),
             order=jnp.min(order),
-            apart=apart(
-                machine, self.events, self.modes, self.contacts, clock, ends - clock, before
-            ),
+            apart=reduce(jnp.minimum, left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
             averages=means(integrals, time),
             largest=jnp.max(largest, axis=0),
             escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
+
+    def _left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
+        """Time from the end of the chatter that begins with event number i to the next event, if
+        that is not its release (of which `_escape` says more)."""
+        landing = self.events[i]
+        if self.events[(i + 1) % self.legs] == landing._replace(use=LEAVES):
+            return jnp.full_like(until, jnp.inf)
+        return until - last.s - remaining(self.departing(machine, i), landing.number, last)
 
     def _escape(
         self, machine: AbstractMachine, i: int, last: Hops, clock: Array, states: Array,
@@ -478,8 +486,9 @@ class Shooting(eqx.Module):
         def order(event, s, u):
             if not event.of(machine).holds_mode:
                 return jnp.ones_like(s)
-            j, before = mode_number(machine, event.number), self.modes_in(leg - 1)
-            mode = after_event(machine, event.number, s, self.unravel(u), before)[1][j]
+            j, before = mode_number(machine, event.number), self.flight(machine, leg - 1)
+            modes, state = (before.modes, before.contact), self.unravel(u)
+            mode = after_event(machine, event.number, s, state, *modes)[1][j]
             wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 

@@ -184,12 +184,13 @@ def _rates(problem: Shooting, x, leg, number: int, s):
     u = jax.tree.map(lambda a, b: jnp.where(begins, a, b), problem.unravel(states[leg]), flown)
     modes = problem.modes_in(leg)
     modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
-    field = Flight(machine, modes, problem.method, problem.like).smooth.field
+    contact = problem.flight(machine, leg).contact
+    held = Flight(machine, modes, problem.method, problem.like, contact)
 
     def guard(s, state):
-        return guard_of(machine, number, s, state, modes)
+        return guard_of(machine, number, s, state, modes, contact)
 
-    found = guard_rates(field, guard, s, u)
+    found = guard_rates(held.smooth.field, guard, s, u)
     return found.x, found.v
 
 
@@ -206,7 +207,9 @@ def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float
     """The mode in which a switch that is just held would leave its surface."""
     x = jnp.asarray(at.x)
     state, modes = problem.state_at(x, leg, jnp.asarray(s)), problem.modes_in(leg)
-    new = after_event(problem.at(x), number, jnp.asarray(s), state, modes)[1]
+    machine = problem.at(x)
+    contact = problem.flight(machine, leg).contact
+    new = after_event(machine, number, jnp.asarray(s), state, modes, contact)[1]
     return float(new[mode_number(problem.machine, number)])
 
 

@@ -68,14 +68,20 @@ def _legs_of_sections(problem: Shooting, x: Array) -> tuple[np.ndarray, np.ndarr
     return legs, places
 
 
+def _own_modes(problem: Shooting, x: Array) -> tuple[Array, ...]:
+    """The machine's own modes on the first section of a solution."""
+    return problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
+
+
 def counted_of(problem: Shooting, step: Step, state: State | None = None) -> Counted:
     """The impacts of a motion that rests.
 
-    **Arguments:** its state on the section, if that is known.
+    **Arguments:** its bare state on the section, if that is known.
     """
     x = jnp.asarray(step.x)
     if state is None:
         state = jax.tree.map(lambda x: x[0], sections_of(problem, x)[0])
+    state = with_modes(state, _own_modes(problem, x))
     return jax.tree.map(np.asarray, _simulated(problem, x, state))
 
 
@@ -130,11 +136,10 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
     order = np.argsort(within)
     since = phase_at(machine, within[order])
     duration = jnp.asarray(seen.duration)
-    own = problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
     return Orbit(
         machine=machine,
         method=problem.method,
-        state=with_modes(state, own),
+        state=with_modes(state, _own_modes(problem, x)),
         sections=sections,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,

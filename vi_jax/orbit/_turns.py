@@ -72,7 +72,7 @@ class _Guard(NamedTuple):
 
     def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
         """The guard in a state."""
-        return guard_of(flight.machine, self.number, s, state, flight.modes)
+        return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
 
     def at(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
         """The guard, by the state's vector."""
