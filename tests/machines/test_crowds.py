@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.machine import stops_of
 from vi_jax.machine.numbers import with_leaf
 
 from differences import quick
@@ -72,7 +73,7 @@ def test_a_crowd(name):
     def one(drawn, starts):
         scene = changed(machine, drawn)
         run = vi.simulate(scene, scene.start(**starts), CYCLES)
-        stops = [stop for stop in scene.stops if stop.coordinate == 0]
+        stops = [stop for stop in stops_of(scene) if stop.coordinate == 0]
         depth = [
             jnp.where(stop.sign > 0, run.y_max - stop.gap, -run.y_min - stop.gap).max()
             for stop in stops
