@@ -152,7 +152,7 @@ def test_a_motor_counts_its_turns_in_every_verb():
         orbit, parameter="kappa", bounds=(1.09, 1.11), max_step=0.2, progress=False
     )
     assert branch.ends == ("bounds", "bounds") and bool(branch.stable.all())
-    assert branch.column("kappa") is branch.parameter
+    np.testing.assert_array_equal(branch.column("kappa"), branch.parameter)
     exponents = vi.lyapunov(machine, orbit.state, 100, progress=False).exponents
     decay = np.log(found[:3]) / float(orbit.duration)
     np.testing.assert_allclose(exponents, [0, *decay], rtol=2e-2, atol=1e-2)
