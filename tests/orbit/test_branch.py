@@ -255,7 +255,7 @@ def test_a_branch_in_files(short, tmp_path):
 
 
 def test_a_restored_branch_goes_on(short):
-    """Its special points are told by their number, also in reversed copies."""
+    """A pickled or reversed copy can be switched at: its points hold their row by number."""
     again = pickle.loads(pickle.dumps(short))
     turned = dataclasses.replace(again, steps=again.steps[::-1], ends=again.ends[::-1])
     np.testing.assert_array_equal(turned.multipliers[::-1], short.multipliers)

@@ -34,8 +34,11 @@ def errors_in(place: str) -> Iterator[None]:
 
 
 def start_of(machine: AbstractMachine, table: Any) -> Any:
-    """Return a state of the machine from `[start]`: by the arguments of its `start`, from its start
-    with these numbers in place of its own, or of these alone. **Raises:** `InputError`."""
+    """Return the state that `[start]` describes. **Raises:** `InputError`.
+
+    Its keys are the arguments of the machine's `start`, if that has any; else components of the
+    state, which replace those of the default start. Without a `start` they are the whole state.
+    """
     if not isinstance(table, dict):
         return table
     if type(machine).start is AbstractMachine.start:

@@ -17,6 +17,7 @@ from .enumeration import NamedEnumeration as NamedEnumeration
 from .enumeration import in_names as in_names
 from .enumeration import number_of as number_of
 from .events import Rates as Rates
+from .events import force_rate as force_rate
 from .events import guard_rates as guard_rates
 from .fusion import compiling as compiling
 from .fusion import jit as jit

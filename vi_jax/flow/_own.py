@@ -319,11 +319,18 @@ def check_parts(machine: AbstractMachine) -> None:
 
 
 def _check_names(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for a stop that names no velocity."""
-    if isinstance(machine, Mechanical):
-        return
+    """**Raises:** `ValueError` for a stop that names no velocity, or an angle of `wrap_angles`."""
+    wrapped = getattr(type(machine).renewed, "angles", frozenset())
     for stop in listed(machine.contacts):
         on = getattr(stop, "on", None)
+        named = {on} if isinstance(on, str) else {*on} if isinstance(on, tuple) else set()
+        if isinstance(stop, RigidStop) and wrapped & named:
+            raise ValueError(
+                f"A stop is at one value of {min(wrapped & named)!r}, which `wrap_angles` changes "
+                "by whole turns: leave the angle out there, with a stop at each end of its range."
+            )
+        if isinstance(machine, Mechanical):
+            continue
         if isinstance(stop, RigidStop | SoftStop) and on is not None and not _is_pair(on):
             raise ValueError(
                 f"Argument `on` of a stop of a {type(machine).__name__} must be the names of "

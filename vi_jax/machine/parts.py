@@ -25,19 +25,10 @@ def listed(parts: object) -> tuple[Any, ...]:
 
 
 def stops_in(machine: Machine) -> tuple[RigidStop, ...]:
-    """The rigid stops among a machine's contacts. **Raises:** `ValueError` for one on an angle of
-    `wrap_angles`."""
+    """The rigid stops among a machine's contacts."""
     contacts = listed(machine.contacts)
-    places, wrapped = _places(contacts), getattr(type(machine).renewed, "angles", frozenset())
-    stops = [x for x in contacts if isinstance(x, RigidStop)]
-    for on in (x.on for x in stops):
-        both = wrapped & set((on,) if isinstance(on, str) else on if isinstance(on, tuple) else ())
-        if both:
-            raise ValueError(
-                f"A stop is at one value of {min(both)!r}, which `wrap_angles` changes by whole "
-                "turns: leave the angle out there, with a stop at each end of its range."
-            )
-    return tuple(_at(x, places) for x in stops)
+    places = _places(contacts)
+    return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
 
 
 def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, State, Vector
-from ..flow import TIME, Integrals, Rates, guard_rates
+from ..flow import TIME, Integrals, Rates, force_rate, guard_rates
 from ..machine import RigidStop, push_of, stops_of
 from ._flight import Flight, force_on
 
@@ -103,13 +103,8 @@ def _rates(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Rates:
 def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
     """About how long a hop takes: the force grows evenly."""
     s, u = stop_gradient((s, u))
-    field = free.smooth.field
-
-    def force(s, state):
-        return guard_rates(field, partial(stop.guard, free.machine), s, state).a
-
-    state, here = free.unravel(u), _rates(free, stop, s, u)
-    rise = jax.jvp(force, (s, state), (jnp.ones_like(s), field(s, state)))[1]
+    here, body = _rates(free, stop, s, u), free.machine.coordinates[stop.coordinate]
+    rise = stop.sign * force_rate(free.smooth, body.position, free.smooth, s, free.unravel(u))
     root = jnp.sqrt(jnp.maximum(0.25 * here.a**2 - 2 * rise * here.v / 3, 0.0))
     slower, faster = root - 0.5 * here.a, root + 0.5 * here.a
     pressed = -2 * here.v / jnp.where(faster > 0, faster, 1.0)
@@ -146,9 +141,10 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
         return force_on(held, number, s, state)
 
     def along(function):
-        return lambda s, state: jax.jvp(function, (s, state), (jnp.ones_like(s), field(s, state)))[
-            1
-        ]
+        def rate(s, state):
+            return jax.jvp(function, (s, state), (jnp.ones_like(s), field(s, state)))[1]
+
+        return rate
 
     first = along(force)
     second = along(first)

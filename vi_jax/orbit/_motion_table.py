@@ -411,7 +411,8 @@ class MotionTable(Table):
 
 
 def _brief_flight(problem: Shooting, at: Step) -> int | None:
-    """The release after which a body lands on the same stop at once; `None` if there is none."""
+    """The number of a release whose flight to the same stop is brief, and the shortest interval
+    between two events; `None` without one."""
     if not problem.landings:
         return None
     x = jnp.asarray(at.x)

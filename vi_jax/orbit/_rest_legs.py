@@ -42,7 +42,7 @@ _LOGGED, _MOST = 512, 24
 # rounding, within what is corrected.
 _EARLIER = 1e-7
 
-# A hop that takes longer than this part of a cycle is none of a chatter: as steps of a simulation.
+# A hop longer than a fifth of a cycle, the longest step of a simulation, is no part of a chatter.
 _SHORT = 5
 
 _INSTEAD = (

@@ -39,7 +39,7 @@ DETAILS = {
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
 
-# What is said of a rest, by the event or the change that it is lost with.
+# How a branch words the end of a rest, by the event or the change at which it ends.
 RESTS = {
     LANDS: "a rest on a stop is lost: its chatter takes until the stop lets go",
     LEAVES: "a rest on a stop is divided {place}, where the force on the body falls to zero",
