@@ -158,7 +158,7 @@ def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[in
         return None
     places = _tangent_places(program)
     wanted = tuple(i in places and linear[places[i]] for i in range(len(base.in_avals)))
-    own = _derivative_places(base, program.varied)
+    own = forward(base, program.varied).slopes
     if set(weights) - set(own.values()):
         return None
     given = tuple(own.get(k, -1) in weights for k in range(_result_count(base)))
@@ -179,21 +179,6 @@ def _tangent_places(program: LaneProgram) -> dict[int, int]:
     return {i: len(program.base.in_avals) + n for n, i in enumerate(moved)}
 
 
-def _derivative_places(base: LaneProgram, varied: tuple[bool, ...]) -> dict[int, int]:
-    """Of the results and parts of a row of a program, where `forward(base, varied)` has their
-    derivatives."""
-    _, has = forward(base, varied)
-    outs, rows = len(base.out_avals), len(base.row_avals)
-    places, at = {}, outs
-    for k, here in enumerate(has):
-        if k == outs:
-            at += rows
-        if here:
-            places[k] = at
-            at += 1
-    return places
-
-
 def _result_count(program: LaneProgram) -> int:
     return len(program.out_avals) + len(program.row_avals)
 
@@ -210,12 +195,12 @@ def _columns(*args, program: ReverseProgram) -> list[Any]:
     n, batch = len(base.in_avals), program.batch([x.shape for x in args])
     inputs, given = list(args[:n]), args[n:]
     inputs[0] = jnp.broadcast_to(inputs[0], (*batch, *base.in_avals[0].shape))
-    derived, _ = forward(base, varied)
-    own = _derivative_places(base, varied)
+    derived = forward(base, varied)
+    own = derived.slopes
     some = iter(given)
     weights = {own[k]: next(some) for k, here in enumerate(program.given) if here}
     tangents = [None for here in varied if here]
-    found = by_columns(derived, "auto", [*inputs, *tangents], weights, batch)
+    found = by_columns(derived.program, "auto", [*inputs, *tangents], weights, batch)
     return [found[n + k] for k in range(len(tangents))]
 
 
@@ -248,11 +233,10 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
     inputs, cotangents = primals[:n], primals[n:]
     dc = _by_result(program, changed)
     if any(moved):
-        derived, _ = forward(base, moved)
-        own = _derivative_places(base, moved)
+        derived, _, places, own = forward(base, moved)
         c = _by_result(program, cotangents)
         weights = {own[k]: x for k, x in c.items() if k in own}
-        weights |= {_value_place(base, moved, k): x for k, x in dc.items()}
+        weights |= {places[k]: x for k, x in dc.items()}
         inputs = [*inputs, *(x for x, here in zip(tangents[:n], moved, strict=True) if here)]
     else:
         derived, weights = base, dc
@@ -274,13 +258,6 @@ def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, 
     return {k: x for k, x in zip(places, cotangents, strict=True) if x is not None}
 
 
-def _value_place(base: LaneProgram, varied: tuple[bool, ...], k: int) -> int:
-    """Where `forward(base, varied)` has result, or part of a row, number k of `base`."""
-    _, has = forward(base, varied)
-    outs = len(base.out_avals)
-    return k if k < outs else k + sum(has[:outs])
-
-
 def _transposed_back(cotangents, *args, program: ReverseProgram):
     """Reverse over reverse. Jᵀc is linear in c, and its transpose is J. What `_jvp` gives is linear
     in dc and v, and by the symmetry of second derivatives its transpose in v is of its own kind:
@@ -297,20 +274,19 @@ def _transposed_back(cotangents, *args, program: ReverseProgram):
             )
         base = derived.base
     varied = program.varied[: len(base.in_avals)]
-    along, _ = forward(base, varied)
-    own = _derivative_places(base, varied)
+    along, _, _, own = forward(base, varied)
     w = [ad.instantiate_zeros(x) for x in cotangents]
     inputs = [*args[: len(base.in_avals)], *w]
     weights = [k for k, here in enumerate(program.given) if here]
     found: dict[int, Any] = {}
     if any(linear[n:]):
         values = lanes_p.bind(*inputs, program=along, backend="auto")
-        of_value = {_value_place(base, derived.varied, k) if second else k: k for k in own}
+        of_value = {forward(base, derived.varied).values[k] if second else k: k for k in own}
         for i, k in enumerate(weights, n):
             if linear[i] and k in of_value:
                 found[i] = values[own[of_value[k]]]
     if second:
-        before = {place: k for k, place in _derivative_places(base, derived.varied).items()}
+        before = {place: k for k, place in forward(base, derived.varied).slopes.items()}
         pairs = [(before.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
         given = {own[k]: x for k, x in pairs if k in own}
         places = {i: k for i, k in _tangent_places(derived).items() if linear[k]}

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,17 +47,37 @@ def _jvp(primals, tangents):
 quotient_p = elementwise_primitive("quotient", lambda x, y: x / y, _jvp)
 
 
-@functools.lru_cache(maxsize=64)
-def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram, tuple[bool, ...]]:
-    """The program of value and forward derivative.
+class Derived(NamedTuple):
+    """A program of values and derivatives. The tangents follow the inputs, the derivatives of the
+    results follow the results, those of a row follow the row."""
 
-    The tangents follow the inputs, the derivatives of the results follow the results, those of a
-    row follow the row. What cannot depend on a varied input is not differentiated.
+    program: LaneProgram
+    has: tuple[bool, ...]
+    """Which results of the values' program, and then which parts of a row, have a derivative."""
+    values: tuple[int, ...]
+    """The places of those results and parts."""
+    slopes: dict[int, int]
+    """By their number, the places of their derivatives."""
+
+    @classmethod
+    def of(cls, program: LaneProgram, has: tuple[bool, ...], results: int) -> "Derived":
+        """`results` of the values' program, which are followed by the parts of a row."""
+        values, slopes, place = [], {}, 0
+        for part in (range(results), range(results, len(has))):
+            values += range(place, place + len(part))
+            place += len(part)
+            for number in part:
+                if has[number]:
+                    slopes[number], place = place, place + 1
+        return cls(program, has, tuple(values), slopes)
+
+
+@functools.lru_cache(maxsize=64)
+def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
+    """The program of value and forward derivative; what cannot depend on a varied input is not
+    differentiated.
 
     **Arguments:** the program; which inputs have a tangent.
-
-    **Returns:** the program of both; which results, and then which parts of a row, have a
-    derivative.
     """
     if program.widening is not None:
         return _widened_forward(program, program.widening, varied)
@@ -75,19 +95,17 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> tuple[LaneProgram
         varied=varied,
         base=program,
     )
-    return derived, (*depend.outs, *rows)
+    return Derived.of(derived, (*depend.outs, *rows), len(depend.outs))
 
 
-def _widened_forward(
-    program: LaneProgram, widening: Widening, varied: tuple[bool, ...]
-) -> tuple[LaneProgram, tuple[bool, ...]]:
+def _widened_forward(program: LaneProgram, widening: Widening, varied: tuple[bool, ...]) -> Derived:
     """What `forward` returns for a widened program: its source is differentiated, then widened.
 
     JAX cannot do it the other way round: under `jax.vmap` within a branch, a result with its own
     derivative gets an axis if its value has one, even where its derivative has one too.
     """
     source, batched, number, wide = widening
-    derived, has = forward(source, varied)
+    derived, has, *_ = forward(source, varied)
     more = (*batched, *(b for b, here in zip(batched, varied, strict=True) if here))
     outs = len(wide.outs)
     depend = dependent_parts(derived, more, smooth=False)._replace(
@@ -95,7 +113,8 @@ def _widened_forward(
         rows=_with_its_derivatives(wide.rows, has[outs:]),
     )
     both = _widened(Widening(derived, more, number, depend))
-    return dataclasses.replace(both, varied=varied, base=program), has
+    both = dataclasses.replace(both, varied=varied, base=program)
+    return Derived.of(both, has, outs)
 
 
 def _with_its_derivatives(wide: tuple[bool, ...], has: tuple[bool, ...]) -> tuple[bool, ...]:

@@ -62,14 +62,9 @@ def tape_add(t: Text, pointer: str, offset: int, avals: list[Any], arrays: list[
         else:
             fill(t, place, new)
     for mask, pairs in rare.items():  # the weights of a law matter in the iterations with an impact
-        inside, after = t.label(), t.label()
-        t.fork(t.any(mask), inside, after, rare=True)
-        t.open(inside)
-        for place, new in pairs:
-            fill(t, place, new)
-        t.line(f"br label %{after}")
-        t.close()
-        t.follow(after)
+        with t.skipped_unless(mask, rare=True):
+            for place, new in pairs:
+                fill(t, place, new)
 
 
 def only_in(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:

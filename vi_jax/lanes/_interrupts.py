@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from ._code import engine_of
-from ._recent import Recent, made_once
+from ._shared import Recent, made_once
 
 # The answer of a handler that has no error to report; `call_handler` below compares with it.
 SUCCESS = 1

@@ -305,13 +305,8 @@ class _Writer:
         if not row:
             return
         fits = t.both(mask, t.binary("icmp slt", place, t.constant(rows, "i64"), "i1"))
-        inside, after = t.label(), t.label()
-        t.fork(t.any(fits), inside, after, rare=True)
-        t.open(inside)
-        self._put_row(lane, fits, place, row)
-        t.line(f"br label %{after}")
-        t.close()
-        t.follow(after)
+        with t.skipped_unless(fits, rare=True):
+            self._put_row(lane, fits, place, row)
 
     def _put_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
         t = self.t

@@ -1,4 +1,4 @@
-"""The elementary functions of the C library as code on whole vectors.
+"""Elementary functions without a hardware instruction, as code on whole vectors.
 
 Each is written for double precision, and single precision goes by way of it. Errors are at most 2
 units in the last place (`tests/lanes/test_library.py`). Subnormal results may be zero: the threads
@@ -7,9 +7,10 @@ that run lanes take such numbers for zero.
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from math import factorial, inf, log, nan, pi
+from math import factorial, frexp, inf, nan, pi
+from math import log as ln
+from typing import Any
 
-from ._functions import LN2, horner, mantissa, parts_of
 from ._text import Text, Value
 
 # Terms from which on a polynomial is split; with all in one chain erf and erfc take a fifth longer.
@@ -76,6 +77,9 @@ class Real:
     def equals(self, other) -> Value:
         return self._two("fcmp oeq", other, "i1").value
 
+    def is_no_number(self) -> Value:
+        return self._two("fcmp uno", self, "i1").value
+
     def choose(self, flag: Value, other) -> "Real":
         """This where the flag holds, else the other."""
         return Real(self.t, self.t.select(flag, self.value, self.of(other).value))
@@ -109,20 +113,39 @@ class Real:
 
     def split(self) -> "tuple[Real, Real]":
         """For a normal positive number, m between √½ and √2 and a whole n: m 2^n."""
-        m, power = mantissa(self.t, self.value)
-        return Real(self.t, m), Real(self.t, self.t.cast("sitofp", power, "double"))
+        t = self.t
+        bits = t.cast("bitcast", self.value, "i64")
+        shifted = t.binary("sub", bits, t.constant(0x3FE6A09E667F3BCD, "i64"))
+        power = t.binary("ashr", shifted, t.constant(52, "i64"))
+        shifted = t.binary("sub", bits, t.binary("shl", power, t.constant(52, "i64")))
+        m = t.cast("bitcast", shifted, "double")
+        return Real(t, m), Real(t, t.cast("sitofp", power, "double"))
+
+    def horner(self, coefficients: Sequence[float]) -> "Real":
+        """The polynomial with these coefficients, constant term first."""
+        total = self.of(coefficients[-1])
+        for coefficient in coefficients[-2::-1]:
+            total = total * self + coefficient
+        return total
 
     def polynomial(self, coefficients: Sequence[float], first: int = 2) -> "Real":
-        """With these coefficients, constant term first; of a long one all but the `first` terms as
-        two that do not wait for each other, of the even powers and of the odd."""
+        """The same; of a long one all but the `first` terms as two polynomials that do not wait for
+        each other, of the even powers and of the odd."""
         if len(coefficients) < _LONG:
-            return Real(self.t, horner(self.t, coefficients, self.value))
+            return self.horner(coefficients)
         square, rest = self * self, coefficients[first:]
         even, odd = (square.polynomial(rest[i::2]) for i in range(2))
         total = self * odd + even
         for coefficient in coefficients[first - 1 :: -1]:
             total = total * self + coefficient
         return total
+
+    def less(self, turns: "Real", parts: Sequence[float]) -> "Real":
+        """This less so many times the sum of `parts`."""
+        found = self
+        for part in parts:
+            found = found - turns * part
+        return found
 
     def power_of_two(self) -> "Real":
         """2 to this whole number, from -1022 to 1023; infinity at 1024."""
@@ -153,6 +176,96 @@ def significand(a: Real) -> tuple[Real, Real]:
     whole = Real(a.t, a.t.cast("uitofp", a.t.cast("bitcast", a.value, "i64"), "double"))
     m, n = whole.choose(small, a).split()
     return m, (n - 1074.0).choose(small, n)
+
+
+def _parts_of(number: float, count: int) -> list[float]:
+    """`number` (to some hundred bits) as a sum of doubles whose products with small integers are
+    exact."""
+    exact = {
+        pi: Fraction(884279719003555, 281474976710656) + Fraction(1.2246467991473532e-16)
+        + Fraction(-2.9947698097183397e-33),
+        ln(2): Fraction(ln(2)) + Fraction(2.3190468138462996e-17),
+    }[number]  # fmt: skip
+    parts = []
+    for _ in range(count - 1):
+        scale = 2.0 ** (29 - frexp(abs(float(exact)))[1])
+        head = round(exact * Fraction(scale)) / scale
+        parts.append(head)
+        exact -= Fraction(head)
+    return [*parts, float(exact)]
+
+
+_PI, _PI_LOW = pi, 1.2246467991473532e-16
+_PI_PARTS, _LN2 = _parts_of(pi, 3), _parts_of(ln(2), 2)
+
+# Those that a motion needs in each step: Taylor's series.
+_SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(11))
+_COS = tuple((-1) ** n / factorial(2 * n) for n in range(12))
+_EXP = tuple(1 / factorial(n) for n in range(14))
+_ATANH = tuple(2 / (2 * n + 1) for n in range(12))
+
+# Beyond, a double does not tell where in a turn it is.
+_LARGEST_PHASE = 2.0**52
+
+
+def sincos(x: Real) -> tuple[Real, Real]:
+    """Sine and cosine of a phase, to rounding up to a million turns; any number beyond 2^52."""
+    t, turns = x.t, (x * (1 / pi)).call("roundeven")
+    # What is too large, or no number, becomes any whole one.
+    whole = t.cast("fptosi", turns.value, "i64")
+    whole = t.value(f"freeze {t.vector('i64')} {whole.text}", "i64")
+    odd = t.binary("shl", whole, t.constant(63, "i64"))  # the sign bit of (-1)^turns
+
+    def flipped(y: Real) -> Real:
+        bits = t.binary("xor", t.cast("bitcast", y.value, "i64"), odd)
+        return Real(t, t.cast("bitcast", bits, "double"))
+
+    rest = x.less(turns, _PI_PARTS)
+    square = rest * rest
+    sine = flipped(rest * square.horner(_SIN))
+    return sine, flipped(square.horner(_COS))
+
+
+def sin(x: Real) -> Real:
+    return _of_any_phase(x, sincos(x)[0])
+
+
+def cos(x: Real) -> Real:
+    return _of_any_phase(x, sincos(x)[1])
+
+
+def _of_any_phase(x: Real, value: Real) -> Real:
+    """The sine or cosine of any x; not a number beyond 2^52, where x has no digits of a phase."""
+    return value.choose(x.size() < _LARGEST_PHASE, nan)
+
+
+def exp(x: Real) -> Real:
+    t = x.t
+    y = x.at_least(-760.0).at_most(720.0)
+    n = (y * (1 / ln(2))).call("roundeven")
+    value = y.less(n, _LN2).horner(_EXP)
+    # 2^n in two factors, so that neither leaves the range of exponents.
+    finite = x.of(0.0).choose(x.is_no_number(), n)
+    whole = t.cast("fptosi", finite.value, "i64")
+    half = t.binary("ashr", whole, t.constant(1, "i64"))
+    for power in (half, t.binary("sub", whole, half)):
+        biased = t.binary("add", power, t.constant(1023, "i64"))
+        bits = t.binary("shl", biased, t.constant(52, "i64"))
+        value = value * Real(t, t.cast("bitcast", bits, "double"))
+    return value
+
+
+def log(x: Real) -> Real:
+    tiny = x < 2.0**-1000
+    m, n = (x * 2.0**54).choose(tiny, x).split()
+    n = n.minus(54.0).choose(tiny, n)
+    ratio = m.minus(1.0) / m.plus(1.0)
+    series = ratio * (ratio * ratio).horner(_ATANH)
+    low = series + n * _LN2[1]
+    value = n * _LN2[0] + low
+    value = value.choose(x < inf, x)
+    value = x.of(-inf).choose(x.equals(0.0), value)
+    return x.of(nan).choose(x < 0.0, value)
 
 
 # Polynomials of elementary functions, constant term first.
@@ -219,16 +332,15 @@ CBRT = (
 
 
 # (e^r - 1 - r) / r², by Taylor's series: |r| <= ln(2) / 2, error below 1e-17.
-_EXP = tuple(1 / factorial(n) for n in range(2, 14))
+_EXP_REST = tuple(1 / factorial(n) for n in range(2, 14))
 # ln((1 + s) / (1 - s)) / s - 2 over s², the same; s² <= 0.0295.
 _LOG = tuple(2 / (2 * n + 3) for n in range(10))
 # 2^r / r - 1 / r, the same; |r| <= 1/2.
-_EXP2 = tuple(log(2) ** n / factorial(n) for n in range(1, 14))
+_EXP2 = tuple(ln(2) ** n / factorial(n) for n in range(1, 14))
 
-_HALF_PI = [part / 2 for part in parts_of(pi, 4)]
+_HALF_PI = [part / 2 for part in _parts_of(pi, 4)]
 # For |x| up to here n times each of the first three is exact.
 _TURNED = 2.0**20
-_PI, _PI_LOW = pi, 1.2246467991473532e-16
 
 
 def _odd(x: Real, value: Real) -> Real:
@@ -239,11 +351,11 @@ def _odd(x: Real, value: Real) -> Real:
 
 def _split_exponent(x: Real) -> tuple[Real, Real, Real]:
     """x as n ln(2) + r, |r| <= 0.35: n, r rounded, and e^r - 1 less that."""
-    n = (x * (1 / log(2))).call("roundeven")
-    head = x - n * LN2[0]  # exact
-    r = head.minus(n * LN2[1])
-    rest = head.minus(r) - n * LN2[1]
-    return n, r, r * r * r.polynomial(_EXP) + (rest + rest * r)
+    n = (x * (1 / ln(2))).call("roundeven")
+    head = x - n * _LN2[0]  # exact
+    r = head.minus(n * _LN2[1])
+    rest = head.minus(r) - n * _LN2[1]
+    return n, r, r * r * r.polynomial(_EXP_REST) + (rest + rest * r)
 
 
 def exp_parts(x: Real) -> tuple[Real, Real]:
@@ -300,8 +412,8 @@ def _log_sum(u: Real, low: Real, doublings: Real | float = 0.0) -> Real:
     square = s * s
     # ln(1 + f) = 2 artanh(s), and 2s = f - s f.
     rest = low / u - s * (f - square * square.polynomial(_LOG))
-    high, off = fast_sum(n * LN2[0], f)
-    value = high + (off + (n * LN2[1] + rest))
+    high, off = fast_sum(n * _LN2[0], f)
+    value = high + (off + (n * _LN2[1] + rest))
     return value.choose(u < inf, u)
 
 
@@ -427,16 +539,9 @@ def tan(x: Real) -> Real:
 def _elsewhere(name: str, x: Real, where: Value, value: Real) -> Real:
     """`value`, but the C library's function where a flag holds; skipped if it does in no lane."""
     t = x.t
-    inside, after = t.label(), t.label()
-    before = t.block
-    t.fork(t.any(where), inside, after, rare=True)
-    t.open(inside)
-    laid = t.select(where, t.each(name, x.value), value.value)
-    end = t.block
-    t.line(f"br label %{after}")
-    t.close()
-    t.follow(after)
-    return Real(t, t.phi("double", (laid.text, end), (value.value.text, before)))
+    with t.skipped_unless(where, rare=True) as fork:
+        laid = t.select(where, t.each(name, x.value), value.value)
+    return Real(t, fork.joined(laid, value.value))
 
 
 def exp2(x: Real) -> Real:
@@ -500,14 +605,16 @@ def erfc(x: Real) -> Real:
     return (1.0 - near.with_sign_of(x)).choose(below, (2.0 - far).choose(left, far))
 
 
-def rule(function: Callable[..., Real]) -> Callable[..., Value]:
-    """A function of `Real`s for values of either precision."""
+def rule(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of `Real`s, with one result or several, for values of either precision."""
 
-    def written(t: Text, *args: Value) -> Value:
+    def written(t: Text, *args: Value) -> Any:
         single = args[0].kind == "float"
         wide = [t.cast("fpext", a, "double") if single else a for a in args]
-        value = function(*(Real(t, a) for a in wide)).value
-        return t.cast("fptrunc", value, "float") if single else value
+        found = function(*(Real(t, a) for a in wide))
+        several = found if isinstance(found, tuple) else (found,)
+        narrow = [t.cast("fptrunc", x.value, "float") if single else x.value for x in several]
+        return tuple(narrow) if isinstance(found, tuple) else narrow[0]
 
     return written
 
@@ -515,13 +622,13 @@ def rule(function: Callable[..., Real]) -> Callable[..., Value]:
 LIBRARY = {
     function.__name__: rule(function)
     for function in (
-        tanh, tan, sinh, cosh, asin, acos, atan, atan2, asinh, acosh, atanh,
-        exp2, expm1, log1p, cbrt, erf, erfc,
+        sin, cos, sincos, exp, log, tanh, tan, sinh, cosh, asin, acos, atan, atan2, asinh, acosh,
+        atanh, exp2, expm1, log1p, cbrt, erf, erfc,
     )
 }  # fmt: skip
 
 
-_LN2 = parts_of(log(2), 3)
+_LN2_PARTS = _parts_of(ln(2), 3)
 # ln((1 + s) / (1 - s)) / s = 2 + s² (2/3 + s² p(s²)), by Taylor's series; s² <= 0.0295.
 _THIRD, _THIRD_LOW = 2 / 3, float(Fraction(2, 3) - Fraction(2 / 3))
 _LOG_TAIL = tuple(2 / (2 * n + 5) for n in range(11))
@@ -549,10 +656,10 @@ def _logarithm(a: Real) -> tuple[Real, Real]:
     rest, rest_low = _product(s, cube)
     rest_low = rest_low + s * cube_low + s_low * cube
     # n ln(2) + 2s + rest: the first two parts of ln(2) times n are exact.
-    high, off = fast_sum(n * _LN2[0], 2.0 * s)
-    high, more = two_sum(high, n * _LN2[1])
+    high, off = fast_sum(n * _LN2_PARTS[0], 2.0 * s)
+    high, more = two_sum(high, n * _LN2_PARTS[1])
     high, least = two_sum(high, rest)
-    low = off + more + least + (n * _LN2[2] + 2.0 * s_low + rest_low)
+    low = off + more + least + (n * _LN2_PARTS[2] + 2.0 * s_low + rest_low)
     return fast_sum(high, low)
 
 

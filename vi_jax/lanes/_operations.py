@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from . import _functions as functions
 from ._library import LIBRARY, power
 from ._text import KINDS, Text, Value, is_float
 
@@ -287,40 +286,15 @@ def _(t, p, d, a, b):
     if a.kind == "float" and b.number is not None and b.number != round(b.number):
         # No negative base has such a power, and double precision leaves single to rounding.
         wide = t.cast("fpext", a, "double")
-        exponent = mul(t, functions.log_(t, wide), t.constant(b.number, "double"))
-        return t.cast("fptrunc", functions.exp(t, exponent), "float")
+        exponent = mul(t, LIBRARY["log"](t, wide), t.constant(b.number, "double"))
+        return t.cast("fptrunc", LIBRARY["exp"](t, exponent), "float")
     return power(t, a, b)
-
-
-@elementwise("exp")
-def _(t, p, d, a):
-    return functions.exp(t, a)
-
-
-@elementwise("log")
-def _(t, p, d, a):
-    return functions.log_(t, a)
 
 
 @elementwise("logistic")
 def _(t, p, d, a):
     one = t.constant(1, a.kind)
-    return div(t, one, add(t, one, functions.exp(t, neg(t, a))))
-
-
-@elementwise("sin")
-def _(t, p, d, a):
-    return functions.of_any_phase(t, a, functions.sincos(t, a)[0])
-
-
-@elementwise("cos")
-def _(t, p, d, a):
-    return functions.of_any_phase(t, a, functions.sincos(t, a)[1])
-
-
-@elementwise("sincos")
-def _(t, p, d, a):
-    return functions.sincos(t, a)
+    return div(t, one, add(t, one, LIBRARY["exp"](t, neg(t, a))))
 
 
 for _name, _function in LIBRARY.items():

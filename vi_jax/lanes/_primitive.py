@@ -19,9 +19,9 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from . import _xla as xla
 from ._arrays import MOST_IN_REGISTERS
-from ._context import within
 from ._derivative import forward, widened
 from ._program import LaneProgram, dependent_parts
+from ._shared import within
 from ._vector import Unsupported
 from .call import header, registered
 from .runtime import AnyProgram, kernel_of
@@ -129,17 +129,13 @@ batching.primitive_batchers[lanes_p] = _batched
 def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
     """Values and derivatives by one program (`forward`)."""
     varied = tuple(type(t) is not ad.Zero for t in tangents)
-    derived, has = forward(program, varied)
+    derived = forward(program, varied)
     changes = [t for t in tangents if type(t) is not ad.Zero]
-    out = iter(lanes_p.bind(*primals, *changes, program=derived, backend=backend))
-    values, derivatives = [], []
-    # The results and their derivatives, then the rows and theirs.
-    for part in (has[: _result_count(program)], has[_result_count(program) :]):
-        values += [next(out) for _ in part]
-        derivatives += [next(out) if here else None for here in part]
+    out = lanes_p.bind(*primals, *changes, program=derived.program, backend=backend)
+    values = [out[place] for place in derived.values]
     return values, [
-        ad.Zero(jax.typeof(v).to_tangent_aval()) if s is None else s
-        for v, s in zip(values, derivatives, strict=True)
+        out[derived.slopes[k]] if here else ad.Zero(jax.typeof(values[k]).to_tangent_aval())
+        for k, here in enumerate(derived.has)
     ]
 
 
@@ -198,10 +194,6 @@ def _saved(policy: object) -> bool:
     """Whether a policy of `jax.checkpoint` says to save a value: by `True`, or by an instance of
     JAX's `SaveableType` (0.10.2), which no public module has."""
     return policy is True or type(policy).__name__.startswith("Saveable")
-
-
-def _result_count(program: LaneProgram) -> int:
-    return len(program.out_avals)
 
 
 ad.primitive_jvps[lanes_p] = _jvp

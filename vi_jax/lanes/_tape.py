@@ -16,7 +16,6 @@ A full tape is copied into twice the memory, up to `MOST_BYTES` a thread. Beyond
 with an error.
 """
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -190,11 +189,6 @@ def reverse_text(
     return _Writer(program, width, one_for_all).text(bits, entries, most)
 
 
-def _is_no_number(t: Text, x: Value) -> Value:
-    """Whether a number is NaN or infinite: 0 times it is NaN then."""
-    return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
-
-
 def _read(t: Text, pointer: str, stride: Value, lane: Value, aval: Any, mask: Value) -> Array:
     """An array of each lane, zeros where `mask` does not hold (see `gathering`)."""
     return held(t, gathering(t, pointer, t.binary("mul", lane, stride), aval, mask))
@@ -304,21 +298,25 @@ class _Writer:
             return none
         room = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
         mask = t.both(complete, room)
+
+        def read() -> list[Array]:
+            found = self._weights(t, self.results, avals, lane, place, mask)
+            self._spoil_by_no_numbers(t, found)
+            return found
+
         if not all(isinstance(x, Registers) for x in none):
-            read = self._weights(t, self.results, avals, lane, place, mask)
-            self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in read])
-            return read
-        inside, after, before = t.label(), t.label(), t.block
-        t.fork(t.any(mask), inside, after)
-        t.open(inside)
-        read = self._weights(t, self.results, avals, lane, place, mask)
-        self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in read])
-        end = t.block
-        t.line(f"br label %{after}")
-        t.close()
-        t.follow(after)
-        either = lambda a, b: t.phi(a.kind, (a.text, end), (b.text, before))
-        return [mapped(t, either, a, b) for a, b in zip(read, none, strict=True)]
+            return read()
+        with t.skipped_unless(mask) as fork:
+            found = read()
+        return [mapped(t, fork.joined, a, b) for a, b in zip(found, none, strict=True)]
+
+    def _spoil_by_no_numbers(self, t: Text, arrays: list[Array]) -> None:
+        """NaN and infinity as a cotangent: 0 times it is NaN."""
+
+        def is_no_number(x: Value) -> Value:
+            return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
+
+        self._spoil(t, [mapped(t, is_no_number, x, kind="i1") for x in arrays])
 
     def _spoil(self, t: Text, flags: list[Array]) -> None:
         """The lanes in which one of these flags holds have no derivative."""
@@ -404,7 +402,7 @@ class _Writer:
         avals = self.program.weight_avals[: self.results]
         weights = self._weights(t, 0, avals, lane, None, present)
         self.frame.store_number(t, "spoilt", t.constant(False, "i1"))
-        self._spoil(t, [mapped(t, partial(_is_no_number, t), x, kind="i1") for x in weights])
+        self._spoil_by_no_numbers(t, weights)
         self._spoil_by_missing_rows(t, lane, rows.item(), present)
         args = [*inputs, *carry, *weights]
         to_inputs, to_carry = self._back(t, self.program.end.backward, args, present)

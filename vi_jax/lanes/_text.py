@@ -1,7 +1,8 @@
 """Vector code as LLVM's text: values, operations on them, and blocks."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -280,6 +281,19 @@ class Text:
         """End the block: go on at one of two labels. If `yes` is `rare`, `no` is kept fast."""
         self.line(f"br i1 {condition}, label %{yes}, label %{no}{', !prof !0' if rare else ''}")
 
+    @contextmanager
+    def skipped_unless(self, mask: Value, *, rare: bool = False) -> "Iterator[Skipped]":
+        """Blocks that are skipped where the mask holds in no lane; `rare` as in `fork`."""
+        inside, after = self.label(), self.label()
+        way = Skipped(self, self.block)
+        self.fork(self.any(mask), inside, after, rare=rare)
+        self.open(inside)
+        yield way
+        way.end = self.block
+        self.line(f"br label %{after}")
+        self.close()
+        self.follow(after)
+
     def follow(self, label: str) -> None:
         """Begin a block that the blocks of all open scopes dominate, without a scope of its own."""
         self._begin(label)
@@ -312,6 +326,21 @@ class Text:
     def _phi(self, kind: str, ways: Sequence[tuple[str, str]]) -> str:
         pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
         return f"phi {self.vector(kind)} {pairs}"
+
+
+@dataclass
+class Skipped:
+    """Blocks that are skipped, or not."""
+
+    text: Text
+    before: str
+    """The block from which they are skipped."""
+    end: str = ""
+    """The last of them."""
+
+    def joined(self, a: Value, b: Value) -> Value:
+        """a, which was computed in these blocks; b where they were skipped."""
+        return self.text.phi(a.kind, (a.text, self.end), (b.text, self.before))
 
 
 # Text whose arithmetic has one meaning: equal operations give equal bits in any function.

@@ -14,7 +14,7 @@ from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
 from ._program import LaneProgram
-from ._recent import Recent
+from ._shared import Recent
 
 
 class Functions(NamedTuple):

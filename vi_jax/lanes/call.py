@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_dropped, interrupt_raises, watch
-from ._recent import made_once
+from ._shared import made_once
 from ._tape import OUT_OF_MEMORY
 from ._vector import Unsupported
 from .runtime import KernelCall, kernel_by_key

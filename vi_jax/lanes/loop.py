@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from . import _backward as _backward  # how `lanes_p` is differentiated in reverse mode
-from ._context import within
 from ._primitive import lanes_p
+from ._shared import within
 from ._trace import Functions, traced
 
 BACKENDS = ("auto", "xla")

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from ._code import compile_in_background, function_at, llvm
-from ._context import within
 from ._kernel import kernel_text
 from ._program import LaneProgram
-from ._recent import Recent
 from ._reverse import ReverseProgram
+from ._shared import Recent, within
 from ._tape import reverse_text
 from ._vector import check
 

@@ -1,9 +1,11 @@
-"""Caches that all threads share: the values used last, and values that are made once."""
+"""What threads share: the values used last, values made once; and what one keeps to itself."""
 
 import functools
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Generic, TypeVar
 
 K = TypeVar("K")
@@ -57,3 +59,13 @@ def made_once(make: Callable[[], V]) -> Callable[[], V]:
             return kept()
 
     return made
+
+
+@contextmanager
+def within(setting: ContextVar, value: object) -> Iterator[None]:
+    """`setting` has this value within this context, in this thread and task alone."""
+    token = setting.set(value)
+    try:
+        yield
+    finally:
+        setting.reset(token)
