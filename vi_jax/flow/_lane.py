@@ -167,21 +167,10 @@ class Lane(NamedTuple):
         if events is None:
             return self
         place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
-        return self.recording(events=_written(events, when, place, clock, kind, number, value))
-
-    def counting(self, when: Flag, clock: Scalar, speed: Scalar, number: Any) -> "Lane":
-        """The lane with an impact counted, and in the log of impacts, if there is room.
-
-        **Arguments:** `when`, whether the impact happened; `clock`, as for `noting`; `speed`, V⁻;
-        `number`, that of the stop.
-        """
-        log, impacts = self.record.log, self.record.impacts
-        if log is not None:
-            log = _written(log, when, impacts, clock, speed, number)
-        return self.recording(log=log, impacts=impacts + jnp.where(when, 1.0, 0.0))
+        return self.recording(events=written(events, when, place, clock, kind, number, value))
 
 
-def _written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
+def written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
     """A log with an entry at this place, if it has one."""
     here = when & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
     column = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
@@ -232,8 +221,6 @@ class Plan(eqx.Module):
     motion: bool = eqx.field(static=True)
     """Whether extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
-    log_switches: bool = eqx.field(static=True)
-    """Whether the log lists switches too, as stops beyond the last, and counts them."""
     events: int = eqx.field(static=True)
     """Events of all kinds to log in each cycle."""
     averages: tuple[str, ...] = eqx.field(static=True)

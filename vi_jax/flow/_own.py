@@ -84,8 +84,7 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             f"{whose} must return what is like its state, {in_short(state)}, but returned "
             f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
         )
-    with in_words_of(f"`cycle` of a {type(machine).__name__}"):
-        jax.eval_shape(lambda x: section_in(machine, x), state)
+    _traced(f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state)
 
 
 def rows_of(machine: AbstractMachine) -> str:
@@ -148,6 +147,12 @@ def in_words_of(whose: str) -> Iterator[None]:
         ) from error
 
 
+def _traced(whose: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """The shapes that a function of a machine returns; errors as `in_words_of`."""
+    with in_words_of(whose):
+        return eqx.filter_eval_shape(function, *arguments)
+
+
 def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
     """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
     `check_field`."""
@@ -156,8 +161,7 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             continue
         whose = f"The restitution law of stop {i} of a {type(machine).__name__}"
         try:
-            with in_words_of(whose):
-                got = jax.eval_shape(stop.rebound, speed)
+            got = _traced(whose, stop.rebound, speed)
         except TypeError as error:
             if str(error).startswith(whose):
                 raise
@@ -376,8 +380,7 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
         _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
         whose = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
-        with in_words_of(whose):
-            _check_state(whose, state, jax.eval_shape(coordinate.placed, state, place, velocity))
+        _check_state(whose, state, _traced(whose, coordinate.placed, state, place, velocity))
     first = len(stops_of(machine))
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))
@@ -387,8 +390,7 @@ def _check_mass(whose: str, coordinate: Coordinate, s: Scalar, state: State) -> 
     """**Raises:** `TypeError` unless a mass is one number, or a function that returns one."""
     mass = coordinate.mass
     if callable(mass):
-        with in_words_of(whose):
-            mass = jax.eval_shape(lambda: jnp.asarray(coordinate.mass_at(s, state)))
+        mass = _traced(whose, lambda: jnp.asarray(coordinate.mass_at(s, state)))
     kind = getattr(mass, "dtype", None) or jnp.result_type(type(mass))
     if jnp.shape(mass) or not jnp.issubdtype(kind, jnp.number):
         raise TypeError(
@@ -407,26 +409,23 @@ def _check_event(
     whose = f"{what} {i} ({event.name or type(event).__name__}) of a {name}"
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates)
     _, own, more = event_of(machine, number, modes, contact)
-    with in_words_of(f"`guard` of {whose}"):
-        guard = jax.eval_shape(lambda: event.guard(machine, s, state, *modes[own], **more))
+    around = machine, s, state, *modes[own]
+    guard = _traced(f"`guard` of {whose}", lambda: event.guard(*around, **more))
     if not _is_number(guard):
         raise TypeError(
             f"`guard` of {whose} must return one floating-point number, but returned "
             f"{in_short(guard)}."
         )
-    with in_words_of(f"`when` of {whose}"):
-        when = jax.eval_shape(lambda: event.happens(machine, s, state, *modes[own]))
+    when = _traced(f"`when` of {whose}", lambda: event.happens(*around))
     if when is not None and (jnp.shape(when) or not jnp.issubdtype(when.dtype, bool)):
         raise TypeError(
             f"`when` of {whose} must return a flag, but returned {in_short(when)}. Compare it with "
             "a number: `state.V > 0`."
         )
     if isinstance(event, Reset):  # its modes are asked for in the state after it
-        with in_words_of(f"`reset` of {whose}"):
-            new = eqx.filter_eval_shape(lambda: event.jump(machine, s, state, *modes))
+        new = _traced(f"`reset` of {whose}", lambda: event.jump(machine, s, state, *modes))
         _check_state(f"The state after {whose}", state, new)
-    with in_words_of(f"`after` of {whose}"):
-        found = eqx.filter_eval_shape(lambda: event.after(machine, s, state, *modes[own], **more))
+    found = _traced(f"`after` of {whose}", lambda: event.after(*around, **more))
     if type(found) is not tuple or len(found) != 2:
         raise TypeError(
             f"`after` of {whose} must return the state and the modes afterwards, but returned "

@@ -100,7 +100,6 @@ def planned(
         parts=parts,
         motion=motion,
         log=options.impact_log,
-        log_switches=options.log_switches,
         events=options.event_log,
         averages=averages,
         rests=(may_rest(machine) if rests is None else rests) and bool(stops_of(machine)),

@@ -14,7 +14,6 @@ from .methods import MethodLike, chosen
 _NUMBERS = ["settle", "method", "begin", "until", "stop"]
 _FIXED = [
     "clock", "samples", "impact_log", "event_log", "record", "rests", "max_impacts", "max_steps",
-    "log_switches",
 ]  # fmt: skip
 
 
@@ -45,8 +44,6 @@ class RunOptions:
     stop: Any = None
     """Ends a lane early, at a record point: `stop(machine, state, record, first)`, a flag, or
     `None` where it cannot tell; `first`, whether recording begins there. A pytree."""
-    log_switches: bool = False
-    """Whether the log of impacts lists switches too, as stops beyond the last."""
 
     def checked(self, machine: AbstractMachine | None) -> "RunOptions":
         """The same options once each is known to be one, with the method that they choose.

@@ -4,6 +4,7 @@ import dataclasses
 from math import ceil
 from typing import NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -13,6 +14,7 @@ from .._types import Scalar, State
 from ..flow import (
     AbstractMethod,
     Adaptive,
+    EventKind,
     FixedStep,
     ImplicitSteps,
     MethodLike,
@@ -327,37 +329,40 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
-    """When each cycle of a motion begins, and its impacts and switches, by a simulation."""
-    options = RunOptions(method=orbit.method, impact_log=_LISTED, log_switches=True)
-    plan, start = planned(orbit.machine, orbit.state, int(orbit.cycles), options)
-    log, begins, counts = (np.asarray(a) for a in _listed(plan, start))
-    if counts.max() > _LISTED:
+    """When each cycle of a motion begins, and its impacts, switches and jumps, by a simulation."""
+    machine, cycles = orbit.machine, int(orbit.cycles)
+    options = RunOptions(method=orbit.method, event_log=_LISTED + 1)
+    plan, start = planned(machine, orbit.state, cycles, options)
+    begins, log = jax.device_get(_listed(plan, start))
+    if (log.number[:, _LISTED] >= 0).any():
         raise ValueError(
-            f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has "
-            f"{int(counts.max())}."
+            f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
         )
-    found, events = [], events_of(orbit.machine)
-    for n, (clock, number) in enumerate(zip(log[0], log[1], strict=True)):
-        for s, i in zip(clock[number >= 0], number[number >= 0].astype(int), strict=True):
-            if events[i].ends_cycle:
-                later = (n + 1) % len(log[0])
-                found.append((float(begins[later]), Event(int(i), later)))
+    first = len(stops_of(machine))
+    offsets: dict[int, int] = {EventKind.impact: 0, EventKind.mode: first}
+    offsets[EventKind.reset] = first + len(switches_of(machine))
+    found = []
+    for n in range(cycles):
+        for clock, kind, number in zip(log.phase[n], log.kind[n], log.number[n], strict=True):
+            if int(kind) not in offsets:
+                continue
+            i, later = offsets[int(kind)] + int(number), (n + 1) % cycles
+            if events_of(machine)[i].ends_cycle:
+                found.append((float(begins[later]), Event(i, later)))
             else:
-                found.append((float(begins[n] + s), Event(int(i))))
+                found.append((float(begins[n] + clock), Event(i)))
     return begins, found
 
 
 @compiled
 def _listed(plan, start):
-    """Clock and number of the events of each cycle, when each cycle begins, and their counts."""
+    """When each cycle begins, and the events of each."""
     run = collect(plan, False, *run_lane(plan, start))
-    assert run.impact_log is not None and run.duration is not None
+    assert run.event_log is not None and run.duration is not None
     begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
     if plan.ticks(start):
         begins = jnp.asarray(plan.machine.cycle) * jnp.arange(plan.cycles + 1)
-    events = run.impact_log
-    log = jnp.stack([events.phase, events.stop.astype(events.phase.dtype)])
-    return log, begins, run.impacts
+    return begins, run.event_log
 
 
 @compiled

@@ -7,7 +7,7 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, RigidStop, rubs, stops_of
-from .._lane import Lane, Plan, select, to_event
+from .._lane import Lane, Plan, select, to_event, written
 from ..labelled import EventKind
 
 # By so many roundings a rebound may be faster than the approach: a choice, a few more than the one
@@ -49,10 +49,13 @@ def recorded(
     **Arguments:** `there`, the state in which the stop is met; `hit`, whether it is, by a step that
     is taken; `number`, the stop's; `approach`, V⁻.
     """
-    clock, speed = plan.clock(lane.s, there), lane.record.speed
+    clock, record = plan.clock(lane.s, there), lane.record
+    speed, log, impacts = record.speed, record.log, record.impacts
     if speed is not None:
-        lane = lane.recording(speed=jnp.where(hit, jnp.maximum(speed, approach), speed))
-    lane = lane.counting(hit, clock, approach, number)
+        speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
+    if log is not None:
+        log = written(log, hit, impacts, clock, approach, number)
+    lane = lane.recording(speed=speed, log=log, impacts=impacts + jnp.where(hit, 1.0, 0.0))
     return lane.noting(hit, clock, EventKind.impact, number, approach)
 
 

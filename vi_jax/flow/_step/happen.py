@@ -149,11 +149,6 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
         (kind, listed, value), happens = its_own, happens | here
     clock = plan.clock(lane.s, old)
     lane = lane.noting(taken & happens, clock, kind, listed, value)
-    if plan.log_switches:
-        zero = any_number = jnp.zeros_like(clock)
-        for number, turn in turns.items():
-            any_number = jnp.where(turn, float(number), any_number)
-        lane = lane.counting(taken & happens, clock, zero, any_number)
     lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
     lane = let_go(plan, lane, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)

@@ -133,10 +133,7 @@ class AbstractMethod(eqx.Module):
         self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
     ) -> tuple[State, Integrals, Scalar, list[Stage]]:
         """Return what `step` does, and the stages of the step: states within it, at which guards
-        are evaluated that its ends do not resolve. By default they are steps to three places.
-
-        **Arguments:** as `step`.
-        """
+        are evaluated that its ends do not resolve. By default they are steps to three places."""
         new, beside, error = self.step(smooth, s0, s1, state, beside)
         if not self.holds(smooth.machine):
             return new, beside, error, []

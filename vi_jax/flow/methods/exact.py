@@ -98,10 +98,7 @@ class ExactFlight(AbstractMethod):
         return jnp.minimum(clear(machine, s, state), machine.cycle / self.steps_per_cycle)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
+        """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it."""
         machine = smooth.machine
         if isinstance(machine, LinearMachine | ModalMachine):
             return _linear(smooth, s0, s1, state, beside)

@@ -37,10 +37,7 @@ def _unrolled(solver: object) -> Unrolled:
 
 def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
     """Return what a step of the solver leads to: the state, what is integrated `beside` it, the
-    errors of both, the slopes at the stages, and these.
-
-    **Arguments:** as `AbstractMethod.step`.
-    """
+    errors of both, the slopes at the stages, and these."""
 
     def field(s, y, args):
         state, beside = y
@@ -71,7 +68,15 @@ def _number_or_none(x: Any) -> Any:
     return None if x is None else _number(x)
 
 
-class Adaptive(AbstractMethod):
+class _RungeKutta(AbstractMethod):
+    """A method whose steps have stages."""
+
+    def step(self, smooth, s0, s1, state, beside):
+        """One Runge–Kutta step, and its error."""
+        return self.step_with_stages(smooth, s0, s1, state, beside)[:3]
+
+
+class Adaptive(_RungeKutta):
     """A diffrax Runge–Kutta solver with steps sized by its error estimate.
 
     An implicit one (`diffrax.Kvaerno5()`) is for machines of which a part fades much faster than
@@ -112,10 +117,7 @@ class Adaptive(AbstractMethod):
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     def with_sizes(self, sizes):
-        """With errors judged by these sizes, unless an absolute tolerance is given.
-
-        **Arguments:** as `AbstractMethod.with_sizes`.
-        """
+        """With errors judged by these sizes, unless an absolute tolerance is given."""
         return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
 
     @property
@@ -123,19 +125,9 @@ class Adaptive(AbstractMethod):
         """Not with an implicit solver."""
         return not self.solver.implicit
 
-    def step(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step and its error norm (root mean square over the components of the
-        state and the integrals of averages).
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
-        return self.step_with_stages(smooth, s0, s1, state, beside)[:3]
-
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """`step`, and the stages of the solver.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
+        """One Runge–Kutta step, its error norm (root mean square over the components of the state
+        and the integrals of averages), and its stages."""
         rtol, atol, floor = self._tolerances(s0)
         solver = self.solver
         if solver.implicit:
@@ -164,10 +156,7 @@ class Adaptive(AbstractMethod):
 
     def guard_error(self, stages, values, h, longest, *, acts, size):
         """As the error of a number of the state whose rate is the guard: the impulse of a force
-        that holds a body, say. A guard that does not act needs to be known to 1e-6 only.
-
-        **Arguments:** as `AbstractMethod.guard_error`.
-        """
+        that holds a body, say. A guard that does not act needs to be known to 1e-6 only."""
         rtol, atol, _ = self._tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
@@ -192,7 +181,7 @@ class Adaptive(AbstractMethod):
         return jnp.clip(factor, 0.2, 5.0).astype(error.dtype)
 
 
-class FixedStep(AbstractMethod):
+class FixedStep(_RungeKutta):
     """An explicit diffrax Runge–Kutta solver with a fixed number of steps in a cycle.
 
     Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
@@ -224,24 +213,11 @@ class FixedStep(AbstractMethod):
             )
 
     def may_be_unstable(self, machine, s, state):
-        """True if the fastest decay of the machine is unknown.
-
-        **Arguments:** as `AbstractMethod.may_be_unstable`.
-        """
+        """True if the fastest decay of the machine is unknown."""
         return self.follows_fading and not fading_is_known(machine, s, state)
 
-    def step(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, and whether it is unstable.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
-        return self.step_with_stages(smooth, s0, s1, state, beside)[:3]
-
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """`step`, and the stages of the solver.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
+        """One Runge–Kutta step, whether it is unstable, and its stages."""
         new, after, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
@@ -291,10 +267,7 @@ class ImplicitSteps(FixedStep):
         return False
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, and the stages of the solver; its error is not asked for.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
+        """One Runge–Kutta step, and the stages of the solver; its error is not asked for."""
         solver = Unrolled(self.solver.solver, tolerance=8 * jnp.finfo(s0.dtype).eps)
         new, beside, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))

@@ -168,9 +168,6 @@ class Taylor(AbstractMethod):
         return min((8 * pi / self.steps_per_cycle) ** self.order / factorial(self.order), 0.1)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The sum of the series at `s1`.
-
-        **Arguments:** as `AbstractMethod.step`.
-        """
+        """The sum of the series at `s1`."""
         new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)

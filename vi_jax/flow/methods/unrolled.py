@@ -53,10 +53,7 @@ class Unrolled(diffrax.AbstractSolver):
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        """No hidden state: the first stage is evaluated anew in each step.
-
-        **Arguments:** those of `diffrax`'s `init`, not used.
-        """
+        """No hidden state: the first stage is evaluated anew in each step."""
         return None
 
     def func(self, terms, t0, y0, args):
@@ -64,12 +61,7 @@ class Unrolled(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step over [t0, t1].
-
-        **Arguments:** those of `diffrax`'s `step`; `solver_state` and `made_jump` are not used.
-
-        **Returns:** as `diffrax`'s `step`.
-        """
+        """One step over [t0, t1]."""
         y1, error, slopes, _ = self.step_with_stages(terms, t0, t1, y0, args)
         control = terms.contr(t0, t1)
         stages = [terms.prod(slope, control) for slope in slopes]
@@ -78,10 +70,7 @@ class Unrolled(diffrax.AbstractSolver):
 
     def step_with_stages(self, terms, t0, t1, y0, args):
         """Return the end of a step over [t0, t1], its error, the slope of each stage, and share
-        of the step, t, y and weight in the error of each.
-
-        **Arguments:** as `step`.
-        """
+        of the step, t, y and weight in the error of each."""
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         if self.implicit:
