@@ -114,7 +114,7 @@ def attempt(
     stages, looks = [], looks_within(plan, lane.state)
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
-        stages = foreseen_stages(motion, lane.s, h) if looks else stages
+        stages = foreseen_stages(lane.s, h) if looks else stages
     elif looks:
         there = lane.s, s1, lane.state
         new, beside, error, stages = method.step_with_stages(smooth, *there, beside)
@@ -132,7 +132,13 @@ def attempt(
         for one, body in zip(alone, machine.coordinates, strict=True):
             begin = rates(one.field, body.position, lane.s, lane.state)
             ends.append((begin, rates(one.field, body.position, s1, new)))
-    seen = within(plan, lane, alone, ends, stages, h)
+
+    def at(share: Scalar) -> State:
+        if motion is not None:
+            return motion.at(share * h)[0]
+        return method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
+
+    seen = within(plan, lane, alone, ends, stages, at, h)
     of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))

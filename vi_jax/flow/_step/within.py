@@ -21,7 +21,7 @@ from ..._types import Flag, Scalar, State
 from ...machine import AbstractMachine, RigidStop, events_of, sides_of, stops_of
 from .._lane import Lane, Plan, any_of
 from ..events import Rates, rates
-from ..methods import Foreseen, Stage
+from ..methods import Stage
 from ..smooth import SmoothMachine, exact, is_affine
 
 # Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
@@ -67,9 +67,9 @@ def events_looked_at(plan: Plan, state: State) -> list[int]:
     return [*stops, *others]
 
 
-def foreseen_stages(motion: Foreseen, s: Scalar, h: Scalar) -> list[Stage]:
+def foreseen_stages(s: Scalar, h: Scalar) -> list[Stage]:
     """Places within a step of a motion that is known beforehand."""
-    return [Stage(share, s + share * h, motion.at(share * h)[0]) for share in _SHARES]
+    return [Stage(share, s + share * h, None) for share in _SHARES]
 
 
 def guards_error(
@@ -102,12 +102,13 @@ def apart(stages: list[Stage]) -> list[Stage]:
 
 def within(
     plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], ends: list[tuple[Rates, Rates]],
-    stages: list[Stage], h: Scalar,
+    stages: list[Stage], at: Callable[[Scalar], State], h: Scalar,
 ) -> Within:  # fmt: skip
     """Return the guards at the stages of a step.
 
     **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
-    `ends`, its rates where the step begins and ends; `h`, the length of the step.
+    `ends`, its rates where the step begins and ends; `at(share)`, the state at a share of the step,
+    asked for where the stages have none; `h`, the length of the step.
     """
     if not stages:
         return Within({}, {}, {})
@@ -119,7 +120,9 @@ def within(
     def moves(k: int, s: Scalar, state: State) -> Rates:
         return rates(alone[k].field, machine.coordinates[k].position, s, state)
 
-    slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
+    slow = {k: jnp.zeros((), bool) for k in limited}
+    if not plan.method.resolves(machine):
+        slow = {k: _is_slow(plan, lane, k, stop_gradient(ends[k]), h) for k in limited}
 
     def pulls(s: Scalar, state: State) -> dict[int, Scalar]:
         found = {}
@@ -138,13 +141,19 @@ def within(
                 found[number] = sides_of(machine, number, s, state, *around)
         return found
 
-    places = stop_gradient([(x.s, x.state) for x in stages])
-    places = jtu.tree_map(lambda *x: jnp.stack(x), *places)
+    known = stages[0].state is not None
+    places = [(x.s, x.state if known else jnp.asarray(x.share, h.dtype)) for x in stages]
+    places = jtu.tree_map(lambda *x: jnp.stack(x), *stop_gradient(places))
+
+    def seen(function: Callable[..., Any]) -> Callable[[tuple], Any]:
+        there = function if known else lambda s, share: function(s, at(share))
+        return functools.partial(for_each, there)
+
     forces = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
     if limited:
         asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
-        forces = jax.lax.cond(asked, lambda x: for_each(pulls, x), lambda _: forces, places)
-    return Within(forces, for_each(guards, places) if looked_at else {}, slow)
+        forces = jax.lax.cond(asked, seen(pulls), lambda _: forces, places)
+    return Within(forces, seen(guards)(places) if looked_at else {}, slow)
 
 
 def for_each(function: Callable[..., Any], given: tuple) -> Any:

@@ -43,7 +43,8 @@ class Stage(NamedTuple):
     share: float
     """Of the step; static."""
     s: Scalar
-    state: State
+    state: State | None
+    """`None` of a method that can tell it by another step, where it is asked for."""
     weight: float = 0.0
     """Of the stage in the error estimate of the step; static, 0 of a method that has none."""
 
@@ -81,6 +82,11 @@ class AbstractMethod(eqx.Module):
         """Whether a step holds the bodies that rest, as one does that evaluates the field; else the
         whole state stays as it is while a body rests."""
         return True
+
+    def resolves(self, machine: AbstractMachine) -> bool:
+        """Whether steps are so short that a free body cannot turn twice in one without being seen;
+        static."""
+        return False
 
     def check(self, machine: AbstractMachine) -> None:
         """Raise a `ValueError` if this method cannot move `machine`."""
@@ -133,15 +139,11 @@ class AbstractMethod(eqx.Module):
         self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
     ) -> tuple[State, Integrals, Scalar, list[Stage]]:
         """Return what `step` does, and the stages of the step: states within it, at which guards
-        are evaluated that its ends do not resolve. By default they are steps to three places."""
+        are evaluated that its ends do not resolve. By default they are three places to step to."""
         new, beside, error = self.step(smooth, s0, s1, state, beside)
         if not self.holds(smooth.machine):
             return new, beside, error, []
-        stages = []
-        for share in QUARTERS:
-            s = s0 + share * (s1 - s0)
-            stages.append(Stage(share, s, self.step(smooth, s0, s, state, {})[0]))
-        return new, beside, error, stages
+        return new, beside, error, [Stage(x, s0 + x * (s1 - s0), None) for x in QUARTERS]
 
     def guard_error(
         self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool,
