@@ -92,3 +92,9 @@ def test_a_branch_and_a_table_keep_the_modes(orbit):
     np.testing.assert_allclose(run.last.Y, there.state.Y, atol=1e-8)
     kept = run.to_xarray(along="section").section_mode_0
     np.testing.assert_array_equal(kept, run.modes[0])
+
+
+def test_kicks_are_refused_where_a_state_does_not_tell_its_modes(orbit):
+    """The modes of a start were those in which a motion begins, whatever the orbit's were."""
+    with pytest.raises(ValueError, match="must have modes that follow from its state"):
+        vi.minimal_kick(orbit.machine, orbit, progress=False)

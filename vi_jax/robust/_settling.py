@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -21,9 +22,11 @@ from ..machine import (
     angles_in,
     bare,
     begin_modes,
+    begun,
     field_in,
     in_rows,
     is_autonomous,
+    modes_of,
     nearest_images,
 )
 from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit, unit_of
@@ -130,9 +133,15 @@ class Settling:
     def _advanced(
         self, rows: Rows, cycles: int, wanted: Bool[np.ndarray, " lanes"], begin: float
     ) -> list[np.ndarray]:
-        """States so many cycles later, whether they got there, and whether they were no starts."""
+        """States so many cycles later, whether they got there, and whether they were no starts.
+
+        **Raises:** `ValueError` where the machine is in other modes then than a motion that begins
+        there, since states alone are told apart.
+        """
         numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
-        return [np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers)]
+        *found, other = (np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers))
+        _refuse_other_modes(other)
+        return found
 
     def carried(self, rows: Rows, cycles: int) -> Rows:
         """States so many cycles later; NaN for a start that does not get there."""
@@ -270,13 +279,14 @@ def settling_on(
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
+    here = adopted(the_map.machine, motion.state if isinstance(motion, Orbit) else motion, name)
+    _refuse_other_modes(_in_other_modes(the_map, jtu.tree_map(lambda x: x[None], here)))
+    like = bare(here)
     if isinstance(motion, Orbit):
         if not bool(one_orbit(name, motion).stable):
             raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
-        like = bare(adopted(the_map.machine, motion.state, name))
         rows = np.asarray(in_rows(motion.sections))[: int(motion.cycles)]
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
-    like = bare(adopted(the_map.machine, motion, name))
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
     if _stands_still(the_map.machine, like):
@@ -316,7 +326,24 @@ def _advanced(
     run = _runs(the_map, like, rows, 1, cycles - 1, begin, wanted)
     last = in_rows(run.sections, 2)[:, -1]
     good = run.successful & jnp.isfinite(last).all(axis=1)
-    return last, good, run.result == RESULTS.bad_start
+    other = wanted & good & _in_other_modes(the_map, jax.vmap(lambda run: run.last)(run))
+    return last, good, run.result == RESULTS.bad_start, other
+
+
+def _in_other_modes(the_map: CycleMap, states: State) -> Any:
+    """Whether the machine is in other modes of its own in some states than a motion that begins
+    there."""
+    modes, new = modes_of(states) or (), modes_of(begun(the_map.machine, bare(states), 1)) or ()
+    pairs = zip(modes, new, strict=True) if modes else ()
+    return sum((one != other for one, other in pairs), start=jnp.zeros((), bool))
+
+
+def _refuse_other_modes(other: Any) -> None:
+    if np.any(other):
+        raise ValueError(
+            "Argument `machine` must have modes that follow from its state on the section (see "
+            "`AbstractMachine.modes`), but a motion comes to it in other modes than one begins in."
+        )
 
 
 def _runs(
