@@ -103,3 +103,35 @@ def test_what_repeats_and_what_spirals_in():
     # Steps of a tolerance wander within it, which hides a split as small.
     assert period(100 * noise, wander=1e-5) == 1 and period(split, wander=1e-8) == 1
     assert period(noise, tolerance=1e-8) == none
+
+
+class Small(vi.AbstractMachine):
+    """A well, or two beside each other, in a unit of length."""
+
+    length: float
+    steep: float = 1.0
+    damping: float = 0.3
+    cycle = 2 * np.pi / 0.77
+
+    def field(self, s, x):
+        y = x.x / self.length
+        pull = 0.1 * jnp.cos(0.77 * s) + self.steep * (y - y**3) - (1 - self.steep) * y
+        return vi.State(x=x.v, v=self.length * pull - self.damping * x.v)
+
+    def start(self):
+        return vi.State(x=0.3 * self.length, v=0.0 * self.length)
+
+
+def test_small_motions_are_compared_by_their_own_size():
+    """In any unit of length two frequencies do not repeat, and two wells are two motions."""
+    lengths, options = [1.0, 1e-6, 1e-9], {"settle": 60, "progress": False}
+    data = vi.scan(
+        Small(1.0, 0.0, 0.0), {"length": lengths}, measure=vi.Regime(longest=8), **options
+    )
+    assert data.period.values.tolist() == [vi.REGIMES.unsettled] * 3
+    for length in lengths:
+        swept = vi.sweep(Small(length, 0.0, 0.0), "damping", [0.0], cycles=16, **options)
+        assert swept.period.tolist() == [vi.REGIMES.unsettled]
+        region = {"start.x": (-length, length)}
+        found = vi.basins(Small(length), region, resolution=4, longest=2, **options)
+        assert len(found.attractors) == 2

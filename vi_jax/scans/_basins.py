@@ -1,11 +1,11 @@
 """`basins`: which start goes to which motion, the motions found on the way."""
 
 import difflib
-import functools
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -53,7 +53,7 @@ from ._scan import LanesFailed, scan
 from ._shaken import START
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
-from .regime import CODES, REGIMES, flags
+from .regime import CODES, REGIMES, flags, size_of
 
 _BEYOND = REASON_NAMES.index("bad_start")
 
@@ -137,12 +137,7 @@ class Basins(NamedTuple):
         **Raises:** `ValueError` if the starts lie on no grid, or for scales of other components.
         """
         label, there, names = self._grid()
-        given = {} if scales is None else dict(scales)
-        for name, scale in given.items():
-            if name not in names:
-                raise ValueError(f"Argument `scales` must name {names}, but names {name!r}.")
-            given_number("scales", scale, low=0.0, open_low=True)
-        scale = np.array([float(given.get(name, 1.0)) for name in names])
+        scale = scales_along(names, scales)
         at_stop = self.data["label"].attrs.get("at_stop", ())
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
         centres = [np.asarray(self.data[name], float) for name in names]
@@ -250,6 +245,16 @@ class Basins(NamedTuple):
         return summary_table(str(self))
 
 
+def scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np.ndarray:
+    """What counts as distance 1 along these axes. **Raises:** as `Basins.integrity`."""
+    given = {} if scales is None else dict(scales)
+    for name, scale in given.items():
+        if name not in names:
+            raise ValueError(f"Argument `scales` must name {list(names)}, but names {name!r}.")
+        given_number("scales", scale, low=0.0, open_low=True)
+    return np.array([float(given.get(name, 1.0)) for name in names])
+
+
 # Options of `scan` that verbs which scan starts set themselves.
 _SET = {"measure", "paired", "cycles", "derivatives", "axes"}
 
@@ -307,8 +312,8 @@ def basins(
       for fractions with a standard error.
     - `settle`: drive cycles before the motion is judged.
     - `longest`, `tolerance`: as in `Regime`.
-    - `apart`: section states farther apart than this (relative to 1 + |state|) belong to different
-      motions.
+    - `apart`: section states farther apart than this belong to different motions; relative to
+      1 + |state|, or as in `Regime` if the motions are small.
     - `method`, `start`, `progress`, and further options: as for `scan` (`store` to interrupt and
       resume).
 
@@ -327,7 +332,7 @@ def basins(
         paired=samples is not None, progress=progress, **options,
     )  # fmt: skip
     begin = machine.start() if start is None else start
-    kept = functools.partial(ScanInterrupted, data, options.get("store"))
+    kept = partial(ScanInterrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
         return sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)
 
@@ -358,7 +363,9 @@ def sorted_out(
             [np.asarray(x)[1 : cycles + 1] for x in components(run.sections, 1).values()], axis=1
         )
 
-    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin))
+    starts = [data[name].values for name in data.coords if str(name).startswith(START)]
+    size = partial(size_of, machine, begin, starts)
+    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), size)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
@@ -500,12 +507,14 @@ def _labelled(
     apart: float,
     followed: Callable[[np.ndarray, int], np.ndarray],
     angles: np.ndarray | None,
+    size: Callable[[np.ndarray], Any],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """A label for each lane, and the section states (period, components) of each motion, that of
     the most lanes first.
 
     **Arguments:** what the scan found; the names of a state's components; how far states of one
-    motion may differ; what gives the section states of a motion from one of them and its period.
+    motion may differ; what gives the section states of a motion from one of them and its period;
+    which of the components are angles; the size of motions that have these states.
     """
     period = np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
@@ -514,7 +523,8 @@ def _labelled(
     if not settled.size:
         return label, []
     # Lanes on one motion fall into few cells; what is found for one of them holds for all.
-    cells = np.floor(states[settled] / apart).astype(np.int64)
+    unit = float(size(states[settled]))
+    cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     motions: list[np.ndarray] = []
@@ -523,7 +533,7 @@ def _labelled(
         p, state = int(period[lane]), states[lane]
         for j, motion in enumerate(motions):
             near = nearest_images(angles, motion, state)
-            if len(motion) == p and distance(near, state).min() <= apart:
+            if len(motion) == p and distance(near, state, unit).min() <= apart:
                 of_cell[i] = j
                 break
         else:

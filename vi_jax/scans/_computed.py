@@ -118,7 +118,7 @@ def computed(
         data = kept.data()
         for name in blocks.axes:
             data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
-        data.attrs = attributes_of(description, program.first(blocks)[0])
+        data.attrs = attributes_of(description, program.at(blocks, 0)[0])
         return data
 
     with contextlib.closing(kept):

@@ -33,23 +33,15 @@ def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     def described(tree: object) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
-    machine: dict[str, Any]
-    if program.machine is not None:
-        machine = {
-            name: _described(leaf(program.machine, name)) for name in leaf_names(program.machine)
-        }
-        machine["structure"] = _lasting(str(jtu.tree_structure(program.machine)))
-    else:  # a function is known by what it makes
+    machine: dict[str, Any] = {}
+    parts = {"": program.machine}
+    if program.machine is None:  # a function is known by what it makes
         machine = {"made by": _lasting(getattr(program.build, "__qualname__", repr(program.build)))}
-        for name, place in (("first", 0), ("last", -1)):
-            made, _ = program.lane(_lane(blocks, place))
-            machine |= {
-                f"{name} {leaf_}": _described(leaf(made, leaf_)) for leaf_ in leaf_names(made)
-            }
-            machine[f"{name} structure"] = _lasting(str(jtu.tree_structure(made)))
-    start: Any = "the machine's own"
-    if program.start is not None:
-        start = {name: _described(leaf(program.start, name)) for name in leaf_names(program.start)}
+        parts = {"first ": program.at(blocks, 0)[0], "last ": program.at(blocks, -1)[0]}
+    for which, part in parts.items():
+        machine |= {which + name: x for name, x in _numbers(part).items()}
+        machine[f"{which}structure"] = _lasting(str(jtu.tree_structure(part)))
+    start = "the machine's own" if program.start is None else _numbers(program.start)
     about: dict[str, Any] = {
         "machine": machine,
         "start": start,
@@ -83,10 +75,6 @@ def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
 def _lasting(text: str) -> str:
     """Without addresses in memory, which are others in each process."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
-
-
-def _lane(blocks: Blocks, place: int) -> dict[str, Any]:
-    return {name: jnp.asarray(x[place]) for name, x in blocks.axes.items()}
 
 
 def _codes(program: ScanProgram) -> dict[str, str]:
@@ -190,8 +178,8 @@ def _members(kind: type) -> Iterator[Any]:
             yield from (name, value)
 
 
-def _described(x: object) -> Any:
-    return np.asarray(x, float).tolist()
+def _numbers(tree: Any) -> dict[str, Any]:
+    return {name: np.asarray(leaf(tree, name), float).tolist() for name in leaf_names(tree)}
 
 
 def attributes_of(about: dict[str, Any], machine: AbstractMachine) -> dict[str, Any]:
@@ -220,7 +208,7 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
             **flags({"not_computed": NOT_COMPUTED} | {n: i for i, n in enumerate(REASON_NAMES)}),
         }
     }
-    machine, start = program.first(blocks)
+    machine, start = program.at(blocks, 0)
     if outcomes_of(machine):
         outcomes = {name: i for i, name in enumerate(outcomes_of(machine))}
         known["outcome"] = {
@@ -261,4 +249,4 @@ def unit_on_axis(program: ScanProgram, blocks: Blocks, name: str) -> str:
         return ""
     if program.build is not None and not name.startswith(START):
         return ""
-    return unit_of(program.first(blocks)[0].units, name)
+    return unit_of(program.at(blocks, 0)[0].units, name)

@@ -12,7 +12,16 @@ from .._messages import at_work, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
-from ._basins import Attractor, Basins, Integrity, check_options, followed, sorted_out, starts_in
+from ._basins import (
+    Attractor,
+    Basins,
+    Integrity,
+    check_options,
+    followed,
+    scales_along,
+    sorted_out,
+    starts_in,
+)
 from ._computed import ScanInterrupted
 from ._shaken import START
 from .grid import axes_of
@@ -165,7 +174,9 @@ def integrity_profile(
     given_number("apart", apart, low=0.0, open_low=True)
     row = np.unique(axes_of({parameter: values}, "values")[parameter])
     axes = starts_in(region, resolution, None, 0)
-    _check_scales(axes, scales)
+    for x in axes.values():
+        count("resolution", x.size, least=2)
+    scales_along([*axes], scales)
     method = chosen(machine, method)
     data = followed(
         machine, {parameter: row, **axes}, longest, tolerance, start=start, settle=settle,
@@ -183,17 +194,6 @@ def integrity_profile(
             integrity.append(one.integrity(scales=scales))
             tell(1)
     return _profile(parameter, row, axes, found, integrity)
-
-
-def _check_scales(axes: Mapping[str, np.ndarray], scales: Mapping[str, float] | None) -> None:
-    """**Raises:** `ValueError` or `TypeError` for what cannot be measured on this grid, before any
-    work is done."""
-    for x in axes.values():
-        count("resolution", x.size, least=2)
-    for name, scale in ({} if scales is None else dict(scales)).items():
-        if name not in axes:
-            raise ValueError(f"Argument `scales` must name {list(axes)}, but names {name!r}.")
-        given_number("scales", scale, low=0.0, open_low=True)
 
 
 def _profile(

@@ -55,7 +55,7 @@ from ..machine import (
 )
 from ._shaken import Shaken, shaken_by
 from .grid import LANE
-from .regime import CODES, REGIMES, flags, impacts_of, least_period
+from .regime import CODES, REGIMES, flags, impacts_of, least_period, size_of
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|:
 # choices.
@@ -270,10 +270,8 @@ def sweep(
     shaken = shaken_by(noise, key, (), (), ())
     if shaken is not None:
         check_noise(machine, bare(start), noise)
-    options = (settle, cycles, method, rests, tolerance, max_steps, shaken)
-    if not is_outermost(machine, values, start, tolerance, shaken):
-        return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
-    if values.size <= _AT_ONCE:
+    options = (settle, cycles, method, rests, tolerance, max_steps, shaken, bare(start))
+    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, tolerance, shaken):
         return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
     # All by one program: the last part is filled up by what ends at once.
     size, missing = values.size, -values.size % _AT_ONCE
@@ -329,11 +327,13 @@ def taken_along(machine: AbstractMachine, state: State) -> State:
 
 @compiled
 def _sweep(
-    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps, shaken
-) -> tuple[State, Sweep]:
+    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps, shaken,
+    first,
+) -> tuple[State, Sweep]:  # fmt: skip
     """The state after the last value, and what was found at each.
 
-    **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it.
+    **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it; `first`, the state
+    at the first value of all.
     """
 
     def one(state, value):
@@ -353,7 +353,7 @@ def _sweep(
         assert run.impact_speed is not None and run.duration is not None
         period = least_period(
             sections, run.impacts, longest=cycles // 2, tolerance=tolerance, wander=method.wander,
-            angles=angles_in(here, bare(state)),
+            size=size_of(here, first, sections), angles=angles_in(here, bare(state)),
         )  # fmt: skip
         impacts = impacts_of(run.impacts.astype(value.dtype), period)
         return onward, Sweep(

@@ -89,11 +89,6 @@ class Blocks:
             for c, part, size in zip(corner, self.block, self.shape, strict=True)
         )
 
-    def index(self, where: tuple[slice, ...]) -> int:
-        """The number of the block that lies there."""
-        corner = [part.start // size for part, size in zip(where, self.block, strict=True)]
-        return int(np.ravel_multi_index(corner, self.counts))
-
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of the block's lanes, and their numbers as `LANE`."""
         beside = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}

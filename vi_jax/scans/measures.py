@@ -2,8 +2,9 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, ClassVar
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,9 +14,17 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._types import Flag, State
 from ..flow import AbstractMethod, Run
-from ..machine import AbstractMachine, angles_in, by_default, by_name, components, frequency_ratio
+from ..machine import (
+    AbstractMachine,
+    angles_in,
+    bare,
+    by_default,
+    by_name,
+    components,
+    frequency_ratio,
+)
 from ._lyapunov import lyapunov
-from .regime import CODES, REGIMES, flags, impacts_of, least_period
+from .regime import CODES, REGIMES, flags, impacts_of, least_period, size_of
 
 Numbers = dict[str, Array]
 About = Mapping[str, Mapping[str, Any]]
@@ -55,6 +64,10 @@ class AbstractMeasure(eqx.Module):
         """This measure for motions that are carried by a method; itself, if it is no matter how."""
         return self
 
+    def begun(self, start: State) -> "AbstractMeasure":
+        """This measure for a motion that begins in `start`; itself, if it is no matter where."""
+        return self
+
     @abc.abstractmethod
     def __call__(self, machine: AbstractMachine, run: Run) -> Numbers:
         """Named numbers (or short arrays) of one lane."""
@@ -86,50 +99,74 @@ class AbstractMeasure(eqx.Module):
         return {}
 
 
-class Extremes(AbstractMeasure):
-    """`y_min`, `y_max` and the greatest impact speed `impact_speed` over the cycles observed."""
+class _Kind(NamedTuple):
+    """What a measure is that scans know by its name."""
 
-    attributes: ClassVar[About] = {
-        "y_min": {"unit_of": "position", "long_name": "smallest position"},
-        "y_max": {"unit_of": "position", "long_name": "greatest position"},
-        "impact_speed": {"unit_of": "velocity", "long_name": "greatest V⁻"},
-    }
+    record: str
+    attributes: About
+    numbers: Callable[[AbstractMachine, Any], Numbers]
 
-    def __call__(self, machine, run):
-        """Extremes and the greatest speed of approach of one lane."""
-        assert run.y_min is not None and run.y_max is not None and run.impact_speed is not None
-        return {
+
+def _frequency_ratio(machine: AbstractMachine, run: Any) -> Numbers:
+    ratio = frequency_ratio(machine, jnp.mean(run.duration))
+    if ratio is None:
+        raise ValueError("Measure `frequency_ratio` needs a machine that is driven.")
+    return {"frequency_ratio": ratio}
+
+
+_KINDS = {
+    "extremes": _Kind(
+        "motion",
+        {
+            "y_min": {"unit_of": "position", "long_name": "smallest position"},
+            "y_max": {"unit_of": "position", "long_name": "greatest position"},
+            "impact_speed": {"unit_of": "velocity", "long_name": "greatest V⁻"},
+        },
+        lambda machine, run: {
             "y_min": jnp.min(run.y_min),
             "y_max": jnp.max(run.y_max),
             "impact_speed": jnp.max(run.impact_speed),
-        }
+        },
+    ),
+    "frequency_ratio": _Kind(
+        "motion",
+        {"frequency_ratio": {"unit_of": "frequency_ratio", "long_name": "mean speed of the drive"}},
+        _frequency_ratio,
+    ),
+    "power": _Kind(
+        "motion",
+        {"power": {"unit_of": "power", "long_name": "mean impact power"}},
+        lambda machine, run: {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)},
+    ),
+    "impact_rate": _Kind(
+        "sections",
+        {"impact_rate": {"units": "1/cycle", "long_name": "impacts per drive cycle"}},
+        lambda machine, run: {"impact_rate": jnp.mean(run.impacts.astype(_dtype(run)))},
+    ),
+    "steps": _Kind(
+        "sections",
+        {"steps": {"long_name": "steps tried"}, "rejected": {"long_name": "steps rejected"}},
+        lambda machine, run: {"steps": run.steps, "rejected": run.rejected},
+    ),
+}
 
 
-class FrequencyRatio(AbstractMeasure):
-    """`frequency_ratio`, the mean crank speed over the cycles observed."""
+class Usual(AbstractMeasure):
+    """Numbers that a run has of its cycles: extremes, mean speed of the drive, mean power of the
+    impacts, impacts in a cycle, steps tried and rejected."""
 
-    attributes: ClassVar[About] = {
-        "frequency_ratio": {"unit_of": "frequency_ratio", "long_name": "mean speed of the drive"}
-    }
+    name: str = eqx.field(static=True)
+
+    @property
+    def record(self):  # pyright: ignore
+        """As the numbers need it."""
+        return _KINDS[self.name].record
+
+    def described(self, start):
+        return _KINDS[self.name].attributes
 
     def __call__(self, machine, run):
-        """The mean of one lane. **Raises:** `ValueError` for a machine without a drive."""
-        assert run.duration is not None
-        ratio = frequency_ratio(machine, jnp.mean(run.duration))
-        if ratio is None:
-            raise ValueError("Measure `frequency_ratio` needs a machine that is driven.")
-        return {"frequency_ratio": ratio}
-
-
-class Power(AbstractMeasure):
-    """`power`, the mean rate at which impacts take up energy."""
-
-    attributes: ClassVar[About] = {"power": {"unit_of": "power", "long_name": "mean impact power"}}
-
-    def __call__(self, machine, run):
-        """Energy lost in impacts over the time that one lane took."""
-        assert run.duration is not None and run.impact_energy is not None
-        return {"power": jnp.sum(run.impact_energy) / jnp.sum(run.duration)}
+        return _KINDS[self.name].numbers(machine, run)
 
 
 class Average(AbstractMeasure):
@@ -179,33 +216,6 @@ class Sections(AbstractMeasure):
         return {name: x[-self.number :] for name, x in components(run.sections, 1).items()}
 
 
-class ImpactRate(AbstractMeasure):
-    """`impact_rate`, the impacts in a drive cycle, on average over the cycles observed."""
-
-    record = "sections"
-    attributes: ClassVar[About] = {
-        "impact_rate": {"units": "1/cycle", "long_name": "impacts per drive cycle"}
-    }
-
-    def __call__(self, machine, run):
-        """Impacts a cycle of one lane."""
-        return {"impact_rate": jnp.mean(run.impacts.astype(_dtype(run)))}
-
-
-class Steps(AbstractMeasure):
-    """`steps` and `rejected`, the steps tried and those rejected on their error estimate."""
-
-    record = "sections"
-    attributes: ClassVar[About] = {
-        "steps": {"long_name": "steps tried"},
-        "rejected": {"long_name": "steps rejected"},
-    }
-
-    def __call__(self, machine, run):
-        """Steps tried and rejected in the cycles of one lane."""
-        return {"steps": run.steps, "rejected": run.rejected}
-
-
 class Exponent(AbstractMeasure):
     """`exponent`, the greatest Lyapunov exponent, over `observed` further drive cycles."""
 
@@ -227,10 +237,7 @@ class Exponent(AbstractMeasure):
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """The exponent of one lane.
-
-        **Arguments:** as `AbstractMeasure.refine`.
-        """
+        """The exponent of one lane."""
         found_out = lyapunov(
             machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
@@ -242,12 +249,14 @@ class Regime(AbstractMeasure):
 
     A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`
     (relative to 1 + |state|; by default 1e-6, or ten tolerances of a method that sizes its steps by
-    one) with as many impacts in each cycle; see `least_period` for one that still spirals in. Other
-    motions are observed for another `observed` cycles. Unless its greatest Lyapunov exponent
-    exceeds `threshold` there (in the machine's own unit of rates), a motion is unsettled or
-    quasi-periodic. If it does, the motion is continued for `lasting` cycles and observed once more:
-    it is chaotic if its exponent exceeds `threshold` again, else transiently chaotic: it has
-    settled meanwhile, or is about to. `REGIMES` has the numbers that stand for these in `period`.
+    one) with as many impacts in each cycle; see `least_period` for one that still spirals in. If
+    all numbers of start and sections are below 0.01, the largest of them takes the place of the 1
+    (a machine in SI units). Other motions are observed for another `observed` cycles. Unless its
+    greatest Lyapunov exponent exceeds `threshold` there (in the machine's own unit of rates), a
+    motion is unsettled or quasi-periodic. If it does, the motion is continued for `lasting` cycles
+    and observed once more: it is chaotic if its exponent exceeds `threshold` again, else
+    transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers that
+    stand for these in `period`.
 
     While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
     off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
@@ -261,6 +270,8 @@ class Regime(AbstractMeasure):
     lasting: int = eqx.field(static=True, default=4000)
     wander: Any = eqx.field(default=0.0, kw_only=True)
     """What sections wander by under the method; a scan puts its own method's here."""
+    start: Any = eqx.field(default=(), kw_only=True)
+    """Where the motion begins, by which its size is judged; a scan puts each lane's here."""
     record = "sections"
     attributes: ClassVar[About] = {
         "period": {"units": "cycles", "long_name": "least period", **flags(CODES)},
@@ -283,6 +294,10 @@ class Regime(AbstractMeasure):
         method."""
         return dataclasses.replace(self, wander=method.wander)
 
+    def begun(self, start):
+        """The measure, knowing how large the motion was."""
+        return dataclasses.replace(self, start=bare(start))
+
     @property
     def cycles(self):
         """Twice the longest period, so that each is seen to repeat."""
@@ -299,7 +314,7 @@ class Regime(AbstractMeasure):
         angles = angles_in(machine, jtu.tree_map(lambda x: x[0], run.sections))
         period = least_period(
             sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
-            wander=self.wander, angles=angles,
+            wander=self.wander, size=size_of(machine, self.start, sections), angles=angles,
         )  # fmt: skip
         return {
             "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),
@@ -313,10 +328,7 @@ class Regime(AbstractMeasure):
         )
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Chaotic or not; at the second pass, still or not.
-
-        **Arguments:** as `AbstractMeasure.refine`.
-        """
+        """Chaotic or not; at the second pass, still or not."""
         settle = pass_number * (self.observed + self.lasting)
         out = lyapunov(
             machine, state, self.observed, settle=settle, number=1, method=method, rests=rests
@@ -329,3 +341,11 @@ class Regime(AbstractMeasure):
         return {
             "period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(found["period"].dtype)
         }
+
+
+MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
+    **{name: functools.partial(Usual, name) for name in _KINDS},
+    "regime": Regime,
+    "sections": Sections,
+    "exponent": Exponent,
+}

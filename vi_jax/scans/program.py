@@ -46,19 +46,7 @@ from ..machine import (
 )
 from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
 from .grid import Blocks
-from .measures import (
-    AbstractMeasure,
-    Average,
-    Exponent,
-    Extremes,
-    FrequencyRatio,
-    ImpactRate,
-    Numbers,
-    Power,
-    Regime,
-    Sections,
-    Steps,
-)
+from .measures import MEASURES, AbstractMeasure, Average, Numbers
 from .statistics import Escape
 
 _USUAL = RunOptions()
@@ -122,9 +110,9 @@ class ScanProgram(eqx.Module):
                 start = replaced(start, with_leaf(bare(start), name.removeprefix(START), value))
         return machine, self._nudged(start, START, nudge)
 
-    def first(self, blocks: Blocks) -> tuple[AbstractMachine, State]:
-        """Machine and start of the first lane."""
-        return self.lane({name: jnp.asarray(x[0]) for name, x in blocks.axes.items()})
+    def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
+        """Machine and start of the lane at this place of all axes."""
+        return self.lane({name: jnp.asarray(x[place]) for name, x in blocks.axes.items()})
 
     def _nudged(self, tree: Any, prefix: str, nudge: Array | None) -> Any:
         """`tree` with the numbers moved that derivatives are asked for."""
@@ -173,10 +161,10 @@ class ScanProgram(eqx.Module):
         run = simulate_pool(lane_of, values, self.cycles, options, wanted, noise_of)
 
         def measured(values, run):
-            machine, _ = lane_of(values)
+            machine, start = lane_of(values)
             found = {}
             for measure in self.measures:
-                new = measure(machine, run)
+                new = measure.begun(start)(machine, run)
                 _check_variables(measure, new, [*found, "result"])
                 found |= new
             for name, x in found.items():
@@ -438,18 +426,6 @@ class Custom(AbstractMeasure):
                     f"{name!r} is {value!r}."
                 ) from None
         return numbers
-
-
-MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
-    "extremes": Extremes,
-    "regime": Regime,
-    "frequency_ratio": FrequencyRatio,
-    "power": Power,
-    "impact_rate": ImpactRate,
-    "sections": Sections,
-    "exponent": Exponent,
-    "steps": Steps,
-}
 
 
 def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:

@@ -6,11 +6,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar, State
-from ..machine import in_rows, nearest_images
+from ..machine import AbstractMachine, in_rows, nearest_images, scales_known
+from ..orbit import unit_of
 
 Number = Scalar | float
 
@@ -21,6 +23,10 @@ _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 # The least that sections are held to: so many times what they wander by, and so many roundings.
 # Choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
+
+
+# Motions are small if no number of their states is as large: as the errors of steps are judged.
+_SMALL = 1e-2
 
 
 class REGIMES(IntEnum):
@@ -50,6 +56,15 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
+def size_of(machine: AbstractMachine, *states: Any) -> Scalar | float:
+    """Return what counts as 1 where states of a motion are compared: the largest number in these
+    states if it is small, else 1; 1 for a machine whose numbers are about 1 by definition."""
+    if scales_known(machine):
+        return 1.0
+    size = unit_of(jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(states)]))
+    return jnp.where(size < _SMALL, size, 1.0)
+
+
 def least_period(
     sections: State,
     impacts: Int[Array, " cycles"],
@@ -57,6 +72,7 @@ def least_period(
     longest: int,
     tolerance: Number | None = None,
     wander: Number = 0.0,
+    size: Number = 1.0,
     angles: np.ndarray | None = None,
 ) -> Int[Array, ""]:
     """The fewest drive cycles after which a motion repeats, its impacts too, or
@@ -70,21 +86,22 @@ def least_period(
 
     **Arguments:** section states one after the other, a pytree with leaves (cycles,), more than
     `longest` of them; the impacts of the cycle that ends at each; the longest period looked for;
-    how far sections a period apart may differ (relative to 1 + |state|), by default 1e-6 or, if
-    that is more, ten times what they wander by; what the sections of a motion that repeats wander
-    by under its method (`AbstractMethod.wander`); which of their numbers are angles (`angles_in`).
+    how far sections a period apart may differ (relative to `size` + |state|), by default 1e-6 or,
+    if that is more, ten times what they wander by; what the sections of a motion that repeats
+    wander by under its method (`AbstractMethod.wander`); the size of the motion (`size_of`); which
+    of their numbers are angles (`angles_in`).
     """
     states = in_rows(sections).T
     if tolerance is None:
         tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
     rows = jnp.concatenate([states, impacts[None].astype(states.dtype)])
-    size = states.shape[1] - longest
+    count = states.shape[1] - longest
     last = rows[:, longest:]
     angles = None if angles is None else np.append(angles, False)
-    scale = 1 + jnp.abs(last[:-1])
+    scale = size + jnp.abs(last[:-1])
 
     def compared(_, p):
-        before = jax.lax.dynamic_slice_in_dim(rows, longest - p, size, axis=1)
+        before = jax.lax.dynamic_slice_in_dim(rows, longest - p, count, axis=1)
         now = last if angles is None else nearest_images(angles, last.T, before.T).T
         apart = jnp.abs(now - before)
         return _, jnp.where(jnp.any(apart[-1] > 0), jnp.inf, jnp.max(apart[:-1] / scale))
