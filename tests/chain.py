@@ -1,76 +1,56 @@
-"""A machine of one's own: balls in a row that touch, with or without a wall behind the last."""
+"""Balls in a row that touch, with or without a wall behind the last."""
 
+from itertools import pairwise
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
 
-class Balls(eqx.Module):
-    x: tuple[jax.Array, ...]
-    v: tuple[jax.Array, ...]
-
-
-def balls(x, v):
-    """A state of the chain."""
-    return Balls(*(tuple(jnp.asarray(float(a)) for a in each) for each in (x, v)))
-
-
-class Chain(vi.AbstractMachine):
+class Chain(vi.Mechanical):
     """Balls without size, each to be left of the next, and the last one of a wall; a constant force
     per mass presses them to the right."""
 
     restitution: Any = 1.0
-    masses: tuple[float, ...] = (1.0, 1.0, 1.0)
+    weights: tuple[float, ...] = (1.0, 1.0, 1.0)
     wall: float | None = None
-    force: Any = 0.0
+    pressed: Any = 0.0
     length: Any = 1.0
 
     @property
-    def contacts(self):
-        count = len(self.masses) - 1
-        between = tuple(vi.RigidStop(0.0, self.restitution, coordinate=i) for i in range(count))
-        if self.wall is None:
-            return between
-        return (*between, vi.RigidStop(self.wall, self.restitution, coordinate=count))
+    def q(self):
+        return tuple("abcdef"[: len(self.weights)])
 
     @property
-    def coordinates(self):
-        found = [self._between(i) for i in range(len(self.masses) - 1)]
-        if self.wall is not None:
-            last = vi.Coordinate(
-                lambda z: z.x[-1],
-                lambda z: z.v[-1],
-                lambda z, Y, V: Balls((*z.x[:-1], Y), (*z.v[:-1], V)),
-                self.masses[-1],
-            )
-            found.append(last)
-        return tuple(found)
-
-    def _between(self, i):
-        a, b = self.masses[i : i + 2]
-
-        def placed(z, Y, V):
-            far, fast = Y - (z.x[i] - z.x[i + 1]), V - (z.v[i] - z.v[i + 1])
-            x, v = list(z.x), list(z.v)
-            x[i], x[i + 1] = x[i] + b / (a + b) * far, x[i + 1] - a / (a + b) * far
-            v[i], v[i + 1] = v[i] + b / (a + b) * fast, v[i + 1] - a / (a + b) * fast
-            return Balls(tuple(x), tuple(v))
-
-        def apart(numbers):
-            return numbers[i] - numbers[i + 1]
-
-        return vi.Coordinate(lambda z: apart(z.x), lambda z: apart(z.v), placed, a * b / (a + b))
+    def mass(self):
+        return self.weights
 
     @property
     def cycle(self):
         return self.length
 
-    def field(self, s, z):
-        return Balls(z.v, tuple(self.force + 0 * v for v in z.v))
+    @property
+    def contacts(self):
+        gaps = [lambda q, a=a, b=b: getattr(q, a) - getattr(q, b) for a, b in pairwise(self.q)]
+        stops = [vi.RigidStop(0.0, self.restitution, on=gap) for gap in gaps]
+        if self.wall is not None:
+            stops.append(vi.RigidStop(self.wall, self.restitution, on=self.q[-1]))
+        return tuple(stops)
+
+    def force(self, t, q, v):
+        return dict(zip(self.q, (m * self.pressed for m in self.weights), strict=True))
+
+    def balls(self, x, v):
+        """A state of the chain."""
+        x, v = (dict(zip(self.q, map(float, each), strict=True)) for each in (x, v))
+        return self.at(**x, v=v)
+
+
+def row(z):
+    """The places and the velocities in states of a chain."""
+    return np.array([x for name, x in vars(z).items() if name != "v"]), np.array(
+        [*vars(z.v).values()]
+    )
 
 
 def passed(v, k, masses, wall=False):

@@ -64,6 +64,10 @@ COUNT, REAL = "must be an integer", "must be a real number"
 ROW = "must be one row of finite real numbers"
 CALLS = {
     **{f"settle={x!r}": (simulate(settle=x), f"`settle` {COUNT}") for x in ("3", None, 2.5, True)},
+    "cycles=0": (simulate(cycles=0), "`cycles` must be at least 1, but got 0"),
+    "cycles=2.5": (simulate(cycles=2.5), "`cycles` must be an integer, but got 2.5"),
+    "record='all'": (simulate(record="all"), "`record` must be one of 'motion', 'sections'"),
+    "NaN in a start": (simulate(vi.OscillatorState(np.nan, 0.0)), "must be finite"),
     "settle=[1]": (simulate(settle=[1]), f"`settle` {COUNT}"),
     "settle=10**20": (simulate(settle=10**20), "`settle` must be at most"),
     "settle of lyapunov": (lambda: vi.lyapunov(SCENE, START, 10, settle="3"), f"`settle` {COUNT}"),

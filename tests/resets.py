@@ -7,19 +7,10 @@ import numpy as np
 import vi_jax as vi
 
 
-class Legs(eqx.Module):
-    """Angles of the leg that stands and between both, with their rates."""
-
-    stance: jax.Array
-    turning: jax.Array
-    between: jax.Array
-    swinging: jax.Array
-
-
 def legs(stance, turning):
-    """Just after a heel strike."""
+    """Just after a heel strike: angles of the leg that stands and between both, and their rates."""
     swinging = turning * (1 - jnp.cos(2 * stance))
-    return Legs(*map(jnp.asarray, (stance, turning, 2 * stance, swinging)))
+    return vi.State(stance=stance, turning=turning, between=2 * stance, swinging=swinging)
 
 
 class Walker(vi.AbstractMachine):
@@ -45,7 +36,9 @@ class Walker(vi.AbstractMachine):
     def field(self, s, x):
         falls = jnp.sin(x.stance - self.slope)
         pull = (x.turning**2 - jnp.cos(x.stance - self.slope)) * jnp.sin(x.between)
-        return Legs(x.turning, falls, x.swinging, falls + pull)
+        return dict(
+            stance=x.turning, turning=falls, between=x.swinging, swinging=falls + pull
+        )  # fmt: skip
 
     def position(self, x):
         return x.stance
@@ -57,14 +50,6 @@ class Walker(vi.AbstractMachine):
         return 0.8
 
 
-class Sliding(eqx.Module):
-    """Place and speed of an impactor, and how fast what it drives slides."""
-
-    q: jax.Array
-    v: jax.Array
-    u: jax.Array
-
-
 class StickSlip(vi.AbstractMachine):
     """An impactor drawn by a voltage (COCO's example of impacts with stick and slip, Dankowicz and
     Schilder, Recipes for Continuation, 2013): an impact makes the base slide until friction holds
@@ -72,39 +57,30 @@ class StickSlip(vi.AbstractMachine):
 
     voltage: jax.Array = eqx.field(converter=jnp.asarray)
 
-    @property
-    def cycle(self):
-        return np.pi / 0.92
-
-    @property
-    def events(self):
-        impact = vi.Reset(
+    cycle = np.pi / 0.92
+    events = (
+        vi.Reset(
             lambda machine, s, x, slides: x.q - 0.5,
-            lambda machine, s, x, slides: Sliding(x.q, -0.8 * x.v, 0.3 * x.v),
-            modes=lambda machine, s, x, slides: (1.0,),
+            lambda machine, s, x, slides: dict(v=-0.8 * x.v, u=0.3 * x.v),
+            modes=lambda machine, s, x, slides: 1.0,
             value=lambda machine, s, x, slides: x.v,
             name="impact",
-        )
-        sticks = vi.Reset(
+        ),
+        vi.Reset(
             lambda machine, s, x, slides: jnp.where(slides > 0, -x.u, -1.0),
-            lambda machine, s, x, slides: Sliding(x.q, x.v, jnp.zeros_like(x.u)),
-            modes=lambda machine, s, x, slides: (0.0,),
-        )
-        return impact, sticks
+            lambda machine, s, x, slides: dict(u=0.0),
+            modes=lambda machine, s, x, slides: 0.0,
+        ),
+    )
 
     def modes(self, s, x):
         return (jnp.where(x.u > 0, 1.0, 0.0),)
 
-    def force(self, s, x):
-        drawn = (self.voltage * jnp.sin(0.92 * s) / (1 - x.q)) ** 2
-        return drawn - 0.04 * x.v - x.q
-
     def field(self, s, x, slides):
-        force = self.force(s, x)
+        force = (self.voltage * jnp.sin(0.92 * s) / (1 - x.q)) ** 2 - 0.04 * x.v - x.q
         # While it sticks u is zero: what fades there leaves no neutral component.
-        pulled = jnp.where(slides > 0, 3.17 + 1.2 * force, force)
         braked = jnp.where(slides > 0, -3.17 - 0.2 * force, -x.u)
-        return Sliding(x.v, pulled, braked)
+        return dict(q=x.v, v=force + slides * (3.17 + 0.2 * force), u=braked)
 
     def position(self, x):
         return x.q
@@ -156,32 +132,3 @@ class Excited(vi.AbstractMachine):
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, 0.2 * x.V - x.Y)
-
-
-class Toggled(vi.AbstractMachine):
-    """A body between two walls, drawn to the one that it did not hit last; by time."""
-
-    restitution: jax.Array = eqx.field(default=0.8, converter=jnp.asarray)
-
-    @property
-    def contacts(self):
-        def drawn_away(side):
-            return lambda machine, s, x, pull: (side,)
-
-        return (
-            vi.RigidStop(1.0, self.restitution, modes=drawn_away(-1.0)),
-            vi.RigidStop(1.0, self.restitution, "left", modes=drawn_away(1.0)),
-        )
-
-    @property
-    def cycle(self):
-        return 10.0
-
-    def modes(self, s, x):
-        return (1.0,)
-
-    def field(self, s, x, pull):
-        return vi.OscillatorState(x.V, pull)
-
-    def step_limit(self, s, x):
-        return 0.5

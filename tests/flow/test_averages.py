@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
 
 from shaken_oscillator import Shaken
 
@@ -56,12 +55,14 @@ def test_energy_is_balanced_by_steps(method, close):
     """Through impacts, and through chatter and rest."""
 
     def one(gap):
-        return vi.simulate(Shaken(gap=gap), begin(gap), 12, method=method)
+        return vi.simulate(Shaken(gap=gap), begin(gap), 12, method=method, samples=8)
 
     run = jax.vmap(one)(jnp.array([0.5, -0.3]))
     assert int(run.impacts.sum(axis=1).min()) > 20 and run.rests.sum(axis=1).tolist() == [0, 1]
     left = jax.vmap(unbalanced)(run)
     np.testing.assert_allclose(left, 0.0, atol=close)
+    push = np.cos(np.arange(97) * np.pi / 4)
+    np.testing.assert_allclose(run.samples.quantities["push"], [push, push], atol=1e-12)
 
 
 @pytest.mark.parametrize("gap", [1.3, 0.1], ids=["impacts", "chatter and rest"])
@@ -83,25 +84,6 @@ def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
     assert float(jnp.ptp(run.duration)) > 0.01  # so that the mean of the means is another number
     mean = run.mean_averages()["speed"]
     np.testing.assert_allclose(mean, 8 * 2 * np.pi / run.duration.sum(), rtol=1e-14)
-
-
-def test_beside_scipy_with_samples_between():
-    """The integrals go on from sample to sample."""
-    machine = Shaken(gap=50.0)
-
-    def field(s, x):
-        pace = 1 / 0.8
-        push = np.cos(s) - x[0] - 0.1 * x[1]
-        return np.array([x[1], push, np.cos(s) * x[1], 0.1 * x[1] ** 2]) * pace
-
-    beside = solve_ivp(field, (0, 2 * np.pi), [0.1, 0.2, 0, 0], rtol=1e-12, atol=1e-12)
-    run = vi.simulate(machine, begin(), 1, method=vi.Taylor(), samples=8)
-    lengths = beside.y[2:, -1] * 0.8 / (2 * np.pi)
-    np.testing.assert_allclose([run.averages[x][0] for x in ("taken", "lost")], lengths, atol=1e-9)
-    assert run.samples is not None
-    np.testing.assert_allclose(
-        run.samples.quantities["push"], np.cos(np.arange(9) * np.pi / 4), atol=1e-12
-    )
 
 
 @pytest.mark.slow

@@ -87,26 +87,3 @@ def test_roads_agree(name):
     for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
         if a.dtype == jnp.float64:
             np.testing.assert_allclose(a, b, rtol=0, atol=close)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["exact flight", "motor"])
-def test_groups_of_any_width_give_the_same(name):
-    """Few lanes go in narrow groups and many in wide ones: the same to the last bit."""
-    make, method, options = CASES[name]
-
-    @jax.jit
-    @jax.vmap
-    def lanes(ratio):
-        scene = make(ratio)
-        return vi.simulate(scene, scene.start(Y=0.1, V=0.2), 12, method=method, **options)
-
-    many = 4 * 16 * vi.lanes.cores() + 3
-    ratios = jnp.linspace(0.7, 1.3, many)
-    whole = lanes(ratios)
-    assert bool(jnp.all(whole.successful))
-    for few in (1, 3, 14):
-        chosen = np.random.default_rng(few).choice(many, few)
-        part = lanes(ratios[chosen])
-        for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
-            np.testing.assert_array_equal(np.asarray(a)[chosen], b)

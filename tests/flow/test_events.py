@@ -50,24 +50,6 @@ def test_entry_and_exit_within_a_step(method):
     assert (speed > 0.5).all() and (speed < 3).all()
 
 
-def test_a_poisoned_lane_harms_no_other():
-    scene = vi.Scene.ideal(frequency_ratio=0.9)
-    Y = jnp.array([0.0, jnp.nan, 0.5, 3.0])
-
-    @jax.jit
-    @jax.vmap
-    def lanes(Y):
-        return vi.simulate(scene, scene.start(Y=Y), 10, method=vi.ExactFlight())
-
-    run = lanes(Y)
-    assert list(np.asarray(run.successful)) == [True, False, True, False]
-    bad = run.result == vi.RESULTS.bad_start
-    assert list(np.asarray(bad)) == [False, True, False, True]
-    for lane, y in ((0, 0.0), (2, 0.5)):
-        alone = vi.simulate(scene, scene.start(Y=y), 10, method=vi.ExactFlight())
-        np.testing.assert_allclose(run.sections.Y[lane], alone.sections.Y, atol=1e-12)
-
-
 def test_ends_with_a_reason():
     scene = vi.Scene.ideal(frequency_ratio=0.9)
     run = vi.simulate(scene, scene.start(), 10, method=vi.FixedStep(), max_steps=50)

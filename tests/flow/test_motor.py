@@ -5,9 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.lanes import sincos
-
-from envelope.independent import turned
 
 
 @pytest.mark.parametrize("crank", ["cosine", "slider"])
@@ -49,15 +46,6 @@ def test_start_from_rest():
     assert float(run.frequency_ratio[-1]) == pytest.approx(0.9, abs=0.02)
 
 
-def test_sine_and_cosine_to_rounding():
-    phase = jnp.linspace(-7.0, 14.0, 20001)
-    sine, cosine = jax.jit(sincos)(phase)
-    np.testing.assert_allclose(sine, np.sin(phase), atol=1e-15)
-    np.testing.assert_allclose(cosine, np.cos(phase), atol=1e-15)
-    slope = jax.vmap(jax.grad(jax.grad(lambda x: sincos(x)[0])))(phase[:50])
-    np.testing.assert_allclose(slope, -np.sin(phase[:50]), atol=1e-15)
-
-
 def test_fixed_steps_stay_stable_for_a_strong_motor():
     # Its shaft comes back to speed within a small part of a cycle, at low speed most of all.
     def last(torque, kappa, method):
@@ -72,27 +60,3 @@ def test_fixed_steps_stay_stable_for_a_strong_motor():
     )
     assert bool(good.all())
     np.testing.assert_allclose(found, exact, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_an_exact_crank_beside_scipy_by_both_clocks():
-    scene = vi.Parameters(torque=2.0, control=0.9, restitution=0.5).scene(crank="slider")
-    drive, (stop,), start = scene.drive, scene.stops, (0.3, 0.2, 0.8)
-    numbers = {
-        "tau0": float(drive.strength), "kappa": float(drive.control), "eps": float(drive.coupling),
-        "mu": float(drive.slider_inertia), "xi": float(scene.damping_ratio),
-    }  # fmt: skip
-    stops = [(1, float(stop.gap), float(stop.restitution))]
-    truth = turned(numbers, stops, list(start), 15, ratio=1 / 3)
-    begin = scene.start(**dict(zip("YVW", start, strict=True)))
-    runs = [
-        vi.simulate(scene, begin, 15, method=vi.Adaptive(rtol=1e-12), clock=clock)
-        for clock in ("phase", "time")
-    ]
-    for run in runs:
-        found = np.stack([getattr(run.sections, name) for name in "YVW"], -1)
-        np.testing.assert_allclose(found, truth, atol=1e-10)
-        np.testing.assert_allclose(run.frequency_ratio, 2 * np.pi / run.duration, rtol=1e-14)
-    assert int(runs[0].impacts.sum()) >= 14
-    np.testing.assert_allclose(runs[0].duration, runs[1].duration, atol=1e-10)
-    np.testing.assert_array_equal(runs[0].impacts, runs[1].impacts)

@@ -32,21 +32,6 @@ class Walled(Free):
         return {"square": x.V**2}
 
 
-class Cushioned(Free):
-    """With a spring stop of stiffness 10 beyond 1."""
-
-    @property
-    def contacts(self):
-        return vi.SoftStop(1.0, 10.0, damping=0.0)
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V)
-
-    def averages(self, s, x):
-        touches = x.Y > 1.0
-        return {"contact": 1.0 * touches, "force": jnp.where(touches, 10.0 * (x.Y - 1.0), 0.0)}
-
-
 def walled(restitution=0.7, place=0.0):
     return Walled(jnp.array(restitution), jnp.array(place))
 
@@ -191,30 +176,6 @@ def test_energy_is_balanced_for_any_number_of_impulses():
     mean, error = means(lost)
     assert error < 2e-3
     assert abs(mean - SIGMA**2 / 2) < 3 * error
-
-
-@pytest.mark.slow
-def test_a_spring_stop_is_touched_as_boltzmann_says():
-    """Means at no time between impulses, from those for two numbers of impulses."""
-    found = {}
-    for impulses in (32, 64):
-
-        def observed(key, noise=shaken(impulses)):  # noqa: B008
-            start = vi.OscillatorState(jnp.array(0.5), jnp.array(0.0))
-            options = {"settle": 40, "noise": noise, "key": key, "event_log": 16}
-            run = vi.simulate(Cushioned(), start, 400, **options)
-            log = run.event_log
-            touched = jnp.sum((log.kind == 3) & (log.value > 0), axis=-1)
-            return {**run.averages, "touched": touched / CYCLE}
-
-        values = jax.jit(jax.vmap(observed))(jax.random.split(jax.random.key(impulses), 1024))
-        found[impulses] = {name: means(x) for name, x in values.items()}
-    truth = {"contact": 0.0540010619, "force": 0.0867696801, "touched": 0.0754152755}
-    for name, value in truth.items():
-        (few, doubt), (many, error) = found[32][name], found[64][name]
-        error = np.hypot(2 * error, doubt)
-        assert error < 0.02 * value
-        assert abs(2 * many - few - value) < 3 * error, name
 
 
 class Growing(vi.AbstractMachine):

@@ -1,4 +1,4 @@
-"""A user's own scene: a ball bouncing on a floor under constant force, beside its closed form."""
+"""A machine of one's own: what it is told, and what its parts may be."""
 
 import warnings
 
@@ -33,42 +33,6 @@ class BouncingBall(vi.AbstractMachine):
 
 def ball(gravity=2.0, restitution=0.8):
     return BouncingBall(jnp.asarray(gravity), (vi.RigidStop(0.0, restitution, "left"),))
-
-
-def impact_times(height, gravity, restitution, count):
-    """Closed form: the fall, then flights that each last k times the one before."""
-    fall = np.sqrt(2 * height / gravity)
-    flights = 2 * fall * restitution ** np.arange(1, count)
-    return fall + np.concatenate([[0.0], np.cumsum(flights)])
-
-
-@pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep()], ids=["adaptive", "fixed"])
-def test_bounces_of_a_ball(method):
-    scene, height = ball(), 1.5
-    start = Ball(jnp.asarray(height), jnp.asarray(0.0))
-    run = vi.simulate(scene, start, 6, method=method, impact_log=4)
-    log = run.impact_log
-    cycle, place = np.nonzero(np.asarray(log.stop) >= 0)
-    times = cycle + np.asarray(log.phase)[cycle, place]
-    speeds = np.asarray(log.speed)[cycle, place]
-    truth = impact_times(height, 2.0, 0.8, len(times))
-    np.testing.assert_allclose(times, truth, atol=1e-10)
-    first = np.sqrt(2 * 2.0 * height)
-    np.testing.assert_allclose(speeds, first * 0.8 ** np.arange(len(times)), atol=1e-10)
-    assert len(times) == 3 and run.frequency_ratio is None
-    np.testing.assert_allclose(run.duration, 1.0)
-
-
-def test_derivative_of_the_first_impact():
-    def time(gravity):
-        start = Ball(jnp.asarray(1.5), jnp.asarray(0.0))
-        run = vi.simulate(ball(gravity), start, 2, method=vi.Adaptive(), impact_log=1)
-        return run.impact_log.phase[1, 0]
-
-    # t = √(2h/g), dt/dg = -t/(2g)
-    value, slope = jax.jvp(time, (2.0,), (1.0,))
-    assert float(value) == pytest.approx(np.sqrt(1.5) - 1, abs=1e-10)
-    assert float(slope) == pytest.approx(-np.sqrt(1.5) / 4, abs=1e-9)
 
 
 def test_own_scenes_have_their_own_clock_and_no_closed_form():

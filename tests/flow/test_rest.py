@@ -84,53 +84,6 @@ def test_derivatives_pass_through_rest():
         assert float(derivative(lowest)(ZETA)) == pytest.approx(float(difference), rel=1e-6)
 
 
-def test_starts_on_the_stop():
-    body = scene(gap=0.5)
-    # Pressed on at φ = 0 it stays; with the slightest velocity inwards it does not.
-    for V, rest in ((0.0, True), (-0.3, False), (0.2, False)):
-        run = vi.simulate(body, body.start(Y=0.5, V=V), 1, method=vi.ExactFlight(), samples=64)
-        assert bool(run.successful)
-        assert (float(run.samples.state.Y[1]) == 0.5) == rest
-    # With the stop beyond the crank's reach nothing presses on, and a start at rest leaves.
-    wide = scene(gap=1.5)
-    run = vi.simulate(wide, wide.start(Y=1.5), 1, method=vi.ExactFlight(), samples=64)
-    assert run.rests is None and float(run.samples.state.Y[1]) < 1.5
-
-
-def test_a_motor_turns_on_while_the_body_rests():
-    # The shaft at rest contact feels a spring whose end is held: energy is kept without a motor.
-    table = vi.Parameters(torque=0.0, control=0.5, restitution=0.3, gap=0.3 * 0.04, damping=0.0)
-    motor = table.scene()
-    start = motor.start(Y=0.3, V=0.0, W=1.2)
-    run = vi.simulate(motor, start, 1, method=vi.Adaptive(rtol=1e-12), samples=400)
-    Y, W = np.asarray(run.samples.state.Y), np.asarray(run.samples.state.W)
-    held = np.arange(401) < 400 * np.arccos(0.3) / (2 * np.pi)
-    held &= np.cumprod(Y == Y[0]).astype(bool)
-    assert held.sum() > 20
-    phase = 2 * np.pi * np.arange(401) / 400
-    drive = motor.drive
-    inertia = 1 + drive.slider_inertia * np.sin(phase) ** 2
-    energy = 0.5 * inertia * W**2 + 0.5 * drive.coupling * (Y - np.cos(phase)) ** 2
-    np.testing.assert_allclose(np.asarray(energy)[held], float(energy[0]), rtol=1e-10)
-
-
-def test_nothing_is_lost_over_many_machines():
-    # Damping may outweigh the crank at the moment of a hard impact, and not an instant later.
-    draw = np.random.default_rng(0).uniform
-
-    def lane(k, zeta, gap, xi):
-        body = scene(zeta, k, gap, xi)
-        run = vi.simulate(body, body.start(Y=jnp.minimum(gap, 0.0)), 30, method=vi.ExactFlight())
-        return run.successful, run.y_max - gap
-
-    good, beyond = jax.jit(jax.vmap(lane))(
-        np.repeat([0.0, 1e-9, 0.5, 0.97], 200), draw(0.3, 3, 800), draw(-0.5, 1, 800),
-        draw(0.01, 1, 800),
-    )  # fmt: skip
-    assert bool(good.all())
-    assert float(beyond.max()) < 1e-12
-
-
 @pytest.mark.slow
 def test_single_precision_rests_as_double_does():
     """Random machines that chatter, rest and leave; the flattest hops are below rounding."""

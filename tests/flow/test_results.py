@@ -1,10 +1,5 @@
 """What a run holds: samples, log, counts, words."""
 
-import re
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -40,30 +35,6 @@ def test_sections_only():
     assert int(lean.steps) < int(full.steps)
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"cycles": 0}, ValueError, r"`cycles` must be at least 1, but got 0"),
-        ({"cycles": 2.5}, TypeError, r"`cycles` must be an integer, but got 2.5"),
-        ({"clock": "phases"}, ValueError, r"`clock` must be one of 'phase', 'time', but got"),
-        ({"record": "all"}, ValueError, r"`record` must be one of 'motion', 'sections'"),
-        ({"start": SCENE.start(Y=2.5)}, ValueError, r"`start` must not lie beyond a stop.*0.5 bey"),
-        ({"start": vi.Parameters().scene().start()}, TypeError, r"`start` must be a `Oscillator"),
-        (
-            {"start": vi.OscillatorState(jnp.asarray(jnp.nan), jnp.asarray(0.0))},
-            ValueError,
-            "finite",
-        ),
-    ],
-)
-def test_bad_input(change, error, message):
-    arguments = {"machine": SCENE, "start": SCENE.start(), "cycles": 3, **change}
-    # The run-time type checks of the tests may come first; they are `TypeError`s as well.
-    with pytest.raises(error) as caught:
-        vi.simulate(**arguments)
-    assert error is TypeError or re.search(message, str(caught.value))
-
-
 def test_exact_flight_says_what_it_needs():
     motor = vi.Parameters().scene()
     with pytest.raises(ValueError, match=r"`ExactFlight` needs.*`IdealDrive`.*`Motor`"):
@@ -82,32 +53,6 @@ def test_the_impact_log_tells_crank_angles_in_both_clocks():
     assert np.isfinite(logs[0].phase).sum() > 3
     np.testing.assert_allclose(logs[1].phase, logs[0].phase, atol=1e-9)
     assert np.nanmax(logs[1].phase) <= 2 * np.pi
-
-
-@pytest.mark.slow
-def test_a_run_as_a_labelled_data_set():
-    scene = vi.Scene.ideal(frequency_ratio=0.9)
-
-    def one(gap):
-        changed = eqx.tree_at(lambda s: s.stops[0].gap, scene, gap)
-        return vi.simulate(
-            changed, scene.start(Y=0.5), 3, samples=4, impact_log=5, estimate=True
-        )  # fmt: skip
-
-    run = vi.jit(jax.vmap(one))(jnp.asarray([1.0, 2.0, -1.0]))
-    data = run.to_xarray(["gap"])
-    assert dict(data.sizes) == {"gap": 3, "section": 4, "cycle": 3, "sample": 13, "impact": 5}
-    np.testing.assert_array_equal(data["section_Y"], run.sections.Y)
-    np.testing.assert_array_equal(data["sample_V"], run.samples.state.V)
-    np.testing.assert_array_equal(data["log_speed"], run.impact_log.speed)
-    np.testing.assert_array_equal(data["error_y_max"], run.errors.y_max)
-    np.testing.assert_array_equal(data["sample"], np.arange(13) / 4)
-    assert data["result"].values.tolist() == ["successful", "successful", "bad_start"]
-    alone = vi.simulate(scene, scene.start(), 2, record="sections").to_xarray()
-    assert "y_max" not in alone and alone["impacts"].dims == ("cycle",)
-    assert alone["result"].item() == "successful"
-    with pytest.raises(ValueError, match=r"`dims` must name the 1 batch axes .* 'gap'"):
-        run.to_xarray("gap")
 
 
 @pytest.mark.parametrize(

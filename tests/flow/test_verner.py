@@ -3,8 +3,6 @@
 import functools
 import itertools
 
-import diffrax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -69,24 +67,3 @@ def test_order_conditions(b, order):
     """All hold to rounding up to the order, and some do not beyond it."""
     assert max(worst(b, n) for n in range(1, order + 1)) < 2e-15
     assert worst(b, order + 1) > 1e-8
-
-
-def test_converges_in_diffrax():
-    """As a solver of diffrax's own, on a Kepler orbit: half the step, 1/512 of the error."""
-
-    def field(t, y, args):
-        place, velocity = y
-        return velocity, -place / jnp.sum(place**2) ** 1.5
-
-    start = jnp.array([0.5, 0.0]), jnp.array([0.0, 3.0**0.5])
-    errors = []
-    for steps in (40, 80):
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), vi.Verner9(), 0.0, 2 * jnp.pi, 2 * jnp.pi / steps, start
-        )
-        assert solution.ys is not None
-        (place, velocity), (place0, velocity0) = solution.ys, start
-        apart = jnp.concatenate([place[-1] - place0, velocity[-1] - velocity0])
-        errors.append(float(jnp.max(jnp.abs(apart))))
-    assert errors[1] < 1e-8
-    assert 8.5 < np.log2(errors[0] / errors[1]) < 10.5

@@ -84,6 +84,7 @@ class Floor(vi.AbstractMachine):
 
     friction: jax.Array | float = 0.3
     along: int = 1
+    stop: int = 0
     tuples: bool = False
     cycle = 6.0
 
@@ -98,7 +99,7 @@ class Floor(vi.AbstractMachine):
     @property
     def contacts(self):
         floor = vi.RigidStop(0.0, 0.5, "left")
-        return floor, vi.ContactFriction(self.friction, stop=0, along=self.along)
+        return floor, vi.ContactFriction(self.friction, stop=self.stop, along=self.along)
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -1.0 + 0 * state.V)
@@ -108,6 +109,7 @@ class Floor(vi.AbstractMachine):
     ("wrong", "kind", "message"),
     [
         ({"along": 2}, ValueError, "`along` of a ContactFriction must be the number of a coord"),
+        ({"stop": 1}, ValueError, "`stop` of a ContactFriction .* has 1, but got 1"),
         ({"along": 0}, ValueError, "slips along the stop, but got 0, which stop 0 of the Floor"),
         ({"friction": -0.3}, ValueError, "`level` must be .* but got -0.3"),
         ({"tuples": True}, TypeError, "`placed` of coordinate 0 of a Floor must be like its state"),

@@ -66,10 +66,6 @@ FUNCTIONS = {
     "exponential": (lambda x, y: (jnp.exp(x), jax.nn.sigmoid(x)), 4),
     "logarithm": (lambda x, y: (jnp.log(x), jnp.log(jnp.abs(x))), 4),
     "circle": (lambda x, y: (jnp.sin(x), jnp.cos(x)), 4),
-    "library": (
-        lambda x, y: (jnp.tanh(x), jnp.arctan(x), jnp.arctan2(x, y), jnp.expm1(-jnp.abs(x)),
-                      jnp.log1p(jnp.abs(x)), jax.scipy.special.erf(x)), 16,
-    ),
     "remainder": (lambda x, y: (jax.lax.rem(x, jnp.full_like(x, 2.0)),), 1),
     "whole numbers": (
         lambda x, y: (x.astype(jnp.int32), (x.astype(jnp.int32) % 7) // 3,

@@ -8,9 +8,30 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from rough_block import Block, Plane
-from rough_block import on_plane as at
 from rubbing import Rubbing
+
+
+class Block(vi.Mechanical):
+    """A particle above a floor at y = 0, pulled along it."""
+
+    friction: Any = 0.3
+    restitution: Any = 0.0
+    tangential: Any = 0.0
+    pull: Any = 0.0
+    """Amplitude of a force cos t along the floor."""
+    lift: Any = 0.0
+    """Amplitude of a force sin 2t up."""
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 2 * jnp.pi
+
+    @property
+    def contacts(self):
+        rubs = dict(friction=self.friction, along="x", tangential_restitution=self.tangential)
+        return vi.RigidStop(0.0, self.restitution, "left", on="y", **rubs)
+
+    def force(self, t, q, v):
+        return dict(x=self.pull * jnp.cos(t), y=-1 + self.lift * jnp.sin(2 * t))
 
 
 @pytest.mark.slow
@@ -21,9 +42,8 @@ def test_an_oblique_impact_slips_or_sticks(along):
     k, mu = 0.8, 0.3
 
     def run(u, v):
-        zero = jnp.zeros_like(u)
         block = Block(mu, k, along)
-        return vi.simulate(block, Plane(zero, zero + 0.5, u, -v), 1, impact_log=40)
+        return vi.simulate(block, block.at(y=0.5, v=dict(x=u, y=-v)), 1, impact_log=40)
 
     u, v = (x.ravel() for x in jnp.meshgrid(jnp.linspace(-2, 2, 9), jnp.linspace(0, 2, 5)))
     runs = jax.vmap(run)(u, v)
@@ -37,17 +57,17 @@ def test_an_oblique_impact_slips_or_sticks(along):
                 lost += 0.5 * (slip**2 - new**2) + 0.5 * (1 - k * k) * float(speed) ** 2
                 slip = new
         if int(runs.impacts[i, 0]) < 40 and runs.last.y[i] > 0:  # still bouncing
-            assert float(runs.last.u[i]) == pytest.approx(slip, abs=1e-9)
+            assert float(runs.last.v.x[i]) == pytest.approx(slip, abs=1e-9)
             assert float(runs.impact_energy[i, 0]) == pytest.approx(lost, abs=1e-9)
     # Some end at rest, some slipping, and none turns round but by its restitution.
-    assert along or bool((runs.last.u * u >= -1e-12).all())
+    assert along or bool((runs.last.v.x * u >= -1e-12).all())
 
 
 def test_a_block_slides_to_rest():
     """It lands without restitution at speed 1 along the floor and √2·.1 down: loses μ of that, then
     slides on v²/(2μ)."""
     mu = 0.3
-    run = vi.simulate(Block(mu), at(0, 0.01, 1, 0), 1, event_log=6)
+    run = vi.simulate(Block(mu), Block().at(y=0.01, v=dict(x=1.0)), 1, event_log=6)
     fall = np.sqrt(0.02)
     speed = 1 - mu * fall
     assert run.event_log.kind[0, :3].tolist() == [0, 1, 3]  # hit, rests, sticks
@@ -55,7 +75,7 @@ def test_a_block_slides_to_rest():
         run.event_log.phase[0, :3], [fall, fall, fall + speed / mu], atol=1e-9
     )
     np.testing.assert_allclose(float(run.last.x), fall + speed**2 / (2 * mu), atol=1e-9)
-    assert float(run.last.u) == 0.0
+    assert float(run.last.v.x) == 0.0
 
 
 @pytest.mark.slow
@@ -63,11 +83,11 @@ def test_a_block_bounces_to_rest_while_it_slides():
     """By its momentum: the floor's impulses, those of endless last bounces included, add up to its
     weight, and friction to μ of that."""
     mu, restitution, way = 0.3, 0.5, -1
-    run = vi.simulate(
-        Block(mu, restitution), at(0, 1, 15 * way, 0), 1, method="reference", max_impacts=100
-    )
+    block = Block(mu, restitution)
+    start = block.at(y=1.0, v=dict(x=15.0 * way))
+    run = vi.simulate(block, start, 1, method="reference", max_impacts=100)
     assert int(run.rests[0]) == 1
-    assert float(run.last.u) == pytest.approx(way * (15 - mu * 2 * np.pi), abs=1e-12)
+    assert float(run.last.v.x) == pytest.approx(way * (15 - mu * 2 * np.pi), abs=1e-12)
     # What is lost in bounces, friction's work there included, and what is rubbed off afterwards.
     falls = np.sqrt(2.0)
     rests = falls * (1 + restitution) / (1 - restitution)
@@ -88,8 +108,8 @@ def pressing(machine, s, z):
 
 def ends(pull, lift, one):
     if one:
-        run = vi.simulate(Block(0.3, pull=pull, lift=lift), at(0, 0, 0.2, 0), 4)
-        return jnp.stack([run.last.x, run.last.u])
+        run = vi.simulate(Block(0.3, pull=pull, lift=lift), Block().at(v=dict(x=0.2)), 4)
+        return jnp.stack([run.last.x, run.last.v.x])
     start = vi.OscillatorState(jnp.array(0.0), jnp.array(0.2))
     machine = Rubbing(force, 0.3, {"pull": pull, "lift": lift}, pressing)
     run = vi.simulate(machine, start, 4)
@@ -113,40 +133,16 @@ def test_under_the_force_of_the_floor_friction_is_dry_friction(lift):
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
-class Coupled(vi.AbstractMachine):
+class Coupled(vi.Mechanical):
     """Two coordinates that share their mass, as those of a rod whose end hits a floor do."""
 
-    coupling: Any = 0.7
-    friction: Any = 0.5
-    restitution: Any = 0.9
+    q = ("x", "y")
+    mass = ((1.0, 0.7), (0.7, 1.0))
+    cycle = 1.0
+    contacts = vi.RigidStop(0.0, 0.9, "left", on="y", friction=0.5, along="x")
 
-    @property
-    def coordinates(self):
-        c = self.coupling
-
-        def across(z, Y, V):
-            return Plane(z.x - c * (Y - z.y), Y, z.u - c * (V - z.v), V)
-
-        def along(z, Y, V):
-            return Plane(Y, z.y - c * (Y - z.x), V, z.v - c * (V - z.u))
-
-        mass = 1 - c * c
-        return (
-            vi.Coordinate(lambda z: z.y, lambda z: z.v, across, mass),
-            vi.Coordinate(lambda z: z.x, lambda z: z.u, along, mass),
-        )
-
-    @property
-    def contacts(self):
-        floor = vi.RigidStop(0.0, self.restitution, "left")
-        return floor, vi.ContactFriction(self.friction, stop=0, along=1)
-
-    @property
-    def cycle(self):
-        return 1.0
-
-    def field(self, s, z):
-        return Plane(z.u, z.v, 0 * z.u, 0 * z.v)
+    def force(self, t, q, v):
+        return dict(x=0.0, y=0.0)
 
 
 @pytest.mark.slow
@@ -161,9 +157,8 @@ def test_a_law_that_would_gain_energy_is_refused():
     slips = np.linspace(-3, 3, 25)
 
     def last(u):
-        start = Plane(0 * u, 0 * u + 0.5, u, 0 * u - 1.0)
-        run = vi.simulate(machine, start, 1)
-        return run.last.u, run.last.v, run.successful, run.result == vi.RESULTS.bad_impact
+        run = vi.simulate(machine, machine.at(y=0.5, v=dict(x=u, y=-1.0)), 1)
+        return run.last.v.x, run.last.v.y, run.successful, run.result == vi.RESULTS.bad_impact
 
     u, v, good, bad = (np.asarray(x) for x in jax.vmap(last)(jnp.asarray(slips)))
     gained = 0
@@ -188,15 +183,3 @@ def test_a_law_that_would_gain_energy_is_refused():
             assert good[i]
             np.testing.assert_allclose([u[i], v[i]], after, atol=1e-10)
     assert 0 < gained < 20
-
-
-def test_numbers_of_what_is_not_there_are_refused():
-    class Wrong(Block):
-        @property
-        def contacts(self):
-            return vi.RigidStop(0.0, 0.5, "left"), vi.ContactFriction(0.3, stop=1, along=1)
-
-    with pytest.raises(ValueError, match=r"`stop` of a ContactFriction .* has 1, but got 1"):
-        vi.simulate(Wrong(), at(0, 1, 0, 0), 1)
-    with pytest.raises(ValueError, match="level"):
-        vi.ContactFriction(-0.1, stop=0, along=1)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 
@@ -55,49 +54,8 @@ class Stack(vi.Mechanical):
         return dict(a=jnp.cos(0.3 * t) - q.a, b=0.0)
 
 
-class Backlash(vi.AbstractMachine):
-    """A mass between two soft flanks."""
-
-    play: float = 0.2
-
-    @property
-    def contacts(self):
-        half = self.play / 2
-        return (
-            vi.SoftStop(half, 50.0, damping=0.5, on=("x", "u")),
-            vi.SoftStop(half, 50.0, damping=0.5, side="left", on=("x", "u")),
-        )
-
-    cycle = 2 * jnp.pi
-
-    def field(self, t, z):
-        return dict(x=z.u, u=0.5 * jnp.cos(t) + 0.2 - 0.1 * z.u)
-
-
-class Furnace(vi.AbstractMachine):
-    cycle = 1.0
-    modes = {"on": 0.0}  # noqa: RUF012
-    events = (
-        vi.Reset(lambda m, t, z, on: 294 - z.T, modes=lambda m, t, z, on: 1.0),
-        vi.Reset(lambda m, t, z, on: z.T - 296, modes=lambda m, t, z, on: 0.0),
-    )
-
-    def field(self, t, z, on):
-        return dict(T=25 * on - 2 * (z.T - 285))
-
-
 def numbers(state):
     return np.array([float(x) for x in jax.tree.leaves(state)])
-
-
-def test_an_oscillator_with_a_stop():
-    machine = Oscillator()
-    run = vi.simulate(machine, machine.start(), 50)
-    np.testing.assert_allclose(numbers(run.last), [0.970046817, -1.215965305], atol=2e-9)
-    assert int(run.impacts.sum()) == 50
-    slope = jax.grad(lambda gap: vi.simulate(Oscillator(gap=gap), machine.start(), 3).last.x)
-    apart = [vi.simulate(Oscillator(gap=1 + h), machine.start(), 3).last.x for h in (1e-6, -1e-6)]
-    assert float(slope(1.0)) == pytest.approx(float(apart[0] - apart[1]) / 2e-6, abs=1e-6)
 
 
 def test_friction_on_a_floor_that_a_body_hits():
@@ -137,27 +95,6 @@ def test_as_much_sticks_as_can():
     end = brentq(lambda t: 0.2 * (np.cos(np.pi / 6) - np.cos(t)) - 0.1 * (t - np.pi / 6), 2, 4)
     assert abs(run.last.cart) < 1e-14 and abs(run.last.v.cart) < 1e-15
     np.testing.assert_allclose(run.event_log.phase[0, :2], (np.pi / 6, end), rtol=1e-9)
-
-
-def test_soft_flanks_push_by_themselves():
-    """Beside SciPy, which steps across the kinks of the force."""
-
-    def pushed(depth, rate):
-        return 50.0 * depth + 0.5 * np.sqrt(50.0) * rate if depth > 0 else 0.0
-
-    def field(t, z):
-        x, u = z
-        push = pushed(-x - 0.1, -u) - pushed(x - 0.1, u)
-        return u, 0.5 * np.cos(t) + 0.2 - 0.1 * u + push
-
-    ours = vi.simulate(Backlash(), vi.State(x=0.0, u=0.0), 5, method=vi.Adaptive(rtol=1e-10))
-    theirs = solve_ivp(field, (0, 10 * np.pi), (0.0, 0.0), "DOP853", rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(numbers(ours.last), theirs.y[:, -1], atol=1e-8)
-
-
-def test_a_furnace_with_two_thresholds():
-    run = vi.simulate(Furnace(), vi.State(T=300.0), 4)
-    assert float(run.last.T) == pytest.approx(294.497730558, abs=1e-8)
 
 
 class Counted(vi.AbstractMachine):

@@ -2,18 +2,12 @@
 
 import jax
 import jax.numpy as jnp
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax.machine.numbers import leaf_names
 from vi_jax.machine.units import unit_of
-from vi_jax.scans._describe import variables_of
-from vi_jax.scans.grid import Blocks
-from vi_jax.scans.program import make_program
 
-matplotlib.use("Agg")
 M = vi.machines
 
 # Of each machine: what the position is called, and the units of position, velocity and exponents,
@@ -28,11 +22,6 @@ MACHINES = {
     "capsule": (M.Capsule(), "place in the capsule", "F/k", "F/√(k m)", "√(k/m)"),
     "rotor": (M.UnbalancedRotor(gap=1.0), "Y", "m r/M", "m r ω/M", "ω"),
 }
-
-
-def zeros(call):
-    """What a call would return, computed from nothing."""
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(call))
 
 
 @pytest.fixture(params=MACHINES)
@@ -52,37 +41,6 @@ def test_every_number_has_a_unit(case):
     probe = jax.tree.unflatten(jax.tree.structure(start), list(jnp.arange(float(len(names)))))
     assert unit_of(units, names[int(machine.position(probe))]) == position
     assert unit_of(units, names[int(machine.velocity(probe))]) == velocity
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["capsule", "rotor"])
-def test_runs_and_rates_say_their_units(name):
-    machine, _, position, _, rate = MACHINES[name]
-    run = jax.eval_shape(lambda: vi.simulate(machine, machine.start(), 2, impact_log=2))
-    assert unit_of(dict(run.units), "position") == position
-    found = zeros(lambda: vi.lyapunov(machine, machine.start(), 8, settle=0, number=1))
-    assert found.unit == rate
-    assert f"0{'' if rate == '1' else ' ' + rate} (halves" in str(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["valve", "rotor"])
-def test_scans_and_sweeps_say_their_units(kind):
-    machine, called, position, velocity, rate = MACHINES[kind]
-    name, start = leaf_names(machine)[0], leaf_names(machine.start())[0]
-    axes = {name: np.linspace(0.5, 0.6, 2), f"start.{start}": np.linspace(0.1, 0.2, 2)}
-    job = make_program(machine, tuple(axes), measure=("extremes", "power", "sections", "exponent"))
-    found = variables_of(job, Blocks(axes, 4, paired=False))
-    assert found["y_min"].attributes["units"] == found["y_max"].attributes["units"] == position
-    assert found["impact_speed"].attributes["units"] == velocity
-    assert found["exponent"].attributes["units"] == rate
-    assert found["power"].attributes["units"] == machine.units.get("power", "1")
-    assert found[start].attributes["units"] == unit_of(machine.units, start)
-    values = jnp.linspace(0.5, 0.6, 3)
-    ax = vi.plot_sweep(zeros(lambda: vi.sweep(machine, name, values, settle=0, cycles=4)))
-    wanted = "" if position == "1" else f" ({position})"
-    assert ax.get_ylabel() == f"min {called}{wanted}"
-    plt.close("all")
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@ state or moves along with it, or are moved while they rest."""
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,25 +10,22 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-from chain import Balls, Chain, balls
+from chain import Chain, row
 
 
 class Stack(Chain):
     """Two equal bodies, one against the other and that one against a wall at y = 0."""
 
     restitution: Any = 0.3
-    masses: tuple[float, ...] = (1.0, 1.0)
+    weights: tuple[float, ...] = (1.0, 1.0)
     wall: float | None = 0.0
     length: Any = 2 * np.pi
     forces: Any = None
     """Constant ones on both, and the strength of one on the first that goes by cos s."""
 
-    def field(self, s, z):
-        (u, v), (first, second, turning) = z.v, self.forces
-        return Balls(z.v, (first + turning * jnp.cos(s) - 0.1 * u, second - 0.1 * v))
-
-
-AT_REST = balls((0, 0), (0, 0))
+    def force(self, t, q, v):
+        first, second, turning = self.forces
+        return dict(a=first + turning * jnp.cos(t) - 0.1 * v.a, b=second - 0.1 * v.b)
 
 
 @pytest.mark.slow
@@ -37,7 +33,8 @@ def test_a_stack_pressed_on_a_wall_stays_there():
     """Whichever of them is pressed; and the outer body leaves where its own force turns."""
 
     def run(forces):
-        return vi.simulate(Stack(forces=forces), AT_REST, 1, event_log=6)
+        stack = Stack(forces=forces)
+        return vi.simulate(stack, stack.start(), 1, event_log=6)
 
     runs = jax.vmap(run)(jnp.array([(1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.5, 0.2, 1.0)]))
     assert bool(runs.successful.all())
@@ -45,38 +42,39 @@ def test_a_stack_pressed_on_a_wall_stays_there():
         np.testing.assert_allclose(numbers[:2], 0.0, atol=1e-14)
     leaves = runs.event_log.phase[2][runs.event_log.kind[2] == 2]
     np.testing.assert_allclose(leaves, [2 * np.pi / 3], atol=1e-9)
-    np.testing.assert_allclose(runs.last.x[1][2], 0.0, atol=1e-14)
+    np.testing.assert_allclose(runs.last.b[2], 0.0, atol=1e-14)
 
     def free(s, z):
         return z[1], 0.5 + np.cos(s) - 0.1 * z[1]
 
     there = solve_ivp(free, (2 * np.pi / 3, 2 * np.pi), (0, 0), rtol=1e-11, atol=1e-13).y[:, -1]
-    np.testing.assert_allclose([runs.last.x[0][2], runs.last.v[0][2]], there, atol=1e-8)
+    np.testing.assert_allclose([runs.last.a[2], runs.last.v.a[2]], there, atol=1e-8)
 
 
 class Thrown(Stack):
     """The first one twice as heavy, both thrown off the wall by one and the same acceleration."""
 
-    masses: tuple[float, ...] = (2.0, 1.0)
+    weights: tuple[float, ...] = (2.0, 1.0)
 
-    def field(self, s, z):
-        return Balls(z.v, (1 + 2 * jnp.cos(s),) * 2)
+    def force(self, t, q, v):
+        pull = 1 + 2 * jnp.cos(t)
+        return dict(a=2 * pull, b=pull)
 
 
 @pytest.mark.slow
 def test_a_stack_is_thrown_off_as_one_and_comes_back():
     """As one body, which leaves where 1 + 2 cos s = 0, flies, and bounces to rest or goes on."""
-    run = vi.simulate(Thrown(), AT_REST, 3, event_log=12, max_impacts=2000)
+    run = vi.simulate(Thrown(), Thrown().start(), 3, event_log=12, max_impacts=2000)
     assert bool(run.successful)
     leaves = run.event_log.phase[0][run.event_log.kind[0] == 2]
     begin = 2 * np.pi / 3
     np.testing.assert_allclose(leaves, begin, atol=1e-8)
-    for numbers in (run.sections.x, run.sections.v):
+    for numbers in row(run.sections):
         np.testing.assert_allclose(*numbers, atol=1e-9)
     long = 2 * np.pi - begin
     flight = long**2 / 2 - 2 * (1 - np.cos(begin)) - 2 * np.sin(begin) * long
-    assert flight < 0 and float(run.sections.x[1][1]) == pytest.approx(flight, abs=1e-8)
-    assert int(run.impacts.sum()) > 2 and float(jnp.max(run.sections.x[1])) <= 1e-12
+    assert flight < 0 and float(run.sections.b[1]) == pytest.approx(flight, abs=1e-8)
+    assert int(run.impacts.sum()) > 2 and float(run.sections.b.max()) <= 1e-12
 
 
 class Put(vi.AbstractMachine):
@@ -116,36 +114,16 @@ def test_a_body_that_is_moved_while_it_rests_is_free_again():
     np.testing.assert_allclose(runs.sections.V[:, 1:], np.array([[0], [0], [-0.3]]) * np.ones(4))
 
 
-class Point(eqx.Module):
-    x: Any
-    u: Any
-    y: Any
-    v: Any
-
-
-class Dome(vi.AbstractMachine):
+class Dome(vi.Mechanical):
     """A particle on a smooth dome of radius one, under gravity."""
 
-    contacts: tuple = (vi.RigidStop(-1.0, 0.3, "left"),)
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 2.0
+    contacts = vi.RigidStop(-1.0, 0.3, "left", on=lambda q: jnp.hypot(q.x, q.y))
 
-    def position(self, z):
-        return jnp.hypot(z.x, z.y)
-
-    def velocity(self, z):
-        return (z.x * z.u + z.y * z.v) / jnp.hypot(z.x, z.y)
-
-    def placed(self, z, Y, V):
-        r = jnp.hypot(z.x, z.y)
-        cos, sin = z.x / r, z.y / r
-        along = cos * z.v - sin * z.u
-        return Point(Y * cos, V * cos - along * sin, Y * sin, V * sin + along * cos)
-
-    @property
-    def cycle(self):
-        return 2.0
-
-    def field(self, s, z):
-        return Point(z.u, 0 * z.x, z.v, -1 + 0 * z.x)
+    def force(self, t, q, v):
+        return dict(x=0.0, y=-1.0)
 
 
 @pytest.mark.slow
@@ -155,11 +133,11 @@ def test_a_particle_slides_off_a_dome():
 
     def run(angle):
         sin, cos = jnp.sin(angle), jnp.cos(angle)
-        start = Point(sin, speed * cos, cos, -speed * sin)
+        start = Dome().at(x=sin, y=cos, v=dict(x=speed * cos, y=-speed * sin))
         return vi.simulate(Dome(), start, 1, event_log=2)
 
     def energy(z):
-        return 0.5 * (z.u**2 + z.v**2) + z.y
+        return 0.5 * (z.v.x**2 + z.v.y**2) + z.y
 
     runs = jax.vmap(run)(angles)
     assert bool(runs.successful.all())
@@ -185,49 +163,23 @@ def test_a_particle_slides_off_a_dome():
     np.testing.assert_allclose(slope, (apart[:16] - apart[16:]) / (2 * h), rtol=1e-5, atol=1e-5)
 
 
-def number(default):
-    return eqx.field(default=default, converter=lambda x: jnp.asarray(x, float))
-
-
-class Pair(eqx.Module):
-    x: Any
-    u: Any
-    y: Any
-    v: Any
-
-
-class Pressed(vi.AbstractMachine):
+class Pressed(vi.Mechanical):
     """Two balls of a radius, driven and pressed together."""
 
-    radius: Any = number(0.25)
+    radius: Any = 0.25
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 2 * np.pi
 
     @property
     def contacts(self):
-        return (vi.RigidStop(0.0, 0.3),)
+        return vi.RigidStop(-2 * self.radius, 0.3, on=lambda q: q.x - q.y)
 
-    @property
-    def coordinates(self):
-        def apart(z, Y, V):
-            far, fast = 0.5 * (Y - (z.x - z.y + 2 * self.radius)), 0.5 * (V - (z.u - z.v))
-            return Pair(z.x + far, z.u + fast, z.y - far, z.v - fast)
-
-        return (
-            vi.Coordinate(
-                lambda z: z.x - z.y + 2 * self.radius, lambda z: z.u - z.v, apart, 0.5
-            ),
-        )  # fmt: skip
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    def field(self, s, z):
-        first, second = 1 + 0.3 * jnp.cos(s) - 0.2 * z.x, -1 + 0.1 * jnp.sin(s) - 0.2 * z.y
-        return Pair(z.u, first, z.v, second)
+    def force(self, t, q, v):
+        return dict(x=1 + 0.3 * jnp.cos(t) - 0.2 * q.x, y=-1 + 0.1 * jnp.sin(t) - 0.2 * q.y)
 
     def start(self):
-        x, y = -0.5 - self.radius, 0.3 + self.radius
-        return Pair(x, jnp.zeros_like(x), y, jnp.zeros_like(y))
+        return self.at(x=-0.5 - self.radius, y=0.3 + self.radius)
 
 
 def middle(cycles):
@@ -237,42 +189,6 @@ def middle(cycles):
         return c[1], 0.15 * np.cos(t) + 0.05 * np.sin(t) - 0.2 * c[0]
 
     return solve_ivp(rate, (0, 2 * np.pi * cycles), (-0.1, 0.0), rtol=1e-12, atol=1e-13).y[:, -1]
-
-
-class Ball(eqx.Module):
-    height: Any
-    speed: Any
-    phase: Any
-
-
-class Table(vi.AbstractMachine):
-    """A ball on a shaken table, seen from the laboratory, with the table's phase in the state."""
-
-    strength: Any = number(0.9)
-
-    @property
-    def contacts(self):
-        return (vi.RigidStop(0.0, 0.4, "left"),)
-
-    def position(self, z):
-        return z.height - self.strength * jnp.sin(z.phase)
-
-    def velocity(self, z):
-        return z.speed - self.strength * jnp.cos(z.phase)
-
-    def placed(self, z, Y, V):
-        at, speed = self.strength * jnp.sin(z.phase), self.strength * jnp.cos(z.phase)
-        return Ball(Y + at, V + speed, z.phase)
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    def field(self, s, z):
-        return Ball(z.speed, -jnp.ones_like(s), jnp.ones_like(s))
-
-    def start(self):
-        return Ball(jnp.array(0.3), jnp.array(0.0), jnp.array(0.0))
 
 
 @pytest.mark.slow
@@ -285,7 +201,7 @@ def test_balls_with_a_radius_rest_on_one_another():
     np.testing.assert_allclose(
         [run.last.x, run.last.y], [place - radius, place + radius], rtol=1e-8
     )
-    np.testing.assert_allclose([run.last.u, run.last.v], speed, rtol=1e-8)
+    np.testing.assert_allclose([run.last.v.x, run.last.v.y], speed, rtol=1e-8)
     # On from there, whatever rounding made of their distance.
     for cycles in (4, 5, 6):
         run = vi.simulate(balls, run.last, 1)
@@ -300,22 +216,7 @@ def test_derivatives_of_balls_that_rest_on_one_another():
     def places(radius):
         balls = Pressed(radius)
         last = vi.simulate(balls, balls.start(), 3).last
-        return jnp.stack([last.x, last.u, last.y, last.v])
+        return jnp.stack([last.x, last.v.x, last.y, last.v.y])
 
     # Of the middle nothing depends on the radius. What is left is the chatter completed at once.
     np.testing.assert_allclose(jax.jacfwd(places)(0.25), [-1, 0, 1, 0], atol=1e-9)
-
-
-def test_a_ball_moves_with_the_table_on_which_it_rests():
-    def motion(strength):
-        table = Table(strength)
-        run = vi.simulate(table, table.start(), 4, samples=5)
-        return run.samples.state, run
-
-    state, run = motion(0.9)
-    assert bool(run.successful) and int(run.rests.sum()) == 1
-    settled = slice(10, None)  # the second cycle on
-    height, phase = np.asarray(state.height)[settled], np.asarray(state.phase)[settled]
-    np.testing.assert_allclose(height, 0.9 * np.sin(phase), atol=1e-9)
-    slope = jax.jacfwd(lambda x: motion(x)[0].height)(0.9)[settled]
-    np.testing.assert_allclose(slope, np.sin(phase), atol=1e-8)

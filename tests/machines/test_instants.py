@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from rough_block import ABOVE_AND_ALONG, Plane
-
 State = vi.OscillatorState
 
 
@@ -120,59 +118,50 @@ def test_a_body_is_let_go_of_as_its_force_jumps():
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["reset", "release"]
 
 
-class Lever(vi.AbstractMachine):
+class Lever(vi.Mechanical):
     """A body on the left stop, pulled away from it once another one has hit its own stop."""
 
+    q = ("x", "y")
+    mass = (1.0, 1.0)
     cycle = 4.0
+    modes = {"way": -1.0}  # noqa: RUF012
+    contacts = (
+        vi.RigidStop(0.0, 0.0, "left", on="y"),
+        vi.RigidStop(1.0, 0.5, on="x", modes=lambda m, s, z, way: 1.0),
+    )
 
-    @property
-    def contacts(self):
-        hit = vi.RigidStop(1.0, 0.5, coordinate=1, modes=lambda m, s, z, way: (1.0,))
-        return vi.RigidStop(0.0, 0.0, "left"), hit
-
-    @property
-    def coordinates(self):
-        return ABOVE_AND_ALONG
-
-    def modes(self, s, state):
-        return (-1.0,)
-
-    def field(self, s, z, way):
-        return Plane(z.u, z.v, 0 * z.u, way + 0 * z.v)
+    def force(self, t, q, v, way):
+        return dict(x=0.0, y=way)
 
 
 @pytest.mark.slow
 def test_a_body_is_let_go_of_by_the_impact_of_another():
-    start = Plane(*(jnp.asarray(x) for x in (0.0, 0.0, 0.5, 0.0)))
-    run = vi.simulate(Lever(), start, 1, event_log=4)
+    run = vi.simulate(Lever(), Lever().at(v=dict(x=0.5)), 1, event_log=4)
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["impact", "release"]
     assert float(run.last.y) == pytest.approx(0.5 * 2**2, abs=1e-12)
     assert float(run.last.x) == pytest.approx(1 - 2 * 0.25, abs=1e-12)
 
 
-class Pulled(vi.AbstractMachine):
-    """A block on a floor that is pulled harder from s = 1 on."""
+class Pulled(vi.Mechanical):
+    """A block on a floor that is pulled harder from t = 1 on."""
 
     slope: jax.Array | float = 0.0
-    contacts = (vi.RigidStop(0.0, 0.0, "left"), vi.ContactFriction(1.0, stop=0, along=1))
-    events = vi.Switch(lambda machine, s, state: s - 1.0)
+    q = ("x", "y")
+    mass = (1.0, 1.0)
     cycle = 3.0
+    contacts = vi.RigidStop(0.0, 0.0, "left", on="y", friction=1.0, along="x")
+    events = vi.Switch(lambda machine, s, state: s - 1.0)
 
-    @property
-    def coordinates(self):
-        return ABOVE_AND_ALONG
-
-    def field(self, s, z, on):
-        pull = jnp.where(on > 0, 2.0 + self.slope * (s - 1), 0.5)
-        return Plane(z.u, z.v, pull + 0 * z.u, -1 + 0 * z.v)
+    def force(self, t, q, v, on):
+        return dict(x=jnp.where(on > 0, 2.0 + self.slope * (t - 1), 0.5), y=-1.0)
 
 
 @pytest.mark.slow
 def test_friction_lets_go_as_the_pull_jumps():
     """Whether the pull then grows or falls: u = ∫(pull - 1) ds over two."""
-    start, slopes = Plane(*(jnp.asarray(0.0) for _ in range(4))), jnp.array([0.0, 0.1, -0.1])
-    run = jax.vmap(lambda slope: vi.simulate(Pulled(slope=slope), start, 1))(slopes)
-    np.testing.assert_allclose(run.last.u, 2.0 + 2 * slopes, atol=1e-12)
+    slopes = jnp.array([0.0, 0.1, -0.1])
+    run = jax.vmap(lambda slope: vi.simulate(Pulled(slope=slope), Pulled().at(), 1))(slopes)
+    np.testing.assert_allclose(run.last.v.x, 2.0 + 2 * slopes, atol=1e-12)
 
 
 def test_a_reset_onto_the_surface_of_another_is_no_event_there():

@@ -1,8 +1,5 @@
 """What impacts act on, where that is no constant; and pictures of several coordinates."""
 
-from typing import Any
-
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,20 +7,6 @@ import vi_jax as vi
 from matplotlib.figure import Figure
 from scipy.integrate import quad
 from scipy.optimize import brentq
-
-
-def test_impacts_of_an_unbalanced_rotor_lose_what_its_energy_does():
-    """Without damping and motor nothing else does."""
-    e = 0.2
-    rotor = vi.machines.UnbalancedRotor(
-        coupling=e, gap=0.5, restitution=0.6, strength=0.0, damping_ratio=0.0
-    )
-    steps = vi.FixedStep(diffrax.Tsit5(), 200)
-    run = vi.simulate(rotor, rotor.start(Y=0.1, V=0.3, W=3.0), 4, method=steps)
-    states = run.sections  # where φ = 0
-    energy = 0.5 * (states.V**2 + states.Y**2) + states.P**2 / (2 * e)
-    assert int(run.impacts.sum()) > 3
-    np.testing.assert_allclose(run.impact_energy, -np.diff(energy), atol=2e-9)
 
 
 class Growing(vi.AbstractMachine):
@@ -70,28 +53,21 @@ def test_a_mass_may_be_a_function():
         vi.simulate(Pairs(), start, 1)
 
 
-class Pair(vi.OscillatorState):
-    y: Any
-    v: Any
-
-
-class Bodies(vi.AbstractMachine):
+class Bodies(vi.Mechanical):
     """Two bodies that nothing pulls, between stops of their own."""
 
-    contacts: tuple = (vi.RigidStop(1.0, 0.5), vi.RigidStop(2.0, 0.5, "left", coordinate=1))
-    coordinates: tuple = (
-        vi.Coordinate(lambda z: z.Y, lambda z: z.V, lambda z, Y, V: Pair(Y, V, z.y, z.v)),
-        vi.Coordinate(lambda z: z.y, lambda z: z.v, lambda z, Y, V: Pair(z.Y, z.V, Y, V)),
-    )
-    cycle: float = 3.0
+    q = ("x", "y")
+    mass = (1.0, 1.0)
+    cycle = 3.0
+    contacts = (vi.RigidStop(1.0, 0.5, on="x"), vi.RigidStop(2.0, 0.5, "left", on="y"))
 
-    def field(self, s, z):
-        return Pair(z.V, 0 * z.V, z.v, 0 * z.v)
+    def force(self, t, q, v):
+        return dict(x=0.0, y=0.0)
 
 
 def test_pictures_show_a_coordinate_with_its_own_stops_and_impacts():
     machine = Bodies()
-    start = Pair(*(jnp.asarray(x) for x in (0.0, 0.7, 0.0, -1.1)))
+    start = machine.at(v=dict(x=0.7, y=-1.1))
     run = vi.simulate(machine, start, 1, samples=30, impact_log=4, rests=False)
     assert run.impact_log.stop[0, :2].tolist() == [0, 1]
     for k, (speed, place) in enumerate(((0.7, 1.0), (-1.1, -2.0))):

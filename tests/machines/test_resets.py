@@ -1,8 +1,5 @@
 """Jumps of the state by rules of one's own, modes that impacts change, cycles that events end."""
 
-from typing import Any
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,17 +8,7 @@ import vi_jax as vi
 from scipy.linalg import expm
 from scipy.optimize import brentq, fsolve
 
-from event_by_event import followed
-from resets import (
-    A,
-    Excited,
-    Sliding,
-    StickSlip,
-    ThreeStates,
-    Toggled,
-    Walker,
-    legs,
-)
+from resets import A, Excited, StickSlip, ThreeStates, Walker, legs
 
 CLOSE = vi.Adaptive(rtol=1e-12)
 # Of the walker on a slope of 0.009: by SciPy at 1e-13.
@@ -90,51 +77,8 @@ def test_at_equal_times_exponents_are_those_of_the_multipliers():
     np.testing.assert_allclose(found, np.sort([0.0, *rates])[::-1], rtol=0.02, atol=3e-3)
 
 
-def slid(voltage, x, cycles):
-    """States of the impactor at the ends of its cycles, by SciPy."""
-
-    def field(t, x):
-        force = (voltage * np.sin(0.92 * t) / (1 - x[0])) ** 2 - 0.04 * x[1] - x[0]
-        if slides:
-            return [x[1], 3.17 + 1.2 * force, -3.17 - 0.2 * force]
-        return [x[1], force, -x[2]]
-
-    def hit(t, x):
-        nonlocal slides
-        slides = True
-        return 0.5, -0.8 * x[1], 0.3 * x[1]
-
-    def held(t, x):
-        nonlocal slides
-        slides = False
-        return *x[:2], 0.0
-
-    def ends(t, x):
-        found.append(x)
-        return None if len(found) == cycles else x
-
-    slides, found = False, []
-    events = [
-        (lambda t, x: x[0] - 0.5, hit),
-        (lambda t, x: -x[2] if slides else -1.0, held),
-        (lambda t, x: t - (len(found) + 1) * np.pi / 0.92, ends),
-    ]
-    followed(field, x, 100.0, events, rtol=1e-12)
-    return np.array(found)
-
-
 def sliding(q, v):
-    return Sliding(*(jnp.asarray(x) for x in (q, v, 0.0)))
-
-
-def test_an_impact_sets_a_base_in_motion():
-    run = vi.simulate(StickSlip(0.57), sliding(0.1, 0.0), 8, method=CLOSE, event_log=8)
-    sections = jnp.stack([run.sections.q, run.sections.v, run.sections.u], axis=1)
-    np.testing.assert_allclose(sections[1:], slid(0.57, np.array([0.1, 0, 0]), 8), atol=1e-8)
-    kinds = np.asarray(run.event_log.number)
-    assert (kinds == 0).sum() == (kinds == 1).sum() > 2  # each impact is followed by sticking
-    speeds = run.event_log.value[kinds == 0]
-    assert float(speeds.min()) > 0 and np.isnan(run.event_log.value[kinds == 1]).all()
+    return vi.State(q=q, v=v, u=0.0)
 
 
 @pytest.mark.slow
@@ -182,46 +126,21 @@ def test_a_cycle_that_an_impact_ends():
     np.testing.assert_allclose(branch.at(0.6)[0].state.V, -speed, rtol=1e-9)
 
 
-def toggled(k, times):
-    """Speeds of approach of the body between its walls, from rest in the middle."""
-    speeds, speed = [], np.sqrt(2.0)
-    for _ in range(times):
-        speeds.append(speed)
-        speed = np.sqrt((k * speed) ** 2 + 4.0)
-    return speeds
-
-
-def test_an_impact_changes_a_mode():
-    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
-    run = vi.simulate(Toggled(), start, 1, impact_log=6, method=CLOSE)
-    assert run.impact_log.stop[0].tolist() == [0, 1, 0, 1, 0, 1]
-    np.testing.assert_allclose(run.impact_log.speed[0], toggled(0.8, 6), rtol=1e-10)
-
-
-CASES = {
-    "stick and slip": lambda x: (StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)),
-    "impact": lambda x: (Excited(0.6 + 0.01 * x), vi.OscillatorState(x, 0.5 + 0 * x)),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_backends_agree(name):
+def test_backends_agree():
     @jax.vmap
     def lanes(x):
-        return vi.simulate(*CASES[name](x), 3, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
+        machine, start = StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)
+        return vi.simulate(machine, start, 3, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
 
     runs, at = [], jnp.linspace(-0.5, 0.5, 5)
     for backend in ("auto", "xla"):
         with vi.backend(backend):
             runs.append(jax.jit(lanes)(at))
     fast, slow = runs
-    assert bool(fast.successful.all())
+    assert bool(fast.successful.all()) and int((fast.event_log.number == 1).sum()) > 4
     np.testing.assert_array_equal(fast.event_log.number, slow.event_log.number)
-    np.testing.assert_array_equal(fast.impacts, slow.impacts)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-12),
-        fast.sections, slow.sections,
-    )  # fmt: skip
+    for a, b in zip(*map(jax.tree.leaves, (fast.sections, slow.sections)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 class Thrown(vi.AbstractMachine):
@@ -251,34 +170,6 @@ def test_a_reset_beyond_a_stop_ends_the_lane():
     run = vi.simulate(Thrown(), start, 2)
     assert bool(run.result == vi.RESULTS.bad_reset)
     assert np.isfinite(run.sections.Y[0]) and not np.isfinite(run.last.Y)
-
-
-class Unnamed(eqx.Module):
-    a: Any
-    c: Any
-    b: Any
-
-
-class Bounced(vi.AbstractMachine):
-    """a'' = -a, thrown back at .5, in a state whose second number is no velocity."""
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
-
-    @property
-    def events(self):
-        return (vi.Reset(lambda m, s, x: x.a - 0.5, lambda m, s, x: Unnamed(x.a, x.c, -x.b)),)
-
-    def field(self, s, x):
-        return Unnamed(x.b, x.a, -x.a)
-
-
-def test_a_reset_of_a_state_without_names():
-    run = vi.simulate(Bounced(), Unnamed(*(jnp.array(x) for x in (-1.0, 0.3, 0.1))), 3)
-    assert bool(run.successful)
-    np.testing.assert_allclose(run.y_max, 0.5, atol=1e-9)
-    np.testing.assert_allclose(run.y_min, -np.hypot(1, 0.1), atol=1e-8)
 
 
 def three(b):

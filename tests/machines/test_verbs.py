@@ -53,7 +53,7 @@ CASES = {
         ("grazing", "period-doubling"), "period-doubling", "gap", (0.95, 1.05),
     ),
     "two bodies": Case(
-        TwoBodies(), {}, "x1", "v1", "force", (0.3, 1.0), ("grazing", "period-doubling"),
+        TwoBodies(), {}, "x", "y", "drive", (0.3, 1.0), ("grazing", "period-doubling"),
         "period-doubling", "gap", (0.55, 0.65),
     ),
 }  # fmt: skip
@@ -96,12 +96,12 @@ def test_simulate(case, orbit):
     )
     assert bool(run.successful)
     assert max(float(x.max()) for x in jax.tree.leaves(run.errors.sections)) < 1e-5
-    for name in vars(orbit.state):
+    for found, wanted in zip(*map(jax.tree.leaves, (run.sections, orbit.state)), strict=True):
         # Multipliers of the motion are below 1 and errors fade.
-        wanted = np.broadcast_to(getattr(orbit.state, name), 4)
-        np.testing.assert_allclose(getattr(run.sections, name), wanted, atol=1e-5)
+        np.testing.assert_allclose(found, np.broadcast_to(wanted, 4), atol=1e-5)
     np.testing.assert_array_equal(run.impacts, int(orbit.impacts))
     np.testing.assert_allclose(run.y_max[1:], orbit.y_max, atol=1e-5)
+    np.testing.assert_array_equal(run.to_xarray()["error_y_max"], run.errors.y_max)
     vi.plot_sketch(case.machine)
     if driven:
         vi.plot_history(run, machine=case.machine)
@@ -190,6 +190,9 @@ def test_scan(case, orbit):
         start=orbit.state, settle=200, cycles=128,
         measure=[vi.Regime(), "extremes", vi.Sections(), "impact_rate", vi.Exponent()],
     )  # fmt: skip
+    units = case.machine.units
+    for name, unit in (("y_min", "position"), ("impact_speed", "velocity"), ("exponent", "rate")):
+        assert data[name].attrs.get("units", "1") == units.get(unit, "1")
     assert (np.asarray(data["period"]) == 1).all() and (np.asarray(data["result"]) == 0).all()
     np.testing.assert_allclose(data["y_max"][0], orbit.y_max, atol=1e-5)
     vi.plot_regimes(data, machine=case.machine)

@@ -1,4 +1,4 @@
-"""The woodpecker toy: its known cycle, beside SciPy, energy, derivatives, methods and backends."""
+"""The woodpecker toy: its known cycle, its picture and its words."""
 
 import equinox as eqx
 import jax
@@ -9,15 +9,15 @@ import pytest
 import vi_jax as vi
 from vi_jax.machine import is_in_range, section_in
 
-import pecking
-
 matplotlib.use("Agg")
 WOODPECKER = vi.machines.Woodpecker
 CLOSE = vi.Adaptive(rtol=1e-12)
 
 # Of Glocker's numbers, by an integration from event to event in more than double precision's worth
 # of digits that are kept here: where the cycle begins, how long it takes, how far it goes down.
+# In its impacts it loses LOST of the energy of its weight, by SciPy's DOP853 at 1e-13.
 SPEED, BIRD_RATE, PERIOD, DROP = -0.33947862236, -7.46209464263, 0.14597606514, 19.4453792847e-3
+LOST = 1.245143533e-4
 MULTIPLIER = -0.8391556
 EVENTS = (
     ("mode", 0, 0.0215692), ("mode", 0, 0.0611626), ("release", 0, 0.0669833),
@@ -26,16 +26,13 @@ EVENTS = (
     ("impact", 0, 0.1214251), ("rest", 0, 0.1214251),
 )  # fmt: skip
 
-# Lanes: the cycle; starts beside it, by which its map is seen; other starts, and other frictions.
+# Lanes: the cycle, and starts beside it, by which its map is seen.
 STEP = 1e-5
 STARTS = np.array(
     [
         (0.3, SPEED, BIRD_RATE),
         *((0.3, SPEED + a, BIRD_RATE) for a in (STEP, -STEP)),
         *((0.3, SPEED, BIRD_RATE + a) for a in (30 * STEP, -30 * STEP)),
-        (0.3, -0.36, -7.3),
-        (0.31, -0.3, -7.4),
-        (0.29, -0.5, -7.9),
     ]
 )
 
@@ -53,14 +50,6 @@ def run():
     return found
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return [
-        pecking.cycle([0, pecking.JAMMED, pecking.SECTION, speed, 0, rate], mu)
-        for mu, speed, rate in STARTS
-    ]
-
-
 def lane(tree, i):
     return jax.tree.map(lambda x: x[i], tree)
 
@@ -76,6 +65,7 @@ def test_the_known_cycle(run):
     last = lane(run.last, 0)
     assert float(run.duration[0, 0]) == pytest.approx(PERIOD, rel=1e-9)
     assert float(last.drop) == pytest.approx(DROP, rel=1e-9)
+    assert float(run.impact_energy[0, 0]) == pytest.approx(LOST, rel=1e-7)
     assert float(last.speed) == pytest.approx(SPEED, rel=1e-8)
     assert float(last.bird_rate) == pytest.approx(BIRD_RATE, rel=1e-8)
     assert float(last.height) == 0
@@ -92,38 +82,6 @@ def test_its_multipliers(run):
     slopes = [(ends[i] - ends[i + 1]) / (2 * h) for i, h in ((1, STEP), (3, 30 * STEP))]
     found = np.sort(np.linalg.eigvals(np.transpose(slopes)).real)
     np.testing.assert_allclose(found, [MULTIPLIER, 0], atol=1e-5)
-
-
-@pytest.mark.slow
-def test_beside_scipy(run, truth):
-    for i, wanted in enumerate(truth):
-        last = lane(run.last, i)
-        found = [-last.drop, last.sleeve_angle, last.bird_angle, last.speed, last.sleeve_rate,
-                 last.bird_rate]  # fmt: skip
-        np.testing.assert_allclose(found, wanted.state, rtol=1e-7, atol=1e-9)
-        assert float(run.duration[i, 0]) == pytest.approx(wanted.duration, rel=1e-9)
-        met = [x for x in events(run, i) if x[0] != "rest"]
-        assert [x[:2] for x in met] == [x[:2] for x in wanted.events]
-        np.testing.assert_allclose([x[2] for x in met], [x[2] for x in wanted.events], atol=1e-8)
-    # They are different motions.
-    assert len({len(x.events) for x in truth}) > 1
-
-
-@pytest.mark.slow
-def test_energy(run, truth):
-    """What is lost in impacts, as recorded, and by friction between them is what the motion lost;
-    in the cycle that is weight times drop."""
-    np.testing.assert_allclose(run.impact_energy[:, 0], [x.impact_loss for x in truth], rtol=1e-6)
-    for i, (_, speed, rate) in enumerate(STARTS):
-        begin = np.array([0, pecking.JAMMED, pecking.SECTION, speed, 0, rate])
-        last = lane(run.last, i)
-        end = np.array([-last.drop, last.sleeve_angle, last.bird_angle, last.speed,
-                        last.sleeve_rate, last.bird_rate])  # fmt: skip
-        lost = pecking.energy(begin) - pecking.energy(end)
-        assert float(run.impact_energy[i, 0]) + truth[i].rubbed == pytest.approx(lost, rel=1e-7)
-    work = pecking.WEIGHT[0] * float(run.last.drop[0])
-    assert float(run.impact_energy[0, 0]) + truth[0].rubbed == pytest.approx(work, rel=1e-7)
-    assert float(run.impact_energy[0, 0]) > 0.1 * work
 
 
 def test_its_range():

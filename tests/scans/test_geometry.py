@@ -108,45 +108,6 @@ def test_the_exponent_of_a_boundary_whose_dimension_is_known(grows, falls):
     assert found.exponents[1] == pytest.approx(1.0, abs=0.01)
 
 
-def kicked_disc(size, cycles=100):
-    """Grebogi, McDonald, Ott and Yorke's map (1983) on (0, 2π) × ±0.5: which of θ = 0, π it comes
-    to."""
-    angle = 2 * np.pi * (np.arange(size) + 0.5) / size
-    place = -0.5 + (np.arange(size) + 0.5) / size
-    angle, place = np.meshgrid(angle, place, indexing="ij")
-    for _ in range(cycles):
-        turned = angle + 1.32 * np.sin(2 * angle) - 0.9 * np.sin(4 * angle)
-        angle, place = turned - place * np.sin(angle), -0.3 * np.cos(angle)
-    assert np.abs(np.sin(angle)).max() < 0.1
-    return (np.cos(angle) < 0).astype(int)
-
-
-def test_published_numbers_of_the_map_of_1983():
-    """Its exponent for errors in x, some 0.2; entropies as the tests of Attractors.jl have them, of
-    boxes of 6 × 6 in 300 × 300 starts: 0.40 to 0.42 and, of the boundary, 0.60 to 0.61 there."""
-    label = kicked_disc(300)
-    assert label.mean() == pytest.approx(0.5, abs=0.01)  # x and θ + π are as x and θ
-    found = uncertainty_of(label)
-    low, high = found.intervals[1]
-    assert low < 0.2 < high and abs(found.exponents[1] - 0.2) < 0.02
-    entropy = entropy_of(label, box=6)
-    assert 0.395 < entropy.total < 0.42 and 0.59 < entropy.boundary < 0.61
-
-
-def test_newtons_cubic():
-    """z³ = 1 by Newton's method: its boundary has the dimension 1.42, as the tests of Attractors.jl
-    quote, and S_bb is above ln 2, since everywhere on it all three basins meet."""
-    x = square(600)[0]
-    z = x[:, None] + 1j * x
-    for _ in range(40):
-        z = z - (z**3 - 1) / (3 * z**2)
-    label = np.argmin(np.abs(z[..., None] - np.exp(2j * np.pi * np.arange(3) / 3)), axis=-1)
-    found = uncertainty_of(label)
-    for exponent, (low, high) in zip(found.exponents, found.intervals, strict=True):
-        assert abs(exponent - 0.58) < 0.03 and low < 0.58 < high
-    assert entropy_of(label, box=5).boundary > np.log(2)
-
-
 def disc_and_rest(size=40, *, beyond=0.8):
     """Starts in ±1 of which those in a disc of 0.6 around 0 settle on a motion of two cycles; those
     with V > `beyond` cannot be, as beyond a stop."""

@@ -92,26 +92,3 @@ def test_refused_before_any_work():
         ask(samples=100)
     with pytest.raises(ValueError, match="frequency"):
         vi.integrity_profile(SCENE, "drive.frequency", [0.9], REGION)
-
-
-@pytest.mark.slow
-def test_all_of_the_ball_settles_on_the_motion():
-    """Simulated on circles around the motion: a little inside of the ball all starts come back to
-    it, a little outside some do not."""
-    options = {**QUICK, "resolution": (96, 144)}
-    found = vi.integrity_profile(SCENE, ZETA, [1.4], REGION, **options)
-    (one,) = found.basins
-    for motion, reach in zip(one.attractors, one.integrity(), strict=True):
-        assert not reach.local_at_edge
-        angle = np.linspace(0.0, 2 * np.pi, 400)
-        share = []
-        for radius in (reach.local - reach.resolution, reach.local + 2 * reach.resolution):
-            Y = float(motion.sections["Y"][0]) + radius * np.cos(angle)
-            V = float(motion.sections["V"][0]) + radius * np.sin(angle)
-            starts = {"start.Y": Y[Y < 2.0], "start.V": V[Y < 2.0]}
-            scene = vi.Scene.ideal(
-                frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.05
-            )
-            ends = vi.scan(scene, starts, measure="regime", settle=400, paired=True, progress=False)
-            share.append(float(np.mean(np.round(ends["impacts"]) == round(motion.impacts))))
-        assert share[0] == 1.0 and share[1] < 1.0

@@ -24,15 +24,6 @@ def test_linear_oscillator():
         np.testing.assert_allclose(found.exponents, rates, atol=1e-9)
 
 
-def test_stable_orbit_has_the_rates_of_its_multipliers():
-    scene = ideal(k=0.8, xi=0.01)
-    found = vi.lyapunov(scene, scene.start(), 400, settle=600)
-    closed = vi.closed_form_orbits(scene, cycles=2)
-    orbit = vi.find_orbit(scene, scene.start(Y=closed.Y[0], V=closed.V[0]), cycles=2)
-    rates = np.sort(np.log(np.abs(orbit.multipliers)) / (4 * np.pi / 0.9))[::-1]
-    np.testing.assert_allclose(found.exponents, rates, atol=1e-6)
-
-
 def test_unstable_orbit_has_the_rates_of_its_multipliers():
     # Started on it, the motion stays for the few cycles in which it is observed.
     scene = ideal()
@@ -95,17 +86,6 @@ def test_exponents_add_up_to_the_mean_contraction():
     contraction = -2 * xi + 2 * np.log(k) * impacts * zeta / (2 * np.pi)
     np.testing.assert_allclose(found.exponents.sum(axis=1), contraction, atol=1e-9)
     assert impacts.max() > 0.5
-
-
-@pytest.mark.slow
-def test_motor_has_three_and_vmap_gives_the_same():
-    scene = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene()
-    start = scene.start(Y=0.5)
-    found = vi.lyapunov(scene, start, 200, settle=300)
-    assert found.exponents.shape == (3,)
-    assert bool(found.successful) and float(found.exponents[0]) < 0
-    first = vi.lyapunov(scene, start, 200, settle=300, number=1)
-    np.testing.assert_allclose(first.exponents[0], found.exponents[0], atol=1e-7)
 
 
 def test_failed_runs_and_bad_arguments():

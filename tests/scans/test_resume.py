@@ -52,32 +52,6 @@ def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
         vi.scan(SCENE, axes, store=tmp_path / "full", **options)
 
 
-def test_a_store_knows_functions_by_what_they_make(tmp_path):
-    def maker(gap, factor):
-        def machine(zeta):
-            return vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.02)
-
-        def measure(scene, run):
-            return {"depth": factor * run.y_min[-1]}
-
-        return machine, measure
-
-    def run(gap, factor, **options):
-        machine, measure = maker(gap, factor)
-        axes = {"zeta": [0.8, 1.2]}
-        store = tmp_path / "s"
-        return vi.scan(machine, axes, measure=measure, settle=5, cycles=4, store=store, **options)
-
-    first = run(2.0, 1.0)
-    np.testing.assert_array_equal(run(2.0, 1.0).depth, first.depth)
-    with pytest.raises(ValueError, match=r"first stops\.0\.gap is 2\.0, and now it is 1\.5"):
-        run(1.5, 1.0)
-    with pytest.raises(ValueError, match=r"code of measure 1 is \w+, and now it is"):
-        run(2.0, 3.0)
-    with pytest.raises(ValueError, match="paired is False, and now it is True"):
-        run(2.0, 1.0, paired=True)
-
-
 def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
     store = importlib.import_module("vi_jax.scans.store")
     create = store.zarr.Group.create_array

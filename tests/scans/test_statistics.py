@@ -160,36 +160,6 @@ def test_the_rate_of_escape_is_that_of_the_map():
     assert 1 / float(data.escape_cycle.mean()) > float(found.rate_high)
 
 
-@pytest.mark.slow
-def test_escapes_over_a_barrier_come_as_kramers_says():
-    """The slope of ln(rate) over the barrier, ¼, in units of D is -1 within 5 %. Of the rates
-    themselves 10 % are left to what is no rate between two wells, at barriers as low as 3 D: a way
-    back from beyond the barrier, and the time until it is counted."""
-    heights, damping = np.array([3.0, 4.0, 5.0, 6.0]), 1.0
-    D = 0.25 / heights
-    machine = vi.machines.Duffing(
-        amplitude=0.0, damping=damping, stiffness=-1.0, cubic=1.0, gap=20.0
-    )
-    data = vi.scan(
-        machine, {"noise.V": np.sqrt(2 * damping * D), "noise.path": np.arange(2048)},
-        start=machine.start(Y=-1.0), measure=vi.Escape("Y", high=0.6, samples=16), settle=0,
-        cycles=240, noise=vi.WhiteNoise({"V": 1.0}, impulses=16), key=jax.random.key(3),
-        progress=False,
-    )  # fmt: skip
-    found = vi.escape_rate(data, "noise.path", after=8)
-    rates, weights = found.rate.values, found.escapes.values
-    rows = np.vander(heights, 2)
-    covariance = np.linalg.inv(rows.T @ (rows * weights[:, None]))
-    slope = (covariance @ rows.T @ (weights * np.log(rates)))[0]
-    error = covariance[0, 0] ** 0.5
-    assert error < 0.017
-    assert abs(slope + 1) < 0.05
-    # Per cycle, by the Fokker-Planck equation: half of its least eigenvalue but zero, in Hermite's
-    # functions of the velocity and sinc functions of x, by SciPy.
-    exact = np.array([0.0419567822, 0.0152192643, 0.0056088431, 0.0020751419])
-    assert np.all(np.abs(rates / exact - 1) < 0.1 + 3 / weights**0.5)
-
-
 @pytest.mark.parametrize(
     "of, samples, settle", [("Y", 4, 2), pytest.param("y_max", 0, 2, marks=pytest.mark.slow)]
 )

@@ -42,6 +42,8 @@ def test_a_batch_in_tables():
     run = jax.vmap(one)(jnp.asarray([0.8, 1.0, 1.2]))
     table = run.to_xarray(["gap"], along="impact").to_dataframe()
     assert table.groupby("gap").size().tolist() == run.impacts.sum(axis=1).tolist()
+    with pytest.raises(ValueError, match=r"`dims` must name the 1 batch axes .* 'gap'"):
+        run.to_xarray("gap")
     lanes = run.to_xarray(["gap"], along="gap").to_dataframe()
     assert (
         lanes.result.tolist() == ["successful"] * 3 and lanes.steps.tolist() == run.steps.tolist()

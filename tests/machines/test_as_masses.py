@@ -1,0 +1,218 @@
+"""Ready machines beside the same machines by their masses and forces: the momentum and the energy
+of an impact follow from the masses."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from differences import quick
+
+M, LANES, CYCLES = vi.machines, 24, 4
+
+
+class Masses(vi.Mechanical):
+    """The machine with the numbers of the ready machine `of`."""
+
+    of: Any
+
+    def own(self, x):
+        """The numbers of the ready machine's sections that are compared."""
+        return jax.tree.leaves(x)
+
+    def walls(self, gap, on):
+        sides = ("right", "left")
+        return tuple(vi.RigidStop(gap, self.of.restitution, side, on=on) for side in sides)
+
+
+class Box(Masses):
+    """A ball in a box on a spring."""
+
+    q: ClassVar = ("box", "ball")
+    cycle: ClassVar = 2 * np.pi
+
+    @property
+    def mass(self):
+        return 1.0, self.of.mass_ratio
+
+    def force(self, t, q, v):
+        w, xi = self.of.frequency, self.of.damping_ratio
+        return dict(box=self.of.force * jnp.sin(t) - w * w * q.box - 2 * xi * w * v.box, ball=0.0)
+
+    @property
+    def contacts(self):
+        return self.walls(self.of.half_gap, lambda q: q.ball - q.box)
+
+    def begun(self, x):
+        v = dict(box=x.box_speed, ball=x.box_speed + x.speed)
+        return self.at(box=x.box, ball=x.box + x.place, v=v)
+
+    def seen(self, z):
+        return z.ball - z.box, z.v.ball - z.v.box, z.box, z.v.box
+
+
+class ShakenBox(Box):
+    """In a box that moves as sin t."""
+
+    mass: ClassVar = (1.0,)
+
+    def prescribed(self, t):
+        return dict(box=jnp.sin(t))
+
+    def force(self, t, q, v):
+        return dict(ball=0.0)
+
+    def begun(self, x):
+        return self.at(ball=x.place, v=dict(ball=1.0 + x.speed))
+
+    def seen(self, z):
+        return super().seen(z)[:2]
+
+
+class Spring(Masses):
+    """Duffing's, in time."""
+
+    q: ClassVar = ("x",)
+    mass: ClassVar = (1.0,)
+
+    @property
+    def cycle(self):
+        return 2 * np.pi / self.of.frequency
+
+    def force(self, t, q, v):
+        n, x = self.of, q.x
+        push = n.amplitude * jnp.cos(n.frequency * t) - n.damping * v.x
+        return dict(x=push - n.stiffness * x - n.cubic * x**3)
+
+    @property
+    def contacts(self):
+        return self.walls(self.of.gap, "x")
+
+    def begun(self, x):
+        return self.at(x=x.Y, v=dict(x=x.V))
+
+    def seen(self, z):
+        return z.x, z.v.x
+
+
+class Capsule(Masses):
+    q: ClassVar = ("mass_", "capsule")
+
+    @property
+    def cycle(self):
+        return 2 * np.pi / self.of.frequency
+
+    @property
+    def mass(self):
+        return 1.0, self.of.mass_ratio
+
+    def force(self, t, q, v):
+        pull = q.mass_ - q.capsule + 2 * self.of.damping_ratio * (v.mass_ - v.capsule)
+        drive = self.of.amplitude * jnp.cos(self.of.frequency * t)
+        return dict(mass_=drive - pull, capsule=pull)
+
+    @property
+    def contacts(self):
+        n = self.of
+        return (
+            vi.RigidStop(n.gap, n.restitution, on=lambda q: q.mass_ - q.capsule),
+            vi.DryFriction(n.friction, static_ratio=n.static_ratio, on="capsule"),
+        )
+
+    def begun(self, x):
+        v = dict(mass_=x.speed + x.capsule_speed, capsule=x.capsule_speed)
+        return self.at(mass_=x.place, v=v)
+
+    def seen(self, z):
+        return z.mass_ - z.capsule, z.v.mass_ - z.v.capsule, z.v.capsule, z.capsule
+
+    def own(self, x):
+        return x.place, x.speed, x.capsule_speed, jnp.cumsum(x.progress)
+
+
+class Rotor(Masses):
+    """The inertia of the shaft is 1/ε."""
+
+    q: ClassVar = ("Y", "phi")
+    cycle: ClassVar = vi.turn_of("phi", usual=2 * np.pi)
+
+    def mass(self, q):
+        across = -jnp.sin(q.phi)
+        return [[1.0, across], [across, 1 / self.of.coupling]]
+
+    def force(self, t, q, v):
+        n = self.of
+        motor = n.strength * (n.control - v.phi / n.no_load_speed)
+        return dict(Y=-q.Y - 2 * n.damping_ratio * v.Y, phi=motor / n.coupling)
+
+    @property
+    def contacts(self):
+        return self.walls(self.of.gap, "Y")
+
+    def begun(self, x):
+        return self.at(Y=x.Y, v=dict(Y=x.V, phi=x.P))
+
+    def seen(self, z):
+        return z.Y, z.v.Y, z.v.phi
+
+
+# The ranges of its numbers and of its start.
+HITS = {"restitution": (0.3, 0.9)}
+CASES = {
+    "pair": (M.ImpactPair(), ShakenBox, {**HITS, "half_gap": (0.6, 2)},
+             {"place": (-0.5, 0.5), "speed": (-1, 1)}),
+    "free pair": (
+        M.ImpactPair(mass_ratio=0.2), Box,
+        {**HITS, "half_gap": (0.6, 2), "mass_ratio": (0.1, 1), "damping_ratio": (0, 0.3),
+         "force": (0.1, 1), "frequency": (0, 2)},
+        {"place": (-0.5, 0.5), "speed": (-1, 1), "box": (-0.2, 0.2), "box_speed": (-0.3, 0.3)},
+    ),
+    "duffing": (
+        M.Duffing(), Spring,
+        {**HITS, "amplitude": (0.2, 1), "frequency": (0.6, 1.5), "damping": (0, 0.3),
+         "stiffness": (-0.5, 1), "cubic": (0, 1), "gap": (0.5, 1)},
+        {"Y": (-0.5, 0.5), "V": (-1, 1)},
+    ),
+    "capsule": (
+        M.Capsule(), Capsule,
+        {**HITS, "amplitude": (0.3, 3), "frequency": (0.4, 2), "damping_ratio": (0, 0.2),
+         "mass_ratio": (1, 8), "gap": (0.2, 1.2), "friction": (0.1, 1.5), "static_ratio": (1, 1.4)},
+        {"place": (-0.2, 0.2), "speed": (-0.2, 0.2)},
+    ),
+    "rotor": (
+        M.UnbalancedRotor(gap=1.0, two_sided=True), Rotor,
+        {**HITS, "strength": (0.05, 1), "control": (0.6, 1.8), "no_load_speed": (0.8, 1.2),
+         "coupling": (0.01, 0.3), "damping_ratio": (0.01, 0.2), "gap": (1, 2.5)},
+        {"Y": (-0.8, 0.8), "V": (-0.5, 0.5), "W": (0.7, 1.3)},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", quick(CASES, "free pair", "capsule", "rotor"))
+def test_a_machine_is_that_of_its_masses(name):
+    ready, kind, *ranges = CASES[name]
+    draw = np.random.default_rng(5).uniform
+    drawn = [{key: jnp.asarray(draw(*ends, LANES)) for key, ends in x.items()} for x in ranges]
+
+    def both(numbers, begin):
+        machine = dataclasses.replace(ready, **numbers)
+        start, other = machine.start(**begin), kind(machine)
+        runs = [
+            vi.simulate(x, at, CYCLES, method=vi.Adaptive(rtol=1e-12))
+            for x, at in ((machine, start), (other, other.begun(start)))
+        ]
+        ours = jnp.stack(other.own(runs[0].sections)), jnp.stack(other.seen(runs[1].sections))
+        return ours, [x.impact_energy for x in runs], [x.impacts for x in runs], runs
+
+    states, energies, impacts, runs = vi.jit(jax.vmap(both))(*drawn)
+    assert all(bool(run.successful.all()) for run in runs)
+    for a, b in (states, energies):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8)
+    few = np.maximum(*impacts) < 20  # of a chatter the last ones are of rounding
+    np.testing.assert_array_equal(impacts[0][few], impacts[1][few])
+    np.testing.assert_allclose(*(run.duration for run in runs), rtol=1e-8)
+    assert int(impacts[0].sum()) > LANES
