@@ -4,9 +4,10 @@ The rules return arrays of any kind. The caller puts few numbers into registers 
 costs nothing: what moves them is done while the code is written.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,38 +27,43 @@ structural = partial(register, STRUCTURAL)
 # --- the same numbers at other places
 
 
-def _moved(
-    t: Text,
-    x: Array,
-    shape: Sequence[int],
-    places: Callable,
-    strides: Callable,
-    cut: Callable = lambda axis, place: None,
-) -> Array:
+class _Along(NamedTuple):
+    """Where the numbers of an array lie along one of its axes, by their places in another shape."""
+
+    axis: int | None
+    """The axis of the new shape that goes along it; `None` if none does."""
+    by: int = 1
+    begin: int = 0
+
+    def place(self, t: Text, index: Sequence[Index]) -> Index:
+        if self.axis is None:
+            return self.begin
+        return plus(t, times(t, index[self.axis], self.by), self.begin)
+
+
+def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_Along]) -> Array:
     """An array that shows the numbers of another one.
 
-    **Arguments:** the text; the array; the new shape; from an index of it to that of the other;
-    from the other's strides to its own, and the place of its first number; from a cut of the other
-    to its own axis and place, `None` if it has no such place.
+    **Arguments:** the text; the array; the new shape; how it goes along each axis of the array.
     """
     cuts: dict[int, set[int]] = {}
-    for axis, old in x.cuts.items():
-        for place in old:
-            found = cut(axis, place)
-            if found is None:
-                x, cuts = stored(t, x), {}
-                break
-            cuts.setdefault(found[0], set()).add(found[1])
-        if not x.cuts:
-            break
+    if any(along[a].by != 1 for a in x.cuts):
+        x = stored(t, x)
+    for a, places in x.cuts.items():
+        if (axis := along[a].axis) is not None:
+            cuts.setdefault(axis, set()).update(n - along[a].begin for n in places)
     if isinstance(x, Formula) and x.value is not None:
         return uniform(shape, x.value)
     if isinstance(x, Strided):
-        steps, offset = strides(x.strides)
+        steps, offset = [0] * len(shape), 0
+        for stride, way in zip(x.strides, along, strict=True):
+            offset += stride * way.begin
+            if way.axis is not None:
+                steps[way.axis] += stride * way.by
         return x.viewed(shape, steps, offset)
     known = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
-    cheap = is_cheap(x)
-    return Formula(tuple(shape), x.kind, lambda i: x.at(t, tuple(places(i))), cheap, cuts=known)
+    number = lambda i: x.at(t, tuple(way.place(t, i) for way in along))
+    return Formula(tuple(shape), x.kind, number, is_cheap(x), cuts=known)
 
 
 @structural("reshape")
@@ -71,14 +77,8 @@ def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
         return Registers(x.values.reshape(shape), x.kind)
     mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
     if [x.shape[i] for i in mine] == [shape[i] for i in other]:
-        there = dict(zip(other, mine, strict=True))
-        back = dict(zip(mine, other, strict=True))
-        return _moved(
-            t, x, shape,
-            lambda i: [i[back[a]] if a in back else 0 for a in range(x.ndim)],
-            lambda s: ([s[there[a]] if a in there else 0 for a in range(len(shape))], 0),
-            lambda a, n: (back[a], n) if a in back else (0, 0),
-        )  # fmt: skip
+        axes = dict(zip(mine, other, strict=True))
+        return _moved(t, x, shape, [_Along(axes.get(a)) for a in range(x.ndim)])
     if not isinstance(x, Strided) or [x.strides[i] for i in mine] != [
         contiguous(x.shape)[i] for i in mine
     ]:
@@ -99,29 +99,15 @@ def _(t, p, avals, x):
 def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
     """An array with its axes in another order."""
     order = list(order)
-    return _moved(
-        t, x, [x.shape[a] for a in order],
-        lambda i: [i[order.index(a)] for a in range(len(order))],
-        lambda s: ([s[a] for a in order], 0),
-        lambda a, n: (order.index(a), n),
-    )  # fmt: skip
+    along = [_Along(order.index(a)) for a in range(x.ndim)]
+    return _moved(t, x, [x.shape[a] for a in order], along)
 
 
 @structural("rev")
 def _(t, p, avals, x):
-    shape, turned = avals[0].shape, p["dimensions"]
-
-    def places(index):
-        return [
-            plus(t, n - 1, times(t, i, -1)) if a in turned else i
-            for a, (i, n) in enumerate(zip(index, shape, strict=True))
-        ]
-
-    def strides(steps):
-        back = [-s if a in turned else s for a, s in enumerate(steps)]
-        return back, sum(steps[a] * (shape[a] - 1) for a in turned)
-
-    return _moved(t, x, shape, places, strides)
+    turned = p["dimensions"]
+    along = [_Along(a, -1, n - 1) if a in turned else _Along(a) for a, n in enumerate(x.shape)]
+    return _moved(t, x, x.shape, along)
 
 
 @structural("slice")
@@ -133,19 +119,8 @@ def _(t, p, avals, x):
 def sliced(t: Text, x: Array, begin: Sequence[int], shape: Sequence[int], by=()) -> Array:
     """A part of an array: from a place on, of a shape, every so many numbers along each axis."""
     # JAX's transposes have NumPy's integers.
-    begin, by = [int(n) for n in begin], [int(n) for n in by] or [1] * len(begin)
-
-    def places(index: tuple[Index, ...]) -> list[Index]:
-        return [plus(t, times(t, i, n), b) for i, n, b in zip(index, by, begin, strict=True)]
-
-    def strides(steps: tuple[int, ...]) -> tuple[list[int], int]:
-        offset = sum(a * b for a, b in zip(steps, begin, strict=True))
-        return [a * n for a, n in zip(steps, by, strict=True)], offset
-
-    def cut(axis: int, place: int) -> tuple[int, int] | None:
-        return (axis, place - begin[axis]) if by[axis] == 1 else None
-
-    return _moved(t, x, shape, places, strides, cut)
+    ways = zip(by or [1] * len(begin), begin, strict=True)
+    return _moved(t, x, shape, [_Along(a, int(n), int(b)) for a, (n, b) in enumerate(ways)])
 
 
 @structural("split")
@@ -179,19 +154,8 @@ def _(t, p, avals, x, *sizes):
         x = addressable(t, x)
     if x.size < size:  # else nothing would be computed twice
         x = settled(t, x)
-    return _moved(
-        t, x, shape,
-        lambda index: [index[a] if n != 1 else 0 for a, n in zip(where, x.shape, strict=True)],
-        lambda s: (_broadcast_strides(s, x.shape, where, len(shape)), 0),
-        lambda a, n: (where[a], n),
-    )  # fmt: skip
-
-
-def _broadcast_strides(strides, sizes, where, axes: int) -> list[int]:
-    out = [0] * axes
-    for a, stride, size in zip(where, strides, sizes, strict=True):
-        out[a] = stride if size != 1 else 0
-    return out
+    pairs = zip(where, x.shape, strict=True)
+    return _moved(t, x, shape, [_Along(a if n != 1 else None) for a, n in pairs])
 
 
 def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
