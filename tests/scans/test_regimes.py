@@ -135,3 +135,27 @@ def test_small_motions_are_compared_by_their_own_size():
         region = {"start.x": (-length, length)}
         found = vi.basins(Small(length), region, resolution=4, longest=2, **options)
         assert len(found.attractors) == 2
+
+
+class Turning(vi.AbstractMachine):
+    """Its angle grows by a turn in each cycle, and is at half a turn on the section."""
+
+    cycle = 2 * np.pi
+    renewed = vi.wrap_angles("phi")
+
+    def field(self, s, x):
+        return vi.State(phi=x.dot, dot=1.0 - x.dot)
+
+    def position(self, x):
+        return x.phi
+
+    def velocity(self, x):
+        return x.dot
+
+    def start(self):
+        return vi.State(phi=np.pi, dot=1.0)
+
+
+def test_an_angle_is_one_in_any_order_of_the_state():
+    data = vi.scan(Turning(), {"start.dot": [1.0]}, measure="regime", settle=1, progress=False)
+    assert data.period.values.tolist() == [1]

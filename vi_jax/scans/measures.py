@@ -19,7 +19,6 @@ from ..machine import (
     angles_in,
     bare,
     by_default,
-    by_name,
     components,
     frequency_ratio,
 )
@@ -310,7 +309,7 @@ class Regime(AbstractMeasure):
 
     def __call__(self, machine, run):
         """Period and impacts of one lane; whether it is chaotic is left to `refine`."""
-        sections = {name: x[1:] for name, x in by_name(run.sections).items()}
+        sections = jtu.tree_map(lambda x: x[1:], run.sections)
         angles = angles_in(machine, jtu.tree_map(lambda x: x[0], run.sections))
         period = least_period(
             sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
