@@ -79,8 +79,8 @@ class Record(NamedTuple):
     y_max: Scalar | None
     y_min: Scalar | None
     impacts: Scalar
-    speed: Scalar | None
-    loss: Scalar | None
+    impact_speed: Scalar | None
+    impact_energy: Scalar | None
     rests: Scalar | None
     """Times the body came to rest on a stop."""
     log: Float[Array, "3 size"] | None
@@ -373,8 +373,8 @@ class Plan(eqx.Module):
             y_max=Y if self.motion else None,
             y_min=Y if self.motion else None,
             impacts=zero,
-            speed=zero if self.motion else None,
-            loss=zero if self.motion else None,
+            impact_speed=zero if self.motion else None,
+            impact_energy=zero if self.motion else None,
             rests=zero if self.motion and self.rests else None,
             log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,

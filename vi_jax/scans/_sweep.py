@@ -35,7 +35,6 @@ from ..machine import (
     Stated,
     Summarized,
     adopt,
-    angles_in,
     bare,
     begun,
     check_again,
@@ -55,7 +54,8 @@ from ..machine import (
 )
 from ._shaken import Shaken, shaken_by
 from .grid import LANE
-from .regime import CODES, REGIMES, flags, impacts_of, least_period, size_of
+from .measures import Regime, Usual
+from .regime import CODES, REGIMES, flags
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|:
 # choices.
@@ -335,6 +335,7 @@ def _sweep(
     **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it; `first`, the state
     at the first value of all.
     """
+    regime = Regime(cycles // 2, tolerance=tolerance).under(method)
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}
@@ -346,26 +347,20 @@ def _sweep(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
             **noise,
         )  # fmt: skip
-        sections = jtu.tree_map(lambda x: x[1:], run.sections)
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
         onward = state if number is None else (state, number + jnp.uint32(1))
-        assert run.y_min is not None and run.y_max is not None
-        assert run.impact_speed is not None and run.duration is not None
-        period = least_period(
-            sections, run.impacts, longest=cycles // 2, tolerance=tolerance, wander=method.wander,
-            size=size_of(here, first, sections), angles=angles_in(here, bare(state)),
-        )  # fmt: skip
-        impacts = impacts_of(run.impacts.astype(value.dtype), period)
+        assert run.duration is not None
+        found = Usual("extremes")(here, run) | regime.begun(first)(here, run)
         return onward, Sweep(
             parameter=parameter,
             values=value,
-            y_min=jnp.min(run.y_min),
-            y_max=jnp.max(run.y_max),
-            period=jnp.where(run.successful, period, REGIMES.failed),
-            impacts=jnp.where(run.successful, impacts, jnp.nan),
+            y_min=found["y_min"],
+            y_max=found["y_max"],
+            period=found["period"].astype(jnp.int32),
+            impacts=jnp.where(run.successful, found["impacts"], jnp.nan),
             frequency_ratio=frequency_ratio(here, jnp.mean(run.duration)),
-            impact_speed=jnp.max(run.impact_speed),
-            sections=sections,
+            impact_speed=found["impact_speed"],
+            sections=jtu.tree_map(lambda x: x[1:], run.sections),
             result=run.result,
             averages=run.mean_averages(),
             labels=machine.labels,

@@ -21,11 +21,8 @@ _COLUMNS = (
     "frequency_ratio",
 )  # fmt: skip
 
-# Of those, what the loop has at hand as a cycle ends: the names in its record.
-_OF_CYCLE = {
-    "impacts": "impacts", "y_min": "y_min", "y_max": "y_max", "impact_speed": "speed",
-    "impact_energy": "loss",
-}  # fmt: skip
+# Of those, what the loop has at hand as a cycle ends.
+_OF_CYCLE = _COLUMNS[:5]
 
 Of = str | Callable[..., Any]
 
@@ -294,7 +291,7 @@ class Escape(_Observed):
             return self._outside(parts[name])
         if self.samples or name not in _OF_CYCLE:
             return None
-        value = getattr(record, _OF_CYCLE[name])
+        value = getattr(record, name)
         return None if value is None else self._outside(value) & ~first
 
     def _outside(self, value: Any) -> Any:

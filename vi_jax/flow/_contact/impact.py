@@ -50,12 +50,13 @@ def recorded(
     is taken; `number`, the stop's; `approach`, V⁻.
     """
     clock, record = plan.clock(lane.s, there), lane.record
-    speed, log, impacts = record.speed, record.log, record.impacts
+    speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
     if log is not None:
         log = written(log, hit, impacts, clock, approach, number)
-    lane = lane.recording(speed=speed, log=log, impacts=impacts + jnp.where(hit, 1.0, 0.0))
+    impacts = impacts + jnp.where(hit, 1.0, 0.0)
+    lane = lane.recording(impact_speed=speed, log=log, impacts=impacts)
     return lane.noting(hit, clock, EventKind.impact, number, approach)
 
 
@@ -79,11 +80,11 @@ def strike_once(
         lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(there, stop.place, rebound), lane.state)
         lane = recorded(plan, lane._replace(state=state), there, taken & met, number, approach)
-        loss = lane.record.loss
-        if loss is not None:
+        energy = lane.record.impact_energy
+        if energy is not None:
             lost = stop.loss(approach, share)
             lost = lost if _is_one(body.mass) else body.mass_at(lane.s, there) * lost
-            lane = lane.recording(loss=loss + jnp.where(taken & met, lost, 0.0))
+            lane = lane.recording(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
     return lane, {k: blow}

@@ -313,8 +313,9 @@ def _accounted(
         mass = body.mass_at(instant.s, before)
         lost = lost - mass * amount * 0.5 * (V + left)
         size = size + mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
-    if lane.record.loss is not None:
+    energy = lane.record.impact_energy
+    if energy is not None:
         hit = instant.taken & instant.met
-        lane = lane.recording(loss=lane.record.loss + jnp.where(hit, lost, 0.0))
+        lane = lane.recording(impact_energy=energy + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
     return lane.ended(instant.met, wrong, "bad_impact")

@@ -104,9 +104,10 @@ def _held(
         lane = lane.noting(here, plan.clock(s, state), EventKind.rest, number, blow.approach)
         if count is not None:
             lane = lane.recording(rests=count + jnp.where(here, 1.0, 0.0))
-    loss = lane.record.loss
-    if loss is not None:
-        lane = lane.recording(loss=loss + jnp.where(taken & any_rests, lost, 0.0))
+    energy = lane.record.impact_energy
+    if energy is not None:
+        energy = energy + jnp.where(taken & any_rests, lost, 0.0)
+        lane = lane.recording(impact_energy=energy)
     return lane
 
 
