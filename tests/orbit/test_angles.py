@@ -61,6 +61,32 @@ def test_a_branch_passes_half_a_turn(orbit):
     assert later[1] == pytest.approx(float(end.state.v), abs=1e-8)
 
 
+class Locked(vi.AbstractMachine):
+    """A motor that a rotating field keeps at its own speed: phi = t + ψ, torque = h - K sin ψ."""
+
+    torque: float = 0.25
+    cycle = 2 * np.pi
+    renewed = vi.wrap_angles("phi")
+
+    def field(self, t, z):
+        return {"phi": z.v, "v": self.torque - DAMPING * z.v + 0.2 * jnp.sin(z.phi - t)}
+
+
+def test_a_motor_that_is_locked_lies_on_a_closed_curve():
+    """Its phase makes a whole turn along the curve, and each fold is listed once."""
+    machine = Locked()
+    start = vi.State(phi=np.pi - np.arcsin(0.25), v=1.0)
+    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 20).last, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="torque", bounds=(0.0, 0.6), progress=False)
+    assert branch.ends == ("closed", "closed")
+    folds = sorted(point.parameter for point in branch.special)
+    assert [point.kind for point in branch.special] == ["fold", "fold"]
+    np.testing.assert_allclose(folds, [DAMPING - 0.2, DAMPING + 0.2], atol=1e-10)
+    phase = np.unwrap(branch.sections["phi"])
+    assert abs(phase[-1] - phase[0]) == pytest.approx(2 * np.pi, abs=1e-8)
+    np.testing.assert_allclose(branch.parameter, DAMPING - 0.2 * np.sin(phase), atol=1e-9)
+
+
 def test_a_section_at_half_a_turn_is_one_motion(orbit):
     """Rounding puts it on either side, a whole turn apart."""
     machine = Pendulum(zero=float(orbit.state.phi) - np.pi)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..machine import angles_in, nearest_images
 from ._corrector import Step
 from ._follow import CLOSED, Ending, Event, Table
 from ._shooting import Shooting
@@ -28,8 +29,8 @@ class Closing:
 
     It has if it passes the plane across one of its points, the first or a later one, at the same
     motion in the same direction. A curve that only comes close to itself passes that plane
-    elsewhere. The motion may be met again some cycles later, or with another of its events as the
-    first one: that is the same motion.
+    elsewhere. The motion may be met again some cycles later, with angles that have made whole
+    turns, or with another of its events as the first one: that is the same motion.
 
     **Arguments:** the curve's table.
     """
@@ -53,7 +54,7 @@ class Closing:
         if not self.points or self.points[-1] is not here:
             self.points.append(here)
         near = _NEAR * float(np.linalg.norm((new.x - here.x) / self.table.scale))
-        xs = np.stack([step.x for step in self.points])
+        xs = self._turned(np.stack([step.x for step in self.points]), new)
         apart = np.linalg.norm((xs - new.x) / self.table.scale, axis=1)
         if apart.max() <= near:
             return
@@ -108,12 +109,21 @@ class Closing:
 
     def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
         """The motion counted from the cycle in which its first event is nearest to that of another
-        one."""
-        if not cycle:
-            return begin
-        begin = begin.copy()
-        begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
+        one, with its angles as near."""
+        begin = self._turned(begin, here)
+        if cycle:
+            begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
         return begin
+
+    def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
+        """Motions with their angles at the turns nearest to those of another one."""
+        problem, xs = self.table.problem, xs.copy()
+        angles = angles_in(problem.machine, problem.like)
+        if angles is not None:
+            first, angles = len(problem.events), np.tile(angles, problem.legs)
+            states = slice(first, first + angles.size)
+            xs[..., states] = nearest_images(angles, xs[..., states], np.asarray(here.x)[states])
+        return xs
 
 
 def observed_otherwise(problem: Shooting, x: np.ndarray) -> list[np.ndarray]:
