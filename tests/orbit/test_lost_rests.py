@@ -1,5 +1,6 @@
 """Where a rest on a stop is lost or divided, followed in two parameters."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -25,6 +26,9 @@ def test_a_lost_rest_of_one_body():
     branch = vi.continue_orbit(found(scene, scene.start(Y=0.0)), parameter=ZETA, bounds=(0.5, 0.8))
     (point,) = branch.special
     assert point.kind == "rest" and point.parameter == pytest.approx(0.65836157060536189, abs=1e-11)
+    beyond = point.switch()
+    assert beyond.rests == 0 and beyond.impacts > 5
+    assert float(beyond.machine.drive.frequency_ratio) > point.parameter
     curves = [
         vi.boundary(point, parameter=name, bounds=((0.3, 1.2), between))
         for name, between in (("stops.0.restitution", (0.3, 0.7)), ("stops.0.gap", (-0.2, 0.1)))
@@ -76,7 +80,7 @@ def test_a_rest_that_is_divided():
     branch = vi.continue_orbit(settled(Coupled()), parameter="omega", bounds=bounds, method=finer)
     assert branch.ends == ("rest", "rest") and (branch.rests == 1).all()
     point = branch.special[0]
-    assert "divided" in point.detail
+    assert "divided" in point.detail and point.switch().rests == 2
     assert point.parameter == pytest.approx(0.34710711379082, abs=1e-11)
     multipliers = branch.at(0.35)[0].multipliers
     np.testing.assert_allclose(multipliers, [-0.4504246148, -0.2437666313, 0, 0], atol=1e-8)
@@ -113,3 +117,38 @@ def test_a_ball_on_its_table_and_gears_that_rattle(machine, parameter, bounds):
 
         rests = rest_beside(machine_at, value)
         assert rests[0] == int(orbit.rests) and rests[1] < rests[0]
+
+
+class Switched(vi.AbstractMachine):
+    """x'' + 0.1 x' + x = cos 0.6 t, x ≤ 0, with a switch at a phase, which changes nothing."""
+
+    phase: float = 1.2
+
+    @property
+    def cycle(self):
+        return 2 * np.pi / 0.6
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.0, 0.5, on=("Y", "V"))
+
+    @property
+    def events(self):
+        return vi.Switch(lambda machine, s, x: jnp.sin(0.6 * s - machine.phase))
+
+    def field(self, s, x, side):
+        return vi.OscillatorState(x.V, jnp.cos(0.6 * s) - x.Y - 0.1 * x.V)
+
+    def start(self):
+        return vi.OscillatorState(jnp.asarray(-0.5), jnp.asarray(0.0))
+
+
+def test_an_event_before_a_chatter_is_over():
+    """The body rests for 1.1788045220098, by hops in 60 digits, until the drive changes its sign:
+    the switch cannot come before that rest begins."""
+    orbit = found(Switched(), Switched().start())
+    branch = vi.continue_orbit(orbit, parameter="phase", bounds=(0.5, 1.4), progress=False)
+    assert branch.ends == ("grazing", "bounds") and (branch.rests == 1).all()
+    (point,) = branch.special
+    assert point.parameter == pytest.approx(0.5 * np.pi - 0.6 * 1.1788045220098, abs=1e-7)
+    assert "fall together" in point.detail

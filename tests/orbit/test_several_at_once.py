@@ -53,10 +53,11 @@ def monodromy(point):
     """The monodromy matrix at a special point, by SciPy."""
     machine = point.orbit.machine
     f, k, e = (float(x) for x in (machine.force, machine.coupling, machine.excess))
+    omega = float(getattr(machine, "omega", OMEGA))
 
     def rate(s, y):
         (y1, v1, y2, v2), M = y[:4], y[4:].reshape(4, 4)
-        push, pull = f * np.cos(OMEGA * s), k * (y2 - y1)
+        push, pull = f * np.cos(omega * s), k * (y2 - y1)
         J = np.array([
             [0, 1, 0, 0], [1 - 3 * y1**2 - k, -0.15, k, 0],
             [0, 0, 0, 1], [k, 0, 1 - 3 * y2**2 - k, -0.15],
@@ -68,7 +69,7 @@ def monodromy(point):
     state = point.orbit.state
     begin = [float(state[name]) for name in ("y1", "v1", "y2", "v2")]
     end = solve_ivp(
-        rate, (0, 2 * np.pi / OMEGA), [*begin, *np.eye(4).ravel()], method="DOP853", rtol=1e-12,
+        rate, (0, 2 * np.pi / omega), [*begin, *np.eye(4).ravel()], method="DOP853", rtol=1e-12,
         atol=1e-13,
     ).y[:, -1]  # fmt: skip
     np.testing.assert_allclose(end[:4], begin, atol=1e-9)
@@ -109,6 +110,40 @@ def test_a_branch_that_leaves_another_to_both_sides():
     assert len(places(off, "fold")) == 6
     again = next(point for point in off.special if point.kind == "branch-point").switch().state
     assert abs(float(again["y1"] - again["y2"])) < 1e-9
+
+
+class Swept(Twins):
+    """At another frequency."""
+
+    omega: float = OMEGA
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
+
+    def field(self, s, state):
+        """At the phase of the drive."""
+        return super().field(s * self.omega / OMEGA, state)
+
+
+@pytest.mark.slow
+def test_a_curve_of_folds_of_both_oscillators():
+    """Two multipliers are 1 all along it. It is that of one oscillator: folds in (f, ω) that meet
+    in a cusp, found by an independent shooting code."""
+    machine = Swept()
+    start = {"y1": 0.9, "v1": 0.2, "y2": 0.9, "v2": 0.2}
+    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 200).last, 1, throw=True)
+    bounds = (0.05, 0.25)
+    branch = vi.continue_orbit(orbit, parameter="force", bounds=bounds, progress=False)
+    fold = next(point for point in branch.special if point.kind == "fold")
+    curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
+    assert curve.ends == ("bounds", "bounds")
+    (cusp,) = curve.special
+    assert cusp.kind == "cusp"
+    np.testing.assert_allclose(cusp.parameters, [0.06238715591, 1.289889567], atol=1e-8)
+    for i in range(0, len(curve.steps), 15):
+        values = np.linalg.eigvals(monodromy(SimpleNamespace(orbit=curve.orbit(i))))
+        assert np.sum(np.abs(values - 1) < 1e-5) == 2
 
 
 @pytest.mark.slow

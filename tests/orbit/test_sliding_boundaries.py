@@ -1,4 +1,5 @@
-"""A curve in two parameters along which a surface that slides is touched, beside a closed form."""
+"""Curves in two parameters along which a motion gains or loses a part in which it is held, beside
+closed forms and motions that SciPy follows."""
 
 from typing import Any
 
@@ -6,8 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.integrate import solve_ivp
 
-from rough_floor import Rough
+from belts import Belt
+from den_hartog import den_hartog
+from rough_floor import Rough, branch_of, on_both_sides
 
 pytestmark = pytest.mark.slow
 
@@ -43,3 +47,62 @@ def test_grazing_sliding_of_a_linear_motion():
     belt, omega = curve.parameters.T
     assert np.ptp(omega) == pytest.approx(1.2)
     np.testing.assert_allclose(belt, reached(omega), rtol=1e-9)
+
+
+def test_sticking_begins_along_den_hartogs_curve():
+    """From the motion that does not stop, and from the one that does."""
+    limit = den_hartog(0.75, 0.0)[1]
+    bounds = (0.6 * limit, 1.3 * limit)
+    (point,) = branch_of("level", bounds, omega=0.75, level=0.7 * limit).special
+    for side in (point, on_both_sides(point, "level", bounds)):
+        curve = vi.boundary(
+            side, parameter="omega", bounds=((0.01, 2.0), (0.7, 0.8)), progress=False
+        )
+        assert curve.kind == "crossing-sliding" and curve.ends == ("bounds", "bounds")
+        for i in (0, len(curve.steps) // 2, -1):
+            friction, omega = curve.parameters[i]
+            assert friction == pytest.approx(den_hartog(omega, 0.0)[1], abs=1e-8)
+
+
+class Damped(Belt):
+    """Observed where the body is farthest ahead."""
+
+    damping: Any = 0.1
+    cycle = vi.falling("V", usual=2 * np.pi)
+
+    def field(self, s, x):
+        return vi.OscillatorState(x.V, -x.Y - self.damping * x.V)
+
+
+def test_the_belt_is_only_just_reached():
+    """A body that the belt has let go is next as fast as the belt where it was let go, by
+    shooting: from the motion that sticks, whose part in which it does is the one that vanishes."""
+    machine = Damped()
+    stuck = vi.simulate(machine, machine.start(V=1.5), 1, settle=40).last
+    branch = vi.continue_orbit(
+        vi.find_orbit(machine, stuck, throw=True), parameter="speed", bounds=(1.3, 1.9)
+    )
+    point = branch.special[-1]
+    assert point.kind == "grazing-sliding" and "no longer" in point.detail
+    curve = vi.boundary(point, parameter="damping", bounds=((0.5, 3.5), (0.05, 0.3)))
+    assert curve.ends == ("bounds", "bounds")
+    ends = np.sort(curve.parameters[[0, -1], 0])
+    np.testing.assert_allclose(ends, [0.727689234646, 3.024654895060], atol=1e-10)
+    for speed, damping in curve.parameters[5::12]:
+        assert returns_to(speed, damping) == pytest.approx(0, abs=1e-8)
+
+
+def returns_to(speed, damping):
+    """How far from where the belt let it go a body is next as fast as the belt, by SciPy."""
+
+    def field(_, x):
+        slip = max(speed - x[1], 0.0)
+        return [x[1], -x[0] - damping * x[1] + 0.5 + 0.5 * np.exp(-2 * slip)]
+
+    def fastest(_, x):
+        return field(0, x)[1]
+
+    fastest.terminal, fastest.direction = True, -1
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+    x = solve_ivp(field, (0, 2), [1 - damping * speed, speed], **options).y[:, -1]
+    return solve_ivp(field, (2, 12), x, events=fastest, **options).y[1, -1] - speed

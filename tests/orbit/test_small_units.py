@@ -1,6 +1,7 @@
 """A machine written in micrometres has the same motions as one of size 1."""
 
 import numpy as np
+import pytest
 import vi_jax as vi
 
 SIZES = (1.0, 1e-6)
@@ -33,3 +34,28 @@ def test_all_orbits_are_told_apart():
             all_of_them.orbits, all_of_them.found.tolist(), strict=True
         )])  # fmt: skip
     assert found[0] == found[1] and len(found[0]) == 4
+
+
+@pytest.mark.slow
+def test_what_follows_a_grazing_is_the_same():
+    """Touches and impacts were told apart by lengths and speeds in the machine's units."""
+    found = []
+    for size in SIZES:
+        machine = vi.machines.Duffing(
+            amplitude=size, frequency=0.6, damping=0.1, stiffness=1.0, cubic=0.0, gap=2.0 * size,
+            restitution=0.8, two_sided=False,
+        )  # fmt: skip
+        orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 100).last, throw=True)
+        branch = vi.continue_orbit(
+            orbit, parameter="gap", bounds=(size, 2.5 * size), progress=False
+        )
+        (point,) = branch.special
+        found.append((vi.grazing(point, progress=False), size))
+    (one, _), (other, size) = found
+    assert one.value == pytest.approx(1 / np.hypot(0.64, 0.06), abs=1e-9)
+    assert other.value == pytest.approx(size * one.value, rel=1e-9)
+    assert (one.outcome == other.outcome) and one.windows is not None
+    np.testing.assert_allclose(other.entries, np.sqrt(size) * one.entries, rtol=1e-6)
+    np.testing.assert_array_equal(other.forecast.period, one.forecast.period)
+    np.testing.assert_array_equal(other.machine.period, one.machine.period)
+    np.testing.assert_allclose(other.checked, size * np.array(one.checked), rtol=1e-9)

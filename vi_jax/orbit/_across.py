@@ -11,25 +11,27 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, with_leaf
-from ._corrector import Step, advance, tangent_at
-from ._flight import Event
+from ._corrector import Step, advance
 from ._problem import events_in
 from ._shooting import Shooting
-from ._sliding import change_at
+from ._sliding import change_at, without_part
 from ._solution import sections_of
-from ._surgery import without_events
+from ._surgery import admissible_beside
 from .find import find_orbit
 from .results import Orbit
 
 # Periods after which a stable motion near the point has settled: a choice.
 _SETTLES = 100
 
+# Impacts of a cycle that are listed: a choice.
+_LISTED = 32
+
 # Events that are closer than this (a cycle is 2π) fall together: a choice, above how close a place
 # is located.
 _TOGETHER = 1e-6
 
 
-def without_part(
+def past_part(
     problem: Shooting, step: Step, scale: np.ndarray, distance: float
 ) -> tuple[Shooting, Step] | None:
     """A motion without the part that vanishes at a sliding bifurcation, before and after which its
@@ -41,18 +43,9 @@ def without_part(
     change = change_at(problem, step)
     if change is None or not change.there or change.modes[0] != change.modes[2]:
         return None
-    first = int(np.argmin(np.abs(np.asarray(problem.parts(jnp.asarray(step.x))[0]) - change.clock)))
-    both = [first, (first + 1) % problem.legs]
-    new, start = without_events(problem, np.asarray(step.x), both)
-    scale = new.scale(scale[-1:])
-    tangent = tangent_at(new, start, scale)
-    for sense in (1.0, -1.0):
-        found = advance(new, start, sense * tangent, scale, distance)
-        seen = found.seen
-        inside = seen.nearest.room > 0 and min(seen.approach, default=1.0) > 0
-        if bool(found.good) and inside and min(seen.order, seen.apart) > 0:
-            return new, found
-    return None
+    new, start, _ = without_part(problem, step, change)
+    found = admissible_beside(new, start, new.scale(scale[-1:]), distance)
+    return None if found is None else (new, found)
 
 
 def across_sliding(
@@ -66,8 +59,20 @@ def across_sliding(
     """
     guesses = list(_guesses(problem, step, scale, distance))
     return _beside(
-        problem, step, scale, distance, guesses, lambda events: len(events) != len(problem.events)
-    )
+        problem, step, scale, distance, guesses,
+        lambda orbit: len(events_in(orbit)) != len(problem.events),
+    )  # fmt: skip
+
+
+def across_rest(problem: Shooting, step: Step, scale: np.ndarray, distance: float) -> Orbit | None:
+    """A motion with a rest more or less than the branch has, beside the place where that is lost or
+    divided; `None` if none is found.
+
+    **Arguments:** as `across_sliding`.
+    """
+    guesses, rests = list(_guesses(problem, step, scale, distance)), len(problem.landings)
+    other = lambda orbit: int(orbit.rests) != rests
+    return _beside(problem, step, scale, distance, guesses, other)
 
 
 def across_order(problem: Shooting, step: Step, scale: np.ndarray, distance: float) -> Orbit | None:
@@ -84,12 +89,13 @@ def across_order(problem: Shooting, step: Step, scale: np.ndarray, distance: flo
         clock = np.asarray(problem.parts(jnp.asarray(step.x))[0])
         begins = [int(np.sum(clock < n * cycle)) for n in range(problem.cycles)]
     turned = [here[i:] + here[:i] for i in begins]
-    return _beside(problem, step, scale, distance, both, lambda events: events not in turned)
+    other = lambda orbit: [event for _, event in events_in(orbit)] not in turned
+    return _beside(problem, step, scale, distance, both, other)
 
 
 def _beside(
     problem: Shooting, step: Step, scale: np.ndarray, distance: float, guesses: list[State],
-    other: Callable[[list[Event]], bool],
+    other: Callable[[Orbit], bool],
 ) -> Orbit | None:  # fmt: skip
     """A motion beside a place, with other events than the branch has.
 
@@ -97,8 +103,8 @@ def _beside(
     motion is looked for by its fixed points: from the guesses, and from where a simulation settles.
     Beyond the point is looked at first.
 
-    **Arguments:** as `across_sliding`; states on the section; whether events, in their order, are
-    others.
+    **Arguments:** as `across_sliding`; states on the section; whether a motion is another than
+    those of the branch.
     """
     sense = np.copysign(1.0, float(step.tangent[-1]))
     name = problem.parameters[-1]
@@ -112,8 +118,10 @@ def _beside(
                     method=problem.method, record="sections",
                 )  # fmt: skip
                 guess = run.last
-            found = find_orbit(machine, guess, problem.cycles, method=problem.method)
-            if bool(found.successful) and other([event for _, event in events_in(found)]):
+            found = find_orbit(
+                machine, guess, problem.cycles, method=problem.method, impact_log=_LISTED
+            )
+            if bool(found.successful) and other(found):
                 return found
     return None
 

@@ -27,7 +27,7 @@ from ..machine import (
     with_modes,
 )
 from ._cycle_map import CycleMap, forward_jacobian
-from ._neutral import neutral
+from ._neutral import smallest_solution
 from ._root import shooting_matrix
 
 # Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
@@ -168,10 +168,9 @@ def error_of(
     after = jnp.roll(x, -1, axis=0)
     missing = nearest_images(angles, seen.states[:, -1, -1], after) - after
     missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
-    lost = neutral(ahead)
-    error = jnp.max(jnp.abs(jnp.linalg.solve(ahead + lost.filled, missing)))
-    drifts = jnp.linalg.norm(lost.unmet @ missing) > _DRIFTS * jnp.linalg.norm(missing)
-    return error, drifts
+    step = smallest_solution(ahead, missing)
+    drifts = jnp.linalg.norm(missing - ahead @ step) > _DRIFTS * jnp.linalg.norm(missing)
+    return jnp.max(jnp.abs(step)), drifts
 
 
 def in_order(

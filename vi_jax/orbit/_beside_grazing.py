@@ -26,7 +26,7 @@ from ._forecast import (
 from ._local_map import Graze
 from ._shooting import Shooting
 
-# What differs by less is the same but for rounding: a choice.
+# What differs by less, as a share of the motion, is the same but for rounding: a choice.
 _ROUNDING = 1e-11
 
 # Far away a motion is periodic if it repeats within 1e-6 of how far it is: a choice.
@@ -86,9 +86,10 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
         u = local.matrix @ u
     unit = np.abs(local.kicks).max()
     reach = np.abs(section.matrix @ local.kicks.T).max() / unit * size
-    period = periods_in(last, hits, reach + _ROUNDING)
+    rounding = _ROUNDING * np.abs(smooth).max()
+    period = periods_in(last, hits, reach + rounding)
     deepest = local_depths(local, offsets) ** (2 * local.orders.min())
-    away = np.abs(last).max(axis=(1, 2)) > added.max() * deepest + _ROUNDING
+    away = np.abs(last).max(axis=(1, 2)) > added.max() * deepest + rounding
     good = good & np.isfinite(last).all(axis=(1, 2))
     span = np.abs(last).max(axis=(1, 2), initial=0.0, where=np.isfinite(last))
     far = np.where(good & away, periods_in(last, hits, _FAR * span), 0)

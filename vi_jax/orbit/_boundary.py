@@ -7,26 +7,20 @@ import numpy as np
 
 from .._checks import flag, instance_of, interval
 from ..machine import check_leaf, leaf
-from ._conditions import Special, exchange_at
+from ._conditions import Special, exchange_at, is_defective
 from ._corrector import advance, tangent_at
 from ._follow import both_ways, check_walk
 from ._problem import check_parameter, steps_of
 from ._shooting import Shooting
-from ._sliding import ADDING_SLIDING, GRAZING_SLIDING
+from ._sliding import SLIDING, change_at, without_part
 from ._special_table import Intervals, SpecialTable
 from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
 from .curve import Boundary
 from .special import Point
 
-# What to do instead at a point that is not followed: at others, and at one that is seen from the
-# side on which its motion has the part that vanishes.
 _INSTEAD = (
     "Such a point is found value by value of the second parameter: `find_orbit` with another one, "
     "from this motion, and `continue_orbit` from there locates it again."
-)
-_OTHER_SIDE = (
-    "It is followed from the side without that part: `continue_orbit(point.switch(), ...)` ends at "
-    "it too, and its special point there can be given."
 )
 
 
@@ -96,12 +90,11 @@ def _check_point(point: Point) -> None:
             "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "
             f"bifurcation at which something is touched, but is {one(point.kind)}. {_INSTEAD}"
         )
-    if point.kind in TOUCHING and not point.touches:
-        touched = point.kind in (ADDING_SLIDING, GRAZING_SLIDING)
+    vanishes = point.kind in SLIDING and change_at(point.problem, point.step) is not None
+    if point.kind in TOUCHING and not (point.touches or vanishes):
         raise ValueError(
             "Argument `point` must be a grazing or a sliding bifurcation at which something is "
-            f"touched, but is {one(point.kind)}: {point.detail}. "
-            f"{_OTHER_SIDE if touched else _INSTEAD}"
+            f"touched, but is {one(point.kind)}: {point.detail}. {_INSTEAD}"
         )
 
 
@@ -130,13 +123,16 @@ def _special_motion(
 ) -> tuple[Shooting, Special, np.ndarray]:
     """The equations of the curve, the condition among them that makes its motions special, and
     their unknowns at the point where it begins."""
-    old = point.problem
+    old, start, impact = point.problem, np.asarray(point.step.x), point.impact
+    change = change_at(old, point.step) if point.kind in SLIDING else None
+    if change is not None:  # with the part that vanishes it could not be solved for beyond
+        old, start, impact = without_part(old, point.step, change)
     two = dataclasses.replace(old, parameters=(parameter, *old.parameters))
     corners = two.corners(bounds)
     steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
     problem = dataclasses.replace(two, steps=steps)
     values = float(leaf(old.machine, parameter)), point.parameter
-    x = np.append(np.asarray(point.step.x)[:-1], values)
+    x = np.append(start[:-1], values)
     exchange = None
     if point.kind in (SYMMETRY, CROSSING):
         exchange = exchange_at(problem, x, problem.scale([0.5 * (b - a) for a, b in bounds]))
@@ -145,5 +141,6 @@ def _special_motion(
                 "Argument `parameter` must leave the machine its symmetry, or what else makes "
                 f"branches cross, but with another {parameter} they come apart."
             )
-    condition = Special(point.kind, point.impact, exchange)
+    double = point.kind == FOLD and not is_defective(point.problem, point.step, 1.0)
+    condition = Special(point.kind, impact, exchange, double=double)
     return dataclasses.replace(problem, conditions=(condition,)), condition, x

@@ -1,9 +1,9 @@
 """Conditions beside the equations of a motion: each frees one number of the machine more.
 
 With as many of them as there are parameters less one, the motions are a curve again, which
-`curve.walk` follows: `boundary` asks that a motion be special, `continue_orbit` that a number of it
-be held. Numbers of a motion have names; as functions of its unknowns they
-can be differentiated.
+`_follow.both_ways` follows: `boundary` asks that a motion be special, `continue_orbit` that a
+number of it be held. Numbers of a motion have names; as functions of its unknowns they can be
+differentiated.
 """
 
 import abc
@@ -24,6 +24,7 @@ from ..machine import quantity_of as measured
 from ._corrector import Step, jacobian_at
 from ._observed import Observed
 from ._shooting import Shooting
+from ._sliding import SLIDING, holding
 from ._words import DOUBLING, REST, TORUS, TOUCHING
 from .floquet import compound
 
@@ -63,7 +64,7 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
         ratio = frequency_ratio(problem.at(x), seen.duration / problem.cycles)
         return jnp.asarray(ratio, x.dtype)
     if name in ("fastest_impact", "slowest_impact"):
-        speeds = _speeds(problem, seen)
+        speeds = seen.approach[np.asarray(problem.impacts, int)]
         return jnp.nanmax(speeds) if name == "fastest_impact" else jnp.nanmin(speeds)
     state = _on_section(problem, x)
     inner = name.removeprefix(_SECTION)
@@ -74,22 +75,12 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
     return quantities_on(problem.at(x), row)[inner][0]
 
 
-def _speeds(problem: Shooting, seen: Observed) -> Array:
-    """V⁻ of each impact; NaN where there is none."""
-    return seen.approach[np.asarray(problem.impacts, int)]
-
-
 def _on_section(problem: Shooting, x: Vector) -> State:
     """The state on the first section of a solution."""
-    clock, states = problem.parts(x)
     if not problem.events:
-        return problem.unravel(states[0])
-    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
-    if begins:
-        return problem.state_at(x, begins[0], clock[begins[0]])
-    place = clock[0] + jnp.mod(-clock[0], problem.period(x))
-    leg = jnp.searchsorted(clock, place, side="right") - 1
-    return problem.state_at(x, leg, place)
+        return problem.unravel(problem.parts(x)[1][0])
+    legs, places = problem.sections(x)
+    return problem.state_at(x, legs[0], places[0])
 
 
 @compiled
@@ -103,6 +94,10 @@ def rates_at(
         return {name: quantity_of(problem, x, seen, name) for name in names}
 
     return jax.jvp(values, (x,), (direction,))
+
+
+# A singular value of M - I is zero within this share of the largest one: a choice.
+_DOUBLE = 1e-4
 
 
 class AbstractCondition(eqx.Module):
@@ -275,20 +270,26 @@ class Special(AbstractCondition):
     the product of two is 1, det(M₂ - I) = 0 with the compound matrix M₂ (see `compound`). M has
     poles where an impact grazes, which the speeds of approach take away. At a grazing the condition
     is V⁻ = 0 of the impact that is lost, or a clearance of zero; where a rest is lost that its
-    chatter takes until the release (`escape`), or that the force on the body is zero.
+    chatter takes until the release (`escape`), or that the force on the body is zero; where a
+    switch is held no longer, or not yet, that the force at its event is just what holds it.
     """
 
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
-    """The event that grazes; `None` at a touch, and where nothing grazes."""
+    """The event that grazes, or at which a switch is only just held; `None` at a touch, and where
+    nothing grazes."""
     exchange: Exchange | None = None
     speed: Scalar | float = 0.0
     """V⁻ of that impact, for motions beside a grazing."""
+    double: bool = eqx.field(static=True, default=False)
+    """Whether two multipliers are 1 all along a curve of folds, with an eigenvector each, as of
+    equal machines that do not know of each other: det(M - I) is zero twice then, and the condition
+    is that the product of its other factors is, the sum of the principal minors."""
 
     @property
     def observes(self) -> bool:
-        """False where a rest is lost."""
-        return self.kind != REST
+        """False where a rest is lost, or a switch is only just held."""
+        return not (self.kind == REST or (self.kind in SLIDING and self.impact is not None))
 
     def exchanged(self, problem, x, missing):
         """Where branches cross, one of the equations is exchanged."""
@@ -298,13 +299,33 @@ class Special(AbstractCondition):
         """The determinant, V⁻ or the clearance."""
         if self.kind == REST:
             return problem.rest_lost(x, self.impact)
+        if self.kind in TOUCHING and self.impact is None:
+            return seen.nearest.room
+        if self.kind in SLIDING:
+            i, machine, (clock, states) = self.impact, problem.at(x), problem.parts(x)
+            number, state = problem.events[i].number, problem.unravel(states[i])
+            return holding(problem, machine, i, number, clock[i], state).x
         if self.kind in TOUCHING:
-            return (
-                seen.nearest.room
-                if self.impact is None
-                else seen.approach[self.impact] - self.speed
-            )
+            return seen.approach[self.impact] - self.speed
         matrix = compound(seen.monodromy) if self.kind == TORUS else seen.monodromy
         sign = 1 if self.kind == DOUBLING else -1
-        identity = jnp.eye(matrix.shape[0], dtype=x.dtype)
-        return jnp.linalg.det(matrix + sign * identity) * jnp.prod(seen.approach)
+        matrix = matrix + sign * jnp.eye(matrix.shape[0], dtype=x.dtype)
+        zero = minors(matrix) if self.double else jnp.linalg.det(matrix)
+        return zero * jnp.prod(seen.approach)
+
+
+def minors(matrix: Array) -> Array:
+    """The sum of the principal minors of one row less: the product of all eigenvalues but one,
+    where that one is zero, and smooth, unlike them."""
+    if len(matrix) == 1:
+        return jnp.ones((), matrix.dtype)
+    rest = (np.delete(np.arange(len(matrix)), i) for i in range(len(matrix)))
+    return jnp.sum(jnp.stack([jnp.linalg.det(matrix[np.ix_(rows, rows)]) for rows in rest]))
+
+
+def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
+    """Whether a double multiplier has one eigenvector. With two of them, as where a motion folds
+    and loses a symmetry, no pair of it becomes complex."""
+    sizes, M = np.asarray(problem.scale(())[-problem.states :]), step.seen.monodromy
+    values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
+    return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

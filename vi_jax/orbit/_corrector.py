@@ -5,7 +5,7 @@ A curve is the solutions of n - 1 equations in n unknowns (pseudo-arclength).
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,11 +15,19 @@ from jaxtyping import Array, Float, Int
 
 from .._programs import compiled
 from .._types import Flag, Scalar
+from ._neutral import smallest_solution
 from ._observed import Observed
 from ._shooting import Shooting
-from ._symmetry import images
+from ._symmetry import halves
 
 Vector = Float[Array, " n"]
+
+# The largest component of a last correction, in scaled unknowns.
+_TOLERANCE = 1e-11
+
+# Along a curve of double folds one direction changes nothing in the equations to first order: a
+# singular value is zero within this share of the greatest. A choice.
+_DOUBLE = 1e-6
 
 # Of an orbit, as numbers of the host or of a compiled call.
 Unknowns = np.ndarray | Array
@@ -38,55 +46,18 @@ class Step(NamedTuple):
     """Corrections that it took."""
     good: Flag
     """Whether the corrector converged."""
-    seen: Any
-    """What is observed there, an `Observed` of a branch."""
+    seen: Observed
+    """What is observed there."""
 
 
-def corrected(
-    residual: Callable[[Vector], Vector],
-    observe: Callable[[Vector, Vector], Any],
-    x: Vector,
-    tangent: Vector,
-    scale: Vector,
-    length: Scalar,
-    *,
-    tolerance: float = 1e-11,
-) -> Step:
-    """The point of the curve on the plane that lies `length` along the tangent from `x`.
+def way(here: Step, at: Step, scale: np.ndarray) -> float:
+    """How far along the first one's tangent the second lies, in unknowns divided by `scale`."""
+    return float(np.dot(here.tangent, (at.x - here.x) / scale))
 
-    Newton's method on the equations and the plane. Nothing is close to singular at a fold, since
-    the parameter is one of the unknowns.
 
-    **Arguments:** `residual`, the equations; `observe`, what to observe of a point and its tangent;
-    `x` and `tangent`, the last point and its unit tangent in unknowns divided by `scale`; `length`,
-    that of the step; `tolerance`, for the largest component of a correction (scaled).
-    """
-
-    def plane(y):
-        return jnp.dot(tangent, y - y0)
-
-    def equations(y):
-        return jnp.concatenate([residual(y * scale), plane(y)[None]])
-
-    def newton(carry):
-        y, before, count, *_ = carry
-        jacobian, missing = _jacobian(equations, y)
-        both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
-        move, along = jnp.linalg.solve(jacobian, both).T
-        return y - move, jnp.max(jnp.abs(move)), count + 1, along, before <= tolerance
-
-    def going(carry):
-        _, size, count, _, done = carry
-        return ~done & (size < 10.0) & (count < 13)
-
-    y0 = x / scale + length * tangent
-    start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
-    # One correction more than it takes: the tangent is then that of the solution.
-    y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
-    along = along / jnp.linalg.norm(along)
-    # Rounding may keep the last correction above the tolerance where the curve is steep.
-    good = (size <= 1e3 * tolerance) & jnp.all(jnp.isfinite(along))
-    return Step(y * scale, along, size, count, good, observe(y * scale, along))
+def array_of(tree: object) -> Any:
+    """Host copies of a compiled call's results, so that what follows costs no dispatch."""
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
@@ -100,59 +71,47 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
     return columns.T, values[0]
 
 
-def first_tangent(residual: Callable[[Vector], Vector], x: Vector, scale: Vector) -> Vector:
-    """Unit tangent (scaled) at a point that solves the equations, the last unknown rising."""
-    jacobian, _ = _jacobian(lambda y: residual(y * scale), x / scale)
-    tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
-    return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
-
-
-def way(here: Step, at: Step, scale: np.ndarray) -> float:
-    """How far along the first one's tangent the second lies, in unknowns divided by `scale`."""
-    return float(np.dot(here.tangent, (at.x - here.x) / scale))
-
-
-def array_of(tree: object) -> Any:
-    """Host copies of a compiled call's results, so that what follows costs no dispatch."""
-    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
-
-
-@runtime_checkable
-class Equations(Protocol):
-    """What is solved here: an orbit's equations, or those with a condition beside them."""
-
-    def residual(self, x: Vector) -> Vector:
-        """What the unknowns `x` lack to be a solution."""
-        ...
-
-    def observe(self, x: Vector) -> Observed:
-        """What is observed of a solution."""
-        ...
-
-
 @compiled
-def _compiled_advance(equations, x, tangent, scale, length) -> Step:
-    """As `advance`, of arrays.
+def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
+    """As `advance`. Newton's method on the equations and the plane: nothing is close to singular at
+    a fold, since the parameter is one of the unknowns."""
 
-    **Arguments:** as `advance`.
-    """
+    def equations(y):
+        return jnp.concatenate([problem.residual(y * scale), jnp.dot(tangent, y - y0)[None]])
 
-    def observe(x, tangent):
-        return equations.observe(x)
+    def newton(carry):
+        y, before, count, *_ = carry
+        jacobian, missing = _jacobian(equations, y)
+        both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
+        if problem.is_double:
+            move, along = smallest_solution(jacobian, both, _DOUBLE).T
+        else:
+            move, along = jnp.linalg.solve(jacobian, both).T
+        return y - move, jnp.max(jnp.abs(move)), count + 1, along, before <= _TOLERANCE
 
-    return corrected(equations.residual, observe, x, tangent, scale, length)
+    def going(carry):
+        _, size, count, _, done = carry
+        return ~done & (size < 10.0) & (count < 13)
+
+    y0 = x / scale + length * tangent
+    start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
+    # One correction more than it takes: the tangent is then that of the solution.
+    y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
+    along = along / jnp.linalg.norm(along)
+    # Rounding may keep the last correction above the tolerance where the curve is steep.
+    good = (size <= 1e3 * _TOLERANCE) & jnp.all(jnp.isfinite(along))
+    return Step(y * scale, along, size, count, good, problem.observe(y * scale))
 
 
 def advance(
-    equations: Equations, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
+    problem: Shooting, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
 ) -> Step:
-    """The solution on the plane across a tangent (see `curve.corrected`).
+    """The solution on the plane across a tangent.
 
-    **Arguments:** `x`, the unknowns from where; `tangent`, a unit vector, and `length`, how far
-    along it, both in unknowns divided by `scale`.
+    **Arguments:** the equations; `x`, the unknowns from where; `tangent`, a unit vector, and
+    `length`, how far along it, both in unknowns divided by `scale`.
     """
-    arguments = (jnp.asarray(a) for a in (x, tangent, scale, length))
-    return array_of(_compiled_advance(equations, *arguments))
+    return array_of(_advanced(problem, *map(jnp.asarray, (x, tangent, scale, length))))
 
 
 @compiled
@@ -179,13 +138,20 @@ def off_by(problem: Shooting, x: Unknowns) -> float:
 
 
 @compiled
-def _compiled_tangent(equations, x, scale):
-    return first_tangent(equations.residual, x, scale)
+def _tangent(problem, x, scale):
+    jacobian, _ = _jacobian(lambda y: problem.residual(y * scale), x / scale)
+    tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
+    return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
 
 
-def tangent_at(equations: Equations, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The unit tangent of the solutions through `x`, in scaled unknowns."""
-    return np.asarray(_compiled_tangent(equations, jnp.asarray(x), jnp.asarray(scale)))
+def tangent_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The unit tangent (scaled) of the solutions through `x`, the last unknown rising."""
+    if not problem.is_double:
+        return np.asarray(_tangent(problem, jnp.asarray(x), jnp.asarray(scale)))
+    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * scale
+    plane = np.linalg.svd(jacobian)[2][-2:]  # one direction in it moves the parameters
+    tangent = np.linalg.svd(plane[:, -2:])[0][:, 0] @ plane
+    return tangent * np.copysign(1.0, tangent[-1])
 
 
 @compiled
@@ -201,12 +167,12 @@ def jacobian_at(problem: Shooting, x):
 
 
 @compiled
-def _compiled_images(problem: Shooting, x):
-    return images(problem, x)
+def _compiled_halves(problem: Shooting, x, mirrored: bool):
+    return halves(problem, x, mirrored)
 
 
-def apart_from_image(problem: Shooting, step: Step) -> np.ndarray:
-    """How far a motion is from being its own image under the symmetry of its machine, in the sizes
-    of the unknowns."""
-    apart = _compiled_images(problem, jnp.asarray(step.x))
+def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
+    """How the second half of the period differs from the first one, or from its image under the
+    symmetry of the machine, in the sizes of the unknowns."""
+    apart = _compiled_halves(problem, jnp.asarray(step.x), mirrored)
     return np.asarray(apart) / problem.half_scale()

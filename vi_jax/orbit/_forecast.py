@@ -14,6 +14,9 @@ LONGEST, LOOKED = 64, 192
 # settling leaves (`_LEFT`) and far below what chaos differs by.
 _REPEATS = 1e-3
 
+# Farther away than so many kicks nothing comes back: a choice.
+_LOST = 1e9
+
 # So much of what the slowest multiplier keeps may be left after settling; within these bounds.
 _LEFT, _FEWEST, _MOST = 1e-7, 400, 6000
 
@@ -50,12 +53,6 @@ class SCENARIOS(NamedEnumeration):
     periodic = "other periodic motions with impacts, near the old one"
     windows_and_chaos = "other periodic motions and chaos in turn, near the old one"
     jump = "nothing near attracts any more: what follows is far away"
-
-
-SCENARIO_NAMES = (
-    "persistence", "nonsmooth_fold", "period_adding", "period_adding_with_chaos", "chaos",
-    "periodic", "windows_and_chaos", "jump",
-)  # fmt: skip
 
 
 class Settled(NamedTuple):
@@ -106,7 +103,7 @@ def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
     settle = settling(local)
     places = np.zeros((len(offsets), LOOKED, z.shape[1]))
     hits = np.zeros((len(offsets), LOOKED))
-    deepest = np.zeros(len(offsets))
+    deepest, size = np.zeros(len(offsets)), kick_sizes(local, offsets)
     with np.errstate(over="ignore", invalid="ignore"):
         for n in range(settle + LOOKED):
             i = n - settle
@@ -119,8 +116,8 @@ def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
                     deepest = np.maximum(deepest, np.sqrt(depth))
                     if k == 0:
                         places[:, i] = kicked
-        period = periods_in(places, hits, kick_sizes(local, offsets))
-    lost = ~np.isfinite(z).all(axis=1) | (np.abs(z).max(axis=1) > 1e6)
+        period = periods_in(places, hits, size)
+    lost = ~(np.abs(z).max(axis=1) <= _LOST * size)
     period = np.where(lost, -1, period)
     return Settled(period, impacts_in(hits, period), places, deepest)
 

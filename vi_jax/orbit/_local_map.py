@@ -124,8 +124,10 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     """
     from scipy.optimize import brentq  # slow to load
 
+    unit = problem.radian
+
     def root(function: Any, low: float, high: float) -> float:
-        found: Any = brentq(lambda s1: float(function(s1)[1]), low, high, xtol=1e-15)
+        found: Any = brentq(lambda s1: float(function(s1)[1]), low, high, xtol=1e-15 * unit)
         return float(found)
 
     def apart(s1):
@@ -154,15 +156,15 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     return np.asarray(inside(leaves)[0]) - np.asarray(free)
 
 
-# A turn this near to a stop touches it: as for the special points.
+# A turn this near to a stop, as a share of the motion, touches it: as for the special points.
 _TOUCHES = 1e-6
 
 # Touches that are closer than this share of a period are one: the depth of what is between them is
 # then of the order of `_TOUCHES`. A choice.
 _APART = 1e-3
 
-# How fast a body approaches a stop on which its rebound is differentiated: laws that depend on the
-# speed are taken at this one. A choice.
+# How fast a body approaches a stop on which its rebound is differentiated, as a share of the
+# motion's speed: laws that depend on the speed are taken at this one. A choice.
 _SLOW = 1e-8
 
 
@@ -205,20 +207,19 @@ def _rooms(problem: Shooting, x):
 
 
 def touched(
-    problem: Shooting, x: np.ndarray, number: int, clock: float
+    problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
 ) -> list[tuple[int, int, float]]:
     """Event, leg and clock of each touch, each once.
 
     **Arguments:** the equations and their solution; event and clock of the touch that is known,
-    which may fall on the end of a flight, where no turn is seen.
+    which may fall on the end of a flight, where no turn is seen; how far the body goes.
     """
     at = jnp.asarray(x)
     rooms, places = (np.asarray(a) for a in _rooms(problem, at))
-    begins, period = np.asarray(problem.parts(at)[0]), float(problem.period(at))
-    within = float(begins[0] + np.mod(clock - begins[0], period))
-    leg = max(0, int(np.searchsorted(begins, within, side="right")) - 1)
-    found = [(number, leg, within)]
-    for leg, other, step in np.argwhere(np.abs(rooms) <= _TOUCHES):
+    period = float(problem.period(at))
+    leg, within = problem.leg_at(at, clock)
+    found = [(number, int(leg), float(within))]
+    for leg, other, step in np.argwhere(np.abs(rooms) <= _TOUCHES * length):
         place = float(places[leg, other, step])
         apart = [
             abs((place - known + period / 2) % period - period / 2)
@@ -289,7 +290,8 @@ def touch_at(
         )
     if number < len(stops_of(problem.machine)):
         push = fast / (fast @ fast)
-        near = u - _SLOW * push
+        unit = np.linalg.norm(gradient * np.asarray(problem.sizes)[1:]) / problem.radian
+        near = u - _SLOW * unit * push
         after = np.asarray(_struck(problem, at, number, leg, s, *map(jnp.asarray, (near, push))))
         kick = Kick(-np.sqrt(2 * rate) * (after - push), 0.5)
     elif event.holds_mode:
@@ -401,7 +403,10 @@ def graze_at(point: Point) -> Graze:
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(jnp.asarray(x)))
     touches = sorted(
-        (touch_at(problem, x, along, *found) for found in touched(problem, x, number, clock)),
+        (
+            touch_at(problem, x, along, *found)
+            for found in touched(problem, x, number, clock, point.step.seen.length)
+        ),
         key=lambda touch: touch.clock % period,
     )
     touches = touches[-1:] + touches[:-1]  # behind the first one comes the section
@@ -499,12 +504,10 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
     **Arguments:** as `touch_at`; the first touch.
     """
     at = jnp.asarray(x)
-    clock, period = np.asarray(problem.parts(at)[0]), float(problem.period(at))
+    period = float(problem.period(at))
     place = period * (np.floor(touch.clock / period) + 1)
-    # Legs begin at clocks within one period of the first.
-    within = clock[0] + np.mod(place - clock[0], period) if problem.events else 0.0
-    leg = max(0, int(np.searchsorted(clock, within, side="right")) - 1)
-    state, slope = _placed(problem, at, jnp.asarray(along), leg, jnp.asarray(within))
+    leg, within = problem.leg_at(at, place if problem.events else 0.0)
+    state, slope = _placed(problem, at, jnp.asarray(along), leg, within)
     matrix = transport(problem, x, touch.leg, touch.clock, place)
     if problem.events and problem.events[0].cycle is not None:  # the section is an event
         matrix = np.asarray(_through(problem, at, 0)) @ matrix

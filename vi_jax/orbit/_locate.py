@@ -24,6 +24,9 @@ BESIDE = 1e-3
 # At most so many times as far on each side.
 MOST = 8
 
+# A zero beside a solution is not further from it (in the parameter's scale): a choice.
+_CLOSE = 1e-2
+
 Advance = Callable[[Any, Any, float], Step]
 
 
@@ -108,6 +111,35 @@ def between(
     if way(here, new, scale) < 0:
         here, new = new, here
     return located(problem, here, new, scale, test)
+
+
+def zero_near(
+    problem: Shooting, x: np.ndarray, scale: np.ndarray, test: Callable[[Step], float]
+) -> Step | None:
+    """The solution close to one at which a test is zero, by the secant method on the parameter;
+    `None` if there is none.
+
+    **Arguments:** the equations; about their solution; the size of each unknown; the test.
+    """
+    found: list[Step] = []
+
+    def value(shift: float) -> float:
+        step = advance(problem, x, np.eye(x.size)[-1], scale, shift)
+        found.append(step)
+        if not bool(step.good):
+            raise NoValueError  # else the secant goes on with NaN, fifty times
+        return test(step)
+
+    from scipy.optimize import newton  # slow to load
+
+    try:
+        shift, report = newton(  # pyright: ignore[reportAssignmentType]
+            value, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
+        )
+        near = report.converged and abs(shift) < _CLOSE and not np.isnan(value(float(shift)))
+    except NoValueError:
+        return None
+    return found[-1] if near else None
 
 
 def crossing(

@@ -24,14 +24,14 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ._closing import Closing
 from ._conditions import alone, overtaken, rates_at
-from ._corrector import Step, advance, apart_from_image, way
+from ._corrector import Step, advance, halves_apart, way
 from ._flight import LANDS, LEAVES
 from ._flight import Event as MotionEvent
 from ._follow import Ending, Event, Table, bounds_of
@@ -41,8 +41,8 @@ from ._observed import ROUNDING
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, refined
 from ._solution import orbit_of
-from ._surgery import halves, origin, without_events
-from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
+from ._surgery import origin, without_events
+from ._symmetry import ALIKE, ROUNDED, may_be_symmetric, may_repeat
 from ._words import (
     ANEW,
     CROSSING,
@@ -50,6 +50,8 @@ from ._words import (
     DOUBLING,
     EXTREMUM,
     FOLD,
+    FROM_HALF,
+    FROM_SYMMETRIC,
     GRAZING,
     HELD_FOLD,
     HOPF,
@@ -105,6 +107,15 @@ _HALVES = 17
 # it has a pole or jumps.
 _ZERO = 1e-6
 
+# A number that changes less than this along the branch (as a share of it, in the norm of the scaled
+# unknowns) does not change but for rounding: a choice. Of a body that hits a stop the greatest
+# position, which is that stop's place, changes by some 1e-16.
+_CHANGES = 1e-9
+
+# If it goes on changing faster than this share of its rates on both sides, there is a corner: a
+# choice, far above what is left at a place that is located to rounding.
+_CORNER = 1e-4
+
 Passed = list[tuple[Point, Step]]
 
 
@@ -121,11 +132,11 @@ class MotionTable(Table):
         extrema: tuple[str, ...], watched: Mapping[str, Callable[[Orbit], float]],
     ):  # fmt: skip
         super().__init__(problem, scale, bounds)
-        self.extrema, self.watched = Extrema(extrema), watched
+        self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.closing = Closing(self)
         self.size, self.duration = None, None
-        self._known: tuple[Any, dict[str, float]] = np.zeros(0), {}
+        self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
@@ -175,7 +186,8 @@ class MotionTable(Table):
         new, x = without_events(old, np.asarray(at.x), both)
         along = np.eye(x.size)[-1]
         scale = new.scale(scale[-1:])
-        return point_at(new, advance(new, x, along, scale, 0.0), scale, REST, detail)
+        at = advance(new, x, along, scale, 0.0)
+        return point_at(new, at, scale, REST, detail, springs=True)
 
     def _not_too_long(self, here: Step) -> Callable[[Step], float]:
         """How far an autonomous motion is from being longer than its steps, as many as ever,
@@ -190,7 +202,7 @@ class MotionTable(Table):
         for i, event in enumerate(self.problem.events):
             falls = lambda step, i=i: float(step.seen.approach[i])
             if event.cycle is not None and not self.problem.conditions:
-                shrinks = lambda at: self._named(HOPF, at, "the motion shrinks to rest", 0)
+                shrinks = lambda at: self._named(HOPF, at, DETAILS[HOPF], 0)
                 yield Event(falls, shrinks, partial(hopf_between, self.problem))
             yield Event(falls, partial(self._ended, here, impact=i))
         # Of events that are together all along the rounding is left out.
@@ -219,7 +231,7 @@ class MotionTable(Table):
             return Ending(at, REST, self._merged(at, flight))
         change = change_at(self.problem, at)
         if change is not None:
-            at = refined(self.problem, at, change)
+            at = refined(self.problem, at, self.scale, change)
         if change is not None and change.kind is not None:
             name = MotionEvent(change.number).called(self.problem.machine)
             place = place_in_words(self.problem, at, change.clock)
@@ -254,7 +266,7 @@ class MotionTable(Table):
                     at, point = self._sprung(at)
                 else:
                     at = self._crossing(here, at, FOLD)
-                    point = self._point(kind, at, "the branch springs from a symmetric motion")
+                    point = self._point(kind, at, DETAILS[FROM_SYMMETRIC])
                 # Beyond it the tests have changed twice: what lies before it shows short of it.
                 return Ending(at, kind, point, self._on_the_way(here, at, _SHORT))
 
@@ -266,39 +278,56 @@ class MotionTable(Table):
         as a special point of that motion."""
         begins, half, step = origin(*alone(self.problem, at, self.scale))
         at = at if self.problem.conditions else begins
-        detail = "the branch springs from a motion of half the period"
         scale = half.scale(self.scale[-1])
-        point = point_at(half, step, scale, DOUBLING, detail, springs=True)
+        point = point_at(half, step, scale, DOUBLING, DETAILS[FROM_HALF], springs=True)
         further = further_of(self.problem, at, self.scale)
         return at, dataclasses.replace(point, further=further)
 
     def passed(self, here: Step, last: Step) -> Passed:
         """The bifurcations between two points, the extremes and the zeros of what is watched, in
         their order."""
-        found = self._bifurcations(here, last, _HALVES)
-        where = partial(self.where, here, last)
-        for at, name, detail in self.extrema.between(self, here, last, where):
-            found.append((self._point(EXTREMUM, at, detail, quantity=name), at))
-        found += self._zeros(here, last)
+        found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
         return sorted(found, key=lambda f: way(here, f[1], self.scale))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
-        """Where the functions that are watched pass zero."""
+        """Where a number is larger, or less, than at all points close by, and where one that is
+        watched passes zero."""
         known, before = self._known
-        before = before if np.array_equal(known, here.x) else self._values(here)
-        self._known = last.x, self._values(last)
-        for name, after in self._known[1].items():
-            value = lambda step, name=name: self._values(step)[name]
-            at = self.where(here, last, value) if before[name] * after < 0 else None
-            if at is not None and abs(value(at)) <= _ZERO * max(abs(before[name]), abs(after)):
-                yield self._point(WATCHED, at, f"{name} passes zero", quantity=name), at
+        before = before if np.array_equal(known, here.x) else self._numbers(here)
+        self._known = last.x, self._numbers(last)
+        for (kind, name), (value, begin) in before.items():
+            other, end = self._known[1][kind, name]
+            steep, least = max(abs(begin), abs(end)), _CHANGES * max(abs(value), abs(other))
+            if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
+                continue
+            at = self.where(here, last, lambda step, k=(kind, name): self._numbers(step)[k][1])
+            if at is None:
+                continue
+            there, rate = self._numbers(at)[kind, name]
+            if kind == WATCHED:
+                real, detail = abs(there) <= _ZERO * steep, f"{name} passes zero"
+            else:
+                sense, most = (1, "largest") if begin > 0 else (-1, "least")
+                # Else it has a pole, as a multiplier at a grazing.
+                real = sense * there >= max(sense * value, sense * other) - least
+                corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
+                detail = f"{name} = {there:.10g} is {most} of all close by{corner}"
+            if real:
+                yield self._point(kind, at, detail, quantity=name), at
 
-    def _values(self, step: Step) -> dict[str, float]:
-        """The numbers that are watched, at a point."""
-        if not self.watched:
-            return {}
-        orbit = orbit_of(*alone(self.problem, step, self.scale)[:2])
-        return {name: float(function(orbit)) for name, function in self.watched.items()}
+    def _numbers(self, step: Step) -> dict[tuple[str, str], tuple[float, float]]:
+        """Of each number whose extremes or zeros are sought its value at a point, and what is zero
+        there: how it changes along the branch, or itself."""
+        found = {}
+        if self.extrema:
+            direction = jnp.asarray(step.tangent * self.scale)
+            values, rates = rates_at(self.problem, self.extrema, jnp.asarray(step.x), direction)
+            found = {(EXTREMUM, n): (float(values[n]), float(rates[n])) for n in self.extrema}
+        if self.watched:
+            orbit = orbit_of(*alone(self.problem, step, self.scale)[:2])
+            values = {name: float(function(orbit)) for name, function in self.watched.items()}
+            found |= {(WATCHED, name): (x, x) for name, x in values.items()}
+        return found
 
     def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Passed:
         """The bifurcations between two points, by the tests that change their signs.
@@ -364,7 +393,7 @@ class MotionTable(Table):
         elif kind == CROSSING and self.symmetric and self._apart(at) < ALIKE:
             kind, detail = SYMMETRY, DETAILS[SYMMETRY]
         elif kind == CROSSING and held:
-            kind, detail = FOLD, HELD_FOLD
+            kind, detail = FOLD, DETAILS[HELD_FOLD]
         return [(self._point(kind, at, detail), at)]
 
     def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
@@ -394,17 +423,14 @@ class MotionTable(Table):
         return crossing(self.problem, self.advance, here, root, tested, admits) or at
 
     def _halves(self, step: Step) -> np.ndarray:
-        """How the second half of the period differs from the first, in the sizes of the unknowns;
-        empty if it cannot be alike."""
-        apart = halves(self.problem, step)
-        return apart / self.problem.half_scale() if apart.size else apart
+        """How the second half of the period differs from the first; empty if it cannot be alike."""
+        return halves_apart(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
 
     def _images(self, step: Step) -> np.ndarray:
-        """How far the motion is from being its own image, in the sizes of the unknowns; empty if it
-        cannot be."""
+        """How far the motion is from being its own image; empty if it cannot be."""
         if not self.symmetric:
             return np.zeros(0)
-        return apart_from_image(self.problem, step)
+        return halves_apart(self.problem, step, mirrored=True)
 
     def _apart(self, step: Step) -> float:
         return float(np.linalg.norm(self._images(step)))
@@ -499,77 +525,3 @@ def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
     rounding."""
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
-
-
-# A number that changes less than this along the branch (as a share of it, in the norm of the scaled
-# unknowns) does not change but for rounding: a choice. Of a body that hits a stop the greatest
-# position, which is that stop's place, changes by some 1e-16.
-_CHANGES = 1e-9
-
-# If it goes on changing faster than this share of its rates on both sides, there is a corner: a
-# choice, far above what is left at a place that is located to rounding.
-_CORNER = 1e-4
-
-Test = Callable[[Step], float]
-
-
-class Extremum(NamedTuple):
-    """A place at which a number is larger, or less, than at all others close by."""
-
-    step: Step
-    name: str
-    detail: str
-
-
-class Extrema:
-    """Looks for extremes along a walk, step by step.
-
-    **Arguments:** names of the numbers.
-    """
-
-    def __init__(self, names: tuple[str, ...]):
-        self.names = names
-        self._known: tuple[Any, Any] = np.zeros(0), ()
-
-    def between(
-        self, curve: Table, here: Step, last: Step, where: Callable[[Test], Step | None]
-    ) -> list[Extremum]:
-        """The extremes between two points that follow each other.
-
-        **Arguments:** the curve; the points; the place between them at which a test is zero.
-        """
-        if not self.names:
-            return []
-        known, there = self._known
-        values, before = there if np.array_equal(known, here.x) else self._at(curve, here)
-        others, after = self._at(curve, last)
-        self._known = last.x, (others, after)
-        found = []
-        for name in self.names:
-            least = _CHANGES * max(abs(values[name]), abs(others[name]))
-            changes = max(abs(before[name]), abs(after[name])) > least
-            if not (changes and before[name] * after[name] < 0):
-                continue
-            at = where(lambda step, name=name: self._at(curve, step)[1][name])
-            if at is None:
-                continue
-            value, rate = (numbers[name] for numbers in self._at(curve, at))
-            sense = 1 if before[name] > 0 else -1
-            if sense * value < max(sense * values[name], sense * others[name]) - least:
-                continue  # a pole, as of a multiplier at a grazing
-            kind = "largest" if sense > 0 else "least"
-            steep = max(abs(before[name]), abs(after[name]))
-            corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
-            detail = f"{name} = {value:.10g} is {kind} of all close by{corner}"
-            found.append(Extremum(at, name, detail))
-        return found
-
-    def _at(self, curve: Table, step: Step) -> tuple[dict[str, float], dict[str, float]]:
-        """The numbers at a point, and how they change along the branch."""
-        direction = jnp.asarray(step.tangent * curve.scale)
-        values, rates = rates_at(curve.problem, self.names, jnp.asarray(step.x), direction)
-        return _as_floats(values), _as_floats(rates)
-
-
-def _as_floats(numbers: dict) -> dict[str, float]:
-    return {name: float(x) for name, x in numbers.items()}

@@ -5,8 +5,6 @@ well as at any other: a number carried along in the state, a body that slides fr
 a family, of which the one nearest to the guess is looked for; or there is none, where it drifts.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
@@ -24,25 +22,17 @@ def rounding(dtype: object) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-class Neutral(NamedTuple):
-    """Projections on the null space of a matrix and on what it does not reach."""
+def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None) -> Array:
+    """What solves `matrix @ step = missing`, where many do, the smallest one. What no step reaches
+    is left over: `missing - matrix @ step`.
 
-    filled: Matrix
-    """To be added to it: an image for each direction that has none, so that it can be inverted.
-    Solutions then have no part in those directions, if there are any. Zero if it is regular."""
-    unmet: Matrix
-    """Projects on what no direction is mapped to."""
-
-
-def neutral(matrix: Matrix) -> Neutral:
-    """The directions that a matrix maps to zero and those it maps nothing to, to rounding."""
+    **Arguments:** the equations; the share of the greatest singular value below which one is zero,
+    by default that of rounding.
+    """
     left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
-    lost = sizes <= rounding(matrix.dtype) * jnp.minimum(sizes[0], _STEEP)
+    least = rounding(matrix.dtype) if least is None else least
+    lost = sizes <= least * jnp.minimum(sizes[0], _STEEP)
     size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
-    lost = lost.astype(matrix.dtype)
-    return Neutral((left * (lost * size)) @ right, (left * lost) @ left.T)
-
-
-def least(matrix: Matrix, missing: Array) -> Array:
-    """What solves `matrix @ step = missing`, where many do, the smallest one."""
-    return jnp.linalg.solve(matrix + neutral(matrix).filled, missing)
+    # An image for each direction that has none, so that the matrix can be inverted.
+    filled = (left * (lost.astype(matrix.dtype) * size)) @ right
+    return jnp.linalg.solve(matrix + filled, missing)

@@ -4,7 +4,6 @@ import dataclasses
 from math import ceil
 from typing import NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -18,12 +17,10 @@ from ..flow import (
     FixedStep,
     ImplicitSteps,
     MethodLike,
-    RunOptions,
+    Run,
     check_parts,
     chosen,
-    collect,
-    planned,
-    run_lane,
+    simulate,
 )
 from ..machine import (
     AbstractMachine,
@@ -331,38 +328,39 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
     """When each cycle of a motion begins, and its impacts, switches and jumps, by a simulation."""
     machine, cycles = orbit.machine, int(orbit.cycles)
-    options = RunOptions(method=orbit.method, event_log=_LISTED + 1)
-    plan, start = planned(machine, orbit.state, cycles, options)
-    begins, log = jax.device_get(_listed(plan, start))
-    if (log.number[:, _LISTED] >= 0).any():
+    run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LISTED + 1)
+    assert run.event_log is not None and run.duration is not None
+    if (np.asarray(run.event_log.kind)[:, -1] >= 0).any():
         raise ValueError(
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
         )
-    first = len(stops_of(machine))
-    offsets: dict[int, int] = {EventKind.impact: 0, EventKind.mode: first}
-    offsets[EventKind.reset] = first + len(switches_of(machine))
-    found = []
-    for n in range(cycles):
-        for clock, kind, number in zip(log.phase[n], log.kind[n], log.number[n], strict=True):
-            if int(kind) not in offsets:
-                continue
-            i, later = offsets[int(kind)] + int(number), (n + 1) % cycles
-            if events_of(machine)[i].ends_cycle:
-                found.append((float(begins[later]), Event(i, later)))
-            else:
-                found.append((float(begins[n] + clock), Event(i)))
+    begins = np.concatenate([[0.0], np.cumsum(np.asarray(run.duration))])
+    if not is_autonomous(machine, bare(orbit.state)):
+        begins = float(machine.cycle) * np.arange(cycles + 1)
+    found, events = [], events_of(machine)
+    for n, s, kind, i in logged_events(machine, run):
+        if kind in (EventKind.rest, EventKind.release):
+            continue
+        if events[i].ends_cycle:
+            later = (n + 1) % cycles
+            found.append((float(begins[later]), Event(i, later)))
+        else:
+            found.append((float(begins[n] + s), Event(i)))
     return begins, found
 
 
-@compiled
-def _listed(plan, start):
-    """When each cycle begins, and the events of each."""
-    run = collect(plan, False, *run_lane(plan, start))
-    assert run.event_log is not None and run.duration is not None
-    begins = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(run.duration)])
-    if plan.ticks(start):
-        begins = jnp.asarray(plan.machine.cycle) * jnp.arange(plan.cycles + 1)
-    return begins, run.event_log
+def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, int, int]]:
+    """Of each event of a run its cycle, the clock since that began, its kind (`EventKind`) and its
+    number among all events."""
+    assert run.event_log is not None
+    kind, number, clock = (
+        np.asarray(a) for a in (run.event_log.kind, run.event_log.number, run.event_log.phase)
+    )
+    stops, switches = len(stops_of(machine)), len(switches_of(machine))
+    others = [kind == EventKind.mode, kind == EventKind.reset]
+    number = number + np.select(others, [stops, stops + switches], 0)
+    places = zip(*np.nonzero(kind >= 0), strict=True)
+    return [(n, float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
 
 
 @compiled

@@ -22,13 +22,13 @@ from ..machine import (
     renews,
     rubs,
     stops_of,
-    switches_of,
     with_leaf,
     with_modes,
 )
 from ._flight import LANDS, LEAVES, Event
-from ._problem import fixed_step_method, sized, steps_of
+from ._problem import fixed_step_method, logged_events, sized, steps_of
 from ._shooting import Shooting
+from .distinct import unit_of
 from .results import Orbit
 
 # A hop is the last one if its rebound is slower than this share of the motion's speed: its error of
@@ -49,7 +49,7 @@ _INSTEAD = (
     "Find such motions value by value: `find_orbit` with another parameter, from this motion."
 )
 
-# A body this close to its stop (relative to 1 + its place) is on it: a choice.
+# A body this close to its stop (relative to the motion, see `distance`) is on it: a choice.
 _ON = 1e-9
 
 Placed = tuple[float, Event]
@@ -73,7 +73,9 @@ def legs_of(
             f"`renewed` or friction on a stop, so that it cannot be followed. {_INSTEAD}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
-    events = _grouped(_logged(machine, run), float(machine.cycle), float(machine.cycle) * cycles)
+    cycle = float(machine.cycle)
+    log = [(n * cycle + s, kind, number) for n, s, kind, number in logged_events(machine, run)]
+    events = _grouped(log, cycle, cycle * cycles)
     if events is None or len(events) > _MOST:
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
@@ -87,7 +89,7 @@ def legs_of(
     )  # fmt: skip
     problem = dataclasses.replace(problem, held=_contact(machine, state, problem.events))
     clock = np.array([place for place, _ in events])
-    rows = _before(orbit, run, clock - _EARLIER * float(machine.cycle))
+    rows = _before(orbit, run, clock - _EARLIER * cycle)
     problem = dataclasses.replace(problem, modes=_modes(problem, orbit.state, clock, rows))
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
@@ -145,32 +147,21 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
     """Of each coordinate, 1 + i if it is on stop number i without landing or leaving, else 0."""
     contact, stops = [0.0] * len(machine.coordinates), stops_of(machine)
     moves = {stops[event.number].coordinate for event in events if event.use}
+    unit = float(unit_of(ravel_pytree(state)[0]))
     for i, stop in enumerate(stops):
         place = machine.coordinates[stop.coordinate].position(state)
-        on = abs(float(stop.beyond(place))) < _ON * (1 + abs(float(place)))
+        on = abs(float(stop.beyond(place))) < _ON * (unit + abs(float(place)))
         if on and stop.coordinate not in moves:
             contact[stop.coordinate] = 1.0 + i
     return tuple(contact)
-
-
-def _logged(machine: AbstractMachine, run: Run) -> list[tuple[float, int, int]]:
-    """Clock since the section, kind and number among all events of each event of a motion."""
-    log, cycle = run.event_log, float(machine.cycle)
-    assert log is not None
-    kind, number, clock = np.asarray(log.kind), np.asarray(log.number), np.asarray(log.phase)
-    stops, switches = len(stops_of(machine)), len(switches_of(machine))
-    number = number + np.select(
-        [kind == EventKind.mode, kind == EventKind.reset], [stops, stops + switches], 0
-    )
-    places = zip(*np.nonzero(kind >= 0), strict=True)
-    return [(n * cycle + clock[n, j], int(kind[n, j]), int(number[n, j])) for n, j in places]
 
 
 def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> list[Placed] | None:
     """The events of a period that begins with a release, if there is one, without the hops of its
     chatters; `None` where a rest has no impact before it.
 
-    **Arguments:** as `_logged` returns; the length of a cycle, and of the period.
+    **Arguments:** clock since the section, kind and number of each event; the length of a cycle,
+    and of the period.
     """
     for number in {n for *_, n in log}:
         # A body that its stop lets go of on the section itself begins the motion as one in flight.

@@ -18,7 +18,7 @@ from .._types import State, Vector
 from ..flow import simulate
 from ..machine import angles_in, bare, in_rows, nearest_images, raveled
 from ._cycle_map import CycleMap
-from ._neutral import least
+from ._neutral import smallest_solution
 from .root_finders import AbstractRootFinder, Found, find_root
 
 
@@ -67,7 +67,7 @@ def _(primals, tangents):
     _, rate = eqx.filter_jvp(
         lambda arc: _missing(arc, root.x, unravel).ravel(), (arc,), (tangents[0],)
     )
-    move = -least(shooting_matrix(jacobians), rate).reshape(root.x.shape)
+    move = -smallest_solution(shooting_matrix(jacobians), rate).reshape(root.x.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
     return root, still._replace(x=move * jnp.where(root.converged > 0, 1.0, jnp.nan))

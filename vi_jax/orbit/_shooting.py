@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._types import Scalar, State, Vector
 from ..flow import TIME, AbstractMethod, average_names, means
@@ -127,6 +127,11 @@ class Shooting(eqx.Module):
     def rests(self) -> bool:
         """Whether a body rests for a part of the motion, or all the time."""
         return bool(self.landings or self.held)
+
+    @property
+    def is_double(self) -> bool:
+        """Whether these are the equations of a curve of double folds (see `Special`)."""
+        return any(getattr(condition, "double", False) for condition in self.conditions)
 
     @property
     def contacts(self) -> tuple[tuple[float, ...], ...]:
@@ -250,6 +255,19 @@ class Shooting(eqx.Module):
         """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
+    def leg_at(self, x: Vector, s: Any) -> tuple[Array, Array]:
+        """The leg in which a clock lies, any number of periods later, and the clock there."""
+        clock, _ = self.parts(x)
+        place = clock[0] + jnp.mod(s - clock[0], self.period(x))
+        return jnp.maximum(jnp.searchsorted(clock, place, side="right") - 1, 0), place
+
+    def sections(self, x: Vector) -> tuple[Int[Array, " cycles"], Float[Array, " cycles"]]:
+        """Of each section the leg in which it lies, and its clock."""
+        begins = [i for i, event in enumerate(self.events) if event.cycle is not None]
+        if begins:
+            return jnp.asarray(begins), self.parts(x)[0][jnp.asarray(begins)]
+        return self.leg_at(x, self.at(x).cycle * jnp.arange(self.cycles, dtype=x.dtype))
+
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """The flight of a leg; behind the hops of a chatter, if it begins with one."""
         flight = Flight(machine, self.modes_in(leg), self.method, self.like)
@@ -315,7 +333,7 @@ class Shooting(eqx.Module):
     def lacks(self, x: Vector) -> Vector:
         """The left sides of the motion's own equations: what each leg lacks to end where the next
         one begins, then the guards; zero for a periodic motion. Its Jacobian is taken forward
-        (`jacobian_at`, `curve.corrected`), so that each leg is carried along with its
+        (`jacobian_at`, `advance`), so that each leg is carried along with its
         derivatives."""
         machine = self.at(x)
         clock, states = self.parts(x)

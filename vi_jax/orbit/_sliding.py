@@ -14,18 +14,25 @@ remains is a touch, or a guard that vanishes at an event.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
-from ..flow import guard_rates
-from ..machine import AbstractEvent, DryFriction, after_event, guard_of, mode_number
-from ._corrector import Step, advance, observe, state_at
+from .._types import Scalar, State
+from ..flow import Rates, guard_rates
+from ..machine import (
+    AbstractEvent,
+    AbstractMachine,
+    DryFriction,
+    after_event,
+    guard_of,
+    mode_number,
+)
+from ._corrector import Step, observe, state_at
 from ._flight import Event, Flight
-from ._locate import NoValueError
-from ._shooting import Shooting
+from ._locate import zero_near
+from ._shooting import Leg, Shooting
 from ._surgery import without_events
 
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
@@ -134,10 +141,8 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     nearest, number = at.seen.nearest, int(at.seen.nearest.event)
     if not holds(Event(number).of(problem.machine)):
         return None
-    clock, _, period = _clocks(problem, at)
-    place = float(clock[0] + np.mod(float(nearest.clock) - clock[0], period))
-    leg = max(0, int(np.searchsorted(clock, place, side="right")) - 1)
-    mode = _mode(problem, leg, number)
+    leg, place = map(float, problem.leg_at(jnp.asarray(at.x), float(nearest.clock)))
+    leg, mode = int(leg), _mode(problem, int(leg), number)
     if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
         return None
     if mode:
@@ -172,17 +177,12 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
     return Change(number, place, (before, -before, 0.0), after != 0)
 
 
-@compiled
-def _rates(problem: Shooting, x, leg, number: int, s):
-    """The guard of a switch that holds, and its rate in that mode, where a flight is at clock
-    `s`."""
-    machine, j = problem.at(x), mode_number(problem.machine, number)
-    clock, states = problem.parts(x)
-    # An event's state is that before it; in a leg it is flown to.
-    begins = jnp.abs(s - clock[leg]) < 1e-12
-    flown = problem.state_at(x, leg, jnp.where(begins, clock[leg], s))
-    u = jax.tree.map(lambda a, b: jnp.where(begins, a, b), problem.unravel(states[leg]), flown)
-    modes = problem.modes_in(leg)
+def holding(
+    problem: Shooting, machine: AbstractMachine, leg: Leg, number: int, s: Scalar, state: State
+) -> Rates:
+    """How far what drives a switch off its surface exceeds what holds it there, with its rates
+    while it is held, in a state of a leg."""
+    j, modes = mode_number(machine, number), problem.modes_in(leg)
     modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
     contact = problem.flight(machine, leg).contact
     held = Flight(machine, modes, problem.method, problem.like, contact)
@@ -190,7 +190,15 @@ def _rates(problem: Shooting, x, leg, number: int, s):
     def guard(s, state):
         return guard_of(machine, number, s, state, modes, contact)
 
-    found = guard_rates(held.smooth.field, guard, s, u)
+    return guard_rates(held.smooth.field, guard, s, state)
+
+
+@compiled
+def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
+    machine, states = problem.at(x), problem.parts(x)[1]
+    # An event's state is that before it; in a leg it is flown to.
+    state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
+    found = holding(problem, machine, leg, number, s, state)
     return found.x, found.v
 
 
@@ -199,7 +207,9 @@ def holding_force(
 ) -> tuple[float, float]:
     """How far what drives a switch off its surface exceeds what holds it there, and how fast that
     grows while it is held."""
-    found = _rates(problem, jnp.asarray(at.x), jnp.asarray(leg), number, jnp.asarray(s))
+    x = jnp.asarray(at.x)
+    begins = bool(s == problem.parts(x)[0][leg])
+    found = _held_at(problem, x, jnp.asarray(leg), number, jnp.asarray(s), begins)
     return float(found[0]), float(found[1])
 
 
@@ -217,48 +227,46 @@ def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float
 _CLOSE = 1e-8
 
 
-def refined(problem: Shooting, at: Step, change: Change) -> Step:
+def refined(problem: Shooting, at: Step, scale: np.ndarray, change: Change) -> Step:
     """The special point at which a part of the motion vanishes, from one that is close to it; the
     same where it is close enough, or no other is found.
 
-    **Arguments:** the equations of the motion with that part; what vanishes.
+    **Arguments:** the equations of the motion with that part; the size of each unknown; what
+    vanishes.
     """
     clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
     close = abs(float(at.seen.apart)) < _CLOSE * problem.radian
     if not change.there or problem.conditions or close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
-    second, alike = (first + 1) % problem.legs, change.modes[0] == change.modes[2]
-    if second <= first:  # the part lies across the begin of the period
+    if first + 1 == problem.legs:  # the part lies across the begin of the period
         return at
-    new, x = without_events(problem, np.asarray(at.x), [first, second] if alike else [first])
-    sizes = new.scale(1.0)
-    fixed = np.eye(x.size)[-1]
-    found: list[Step] = []
+    new, x, event = without_part(problem, at, change)
 
-    def test(parameter: float) -> float:
-        start = np.append((found[-1].x if found else x)[:-1], parameter)
-        step = advance(new, start, fixed, sizes, 0.0)
-        if not bool(step.good):
-            raise NoValueError  # else the secant goes on with NaN, fifty times
-        found.append(step)
-        if alike:
+    def test(step: Step) -> float:
+        if event is None:
             return float(step.seen.nearest.room)
-        place = float(np.asarray(new.parts(jnp.asarray(step.x))[0])[first])
-        return holding_force(new, step, first, change.number, place)[0]
+        place = float(np.asarray(new.parts(jnp.asarray(step.x))[0])[event])
+        return holding_force(new, step, event, change.number, place)[0]
 
-    from scipy.optimize import newton  # slow to load
+    found = zero_near(new, x, new.scale(scale[-1:]), test)
+    return at if found is None else _with_part(problem, at, new, found, first, event is None)
 
-    near, size = float(at.x[-1]), float(abs(at.x[-1])) or 1.0
-    try:
-        root, info = newton(
-            test, near, x1=near + 1e-6 * size, tol=1e-14 * size, full_output=True, disp=False
-        )
-        if not info.converged or np.isnan(test(float(root))):
-            return at
-    except NoValueError:
-        return at
-    return _with_part(problem, at, new, found[-1], first, alike)
+
+def without_part(
+    problem: Shooting, at: Step, change: Change
+) -> tuple[Shooting, np.ndarray, int | None]:
+    """The equations of a motion without the part that vanishes at a special point, and the unknowns
+    that solve them; and its event at which the switch is only just held, `None` where its surface
+    is touched."""
+    clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
+    first = int(np.argmin(np.abs(clock - change.clock)))
+    alike = change.modes[0] == change.modes[2]
+    if not change.there:
+        return problem, np.asarray(at.x), None if alike else first
+    both = [first, (first + 1) % problem.legs]
+    new, x = without_events(problem, np.asarray(at.x), both if alike else [first])
+    return new, x, None if alike else first % new.legs
 
 
 def _with_part(
@@ -276,9 +284,8 @@ def _with_part(
     place, period = clock[first] if not alike else float(step.seen.nearest.clock), new.period(x)
     if alike:
         leg = max(0, first - 1)
-        place = place + float(period) * np.round(
-            (_crude(problem, at, first) - place) / float(period)
-        )
+        before = float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[first])
+        place = place + float(period) * np.round((before - place) / float(period))
         there = ravel_pytree(state_at(new, x, jnp.asarray(leg), jnp.asarray(place)))[0]
         extra = np.stack([np.asarray(there)] * 2)
     else:
@@ -287,7 +294,3 @@ def _with_part(
     states = np.insert(states, [first] * len(extra), extra, axis=0)
     whole = np.asarray(problem.pack(clock, states, step.x[-1:], period))
     return at._replace(x=whole, seen=observe(problem, whole))
-
-
-def _crude(problem: Shooting, at: Step, first: int) -> float:
-    return float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[first])

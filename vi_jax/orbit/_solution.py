@@ -35,8 +35,8 @@ class Counted(NamedTuple):
 
 
 @compiled
-def _compiled_sections(problem, x, legs, places):
-    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(legs, places)
+def _compiled_sections(problem, x):
+    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(*problem.sections(x))
     return states, jnp.max(jnp.abs(problem.lacks(x)))
 
 
@@ -48,29 +48,12 @@ def _clock_of(problem: Shooting, x: Array) -> tuple[np.ndarray, float]:
 def sections_of(problem: Shooting, x: np.ndarray | Array) -> tuple[State, Scalar]:
     """The states on the sections of a solution, leaves (cycles,), and the largest component of its
     residual."""
-    x = jnp.asarray(x)
-    legs, places = _legs_of_sections(problem, x)
-    return _compiled_sections(problem, x, jnp.asarray(legs), jnp.asarray(places))
-
-
-def _legs_of_sections(problem: Shooting, x: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Of each section of a solution, in which leg it lies, and its clock."""
-    clock, period = _clock_of(problem, x)
-    begins = [i for i, event in enumerate(problem.events) if event.cycle is not None]
-    if begins:
-        places, legs = clock[begins], np.asarray(begins)
-    else:
-        places = float(problem.at(x).cycle) * np.arange(problem.cycles)
-        legs = np.zeros(problem.cycles, int)
-        if len(clock):
-            places = clock[0] + np.mod(places - clock[0], period)
-            legs = np.searchsorted(clock, places, side="right") - 1
-    return legs, places
+    return _compiled_sections(problem, jnp.asarray(x))
 
 
 def _own_modes(problem: Shooting, x: Array) -> tuple[Array, ...]:
     """The machine's own modes on the first section of a solution."""
-    return problem.own_modes(int(_legs_of_sections(problem, x)[0][0]))
+    return problem.own_modes(int(problem.sections(x)[0][0]))
 
 
 def counted_of(problem: Shooting, step: Step, state: State | None = None) -> Counted:

@@ -27,8 +27,8 @@ import numpy as np
 from .._messages import so_many
 from .._programs import compiled
 from ._closing import Closing
-from ._conditions import Special
-from ._corrector import Step, advance, apart_from_image, jacobian_at, way
+from ._conditions import Special, is_defective, minors
+from ._corrector import Step, advance, halves_apart, jacobian_at, way
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
 from ._locate import BESIDE, MOST, between, crossing
@@ -47,6 +47,8 @@ from ._words import (
     FLIP,
     FOLD,
     GRAZING,
+    ONE_DOUBLING,
+    ONE_FOLD,
     RESONANCE_1,
     RESONANCE_2,
     RESONANCE_3,
@@ -67,9 +69,6 @@ _ZERO, _ENTRY = 1e-6, 1e-4
 # An impact slower than so many times the root of a clearance is the turn that has it: for
 # accelerations of up to 50.
 _SAME_TURN = 10.0
-
-# What begins at a resonant grazing of a machine with more than two numbers in its state.
-_BEGINS = {1: "a curve of folds begins", -1: "a curve of period doublings begins"}
 
 # Motions that graze are looked at over so many periods.
 PERIODS = 3
@@ -128,7 +127,7 @@ class SpecialTable(Table):
         fastest = here.seen.fastest
         for i in range(len(here.seen.approach)):
             # In a symmetric motion another impact grazes as well, to rounding.
-            if i == grazes and kind != REST:
+            if i == grazes and kind == GRAZING:
                 continue
             test = lambda step, i=i: float(step.seen.approach[i]) / fastest
             lost = partial(self._singular, here, test)
@@ -170,7 +169,7 @@ class SpecialTable(Table):
 
     def _images(self, step: Step) -> np.ndarray:
         """How far the motion is from being its own image."""
-        return apart_from_image(self.problem, step)
+        return halves_apart(self.problem, step, mirrored=True)
 
     def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
         """The point about so far ahead at which the motion is symmetric and the curve is crossed by
@@ -225,7 +224,7 @@ def points_of(
             found.append((place, point(end, steps[place], index=place)))
     for kind, test in _tests_of(problem, condition, scale).items():
         for place, step in _zeros(problem, steps, scale, test):
-            if kind in _DOUBLE and not _is_defective(problem, step, _DOUBLE[kind]):
+            if kind in _DOUBLE and not is_defective(problem, step, _DOUBLE[kind]):
                 continue
             symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
@@ -240,19 +239,11 @@ def points_of(
 _DOUBLE = {RESONANCE_1: 1.0, RESONANCE_2: -1.0}
 
 
-def _is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Whether a double multiplier has one eigenvector. With two of them, as where a motion folds
-    and loses a symmetry, no pair of it becomes complex."""
-    sizes, M = np.asarray(problem.scale(())[-problem.states :]), step.seen.monodromy
-    values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
-    return bool(values[-2] > _ENTRY * values[0])
-
-
 def _symmetric(problem: Shooting, step: Step) -> bool:
     x = jnp.asarray(step.x)
     if not may_be_symmetric(problem, [problem.machine, problem.at(x)]):
         return False
-    return bool(np.linalg.norm(apart_from_image(problem, step)) < ALIKE)
+    return bool(np.linalg.norm(halves_apart(problem, step, mirrored=True)) < ALIKE)
 
 
 def _grazes(step: Step) -> int | None:
@@ -281,8 +272,10 @@ def _resonances(
     known = [local(step) for step in steps]
     both = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
-        what = AT_CODIMENSION_TWO[RESONANT] if both else _BEGINS[sign]
-        what += f" of the motion with one impact in {so_many(n, 'period')}"
+        begins = RESONANT if both else (ONE_FOLD if sign > 0 else ONE_DOUBLING)
+        what = (
+            f"{AT_CODIMENSION_TWO[begins]} of the motion with one impact in {so_many(n, 'period')}"
+        )
         test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
         values = [each.resonance(n, sign) for each in known]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
@@ -314,7 +307,8 @@ def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
     double = plain(lambda s: _others(s, 1 if condition.kind == DOUBLING else -1))
     if condition.kind == FOLD:
-        return {CUSP: _cusp(bare, scale), FLIP: doubling, RESONANCE_1: double}
+        tests = {CUSP: _cusp(bare, scale, 2 if condition.double else 1), FLIP: doubling}
+        return tests if condition.double else tests | {RESONANCE_1: double}
     if condition.kind == DOUBLING:
         return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
     if condition.kind == CROSSING:
@@ -332,11 +326,8 @@ def _product(step: Step, sign: int) -> float:
 
 
 def _others(step: Step, sign: int) -> float:
-    """The product of all eigenvalues of M ± I but one, where that one is zero: the sum of the
-    principal minors of one row less, which unlike the eigenvalues is smooth."""
-    M = step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))
-    minors = (np.delete(np.delete(M, i, 0), i, 1) for i in range(len(M)))
-    return sum(map(_determinant, minors))
+    """The product of all eigenvalues of M ± I but one, where that one is zero."""
+    return float(minors(step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))))
 
 
 def _determinant(matrix: np.ndarray) -> float:
@@ -358,17 +349,24 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp(bare: Shooting, scale: np.ndarray) -> Test:
+def _cusp(bare: Shooting, scale: np.ndarray, many: int) -> Test:
     """How fast the parameters move along a curve of folds, with a sign.
 
     With the left null vector l of F_x both change so that l·F_p dp = 0: along the line across the
-    vector l·F_p, which turns slowly, while the sense in which they go is turned round at a cusp.
+    vector l·F_p, which turns slowly, while the sense in which they go is turned round at a cusp. Of
+    `many` null vectors that one counts on which the parameters act.
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
-        jacobian = np.asarray(jacobian_at(bare, jnp.asarray(step.x)))
+        jacobian = np.array(jacobian_at(bare, jnp.asarray(step.x)))
+        jacobian[:, -2:] *= scale[-2:]
         nulls = _nulls(jacobian[:, :-2], like)
-        first, second = nulls.left @ jacobian[:, -2:] * scale[-2:]
+        if many > 1:
+            lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
+            left = np.linalg.svd(lefts @ jacobian[:, -2:])[0][:, 0] @ lefts
+            sense = 1.0 if like is None else np.sign(left @ like.left)
+            nulls = nulls._replace(left=sense * left)
+        first, second = nulls.left @ jacobian[:, -2:]
         moves = np.asarray(step.tangent)[-2:]
         return float(moves @ [-second, first] / np.hypot(first, second)), nulls
 

@@ -12,33 +12,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ._corrector import Step, advance, observe, state_at
-from ._flight import Event
+from ._corrector import Step, advance, halves_apart, observe, state_at, tangent_at
+from ._locate import zero_near
+from ._observed import ROUNDING
 from ._shooting import Shooting
 from ._solution import sections_of
-
-
-def halves(problem: Shooting, step: Step) -> np.ndarray:
-    """How the second half of the period differs from the first; empty if it cannot be alike."""
-    events, cycles = problem.events, problem.cycles
-    legs = len(events)
-    if cycles % 2 or legs % 2 or not _alike(events, cycles):
-        return np.zeros(0)
-    x = jnp.asarray(step.x)
-    turn = float(problem.period(x)) / 2
-    if not legs:
-        middle = state_at(problem, x, jnp.asarray(0), jnp.asarray(turn))
-        return np.asarray(ravel_pytree(middle)[0] - x[: problem.states])
-    clock, states = (np.asarray(a) for a in problem.parts(x))
-    half = legs // 2
-    late = clock[half:] - clock[:half] - turn
-    return np.append(late, (states[half:] - states[:half]).ravel())
-
-
-def _alike(events: tuple[Event, ...], cycles: int) -> bool:
-    """Whether both halves of a period have the same events."""
-    half = len(events) // 2
-    return events[:half] == tuple(event.later(-(cycles // 2)) for event in events[half:])
 
 
 def several(old: Shooting, n: int) -> Shooting:
@@ -79,26 +57,33 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
         clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
         states = 0.5 * (states[:legs] + states[legs:])
     else:
-        states = states + 0.5 * halves(problem, at)
+        states = states + 0.5 * halves_apart(problem, at) * problem.half_scale()
     mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
     scale = half.scale(scale[-count:])
-    along = np.append(np.zeros(mean.size - 1), 1.0)
 
-    def missing(shift: float) -> float:
-        step = advance(half, mean, along, scale, shift)
-        M = step.seen.monodromy
-        return float(np.linalg.det(M + np.eye(len(M)))) if bool(step.good) else np.nan
+    def doubling(step: Step) -> float:
+        return float(np.linalg.det(step.seen.monodromy + np.eye(problem.states)))
 
-    from scipy.optimize import newton  # slow to load
-
-    shift, report = newton(  # pyright: ignore[reportAssignmentType]
-        missing, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
-    )
-    if not report.converged or not abs(shift) < 1e-2:
-        return at, half, advance(half, mean, along, scale, 0.0)
-    found = advance(half, mean, along, scale, float(shift))
+    found = zero_near(half, mean, scale, doubling)
+    if found is None:
+        return at, half, advance(half, mean, np.eye(mean.size)[-1], scale, 0.0)
     x = repeated(half, found.x, problem)
     return at._replace(x=x, size=found.size, seen=observe(problem, x)), half, found
+
+
+def admissible_beside(
+    problem: Shooting, x: np.ndarray, scale: np.ndarray, distance: float
+) -> Step | None:
+    """The admissible motion at a distance from a solution, on whichever side there is one."""
+    tangent = tangent_at(problem, x, scale)
+    for sense in (1.0, -1.0):
+        found = advance(problem, x, sense * tangent, scale, distance)
+        seen = found.seen
+        inside = min(seen.nearest.room, seen.pull.room, *seen.approach) > 0
+        together = ROUNDING * problem.radian
+        if bool(found.good) and inside and min(seen.order, seen.apart + together) > 0:
+            return found
+    return None
 
 
 # Sections of one motion that differ by less than this (relative to 1 + |state|) are the same: a

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..machine import others_of
-from ._across import across_order, across_sliding, without_part
+from ._across import across_order, across_rest, across_sliding, past_part
 from ._conditions import AbstractCondition, Apart, Special
 from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
 from ._flight import Event
@@ -22,7 +22,7 @@ from ._shooting import Shooting
 from ._sliding import SLIDING
 from ._solution import orbit_of
 from ._special_table import PERIODS
-from ._surgery import repeated, several, without_events
+from ._surgery import admissible_beside, repeated, several, without_events
 from ._words import (
     CROSSING,
     DOUBLING,
@@ -34,6 +34,7 @@ from ._words import (
     RESONANCE_3,
     RESONANCE_4,
     RESONANT,
+    REST,
     SYMMETRY,
     TORUS,
 )
@@ -85,11 +86,21 @@ def _crossed(point: Point, distance: float) -> Orbit:
 
 def _held_otherwise(point: Point, distance: float) -> Orbit:
     """The motion on the other side of a sliding bifurcation."""
-    found = without_part(point.problem, point.step, point.scale, distance)
+    found = past_part(point.problem, point.step, point.scale, distance)
     if found is not None:
         return orbit_of(*found)
     what = "another number of times of sticking or sliding"
     return _otherwise(point, across_sliding, what, distance)
+
+
+def _resting_otherwise(point: Point, distance: float) -> Orbit:
+    """The motion with a rest more or less; where two become one, that with one."""
+    if not point.springs:
+        return _otherwise(point, across_rest, "another number of rests", distance)
+    found = admissible_beside(point.problem, np.asarray(point.step.x), point.scale, distance)
+    if found is None:
+        raise ValueError(f"No motion with one rest was found at distance {distance:g}.")
+    return orbit_of(point.problem, found)
 
 
 def _otherwise(
@@ -130,13 +141,9 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
         nearest = step.seen.nearest
         touch = int(nearest.event), float(nearest.clock)
         new, start = _with_touch(old, np.asarray(step.x), *touch)
-    scale = new.scale(point.scale[-1:])
-    tangent = tangent_at(new, start, scale)
-    for sense in (1.0, -1.0):
-        found = advance(new, start, sense * tangent, scale, distance)
-        inside = found.seen.nearest.room > 0 and min(found.seen.approach, default=1.0) > 0
-        if bool(found.good) and inside:
-            return orbit_of(new, found)
+    found = admissible_beside(new, start, new.scale(point.scale[-1:]), distance)
+    if found is not None:
+        return orbit_of(new, found)
     raise ValueError(
         "Beyond this grazing there is no admissible motion with "
         f"{len(new.impacts)} impacts at distance {distance:g}."
@@ -163,8 +170,7 @@ def _with_touch(
     at, events = jnp.asarray(x), list(old.events)
     clock, states = (np.asarray(a) for a in old.parts(at))
     period = float(old.period(at))
-    leg = max(0, int(np.searchsorted(clock, touch, side="right")) - 1) if events else 0
-    there = state_at(old, at, jnp.asarray(leg), jnp.asarray(touch))
+    there = state_at(old, at, *old.leg_at(at, touch))
     u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(number)
     if not events:
         clock, states, events = np.array([touch]), u, [hit]
@@ -281,6 +287,7 @@ BEGINS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] =
     (None, GRAZING): {_ORBIT: _beyond_grazing},
     (None, CROSSING): {_ORBIT: _crossed},
     (None, SYMMETRY): {_ORBIT: _crossed},
+    (None, REST): {_ORBIT: _resting_otherwise},
     **{(None, kind): {_ORBIT: _held_otherwise} for kind in SLIDING},
     **{
         (curve, kind): {to: partial(_as_kind, to)}

@@ -1,4 +1,4 @@
-"""Motions that are their own image under the symmetry of their machine, half a period later."""
+"""Motions whose second half is as the first, or its image under the symmetry of their machine."""
 
 from collections.abc import Iterable
 
@@ -41,17 +41,27 @@ def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
     return one.of(machine).holds_mode and other.of(machine).holds_mode
 
 
-def images(problem: Shooting, x: Float[Array, " unknowns"]) -> Float[Array, " differences"]:
-    """How the second half of a period differs from the image of the first; zero for a motion that
-    is symmetric, and smooth along its branch, as the events of both halves are compared."""
+def may_repeat(problem: Shooting) -> bool:
+    """Whether the second half of a period with these events can be as the first."""
+    events, half = problem.events, len(problem.events) // 2
+    later = tuple(event.later(-(problem.cycles // 2)) for event in events[half:])
+    return problem.cycles % 2 == 0 and events[:half] == later
+
+
+def halves(
+    problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
+) -> Float[Array, " differences"]:
+    """How the second half of a period differs from the first, or from its image; smooth along a
+    branch, as the events of both halves are compared."""
     half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
 
     def image(u):
+        if not mirrored:
+            return u
         return ravel_pytree(problem.machine.mirrored(problem.unravel(u)))[0]
 
-    if not half:
-        middle = ravel_pytree(problem.state_at(x, 0, turn))[0]
-        return image(x[: problem.states]) - middle
     clock, states = problem.parts(x)
+    if not half:
+        return ravel_pytree(problem.state_at(x, 0, turn))[0] - image(states[0])
     late = clock[half:] - clock[:half] - turn
-    return jnp.concatenate([late, (jax.vmap(image)(states[:half]) - states[half:]).ravel()])
+    return jnp.concatenate([late, (states[half:] - jax.vmap(image)(states[:half])).ravel()])

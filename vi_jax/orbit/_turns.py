@@ -145,17 +145,22 @@ def turns_of(
     whether it ends in the state in which it begins (static).
     """
     bodies, rooms = _turning(flight, places, states, h, closed)
-    room, touch = jnp.full((), jnp.inf, h.dtype), jnp.zeros((), h.dtype)
-    touched = touch
-    for i, (values, place) in enumerate(rooms):
-        least = jnp.argmin(values)
-        touch = jnp.where(values[least] < room, place[least], touch)
-        touched = jnp.where(values[least] < room, float(i), touched)
-        room = jnp.minimum(room, values[least])
+    nearest = _nearest(dict(enumerate(rooms)), h)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
     pull = pull_of(flight, places, states, h, closed=closed)
-    return Turns(low, high, Nearest(room, touch, touched), pull)
+    return Turns(low, high, nearest, pull)
+
+
+def _nearest(rooms: dict[int, _Room], h: Scalar) -> Nearest:
+    """The least of the rooms of events, by their numbers."""
+    least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
+    for number, (room, clock) in rooms.items():
+        i = jnp.argmin(room)
+        other = Nearest(room[i], clock[i], jnp.full((), float(number), h.dtype))
+        less = other.room < least.room
+        least = jax.tree.map(lambda a, b, less=less: jnp.where(less, a, b), other, least)
+    return least
 
 
 def rooms_of(
@@ -227,16 +232,13 @@ def pull_of(
 
     **Arguments:** as `turns_of`.
     """
-    least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
+    forces = {}
     for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
         at = _turns_in(flight, places, states, h, closed, _Pull(number))
         rests = flight.contact[stop.coordinate] == 1.0 + number
         force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
-        i = jnp.argmin(force)
-        other = Nearest(force[i], at.place[i], jnp.full((), float(number), h.dtype))
-        less = other.room < least.room
-        least = jax.tree.map(lambda a, b, less=less: jnp.where(less, a, b), other, least)
-    return least
+        forces[number] = _Room(force, at.place)
+    return _nearest(forces, h)
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:

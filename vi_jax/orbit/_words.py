@@ -22,9 +22,10 @@ RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 # Kinds at which something is touched: by a flight, or by a body that is only just held.
 TOUCHING = (GRAZING, REST, *SLIDING)
 
-# What else a motion may end at than a lost event or a touch; and a turn that a branch makes where
-# it leaves another one to both sides.
-REORDERED, ANEW, TURNS = "reordered", "anew", "turns"
+# What else a motion may end at than a lost event or a touch; a turn that a branch makes where it
+# leaves another one to both sides; a fold where numbers are held; where a branch springs.
+REORDERED, ANEW, TURNS, HELD_FOLD = "reordered", "anew", "turns", "held-fold"
+FROM_HALF, FROM_SYMMETRIC = "from-half", "from-symmetric"
 
 # What is said of a special point, by its kind or one of these.
 DETAILS = {
@@ -35,6 +36,10 @@ DETAILS = {
     TORUS: "a complex pair of multipliers leaves the unit circle",
     TURN: "the parameter turns back where it is followed under conditions",
     TURNS: "a multiplier touches 1: this branch leaves another one to both sides",
+    HELD_FOLD: "a multiplier passes 1",
+    HOPF: "the motion shrinks to rest",
+    FROM_HALF: "the branch springs from a motion of half the period",
+    FROM_SYMMETRIC: "the branch springs from a symmetric motion",
     REORDERED: "two of its events fall together, and come in another order beyond",
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
@@ -45,6 +50,9 @@ RESTS = {
     LEAVES: "a rest on a stop is divided {place}, where the force on the body falls to zero",
     REORDERED: "two rests on a stop become one: the body leaves it {place} no longer",
 }
+
+# What begins at a resonant grazing of a machine with more than two numbers in its state.
+ONE_FOLD, ONE_DOUBLING = "one-fold", "one-doubling"
 
 # What is said of a point of codimension two.
 AT_CODIMENSION_TWO = {
@@ -57,13 +65,12 @@ AT_CODIMENSION_TWO = {
     RESONANCE_3: "the angle of the multipliers is 2π/3",
     RESONANCE_4: "the angle of the multipliers is π/2",
     RESONANT: "a curve of folds and one of period doublings begin",
+    ONE_FOLD: "a curve of folds begins",
+    ONE_DOUBLING: "a curve of period doublings begins",
     FOLD: "the motion that grazes has a multiplier 1",
     DOUBLING: "the motion that grazes has a multiplier -1",
     SYMMETRY: "the motion loses or gains its symmetry: a curve of symmetry breakings comes here",
 }
-
-# The same of a fold where numbers are held: the parameter alone would turn back.
-HELD_FOLD = "a multiplier passes 1"
 
 
 def one(kind: str) -> str:

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -47,23 +47,6 @@ def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
     return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))
 
 
-def on_sections(problem: Shooting, steps: list[Step]) -> dict[str, np.ndarray]:
-    """State and quantities on the first section of each solution, by name; each (points,)."""
-    rows = []
-    for step in steps:
-        states, _ = sections_of(problem, step.x)
-        first = jax.tree.map(lambda x: x[:1], states)
-        own = quantities_on(problem.at(jnp.asarray(step.x)), first)
-        rows.append(components(first, 1) | own)
-    return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
-
-
-def stability_in_words(multipliers: np.ndarray) -> np.ndarray:
-    """Of each point's multipliers, (points, states), the name of the verdict in `STABILITY`."""
-    verdicts = jax.vmap(stability_of)(jnp.asarray(multipliers))
-    return in_names(verdicts)
-
-
 def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any]:
     """Kind, place and extremes of each special point, as variables along `special`."""
     orbits = [point.orbit for point in special]
@@ -80,43 +63,6 @@ def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any
     for i, name in enumerate(names):
         found.setdefault(name, np.array([point.parameters[i] for point in special], float))
     return {f"special_{name}": ("special", x) for name, x in found.items()}
-
-
-def table_of(
-    function: Callable[[Orbit], Any],
-    orbits: Iterable[Orbit],
-    parameter: str,
-    values: np.ndarray,
-    units: Mapping[str, str],
-) -> "xr.Dataset":
-    """What a function makes of each orbit, as a data set over them (see `Branch.table`).
-
-    **Arguments:** `parameter` and `values`, the name of the branch's parameter and its value for
-    each orbit; `units`, the machine's.
-    """
-    if not callable(function):
-        raise TypeError(
-            f"Argument `function` must be a function of an `Orbit`, but got {function!r}."
-        )
-    rows = [_numbers(function(orbit)) for orbit in orbits]
-    shapes = {name: x.shape for name, x in rows[0].items()}
-    for i, row in enumerate(rows):
-        here = {name: x.shape for name, x in row.items()}
-        if here != shapes:
-            raise TypeError(
-                "Argument `function` must return numbers of the same names and shapes at each "
-                f"point, but gave {shapes} at point 0 and {here} at point {i}."
-            )
-    if "parameter" in shapes:
-        raise TypeError(
-            "Argument `function` must call no number `parameter`, which is the branch's own."
-        )
-    data: dict[str, Any] = {name: ("point", values) for name in (parameter, "parameter")}
-    for name, shape in shapes.items():
-        axes = (f"{name}_{k}" for k in range(len(shape)))
-        data[name] = ("point", *axes), np.stack([row[name] for row in rows])
-    named = {name: name for name in (*shapes, parameter)} | {"parameter": parameter}
-    return with_units(xr.Dataset(data, attrs={"parameter": parameter}), units, named)
 
 
 def _numbers(found: object) -> dict[str, np.ndarray]:
@@ -291,7 +237,12 @@ class Curve(InWords, abc.ABC):
     def sections(self) -> dict[str, np.ndarray]:
         """The state on the section and the machine's own quantities there, by name; solved for
         when it is first asked for."""
-        return on_sections(self.problem, self.steps)
+        rows = []
+        for step in self.steps:
+            first = jax.tree.map(lambda x: x[:1], sections_of(self.problem, step.x)[0])
+            own = quantities_on(self.problem.at(jnp.asarray(step.x)), first)
+            rows.append(components(first, 1) | own)
+        return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
 
     @property
     def column_names(self) -> tuple[str, ...]:
@@ -321,8 +272,31 @@ class Curve(InWords, abc.ABC):
 
         **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
         """
-        orbits = (self.orbit(i) for i in range(len(self.steps)))
-        return table_of(function, orbits, self.names[0], self.parameter, self.problem.machine.units)
+        if not callable(function):
+            raise TypeError(
+                f"Argument `function` must be a function of an `Orbit`, but got {function!r}."
+            )
+        rows = [_numbers(function(self.orbit(i))) for i in range(len(self.steps))]
+        shapes = {name: x.shape for name, x in rows[0].items()}
+        for i, row in enumerate(rows):
+            here = {name: x.shape for name, x in row.items()}
+            if here != shapes:
+                raise TypeError(
+                    "Argument `function` must return numbers of the same names and shapes at each "
+                    f"point, but gave {shapes} at point 0 and {here} at point {i}."
+                )
+        if "parameter" in shapes:
+            raise TypeError(
+                "Argument `function` must call no number `parameter`, which is the branch's own."
+            )
+        own = self.names[0]
+        data: dict[str, Any] = {name: ("point", self.parameter) for name in (own, "parameter")}
+        for name, shape in shapes.items():
+            axes = (f"{name}_{k}" for k in range(len(shape)))
+            data[name] = ("point", *axes), np.stack([row[name] for row in rows])
+        named = {name: name for name in (*shapes, own)} | {"parameter": own}
+        table = xr.Dataset(data, attrs={"parameter": own})
+        return with_units(table, self.problem.machine.units, named)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
@@ -368,7 +342,7 @@ class Curve(InWords, abc.ABC):
             "impact_phase": (("point", "impact"), self.impact_phase),
             "impact_speed": (("point", "impact"), self.impact_speed),
             "multipliers": (("point", "state"), self.multipliers),
-            "stability": ("point", stability_in_words(self.multipliers)),
+            "stability": ("point", in_names(jax.vmap(stability_of)(jnp.asarray(self.multipliers)))),
         }
         data |= special_table(self.special, self.names)
         about = {"parameter": self.names[0], "period_in_cycles": self.cycles}

@@ -18,8 +18,6 @@ class STABILITY(NamedEnumeration):
     unknown = "unknown: no orbit was found"
 
 
-STABILITY_NAMES = ("stable", "fold", "period_doubling", "neimark_sacker", "neutral", "unknown")
-
 # A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.
 NEUTRAL = 1e-9
 

@@ -66,7 +66,8 @@ class Point(InWords):
     curve: str | None = None
     """The kind of the boundary on which it lies; `None` on a branch."""
     springs: bool = False
-    """Whether the branch springs here from a motion of half its period, which `orbit` is then."""
+    """Whether the branch springs here from another motion, which `orbit` is then: one of half its
+    period, or one without the flight that divides a rest."""
     quantity: str | None = None
     """Of an extremum, or a number that is watched, its name."""
     index: int = -1
@@ -116,10 +117,11 @@ class Point(InWords):
         On a branch: at a period doubling the motion of twice the period, or of half of it where the
         branch begins at one; at a grazing the motion with that impact less or one more, on the side
         on which it is admissible; where branches cross a motion of the other one; at a sliding
-        bifurcation the motion that sticks once more or less; where two events coincide, as an
-        impact and the section of a machine with `renewed`, the motion with them in another order.
-        Other grazings of a machine with soft stops, friction, modes or `events` are not switched
-        at: take `find_orbit` beyond it, from a simulated motion.
+        bifurcation the motion that sticks once more or less; where a rest is lost or divided the
+        motion with a rest more or less, and where two are joined that with one; where two events
+        coincide, as an impact and the section of a machine with `renewed`, the motion with them in
+        another order. Other grazings of a machine with soft stops, friction, modes or `events` are
+        not switched at: take `find_orbit` beyond it, from a simulated motion.
 
         On a boundary: at a fold–flip the other curve; at a double multiplier 1 or -1 the curve of
         Neimark–Sacker points, or from that the curve of folds or doublings; at a fold or a doubling
