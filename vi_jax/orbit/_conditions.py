@@ -299,14 +299,15 @@ class Special(AbstractCondition):
         """The determinant, V⁻ or the clearance."""
         if self.kind == REST:
             return problem.rest_lost(x, self.impact)
-        if self.kind in TOUCHING and self.impact is None:
+        i = self.impact
+        if i is None and self.kind in TOUCHING:
             return seen.nearest.room
-        if self.kind in SLIDING:
-            i, machine, (clock, states) = self.impact, problem.at(x), problem.parts(x)
+        if i is not None and self.kind in SLIDING:
+            machine, (clock, states) = problem.at(x), problem.parts(x)
             number, state = problem.events[i].number, problem.unravel(states[i])
             return holding(problem, machine, i, number, clock[i], state).x
         if self.kind in TOUCHING:
-            return seen.approach[self.impact] - self.speed
+            return seen.approach[i] - self.speed
         matrix = compound(seen.monodromy) if self.kind == TORUS else seen.monodromy
         sign = 1 if self.kind == DOUBLING else -1
         matrix = matrix + sign * jnp.eye(matrix.shape[0], dtype=x.dtype)

@@ -46,8 +46,8 @@ class Step(NamedTuple):
     """Corrections that it took."""
     good: Flag
     """Whether the corrector converged."""
-    seen: Observed
-    """What is observed there."""
+    seen: Any
+    """What is observed there, an `Observed` of arrays of the host."""
 
 
 def way(here: Step, at: Step, scale: np.ndarray) -> float:
