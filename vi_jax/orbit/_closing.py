@@ -1,17 +1,19 @@
 """Whether a curve of motions has come back to where it began."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._programs import compiled
+from .._types import Vector
 from ..machine import angles_in, nearest_images
 from ._corrector import Step
 from ._follow import CLOSED, Ending, Event, Table
 from ._shooting import Shooting
-from ._solution import sections_of
 
 # The same motion is met again within this (scaled), in a direction that is the same within that:
 # choices, ten thousand times what the corrector leaves, and far less than two passages differ by.
@@ -19,9 +21,6 @@ _AGAIN, _ALONG = 1e-7, 1e-2
 
 # A curve is away from its first point, or near it, at so many lengths of its step: a choice.
 _NEAR = 2.0
-
-# Over this part of a unit what is smooth changes linearly: a choice.
-_SHORT = 1e-6
 
 
 class Closing:
@@ -89,15 +88,12 @@ class Closing:
         """Take unknowns and tangent of the first motion, and of the same one observed
         otherwise."""
         self.cycle = self._cycle(first)
-        x, scale, problem = np.asarray(first.x), self.table.scale, self.table.problem
-        ahead, behind = (
-            observed_otherwise(problem, x + by * first.tangent * scale) for by in (_SHORT, -_SHORT)
-        )
-        tangents = [(a - b) / (2 * _SHORT * scale) for a, b in zip(ahead, behind, strict=True)]
-        others = zip(observed_otherwise(problem, x), tangents, strict=True)
+        x, scale, problem = jnp.asarray(first.x), self.table.scale, self.table.problem
+        found = _others_with_rates(problem, x, jnp.asarray(first.tangent * scale))
+        others = ((np.asarray(other), np.asarray(rate) / scale) for other, rate in found)
         self.begins = [
-            (x, np.asarray(first.tangent)),
-            *(found for found in others if self._apart(first, found[0]) > _AGAIN),
+            (np.asarray(x), np.asarray(first.tangent)),
+            *(other for other in others if self._apart(first, other[0]) > _AGAIN),
         ]
 
     def _cycle(self, step: Step) -> float:
@@ -126,25 +122,25 @@ class Closing:
         return xs
 
 
-def observed_otherwise(problem: Shooting, x: np.ndarray) -> list[np.ndarray]:
+@compiled
+def _others_with_rates(problem: Shooting, x, along):
+    """The same motion observed otherwise, each with its derivative along a direction."""
+    return list(zip(*jax.jvp(partial(_observed_otherwise, problem), (x,), (along,)), strict=True))
+
+
+def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
     """The unknowns of the same motion with others of its events as the first, or without events
     from its other sections on."""
     if problem.autonomous:
         return []
-    at, found = jnp.asarray(x), []
-    parameters, period = x[-len(problem.parameters) :], float(problem.period(at))
+    (clock, states), parameters = problem.parts(x), x[-len(problem.parameters) :]
     if not problem.events:
-        if problem.cycles == 1:
-            return []
-        sections, _ = sections_of(problem, at)
-        for n in range(1, problem.cycles):
-            state = ravel_pytree(jax.tree.map(lambda leaf, n=n: leaf[n], sections))[0]
-            found.append(np.append(np.asarray(state), parameters))
-        return found
-    clock, states = (np.asarray(a) for a in problem.parts(at))
+        sections = zip(*(part[1:] for part in problem.sections(x)), strict=True)
+        later = [ravel_pytree(problem.state_at(x, leg, s))[0] for leg, s in sections]
+        return [jnp.concatenate([state, parameters]) for state in later]
+    found, period = [], problem.period(x)
     for first in range(1, problem.legs):
         if problem.events[first:] + problem.events[:first] == problem.events:
-            later = np.append(clock[first:], clock[:first] + period)
-            turned = problem.pack(later, np.roll(states, -first, axis=0), parameters)
-            found.append(np.asarray(turned))
+            later = jnp.concatenate([clock[first:], clock[:first] + period])
+            found.append(problem.pack(later, jnp.roll(states, -first, axis=0), parameters))
     return found

@@ -2,25 +2,28 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..machine import others_of
-from ._across import across_order, across_rest, across_sliding, past_part
+from .._types import State
+from ..flow import simulate
+from ..machine import after_event, others_of, with_leaf
 from ._conditions import AbstractCondition, Apart, Special
 from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
 from ._flight import Event
 from ._local_map import graze_at
 from ._locate import located
 from ._motion_table import tests_of
+from ._problem import events_in
 from ._shooting import Shooting
-from ._sliding import SLIDING
-from ._solution import orbit_of
+from ._sliding import SLIDING, change_at, without_part
+from ._solution import orbit_of, sections_of
 from ._special_table import PERIODS
 from ._surgery import admissible_beside, repeated, several, without_events
 from ._words import (
@@ -38,10 +41,19 @@ from ._words import (
     SYMMETRY,
     TORUS,
 )
+from .find import find_orbit
 from .results import Orbit
 from .special import Point, point_at
 
 _ORBIT = "orbit"
+
+# Periods after which a stable motion near a point has settled, and the impacts of a cycle that are
+# listed: choices.
+_SETTLES, _LISTED = 100, 32
+
+# Events that are closer than this (a cycle is 2π) fall together: a choice, above how close a place
+# is located.
+_TOGETHER = 1e-6
 
 
 def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
@@ -86,37 +98,90 @@ def _crossed(point: Point, distance: float) -> Orbit:
 
 def _held_otherwise(point: Point, distance: float) -> Orbit:
     """The motion on the other side of a sliding bifurcation."""
-    found = past_part(point.problem, point.step, point.scale, distance)
-    if found is not None:
-        return orbit_of(*found)
-    what = "another number of times of sticking or sliding"
-    return _otherwise(point, across_sliding, what, distance)
+    problem, change = point.problem, change_at(point.problem, point.step)
+    if change is not None and change.there and change.modes[0] == change.modes[2]:
+        new, start, _ = without_part(problem, point.step, change)
+        found = admissible_beside(new, start, new.scale(point.scale[-1:]), distance)
+        if found is not None:
+            return orbit_of(new, found)
+    other = lambda orbit: len(events_in(orbit)) != len(problem.events)
+    return _beside(point, distance, "another number of times of sticking or sliding", other)
 
 
 def _resting_otherwise(point: Point, distance: float) -> Orbit:
     """The motion with a rest more or less; where two become one, that with one."""
     if not point.springs:
-        return _otherwise(point, across_rest, "another number of rests", distance)
+        other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
+        return _beside(point, distance, "another number of rests", other)
     found = admissible_beside(point.problem, np.asarray(point.step.x), point.scale, distance)
     if found is None:
         raise ValueError(f"No motion with one rest was found at distance {distance:g}.")
     return orbit_of(point.problem, found)
 
 
-def _otherwise(
-    point: Point, across: Callable[..., Orbit | None], what: str, distance: float
-) -> Orbit:
-    """The motion that `across` finds. **Raises:** `ValueError` if it finds none.
+def _reordered(point: Point, distance: float) -> Orbit:
+    """The motion beside a place where two events fall together, with others or in another order."""
+    problem, x = point.problem, jnp.asarray(point.step.x)
+    here, begins = list(problem.events), range(len(problem.events))
+    if all(event.cycle is None for event in here):
+        # The same motion may be observed whole cycles later, not from any other of its events.
+        cycle, clock = float(problem.period(x)) / problem.cycles, np.asarray(problem.parts(x)[0])
+        begins = [int(np.sum(clock < n * cycle)) for n in range(problem.cycles)]
+    turned = [here[i:] + here[:i] for i in begins]
+    other = lambda orbit: [event for _, event in events_in(orbit)] not in turned
+    return _beside(point, distance, "its events in another order", other, list(_swapped(point)))
 
-    **Arguments:** what the motion has that the branch has not, in words.
+
+def _swapped(point: Point) -> Iterator[State]:
+    """The state on the section where an event that falls on it comes on the other side of it."""
+    problem, x = point.problem, jnp.asarray(point.step.x)
+    machine, clock, states = problem.at(x), *problem.parts(x)
+    lengths = np.abs(problem.ends(clock, problem.period(x)) - clock) / problem.radian
+    for i, event in enumerate(problem.events):
+        after = problem.events[(i + 1) % problem.legs]
+        if 0 not in (event.cycle, after.cycle) or lengths[i] > _TOGETHER:
+            continue
+        state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
+        # The section's state is that behind it.
+        for each in (after, event) if event.cycle == 0 else (after,):
+            state, modes = after_event(machine, each.number, clock[i], state, modes)
+        yield state
+
+
+def _beside(
+    point: Point, distance: float, what: str, other: Callable[[Orbit], bool],
+    guesses: Sequence[State] = (),
+) -> Orbit:  # fmt: skip
+    """A motion beside a point that the branch has not.
+
+    The map of the section has no jump there but where an impact falls on the section, so that the
+    motion is looked for by its fixed points: from the guesses and from those close by on the
+    branch, and from where a simulation settles. Beyond the point is looked at first.
+
+    **Arguments:** what the motion has, in words; whether a motion is such a one; states on the
+    section.
+
+    **Raises:** `ValueError` if none is found.
     """
-    found = across(point.problem, point.step, point.scale, distance)
-    if found is None:
-        raise ValueError(
-            f"No motion with {what} was found at distance {distance:g} from this {point.kind}. "
-            "Try another distance."
-        )
-    return found
+    problem, step, guesses = point.problem, point.step, list(guesses)
+    for place in (advance(problem, step.x, step.tangent, point.scale, distance), step):
+        if np.all(np.isfinite(place.x)):
+            guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, place.x)[0]))
+    sense = np.copysign(1.0, float(step.tangent[-1]))
+    n, options = problem.cycles, {"method": problem.method}
+    for side in (sense, -sense):
+        value = point.parameter + side * distance * float(point.scale[-1])
+        machine = with_leaf(problem.machine, problem.parameters[-1], value)
+        for guess in (*guesses, None):
+            if guess is None:
+                guess = simulate(machine, guesses[-1], n, settle=_SETTLES * n, **options).last
+            found = find_orbit(machine, guess, n, impact_log=_LISTED, **options)
+            if bool(found.successful) and other(found):
+                return found
+    raise ValueError(
+        f"No motion with {what} was found at distance {distance:g} from this {point.kind}. Try "
+        "another distance."
+    )
 
 
 def _beyond_grazing(point: Point, distance: float) -> Orbit:
@@ -128,7 +193,7 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
             "or ends with it: find the motion beyond it with `find_orbit`."
         )
     if point.impact is None and not point.touches:
-        return _otherwise(point, across_order, "its events in another order", distance)
+        return _reordered(point, distance)
     _check_plain(old)
     if point.impact is not None and old.events[point.impact].cycle is not None:
         raise ValueError(
