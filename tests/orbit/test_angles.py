@@ -96,3 +96,12 @@ def test_a_section_at_half_a_turn_is_one_motion(orbit):
     region = {"start.phi": (-3.0, 3.0), "start.v": (-2.0, 2.0)}
     basins = vi.basins(machine, region, resolution=6, progress=False)
     assert len(basins.attractors) == 1
+
+
+def test_an_erosion_profile_passes_half_a_turn(orbit):
+    zero = float(orbit.state.phi) - np.pi
+    region = {"start.phi": (-3.0, 3.0), "start.v": (-2.0, 2.0)}
+    profile = vi.integrity_profile(
+        Pendulum(), "zero", [zero - 0.1, zero + 0.1], region, resolution=6, progress=False
+    )
+    assert profile.label.tolist() == [[0, 0]]

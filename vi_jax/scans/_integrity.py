@@ -11,7 +11,15 @@ from .._checks import count, given_number
 from .._messages import at_work, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
-from ..machine import AbstractMachine, attributes, check_leaf, summary_table, unit_of, with_leaf
+from ..machine import (
+    AbstractMachine,
+    attributes,
+    check_leaf,
+    nearest_images,
+    summary_table,
+    unit_of,
+    with_leaf,
+)
 from ._basins import (
     Attractor,
     Basins,
@@ -228,12 +236,14 @@ def _followed(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray
     Of the motions of a kind those nearest to each other are one, the nearest pair first.
     """
     names = [name.removeprefix(START) for name in axes]
+    turning = getattr(type(found[0].machine).renewed, "angles", ()) if found[0].machine else ()
+    angles = np.array([name in turning for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
     last: list[Attractor] = []
     rows: list[np.ndarray] = []
     for i, one in enumerate(found):
         pairs = sorted(
-            (_distance(a, b, names, widths), motion, b.label)
+            (_distance(a, b, names, angles, widths), motion, b.label)
             for motion, a in enumerate(last)
             for b in one.attractors
             if a.period == b.period and round(a.impacts) == round(b.impacts)
@@ -251,9 +261,11 @@ def _followed(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray
     return np.array(rows, int).reshape(len(rows), len(found))
 
 
-def _distance(a: Attractor, b: Attractor, names: list[str], widths: np.ndarray) -> float:
+def _distance(
+    a: Attractor, b: Attractor, names: list[str], angles: np.ndarray, widths: np.ndarray
+) -> float:
     """How far sections of two motions of one period are apart, as a part of the region's widths,
     by the best shift in phase."""
-    x, y = (np.stack([m.sections[name] for name in names], axis=1) / widths for m in (a, b))
-    shifts = (np.abs(x - np.roll(y, shift, axis=0)).max() for shift in range(len(y)))
-    return float(min(shifts))
+    x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
+    shifted = (np.roll(y, shift, axis=0) for shift in range(len(y)))
+    return float(min((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted))
