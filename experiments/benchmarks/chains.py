@@ -185,10 +185,7 @@ for cubic in (0.0, 0.3):
 
 # %%
 heads = ["springs", "masses", "code", "µs a lane-cycle", "error", "compile s", "time over best"]
-model = next(
-    (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-     if line.startswith("model name")), platform.machine(),
-) if Path("/proc/cpuinfo").exists() else platform.machine()  # fmt: skip
+model = platform.processor() or platform.machine()
 page = f"""# Long chains beside heyoka
 
 {LANES} lanes of different driving frequencies (0.2 to 0.9), {CYCLES} cycles each, from rest; the \

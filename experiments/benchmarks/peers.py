@@ -9,9 +9,8 @@
 # Rounds are interleaved; compile time is apart. The error is the median difference of the final
 # (Y, V) to a full-precision run, over the lanes that do not amplify 1e-10 beyond 1e-6.
 #
-# Run with `python experiments/benchmarks/peers.py` (extra `bench`). What is measured is kept in the
-# folder for temporary files, and an interrupted run goes on from there; `--fresh` forgets it.
-# `--quick` takes few lanes and writes nothing.
+# Run with `python experiments/benchmarks/peers.py` (extra `bench`; `--quick` for few lanes, writes
+# nothing).
 
 # %%
 import platform

@@ -3,9 +3,8 @@
 #
 # Every method on the same lanes: Table 1's machine (d = 2, k = 0.8; the motor with T0 = 10 N·m),
 # 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9, from rest. What a method costs
-# stands beside what it gets wrong: the state after few and after many cycles, impact times and
-# counts, extremes, orbits with their multipliers and derivatives, how soon it loses a chaotic
-# motion, and how often the *regime* comes out wrong, which is what a scan is for.
+# is listed with what it gets wrong: the state after few and after many cycles, impact times and
+# counts, extremes, and how often the *regime* comes out wrong, which is what a scan is for.
 #
 # Truth is `ExactFlight` for the ideal drive and 40 steps of Verner9 a cycle for the motor. Errors
 # are over the lanes that amplify a displacement of 1e-10 to no more than 1e-6 in 1,000 cycles. Run
@@ -29,7 +28,6 @@ warnings.filterwarnings("ignore", message="vi_jax is running in single precision
 warnings.filterwarnings("ignore", message="[0-9,]+ of [0-9,]+ lanes failed")
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
-from benchmarks.accuracy.landing import landings
 from benchmarks.accuracy.measures import (
     FEW,
     GRID,
@@ -38,25 +36,11 @@ from benchmarks.accuracy.measures import (
     TIMED,
     differ,
     errors_of,
-    guesses,
-    horizon,
-    most_chaotic,
     observe,
-    orbit_of,
     regimes,
     timed,
 )
-from benchmarks.accuracy.methods import (
-    CHOICES,
-    DRIVES,
-    EXACT,
-    FEWER,
-    SCANNED,
-    TRUTH,
-    adaptive,
-    fixed,
-    forget,
-)
+from benchmarks.accuracy.methods import CHOICES, DRIVES, SCANNED, TRUTH, adaptive, fixed, forget
 from benchmarks.accuracy.picture import About, Row, picture
 from tools.study import QUICK, say, write
 from tools.tables import table
@@ -107,36 +91,6 @@ def rows_of(drive: str) -> tuple[list[Row], About]:
 
 results = {drive: rows_of(drive) for drive in DRIVES}
 
-# %% [markdown]
-# ## One lane alone, orbits with their multipliers and derivatives, chaos, and the landing
-#
-# In a chaotic motion (here without damping) no method keeps to the truth; the cycles until the
-# error exceeds 1e-3 grow with the logarithm of its accuracy.
-
-# %%
-alone, orbits, horizons = [], [], []
-chaotic = rate = 0.0
-for drive in DRIVES:
-    fewer = [*([EXACT] if drive == "ideal" else []), *FEWER]
-    programs = [timed(choice, drive, alone=True).run for choice in fewer]
-    for choice, seconds in zip(fewer, side_by_side(programs, ROUNDS), strict=True):
-        alone.append((drive, choice.name, f"{1e3 * seconds:.2f}"))
-    right = orbit_of(TRUTH[drive], drive, guesses(drive))
-    for choice in fewer:
-        mine = orbit_of(choice, drive, right[0])
-        wrongs = (f"{np.abs(a - b).max():.0e}" for a, b in zip(mine, right, strict=True))
-        orbits.append((drive, choice.name, *wrongs))
-    if drive == "ideal":
-        chaotic, rate = most_chaotic(drive)
-        true_states, _ = horizon(TRUTH[drive], drive, chaotic, None)
-        for choice in FEWER:
-            _, cycles = horizon(choice, drive, chaotic, true_states)
-            horizons.append((choice.name, f"{cycles:.0f}"))
-    say(f"{drive}: orbits and chaos")
-    forget("alone", "cycle", "chaos")
-taken_apart = [
-    (name, steps, f"{error:.0e}", f"{wrong:.0e}") for name, steps, error, wrong in landings()
-]
 say("measured")
 
 # %% [markdown]
@@ -228,32 +182,6 @@ brackets time and error.
 
 {every}
 
-## One lane alone
-
-A batch steps in lockstep and waits for rejected steps; one lane does not.
-
-{table(["drive", "method", f"{TIMED} cycles, ms"], alone)}
-
-## Orbits
-
-Eight 2π motions (ζ or κ from 1.05 to 1.4), found by Newton's method: largest error of the \
-section state, of the Floquet multipliers and of d(state)/dζ (or κ).
-
-{table(["drive", "method", "state", "multipliers", "derivative"], orbits)}
-
-## Chaos
-
-Ideal drive without damping: cycles until a run is off by 1e-3 (median of 32 starts) at \
-ζ = {chaotic:.2f}, where the greatest Lyapunov exponent is {rate:.3f} ω.
-
-{table(["method", "cycles"], horizons)}
-
-## The landing, taken apart
-
-Steps of Verner9 on the undamped 4π motion (ζ = 0.9, k = 0.5), displaced by 0.01, four cycles; \
-relative error of the derivative by the start.
-
-{table(["at an impact", "steps a cycle", "error of the state", "of its derivative"], taken_apart)}
 """
 print(report)
 numbers = {

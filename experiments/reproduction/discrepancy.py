@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from vi_jax.orbit import ClosedFormOrbits
-from vi_jax.scans import Sweep
 
 from .motions import GAP
 from .response import LONGEST, WALL, Response, System
@@ -66,8 +65,7 @@ def describe(found: Response) -> dict[str, Any]:
 
     Floats, integers, strings, lists and `None` only. "apart" is where |min Y - min Y of the 2π
     closed form| > 1e-3; "on_the_4pi_curve" compares all values at which the one-impact 4π motion
-    is admissible and stable; a motion's "off_branch" is the difference to the continued branch
-    with its period and impacts at the middle ζ (`None` if none of them reaches there).
+    is admissible and stable.
     """
     return {
         "printed": "The text sees a discrepancy between BB' and CC', in the minimum only, and puts "
@@ -86,16 +84,13 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
         off = np.abs(y_min - short.y_min[:, 0])
         apart = inside[off[inside] > _APART]
         stable = np.flatnonzero(_stable(long))
-        off_long = np.abs(y_min - long.y_min[:, 0])[stable]
-        on_it = off_long < 1e-6
+        on_it = np.abs(y_min - long.y_min[:, 0])[stable] < 1e-6
         widest = inside[np.argmax(off[inside])]
         impacting = inside[np.asarray(at.impacts)[inside] > 0]
         reach, clear = y_min[inside] < WALL, short.y_min[inside, 0] > WALL
         directions[name] = {
             "values": len(inside),
             "apart": len(apart),
-            "apart_from": float(ratios[apart].min()) if len(apart) else None,
-            "apart_to": float(ratios[apart].max()) if len(apart) else None,
             "widest": float(off[widest]),
             "widest_at": float(ratios[widest]),
             "maximum_off": float(np.max(np.abs(y_max[impacting] - GAP))),
@@ -105,10 +100,8 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
             "on_the_4pi_curve": {
                 "stable_values": len(stable),
                 "on_it": int(on_it.sum()),
-                "largest_difference_on_it": float(off_long[on_it].max()) if on_it.any() else None,
-                "elsewhere": [round(float(z), 6) for z in ratios[stable][~on_it]],
             },
-            "motions": [_motion(system, at, ratios, row) for row in rows(system, name, inside)],
+            "motions": [_motion(ratios, row) for row in rows(system, name, inside)],
         }
     return {
         "restitution": system.restitution,
@@ -133,16 +126,7 @@ def shares(sweep: dict[str, Any]) -> tuple[float, float]:
     return one, four
 
 
-def _motion(system: System, at: Sweep, ratios: np.ndarray, row: Row) -> dict[str, Any]:
-    middle = row.part[len(row.part) // 2]
-    off, stable = None, None
-    for branch in system.branches:
-        if (branch.cycles, branch.impact_speed.shape[1]) != (row.cycles, round(row.impacts)):
-            continue
-        for orbit in branch.at(float(ratios[middle])):
-            apart = abs(float(orbit.y_min) - float(at.y_min[middle]))
-            if off is None or apart < off:
-                off, stable = apart, bool(orbit.stable)
+def _motion(ratios: np.ndarray, row: Row) -> dict[str, Any]:
     return {
         "motion": row.motion,
         "from": float(ratios[row.part[0]]),
@@ -150,6 +134,4 @@ def _motion(system: System, at: Sweep, ratios: np.ndarray, row: Row) -> dict[str
         "values": len(row.part),
         "impacts_per_2pi": row.impacts / max(row.cycles, 1),
         "exponent": row.exponent if np.isfinite(row.exponent) else None,
-        "off_branch": off,
-        "branch_stable": stable,
     }

@@ -3,10 +3,9 @@
 #
 # The paper's k = 0.8 without damping (ideal drive, d = 2), between ζ = 0.94, where the 4π motion
 # with one impact is stable, and ζ = 1, where the 2π motion is. In between the 4π motion doubles its
-# period. What comes then is seen twice: as a brute-force bifurcation diagram (two starting states
-# for each ζ, thousands of drive cycles thrown away, one compiled call for all), and as the branches
-# that `continue_orbit` follows. Neither knows of the other, but for the orbits at which the
-# branches begin.
+# period. What comes then is computed twice: as a brute-force bifurcation diagram (two starts for
+# each ζ, thousands of drive cycles discarded, one compiled call for all), and as the branches that
+# `continue_orbit` follows.
 #
 # Shown is the speed V⁻ of every impact: a motion with n impacts in its period is n points, and an
 # impact that is born in a grazing begins at zero. The section is at φ = π, because impacts lie near
@@ -16,11 +15,9 @@
 # runs).
 
 # %%
-import itertools
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +35,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else
 from tools.ideal import GAP, machine
 from tools.study import QUICK, say, write
 from tools.tables import table
-from tools.timing import Clock
 
 K = 0.8
 # Ranges of ζ: the whole, and three stretches of it that are magnified.
@@ -47,8 +43,10 @@ PARTS = {
     "right": (0.9936, 0.9940),
 }  # fmt: skip
 STARTS = np.array([[-2.0, 0.0], [-1.948, 1.207]])  # (Y, V) at φ = π: near a 2π, near a 4π motion
-CHUNK, SEEN, SMALL = 100, 256, 1e-9
-CHUNKS, ROUNDS, VALUES = (10, 50, (64, 32, 32, 32)) if QUICK else (200, 400, (480, 160, 160, 160))
+SEEN = 256
+SETTLE, GROWN, VALUES = (
+    (1000, 100, (64, 32, 32, 32)) if QUICK else (20_000, 800, (480, 160, 160, 160))
+)
 
 
 def at_half_turn(zeta: Any) -> vi.Scene:
@@ -61,73 +59,26 @@ def at_half_turn(zeta: Any) -> vi.Scene:
 
 
 # %%
-@vi.jit
-def settled(zeta: Any, start: Any, chunks: Any, rounds: Any) -> tuple[Any, ...]:
-    """Let every lane settle, and observe it and a neighbour 1e-9 away.
-
-    The neighbour's distance is set back to 1e-9 every two cycles: its mean growth (without the
-    first quarter, in which it turns into the direction that grows most) is the largest Lyapunov
-    exponent.
-
-    Returns sections Y and V, `(lanes, SEEN)`, impact speeds, `(lanes, SEEN, 3)`, and exponents.
-    """
-
-    def one(lane):
-        there = at_half_turn(lane[0])
-
-        def go(state, cycles):
-            return vi.simulate(
-                there, state, cycles, method=vi.ExactFlight(), record="sections"
-            ).last  # fmt: skip
-
-        # In chunks: a run keeps all its sections, and only the last few are wanted.
-        state = there.start(Y=lane[1][0], V=lane[1][1])
-        state = jax.lax.fori_loop(0, chunks, lambda _, state: go(state, CHUNK), state)
-        seen = vi.simulate(there, state, SEEN, method=vi.ExactFlight(), impact_log=3)
-        assert seen.impact_log is not None
-
-        def two_cycles(i, carried):
-            here, near, total = carried
-            here, near = go(here, 2), go(near, 2)
-            far = jnp.hypot(near.Y - here.Y, near.V - here.V)
-            near = jax.tree.map(lambda x, y: x + (y - x) * SMALL / far, here, near)
-            return here, near, total + jnp.where(4 * i >= rounds, jnp.log(far / SMALL), 0.0)
-
-        near = there.start(Y=seen.last.Y + SMALL, V=seen.last.V)
-        carried = (seen.last, near, jnp.zeros(()))
-        total = jax.lax.fori_loop(0, rounds, two_cycles, carried)[2]
-        sections = seen.sections
-        return sections.Y[1:], sections.V[1:], seen.impact_log.speed, total / (1.5 * rounds)
-
-    return jax.lax.map(one, (zeta, start), batch_size=256)
+def settled(zeta: Any, start: Any) -> tuple[Any, ...]:
+    """Sections Y, impact speeds, the last state and the largest Lyapunov exponent of a lane."""
+    there, exact = at_half_turn(zeta), vi.ExactFlight()
+    begin = there.start(Y=start[0], V=start[1])
+    seen = vi.simulate(there, begin, SEEN, settle=SETTLE, method=exact, impact_log=3)
+    grows = vi.lyapunov(there, seen.last, GROWN, settle=0, number=1, method=exact)
+    assert seen.impact_log is not None
+    return seen.sections.Y[1:], seen.impact_log.speed, seen.last, grows.per_cycle[0]
 
 
 grids = [np.linspace(*r, n) for r, n in zip(PARTS.values(), VALUES, strict=True)]
 zeta = np.tile(np.concatenate(grids), 2)
 start = np.repeat([0, 1], len(zeta) // 2)
 part = np.tile(np.repeat(list(PARTS), VALUES), 2)
-arguments = (jnp.asarray(zeta), jnp.asarray(STARTS[start]), CHUNKS, ROUNDS)
-compiled = settled.lower(*arguments).compile()
-with Clock() as clock:
-    Y, V, speed, exponent = map(np.asarray, compiled(*arguments))
-say(f"{len(zeta)} lanes of {CHUNKS * CHUNK} cycles and more: {clock.wall:.1f} s")
+lanes = vi.jit(jax.vmap(settled))(jnp.asarray(zeta), jnp.asarray(STARTS[start]))
+Y, speed, last, exponent = jax.tree.map(np.asarray, lanes)
+say(f"{len(zeta)} lanes of {SETTLE} cycles and more")
 period = np.full(len(zeta), int(vi.REGIMES.unsettled))
 for p in (8, 4, 2, 1):
     period[np.abs(Y[:, p:] - Y[:, :-p]).max(axis=1) < 1e-6] = p
-
-
-def in_bands(count: int) -> np.ndarray:
-    """Return whether a motion visits this many regions of the section in turn, apart in Y or V."""
-    found = np.ones(len(Y), bool)
-    for i, j in itertools.combinations(range(count), 2):
-        separate = np.zeros(len(Y), bool)
-        for a in (Y, V):
-            one, other = a[:, i::count], a[:, j::count]
-            separate |= one.max(axis=1) < other.min(axis=1)
-            separate |= other.max(axis=1) < one.min(axis=1)
-        found &= separate
-    return found
-
 
 # %% [markdown]
 # ## The branches
@@ -142,17 +93,16 @@ def orbit_near(ratio: float, which: int, cycles: int) -> vi.Orbit:
     """Return the orbit on which the lane of a start that is nearest to this ζ ended."""
     mine = np.flatnonzero(start == which)
     i = mine[np.argmin(np.abs(zeta[mine] - ratio))]
-    there = at_half_turn(zeta[i])
-    guess = there.start(Y=float(Y[i, -1]), V=float(V[i, -1]))
-    return vi.find_orbit(there, guess, cycles, throw=True)
+    guess = jax.tree.map(lambda x: x[i], last)
+    return vi.find_orbit(at_half_turn(zeta[i]), guess, cycles, throw=True)
 
 
-def follow(orbit: vi.Orbit, max_step: float) -> vi.Branch:
+def follow(orbit: vi.Orbit, max_step: float = 0.02) -> vi.Branch:
     """Return the branch of an orbit."""
-    bounds = PARTS["wide"]
     found = vi.continue_orbit(
-        orbit, parameter="drive.frequency_ratio", bounds=bounds, step=0.005, max_step=max_step
-    )
+        orbit, parameter="drive.frequency_ratio", bounds=PARTS["wide"], step=0.005,
+        max_step=max_step,
+    )  # fmt: skip
     say(found)
     return found
 
@@ -162,21 +112,11 @@ def of(branch: vi.Branch, kind: str) -> list[vi.Point]:
     return sorted((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
 
 
-def from_two_pi() -> list[vi.Branch]:
-    branch = follow(orbit_near(0.999, 0, 1), 0.05)
-    return [branch, follow(of(branch, "period-doubling")[0].switch(distance=0.003), 0.02)]
-
-
-def from_four_pi() -> list[vi.Branch]:
-    branch = follow(orbit_near(0.945, 1, 2), 0.05)
-    doubled = [follow(p.switch(distance=0.003), 0.02) for p in of(branch, "period-doubling")]
-    touch = of(doubled[0], "grazing")[0]
-    return [branch, *doubled, follow(touch.switch(distance=0.003), 0.02)]
-
-
-with ThreadPoolExecutor(2) as threads:  # what takes the time is compiling
-    jobs = [threads.submit(from_two_pi), threads.submit(from_four_pi)]
-    (two_pi, paired), (four_pi, *eight, three) = (job.result() for job in jobs)
+two_pi = follow(orbit_near(0.999, 0, 1), 0.05)
+paired = follow(of(two_pi, "period-doubling")[0].switch(distance=0.003))
+four_pi = follow(orbit_near(0.945, 1, 2), 0.05)
+eight = [follow(p.switch(distance=0.003)) for p in of(four_pi, "period-doubling")]
+three = follow(of(eight[0], "grazing")[0].switch(distance=0.003))
 # Each branch with its name (none: it is in the legend already) and its colour.
 DRAWN = [
     (two_pi, "2π, 1 impact", color_of(1, 1)), (paired, "4π, 2 impacts", color_of(2, 2)),
@@ -185,41 +125,20 @@ DRAWN = [
 ]  # fmt: skip
 
 # %% [markdown]
-# ## Witnesses
+# ## What was found
 #
-# The closed form's multipliers know nothing of the continuation: where one is -1 a period doubles.
-# Brute force knows of neither: beyond a doubling the square of the distance between the two halves
-# of the 8π motion grows in proportion to ζ, so that a line through the squares tells where it is
-# zero, which no run is long enough to show.
+# The closed form's multipliers do not come from the continuation: where one is -1 a period doubles.
+
 
 # %%
-exact = [jax.jit(lambda z, n=n: vi.closed_form_orbits(at_half_turn(z), cycles=n)) for n in (1, 2)]
-
-
 def closed_doubling(cycles: int, low: float, high: float) -> float:
     """Return the ζ at which a multiplier of the closed form is -1."""
 
     def test(zeta: float) -> float:
-        return float(np.real(np.prod(np.asarray(exact[cycles - 1](zeta).multipliers[0]) + 1)))
+        found = vi.closed_form_orbits(at_half_turn(zeta), cycles=cycles)
+        return float(np.real(np.prod(np.asarray(found.multipliers[0]) + 1)))
 
     return float(brentq(test, low, high, xtol=1e-13))  # pyright: ignore[reportArgumentType]
-
-
-def largest(zetas: np.ndarray) -> np.ndarray:
-    """Return the growth per cycle near the 4π motion, from the closed form's multipliers."""
-    multipliers = np.asarray(jax.vmap(exact[1])(jnp.asarray(zetas)).multipliers)[:, 0]
-    return np.log(np.abs(multipliers).max(axis=1)) / 2
-
-
-def span(values: np.ndarray, form: str = ".6f") -> tuple[str, str]:
-    """Return the least and the greatest value in words."""
-    ends = (values.min(), values.max()) if values.size else (np.nan, np.nan)
-    return f"{ends[0]:{form}}", f"{ends[1]:{form}}"
-
-
-def median_of(values: np.ndarray, form: str) -> str:
-    """Return the median and the range in words."""
-    return f"{np.median(values):{form}} ({' … '.join(span(values, form))})"
 
 
 closed = [closed_doubling(2, 0.95, 0.96), closed_doubling(2, 0.99, 0.9935)]
@@ -228,65 +147,45 @@ first, second = (p.parameter for p in of(four_pi, "period-doubling"))
 born, dies = (of(branch, "grazing")[0].parameter for branch in eight)
 fold, four_ends = of(paired, "fold")[0].parameter, of(four_pi, "grazing")[0].parameter
 two_doubles = of(two_pi, "period-doubling")[0].parameter
-halves = np.abs(Y[:, -1] - Y[:, -3])
-fit = (part == "left") & (period == 4) & (halves > 0.02)
-split, left = np.nan, PARTS["left"][0]
-if fit.sum() >= 3:
-    slope, offset = np.polyfit(zeta[fit] - left, halves[fit] ** 2, 1)
-    split = left - offset / slope
 chaotic = (exponent > 0.003) & (period == vi.REGIMES.unsettled)
-onset, end = span(zeta[chaotic])
 inside = (zeta >= zeta[chaotic].min()) & (zeta <= zeta[chaotic].max())
-regular = (zeta < first - 0.002) & (period == 2)
-off = np.abs(exponent[regular] - largest(zeta[regular]))
 extra = np.isfinite(speed).sum(axis=(1, 2)) - SEEN // 2
-two, four = in_bands(2)[chaotic], in_bands(4)[chaotic]
-merged, stray = span(zeta[chaotic][~four], ".4f"), inside & ~chaotic
-met = span(zeta[(part == "right") & (extra == SEEN // 2)])[0]
-held = span(zeta[(period == 2) & (extra == 0) & (zeta > 0.9935)])[1]
+met = zeta[(part == "right") & (extra == SEEN // 2)].min(initial=np.inf)
+held = zeta[(period == 2) & (extra == 0) & (zeta > 0.9935)].max(initial=0.0)
 
-# %% [markdown]
-# ## What was found
 
-# %%
+def in_words(values: np.ndarray, form: str) -> str:
+    """Return the median and the range."""
+    return f"{np.median(values):{form}} ({values.min():{form}} … {values.max():{form}})"
+
+
 places = table(
-    ["ζ at which", "continuation", "witness"],
+    ["ζ at which", "continuation", "compared with"],
     [
-        [
-            "4π motion doubles", f"{first:.10f}",
-            f"closed form {closed[0]:.10f}; simulated, squares: {split:.7f}",
-        ],
-        ["8π motion touches the stop", f"{born:.10f}", f"simulated: first chaotic value {onset}"],
-        ["8π motion touches the stop", f"{dies:.10f}", f"simulated: last chaotic value {end}"],
+        ["4π motion doubles", f"{first:.10f}", f"closed form {closed[0]:.10f}"],
+        ["8π motion touches the stop", f"{born:.10f}",
+         f"simulated: first chaotic value {zeta[chaotic].min():.6f}"],
+        ["8π motion touches the stop", f"{dies:.10f}",
+         f"simulated: last chaotic value {zeta[chaotic].max():.6f}"],
         ["4π motion doubles", f"{second:.10f}", f"closed form {closed[1]:.10f}"],
-        ["4π motion with 2 impacts folds", f"{fold:.10f}", f"simulated: first seen at {met}"],
+        ["4π motion with 2 impacts folds", f"{fold:.10f}", f"simulated: first seen at {met:.6f}"],
         ["2π motion doubles", f"{two_doubles:.10f}", f"closed form {closed[2]:.10f}"],
-        ["4π motion touches the stop", f"{four_ends:.10f}", f"simulated: last seen at {held}"],
-    ],
-)  # fmt: skip
-chaos = table(
-    ["runs from the first to the last chaotic value", str(inside.sum())],
-    [
-        ["of them chaotic (no period up to 8, exponent above 0.003)", chaotic.sum()],
-        ["exponent per cycle, median (range)", median_of(exponent[chaotic], ".3f")],
-        ["soft impacts per 100 cycles, median (range)",
-         median_of(extra[chaotic] / SEEN * 100, ".1f")],
-        ["in two bands; in four", f"{two.sum()}; {four.sum()}"],
-        [f"exponent less the closed form's, {regular.sum()} stable 4π runs, median (worst)",
-         f"{np.median(off):.1e} ({off.max():.1e})"],
+        ["4π motion touches the stop", f"{four_ends:.10f}", f"simulated: last seen at {held:.6f}"],
     ],
 )  # fmt: skip
 report = f"""# From the 4π motion to chaos
 
 Ideal drive, undamped, k = {K}, d = {GAP:g}; {len(zeta)} runs (two starts at each of {sum(VALUES)}
-values) of {CHUNKS * CHUNK:,} cycles, then {SEEN} observed, in one compiled call
-({clock.cpu:.0f} s of CPU time).
+values) of {SETTLE:,} cycles, then {SEEN} observed, in one compiled call.
 
 ![Bifurcation diagram](../figures/bifurcation_diagram.png)
 
 {places}
 
-{chaos}
+Of the {inside.sum()} runs from the first to the last chaotic value {(inside & chaotic).sum()} are
+chaotic (no period up to 8, exponent above 0.003). Their exponent per cycle is
+{in_words(exponent[chaotic], ".3f")}, median and range; they have
+{in_words(extra[chaotic] / SEEN * 100, ".1f")} soft impacts in 100 cycles.
 
 - There is no cascade. The 4π motion doubles once, and the 8π motion that comes of it is stable for
   {born - first:.1e} in ζ only. Then a turn of it touches the stop, and chaos is there at once. The
@@ -295,20 +194,11 @@ values) of {CHUNKS * CHUNK:,} cycles, then {SEEN} observed, in one compiled call
 - Coming from the other side it is the same, but there the 8π motion lives for
   {second - dies:.0e} in ζ: no simulation shows it, and on a diagram chaos seems to begin at the
   doubling.
-- No periodic window was met. {stray.sum()} of the {inside.sum()} runs did not count as chaotic, at
-  ζ = {", ".join(f"{z:.6f}" for z in zeta[stray]) or "–"}: in the cycles given to settle, a
-  disturbance of the unstable 4π motion grows there by
-  e^{span(largest(zeta[stray]) * CHUNKS * CHUNK, ".1f")[1]} only.
-- The chaos keeps the 4π motion's order: bands visited in turn, one hard impact in two cycles, and a
-  soft one now and then. Four bands are seen up to {merged[0]} and from {merged[1]} on, beside the
-  8π motions.
+- The chaos keeps the 4π motion's order: one hard impact in two cycles, and a soft one now and then.
 - The growth rate jumps above zero where the 8π motion touches the stop. In the stable stretches it
-  falls on the multipliers, which were had without simulating.
-- Beside a doubling {CHUNKS * CHUNK:,} cycles do not settle. So the square of the 8π motion's
-  amplitude was drawn on to zero: it meets the located doubling to {abs(split - first):.0e}.
+  falls on the multipliers of the branches.
 - From {fold:.7f} to {four_ends:.7f} the 4π motion coexists with the 2π motion, or, below
-  {two_doubles:.7f}, with what that doubles into. The two starts show both; from {held} on the
-  second start, the same for all ζ, goes to the other motion before the 4π motion ends.
+  {two_doubles:.7f}, with what that doubles into. The two starts show both.
 """
 print(report)
 numbers = {
@@ -323,54 +213,19 @@ numbers = {
 
 # %% [markdown]
 # ## The picture
-#
-# A stretch of a branch ends at the special point at which stability changes, not at the branch's
-# next point, which may lie farther off than a magnified panel is wide.
 
 
 # %%
-class Piece(NamedTuple):
-    """A stretch of a branch that is stable or unstable all along."""
-
-    parameter: np.ndarray
-    speeds: np.ndarray
-    growth: np.ndarray
-    stable: bool
-
-
-def growth(multipliers: Any, cycles: int) -> np.ndarray:
-    """Return the growth rate per cycle."""
-    return np.log(np.abs(np.asarray(multipliers)).max(axis=-1, keepdims=True)) / cycles
-
-
-def pieces(branch: vi.Branch) -> list[Piece]:
-    """Return the stretches of a branch."""
-    rates = growth(branch.multipliers, branch.cycles)
-    rows = np.column_stack([branch.parameter, branch.impact_speed, rates])
-    turns = np.array([
-        [p.parameter, *np.resize(np.asarray(p.orbit.impact_speed), branch.impact_speed.shape[1]),
-         *growth(p.orbit.multipliers, branch.cycles)]
-        for p in branch.special if p.kind != "grazing"
-    ])  # fmt: skip
-    found, begin = [], 0
-    before: list[np.ndarray] = []
-    for cut in [*(np.flatnonzero(np.diff(branch.stable.astype(int))) + 1), len(rows)]:
-        after = []
-        if cut < len(rows):
-            middle = (rows[cut - 1] + rows[cut]) / 2
-            after = [turns[np.argmin(np.abs(turns - middle)[:, :-1].sum(axis=1))]]
-        here = np.stack([*before, *rows[begin:cut], *after])
-        found.append(Piece(here[:, 0], here[:, 1:-1], here[:, -1:], bool(branch.stable[begin])))
-        begin, before = cut, after
-    return found
-
-
-def draw_branches(ax: Axes, what: str, bounds: tuple[float, float]) -> None:
+def draw_branches(ax: Axes, growth: bool, bounds: tuple[float, float]) -> None:
     """Draw impact speeds or growth of all branches: stable solid, unstable dashed."""
     for branch, _, color in DRAWN:
-        for piece in pieces(branch):
-            look = {"ls": "-" if piece.stable else (0, (2.5, 1.2)), "lw": 2.6, "alpha": 0.6}
-            ax.plot(piece.parameter, getattr(piece, what), color=color, zorder=1, **look)
+        size = np.abs(np.asarray(branch.multipliers)).max(axis=1)[:, None]
+        what = np.log(size) / branch.cycles if growth else np.asarray(branch.impact_speed)
+        stable = size < 1 + 1e-6  # stability changes at points of the branch
+        beside = ~stable | np.roll(~stable, 1) | np.roll(~stable, -1)
+        for mask, style in ((stable, "-"), (beside, (0, (2.5, 1.2)))):
+            look = {"ls": style, "lw": 2.6, "alpha": 0.6, "color": color, "zorder": 1}
+            ax.plot(branch.parameter, np.where(mask, what, np.nan), **look)
     ax.set(xlim=bounds, xlabel="frequency ratio ζ")
 
 
@@ -393,7 +248,7 @@ for name, title in TITLES.items():
         hits = speed[mine, -64:].reshape(mine.sum(), -1)
         across = np.repeat(zeta[mine], hits.shape[1])
         ax.plot(across, hits.ravel(), ".", ms=1.4, mew=0, color=color)
-    draw_branches(ax, "speeds", PARTS[name])
+    draw_branches(ax, False, PARTS[name])
     for point in (point for branch, *_ in DRAWN for point in branch.special):
         hits = np.asarray(point.orbit.impact_speed)
         ax.plot(np.full(len(hits), point.parameter), hits, zorder=4, **mark_style(point.kind))
@@ -408,9 +263,9 @@ ax.axhline(0, color="k", lw=0.8)
 for which, color in enumerate(COLORS):
     mine = (part == "wide") & (start == which)
     ax.plot(zeta[mine], exponent[mine], ".", ms=3, color=color)
-draw_branches(ax, "growth", PARTS["wide"])
+draw_branches(ax, True, PARTS["wide"])
 ax.set(ylim=(-0.2, 0.35), ylabel="growth rate per cycle")
-ax.set_title("dots: growth of a 1e-9 perturbation; lines: ln |largest multiplier| per cycle")
+ax.set_title("dots: largest Lyapunov exponent; lines: ln |largest multiplier| per cycle")
 handles = [
     *(Line2D([], [], color=c, lw=2.6, alpha=0.6, label=x) for _, x, c in DRAWN if x),
     *(Line2D([], [], color="k", ls=s, label=x) for x, s in (("stable", "-"), ("unstable", "--"))),

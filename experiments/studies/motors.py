@@ -4,11 +4,9 @@
 # The paper's Figure 2 belongs to an ideal drive, which turns at the frequency ratio ζ whatever the
 # machine does to it. A motor obeys its control κ only as far as its torque goes: ζ is an outcome.
 #
-# 1. Table 1's machine: κ is run up and closed down for strong and weak motors, with the stop at 2a
-#    and out of reach. The 2π motions are continued in κ through their folds. Both are compared with
-#    a forecast from the ideal machine's load in closed form (Kononenko's method).
-# 2. A motor with an armature, whose current lags: what does the straight line of the paper miss?
-# 3. An unbalanced rotor, beside its averaged response in closed form.
+# For Table 1's machine κ is run up and closed down with strong and weak motors, with the stop at 2a
+# and out of reach. The 2π motions are continued in κ through their folds. Both are compared with a
+# forecast from the ideal machine's load in closed form (Kononenko's method).
 #
 # Run with `python experiments/studies/motors.py` (`--quick` for coarser sweeps, and no files).
 
@@ -22,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
-from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
+from vi_jax.plot.colors import BLUE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -36,7 +34,7 @@ Key = tuple[float, float]
 """A motor's stall torque T0 in N·m, and the gap in m."""
 
 # %% [markdown]
-# ## 1. Run-up and close-down, all motors in one compiled call
+# ## Run-up and close-down, all motors in one compiled call
 
 # %%
 K, NEAR, FAR = 0.5, 0.08, 0.8  # restitution; gaps in metres, 2a and 20a: the free motion needs 11a
@@ -52,10 +50,9 @@ VALUES, SETTLE = (41, 300) if QUICK else (181, 400)
 WAYS = ("run-up", "close-down")
 
 
-def machine(torque: Any, kappa: Any, gap: float = NEAR, lag: Any = None) -> vi.Scene:
-    """Return Table 1's machine with k = 0.5; `lag` is the armature's time constant in s."""
-    table = vi.Parameters(torque=torque, control=kappa, restitution=K, gap=gap, electrical_time=lag)
-    return table.scene()
+def machine(torque: Any, kappa: Any, gap: float = NEAR) -> vi.Scene:
+    """Return Table 1's machine with k = 0.5."""
+    return vi.Parameters(torque=torque, control=kappa, restitution=K, gap=gap).scene()
 
 
 BASE = machine(1.0, 1.0)
@@ -185,125 +182,10 @@ motors = table(heads, rows)
 print(motors)
 
 # %% [markdown]
-# ## 2. An armature
-#
-# The stable 2π motions at many κ, with the straight line and with an armature of τe = ωL/R.
-
-# %%
-TORQUES = (10.0,) if QUICK else (0.2, 2.0, 10.0, 100.0)
-KAPPAS = np.linspace(0.5, 1.9, 5 if QUICK else 57)
-TIMES = (0.1, 1.0) if QUICK else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-OMEGA = float(vi.Parameters().natural_frequency)
-
-
-def settled(torque, kappa):
-    """Return the state after 500 cycles with the straight line."""
-    scene = machine(torque, kappa)
-    steps = vi.FixedStep(steps_per_cycle=24)
-    return vi.simulate(scene, scene.start(), 1, settle=500, method=steps).last
-
-
-def found(torque, kappa, state, time=None):
-    """Return min Y, ζ, the largest multiplier's modulus, whether stable, and impacts."""
-    scene = machine(torque, kappa, lag=None if time is None else time / OMEGA)
-    orbit = vi.find_orbit(scene, scene.start(Y=state.Y, V=state.V, W=state.W))
-    slowest = jnp.max(jnp.abs(orbit.multipliers))
-    return orbit.y_min, orbit.frequency_ratio, slowest, orbit.stable, orbit.impacts
-
-
-lanes = [jnp.asarray(a.ravel()) for a in np.meshgrid(TORQUES, KAPPAS, indexing="ij")]
-states = vi.jit(jax.vmap(settled))(*lanes)
-shape = len(TORQUES), len(KAPPAS)
-line = [np.asarray(x).reshape(shape) for x in vi.jit(jax.vmap(found))(*lanes, states)]
-often, again = jax.tree.map(lambda x: jnp.tile(x, len(TIMES)), (lanes, states))
-lagging = vi.jit(jax.vmap(found))(*often, again, jnp.repeat(jnp.asarray(TIMES), lanes[0].size))
-lagging = [np.asarray(x).reshape(len(TIMES), *shape) for x in lagging]
-same = line[3] & lagging[3] & (line[4] == lagging[4])
-# The largest changes over κ, for each τe and torque.
-changes = [np.where(same, np.abs(lagging[i] - line[i]), 0.0).max(axis=2) for i in range(3)]
-heads = ["T0, N·m", "τe", "L/R, ms", "min Y", "ζ", "largest multiplier"]
-rows = [
-    [f"{torque:g}", f"{time:g}", f"{1e3 * time / OMEGA:.3g}", *(f"{x[i, j]:.1e}" for x in changes)]
-    for j, torque in enumerate(TORQUES)
-    for i, time in enumerate(TIMES)
-]
-armature = table(heads, rows)
-print(armature)
-for time in (None, 0.1):
-    scene = machine(10.0, 0.9, lag=None if time is None else time / OMEGA)
-    start = settled(10.0, 0.9)
-    orbit = vi.find_orbit(scene, scene.start(Y=start.Y, V=start.V, W=start.W), throw=True)
-    name = f"T0 = 10 N·m, κ = 0.9, {'straight line' if time is None else 'τe = 0.1'}"
-    numbers[f"{name}: min Y"] = float(orbit.y_min)
-    if time is not None:
-        numbers[f"{name}: ζ"] = float(np.asarray(orbit.frequency_ratio))
-
-# %% [markdown]
-# ## 3. An unbalanced rotor on an elastic support
-
-# %%
-STRENGTHS, LOW, HIGH, STOP = (0.1, 0.2, 1.0), 0.6, 1.8, 4.0
-
-
-def rotor(strength: float, gap: float | None = None) -> Any:
-    """Return a rotor with ε = 0.01 and ξ = 0.05, with a stop where a gap is given."""
-    return vi.machines.UnbalancedRotor(  # pyright: ignore[reportCallIssue]
-        strength=strength, control=0.8, coupling=0.01, damping_ratio=0.05, gap=gap
-    )
-
-
-def rotors(gap: float | None) -> vi.Sweep:
-    """Sweep every motor up, and then down."""
-
-    def one(strength, kappas):
-        base = rotor(0.1, gap)
-        there = eqx.tree_at(lambda r: (r.strength, r.control), base, (strength, kappas[0]))
-        steps = vi.FixedStep(steps_per_cycle=16)
-        return vi.sweep(there, "control", kappas, settle=SETTLE, cycles=16, method=steps)
-
-    up = np.linspace(LOW, HIGH, 31 if QUICK else 161)
-    values = np.stack([up] * len(STRENGTHS) + [up[::-1]] * len(STRENGTHS))
-    return jax.tree.map(np.asarray, vi.jit(jax.vmap(one))(jnp.asarray(STRENGTHS * 2), values))
-
-
-def leap(sweep: vi.Sweep, row: int) -> str:
-    """Return the two values of κ between which ζ jumps."""
-    ratio, values = np.asarray(sweep.frequency_ratio)[row], np.asarray(sweep.values)[row]
-    i = int(np.nanargmax(np.abs(np.diff(ratio))))
-    low, high = sorted(values[i : i + 2])
-    return f"{low:.4f} … {high:.4f}" if abs(ratio[i + 1] - ratio[i]) > 0.05 else "none"
-
-
-free, held = rotors(None), rotors(STOP)
-speeds, rows, turning = np.linspace(0.5, 2.2, 170_001), [], {}
-for i, strength in enumerate(STRENGTHS):
-    there = rotor(strength)
-    orbit = vi.find_orbit(there, vi.simulate(there, there.start(), 1, settle=300).last, throw=True)
-    turning[strength] = vi.continue_orbit(orbit, parameter="control", bounds=(LOW, HIGH))
-    points = [p.parameter for p in turning[strength].special if p.kind == "fold"]
-    kappa = np.asarray(there.averaged_control(speeds))
-    falls = np.flatnonzero(np.diff(kappa) < 0)
-    averaged = [float(kappa[falls[0]]), float(kappa[falls[-1] + 1])] if falls.size else []
-    cells = [f"{strength:g}"]
-    for k, way in enumerate(WAYS):
-        cells.append(leap(free, i + k * len(STRENGTHS)))
-        if not averaged:
-            cells += ["none", "none"]
-            continue
-        at = sorted(points, reverse=True)[k]
-        cells += [f"{at:.5f}", f"{averaged[k]:.5f}"]
-        numbers[f"τ0 = {strength:g}, {way}: fold, κ"] = at
-        numbers[f"τ0 = {strength:g}, {way}: averaged fold, κ"] = averaged[k]
-    rows.append([*cells, leap(held, i)])
-heads = ["τ0", *(f"{way}{x}" for way in WAYS for x in (" jumps in κ", ": fold", ": averaged"))]
-unbalanced = table([*heads, "run-up with a stop"], rows)
-print(unbalanced)
-
-# %% [markdown]
 # ## Picture
 
 # %%
-figure, axes = panels(14.0, 8.2, 2, 3)
+figure, axes = panels(14.0, 4.4, 1, 3)
 COLORS = dict(zip((100.0, 10.0, 2.0, 0.5, 0.2, 0.1, 0.05), "k #0072b2 #56b4e9 #882255 #e69f00 "
                   "#d55e00 #332288".split(), strict=True))  # fmt: skip
 MARKS = {WAYS[0]: {"marker": "o", "mfc": "none", "ms": 4.5}, WAYS[1]: {"marker": "x", "ms": 3.6}}
@@ -324,44 +206,22 @@ def draw(ax: Any, keys: list[Key], y: str, x: str) -> None:
 
 
 far, near = ([key for key in HIGHEST if key[1] == gap] for gap in (FAR, NEAR))
-for ax, keys in ((axes[0, 0], far), (axes[0, 1], [key for key in near if key[0] < 2])):
+for ax, keys in ((axes[0], far), (axes[1], [key for key in near if key[0] < 2])):
     draw(ax, keys, "frequency_ratio", "parameter")
     ax.axline((1, 1), slope=1, color="0.6", lw=0.9, ls=":")
     ax.set(xlim=(0.5, max(HIGHEST[key] for key in keys)), ylim=(0.4, 3.2))
     ax.set_ylabel("mean frequency ratio ζ")
-for key in near[:: 1 if QUICK else 3]:
-    for y in ("y_min", "y_max"):
-        draw(axes[0, 2], [key], y, "frequency_ratio")
-axes[0, 2].set(xlim=(0.5, 1.9), xlabel="mean frequency ratio ζ", ylabel="min Y, max Y (a)")
 for (key, way), sweep in sweeps.items():
     slip = (np.asarray(sweep.values) - np.asarray(sweep.frequency_ratio)) * key[0]
     look = {"color": COLORS[key[0]], "ls": "none", "markevery": 8, "mew": 0.6, **MARKS[way]}
-    axes[1, 0].plot(sweep.frequency_ratio, slip, **look)
+    axes[2].plot(sweep.frequency_ratio, slip, **look)
 for needed, color, label in ((IDLE, "0.35", "no impacts"), (HARD, BLUE, "2π with impact")):
     look = {"lw": 2.6, "alpha": 0.6, "zorder": 3, "label": f"ideal drive, {label}"}
-    axes[1, 0].plot(ZETAS, needed / PER_NM, color=color, **look)
-axes[1, 0].set(yscale="log", xlim=(0.5, 1.9), ylim=(1e-3, 2), xlabel="mean frequency ratio ζ",
+    axes[2].plot(ZETAS, needed / PER_NM, color=color, **look)
+axes[2].set(yscale="log", xlim=(0.5, 1.9), ylim=(1e-3, 2), xlabel="mean frequency ratio ζ",
                ylabel="T0 (κ - ζ) (N·m)")  # fmt: skip
-for j, (torque, color) in enumerate(zip(TORQUES, (GREEN, ORANGE, BLUE, RED), strict=False)):
-    axes[1, 1].loglog(
-        TIMES, changes[0][:, j], "o-", color=color, ms=4, label=f"T0 = {torque:g} N·m"
-    )
-axes[1, 1].set(xlabel="electrical time τe = ωL/R (1/ω)", ylabel="largest change of min Y (a)")
-for i, (strength, color) in enumerate(zip(STRENGTHS, (RED, BLUE, GREEN), strict=True)):
-    kappa = np.asarray(rotor(strength).averaged_control(speeds))
-    axes[1, 2].plot(kappa, speeds, color=color, lw=5, alpha=0.25)
-    vi.plot_branch(turning[strength], ax=axes[1, 2], y="frequency_ratio", color=color, lw=1.2,
-                   legend=False, label=f"τ0 = {strength:g}")  # fmt: skip
-    for row, way in ((i, WAYS[0]), (i + len(STRENGTHS), WAYS[1])):
-        look = {"color": color, "ls": "none", "markevery": 3, "mew": 0.7, **MARKS[way]}
-        axes[1, 2].plot(free.values[row], np.asarray(free.frequency_ratio)[row], **look)
-axes[1, 2].set(xlim=(LOW, HIGH), ylim=(LOW, HIGH), xlabel="motor control κ", ylabel="mean speed ζ")
-gridded(axes.flat, (
-    "ζ against κ, stop out of reach", "ζ against κ, stop at 2a", "Extremes, stop at 2a",
-    "Load on the motor, all sweeps", "Armature beside straight line, κ = 0.5 … 1.9",
-    "Unbalanced rotor; broad: averaged",
-))  # fmt: skip
-for ax in axes.flat:
+gridded(axes, ("ζ against κ, stop out of reach", "ζ against κ, stop at 2a", "Load on the motor"))
+for ax in axes:
     handles, labels = ax.get_legend_handles_labels()
     named = dict(zip(labels, handles, strict=True))  # each once
     ax.legend(named.values(), named, fontsize=8.5, framealpha=0.9)
@@ -370,11 +230,9 @@ figure.suptitle("○ run-up, × close-down; lines: 2π motions continued in κ (
 # %%
 text = f"""# Motors of limited power
 
-![Sweeps, branches, load, armature and rotor](../figures/motors.png)
+![Sweeps, branches and load](../figures/motors.png)
 
-## Table 1's machine
-
-k = 0.5, Table 1's damping. Each sweep: {VALUES} values of κ from 0.5 up or down to it, at each
+Table 1's machine with k = 0.5. Each sweep: {VALUES} values of κ from 0.5 up or down to it, at each
 {SETTLE} drive cycles to settle and 32 observed. *Special point*: where the continued 2π motion ends
 or turns. *Forecast* of that point: κ = ζ + L(ζ)/τ0 with the ideal machine's load L in closed form.
 
@@ -389,29 +247,6 @@ or turns. *Forecast* of that point: κ = ζ + L(ζ)/τ0 with the ideal machine's
   ζ hardly rises with κ, and then jumps.
 - With the stop at 2a the motor does not hang at ζ = 1. The impact motion carries on beyond it until
   it folds, so that the effect needs a far weaker motor.
-
-## An armature
-
-Stable 2π motions at {len(KAPPAS)} values of κ from 0.5 to 1.9; largest changes over κ.
-
-{armature}
-
-- Over a period the armature keeps nothing, so that mean torque and mean speed lie on the straight
-  line whatever the inductance is. The extremes change by at most
-  {(changes[0] / np.asarray(TIMES)[:, None]).max():.1e} τe, the frequency ratio by
-  {changes[1].max():.0e}, and the largest multiplier by {changes[2].max():.1e}.
-- So the straight line does for frequency responses, extremes and impacts. Where the current itself
-  or a run-up from rest matters, take `DCMotor`.
-
-## An unbalanced rotor
-
-ε = 0.01, ξ = 0.05. *Averaged*: the fold of κ = ζ/w0 + ε ξ ζ⁵/(τ0 D), first order in ε.
-
-{unbalanced}
-
-- Averaging gives the κ of the folds to 0.1 %. A strong motor (τ0 = 1) has no jump.
-- A stop at {STOP:g} m r/M takes the peak away and bends the response to higher speeds, as a
-  hardening spring would. It can bring a jump where there was none, and hold a weak motor down.
 """
 write("motors", text, numbers, figure)
 say("done")

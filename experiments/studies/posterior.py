@@ -15,7 +15,6 @@
 
 # %%
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +32,13 @@ from vi_jax.plot.colors import BLUE, ORANGE, STOP, paler
 jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
-from tools.study import QUICK, write
+from tools.study import QUICK, say, write
 from tools.tables import table
 
 RECORDS, WARM_UP, DRAWS = (8, 100, 100) if QUICK else (200, 300, 800)
 CYCLES, SAMPLES, NOISE = 4, 16, 0.05
 NAMES = ("restitution", "gap", "damping_ratio")
 LABELS = ("restitution k", "gap d (a)", "damping ratio ξ")
-BEGUN = time.perf_counter()
 
 # %% [markdown]
 # ## Model and prior
@@ -117,11 +115,7 @@ def start_of(record: Any) -> Any:
 
 begin = jax.jit(lambda records: jax.lax.map(start_of, records))(records)
 keys = jax.random.split(key_walk, RECORDS)
-walked = time.perf_counter()
-draws, acceptance, divergent = jax.block_until_ready(
-    jax.jit(jax.vmap(posterior))(keys, records, begin)
-)
-walked = time.perf_counter() - walked
+draws, acceptance, divergent = jax.jit(jax.vmap(posterior))(keys, records, begin)
 known = np.asarray(jax.vmap(numbers_of)(truth))
 found = np.asarray(jax.vmap(jax.vmap(numbers_of))(draws))
 
@@ -141,7 +135,6 @@ prior = np.quantile(
 narrower = (high - low).mean(axis=0) / (prior[1] - prior[0])
 for i, name in enumerate(LABELS):
     print(f"{name}: {covered[:, i].mean():.1%} covered, ranks uniform with p = {p_values[i]:.2f}")
-print(f"{RECORDS} posteriors in {walked:.0f} s")
 
 # %% [markdown]
 # ## One of them for ArviZ
@@ -246,7 +239,7 @@ harm that {RECORDS} records would show."""
 
 
 figure = draw()
-print(f"{time.perf_counter() - BEGUN:.0f} s")
+say("drawn")
 slope = np.asarray(jax.jacfwd(positions)(truth[FIRST]))
 numbers = {
     "record of the picture": FIRST,

@@ -7,8 +7,7 @@
 # 256 × 256 simulations by `vi.scan`. The curves laid over come from elsewhere: `vi.boundary`
 # continues the period doubling and the fold of the 2π motion and the second touch of the 4π motion,
 # and the births by grazing lie where the steady vibration without impacts just reaches the stop,
-# 1/|1 - ζ² + 2iξζ| = d. So each checks the other. Random lanes are simulated again with
-# `vi.Adaptive(rtol=1e-9)`.
+# 1/|1 - ζ² + 2iξζ| = d. So each checks the other.
 #
 # Without damping a motion without impacts never settles: the free vibration that the start left
 # stays for good. The map says "unsettled" (or a period, where free and driven vibration happen to
@@ -17,7 +16,6 @@
 # Run with `python experiments/studies/regime_maps.py` (`--quick` for coarse maps).
 
 # %%
-import itertools
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,13 +44,11 @@ from tools.ideal import births, closed_forms, machine
 from tools.pictures import legend_below, panels
 from tools.study import QUICK, say, write
 from tools.tables import table
-from tools.timing import Clock
 
-SIDE, SAMPLE, LATE, LOOKED_AT = (48, 200, 4000, 50) if QUICK else (256, 2000, 20_000, 500)
+SIDE = 48 if QUICK else 256
 SETTLE, RANGE = 400, (0.5, 1.9)  # drive cycles; ζ
 XI_PER_C, TABLE = xi_per_c(), table_damping()
 ZETA, KS, CS = np.linspace(*RANGE, SIDE), np.linspace(0.05, 0.95, SIDE), np.linspace(0, 1.2, SIDE)
-RANDOM = np.random.default_rng(0)
 Lanes = dict[str, np.ndarray]
 Curves = dict[str, list[np.ndarray]]
 
@@ -123,17 +119,14 @@ say("curves")
 
 # %% [markdown]
 # ## The maps
-#
-# A first small map compiles the program, which the clock is not to count.
 
 
 # %%
-def settled(axes: Lanes, method: vi.AbstractMethod, **options: Any) -> xr.Dataset:
+def settled(axes: Lanes) -> xr.Dataset:
     """Return what the machines with these ζ, k and c settle on from rest."""
-    options = {"settle": SETTLE, "lanes": 768 if QUICK else 4096, **options}
     return vi.scan(
-        lambda zeta, k, c: machine(zeta, k, c * XI_PER_C), axes, measure="regime", method=method,
-        workers=2, progress=False, **options,
+        lambda zeta, k, c: machine(zeta, k, c * XI_PER_C), axes, measure="regime", settle=SETTLE,
+        method=vi.ExactFlight(), lanes=768 if QUICK else 4096, workers=2, progress=False,
     )  # fmt: skip
 
 
@@ -142,26 +135,22 @@ class Seen(NamedTuple):
 
     plane: Plane
     data: xr.Dataset
-    clock: Clock
     period: np.ndarray
     """In cycles, or one of `vi.REGIMES`: `(SIDE, SIDE)`."""
     impacts: np.ndarray
     """In a period: `(SIDE, SIDE)`."""
 
 
-settled({"zeta": ZETA[:16], "k": KS[:16], "c": np.zeros(1)}, vi.ExactFlight())
 maps = []
 for plane in PLANES:
-    with Clock() as clock:
-        data = settled(plane.axes, vi.ExactFlight()).squeeze(drop=True)
-    maps.append(Seen(plane, data, clock, data["period"].values, data["impacts"].values))
-    say(f"{plane.title}: {clock.wall:.1f} s, {clock.cpu:.1f} s of CPU time")
+    data = settled(plane.axes).squeeze(drop=True)
+    maps.append(Seen(plane, data, data["period"].values, data["impacts"].values))
+    say(plane.title)
 
 # %% [markdown]
 # ## Checks
 #
-# What cannot be, by the closed form; whether chaos lasts (while a chaotic transient lasts nothing
-# tells it from chaos); and random lanes of each map again by another method.
+# What cannot be, by the closed form.
 
 
 # %%
@@ -188,39 +177,7 @@ def impossible(seen: Seen) -> tuple[int, int, int]:
     return total, wrong, int(np.sum(between & (seen.impacts == 0)))
 
 
-def over_later(seen: Seen) -> tuple[int, int]:
-    """Count of so many lanes called chaotic those that are no longer so after `LATE` cycles."""
-    chaotic = np.argwhere(seen.period == vi.REGIMES.chaotic)
-    i, j = RANDOM.permutation(chaotic)[:LOOKED_AT].T
-    late = settled(seen.plane.lane(i, j), vi.ExactFlight(), paired=True, settle=LATE)
-    return i.size, int(np.sum(late["period"].values != vi.REGIMES.chaotic))
-
-
-def borders(seen: Seen) -> np.ndarray:
-    """Return which lanes have another regime among their eight neighbours."""
-    kind = np.stack([seen.period, np.where(seen.period > 0, seen.impacts, -1)])
-    wide = np.pad(kind, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    places = itertools.product(range(3), repeat=2)
-    return np.any(
-        [np.any(kind != wide[:, a : a + SIDE, b : b + SIDE], axis=0) for a, b in places], 0
-    )
-
-
 limits = [impossible(seen) for seen in maps]
-over = [over_later(seen) for seen in maps]
-picked = RANDOM.integers(0, SIDE, (len(maps), 2, SAMPLE))
-lanes = [seen.plane.lane(*place) for seen, place in zip(maps, picked, strict=True)]
-together = {name: np.concatenate([lane[name] for lane in lanes]) for name in lanes[0]}
-again = settled(together, vi.Adaptive(rtol=1e-9), paired=True, lanes=256)
-parts = [again[name].values.reshape(len(maps), SAMPLE) for name in ("period", "impacts")]
-differing = []  # all; chaotic or unsettled by one of the two; beside another regime; the rest
-for seen, (i, j), period, impacts in zip(maps, picked, *parts, strict=True):
-    was = seen.period[i, j]
-    other = (period != was) | ((period > 0) & (impacts != seen.impacts[i, j]))
-    irregular = other & ((was <= 0) | (period <= 0))
-    border = other & ~irregular & borders(seen)[i, j]
-    rest = other & ~irregular & ~border
-    differing.append([int(x.sum()) for x in (other, irregular, border, rest)])
 say("checked")
 
 # %% [markdown]
@@ -292,34 +249,23 @@ KINDS = (
     "4π with one impact, %", "4π with more impacts, %", "longer periods, %", "chaotic, %",
     "transiently chaotic, %", "impacts, not settled, %",
 )  # fmt: skip
-OTHERS = (
-    f"of {SAMPLE:,} random lanes: another regime by Adaptive",
-    "of these: chaotic or unsettled by one of the two",
-    "regular, with a neighbour of another regime", "neither",
-)  # fmt: skip
 by_kind = zip(KINDS, zip(*map(shares, maps), strict=True), strict=True)
 rows: list[list[Any]] = [
-    ["CPU time, s", *(f"{seen.clock.cpu:.1f}" for seen in maps)],
     *([kind, *(f"{x:.2f}" for x in of)] for kind, of in by_kind),
     [
         "longest period with impacts, cycles",
         *(int(np.max(seen.period[seen.impacts > 0], initial=0)) for seen in maps),
     ],
-    [
-        f"of so many chaotic lanes: not chaotic after {LATE:,} cycles",
-        *(f"{gone} of {size}" for size, gone in over),
-    ],
     ["every third lane on a 2π or 4π motion with one impact", *(f"{x[0]:,}" for x in limits)],
     ["of these: no such stable motion in the closed form", *(x[1] for x in limits)],
     ["lanes without impacts between the births", *(x[2] for x in limits)],
-    *([name, *of] for name, of in zip(OTHERS, zip(*differing, strict=True), strict=True)),
 ]
 lasting = vi.Regime().lasting
 page = f"""# Regime maps
 
 Ideal drive, d = 2, from rest, {SETTLE} cycles to settle and 128 observed; what is chaotic
 there is continued for {lasting:,} cycles, and is called transiently chaotic if it is not chaotic
-then. {SIDE} × {SIDE} lanes a map by `ExactFlight`, 2 workers on 2 cores, compiled before.
+then. {SIDE} × {SIDE} lanes a map by `ExactFlight`.
 
 ![Maps with curves](../figures/regime_maps.png)
 
@@ -337,12 +283,8 @@ then. {SIDE} × {SIDE} lanes a map by `ExactFlight`, 2 workers on 2 cores, compi
   is gone; the chaos that remains lies at the first birth and, up to c = 0.2, in a tongue about
   ζ = 0.55.
 - Transient chaos: without damping the body hits the stop irregularly for hundreds to tens of
-  thousands of cycles. While it lasts nothing tells it from chaos: {over[0][1]} of {over[0][0]}
-  lanes called chaotic without damping are not after {LATE:,} cycles. So "chaotic" says: still so
+  thousands of cycles. While it lasts nothing distinguishes it from chaos: "chaotic" means still so
   after some {lasting:,} cycles.
-- `Adaptive` gives {sum(x[0] for x in differing)} of {SAMPLE * len(maps):,} random lanes another
-  regime; {sum(x[1] for x in differing)} of these are chaotic or unsettled by one of the two: long
-  transients and chaos, where each method goes its own way.
 """
 print(page)
 # With Table 1's damping nearly all lanes settle, so that a test finds these parts on fewer lanes.

@@ -92,24 +92,10 @@ figure, (upper, lower) = panels(11, 5.4, 2, 1, sharex=True, height_ratios=(3, 1)
 upper.plot(np.repeat(RATES, SEEN), lifts.ravel(), ",", color="0.45", rasterized=True)
 upper.plot([], [], ".", color="0.45", ms=3, label="what valves settle on")
 colors = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-names = ("without impact", "one impact", "twice the period", None)
+names = ("without impact", "one impact", "twice the period, q < 1.4", "q > 5.7")
 for branch, color, name in zip((free, hitting, *doubled), colors, names, strict=False):
-    for stable, style in ((True, "-"), (False, "--")):
-        shown = np.where(branch.stable == stable, branch.y_max, np.nan)
-        upper.plot(
-            branch.parameter, shown, style, color=color, lw=1.3, label=name if stable else None
-        )
-marks = {"hopf": ("D", "Hopf"), "grazing": ("^", "grazing"), "period-doubling": ("s", "doubling")}
-seen = set()
-for branch in (free, hitting, *doubled):
-    for point in branch.special:
-        marker, word = marks.get(point.kind, ("o", point.kind))
-        label = None if word in seen else word
-        seen.add(word)
-        upper.plot(
-            point.parameter, float(point.orbit.y_max), marker, color="k", ms=5, mfc="w", label=label
-        )
-upper.set_ylabel("lift at its maxima")
+    vi.plot_branch(branch, ax=upper, y="y_max", color=color, lw=1.3, label=name)
+upper.set(xlabel="", ylabel="lift at its maxima")
 upper.legend(frameon=False, fontsize=9, ncols=2, loc="upper left")
 lower.plot(RATES, impacts.mean(axis=1), ".", color="0.3", ms=2.5)
 lower.set(xlabel="flow rate q", ylabel="impacts in a cycle", xlim=(0, 9))

@@ -12,7 +12,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     **Raises:** `ValueError` if a row has another number of cells.
     """
     # A heading without text is one blank wide.
-    lines = [_line(heads).replace("|  |", "| |"), "|" + "---|" * len(heads)]
+    lines = [_line(heads).replace("  ", " "), "|" + "---|" * len(heads)]
     for row in rows:
         if len(row) != len(heads):
             raise ValueError(f"{len(row)} cells under {len(heads)} headings: {row}")

@@ -19,7 +19,7 @@ SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith(
 ORDER = (
     "siconos_balls", "matlab_balls", "contact_gradients", "heyoka_ramp", "heyoka_sensitivity",
     "coco_grazing", "coco_stick_slip", "pwsdde_pair", "mpgos_valve", "siconos_friction",
-    "bstab_belt", "duffing_basins", "walker", "siconos_chain", "siconos_bar",
+    "bstab_belt", "duffing_basins", "woodpecker", "walker", "siconos_chain", "siconos_bar",
 )  # fmt: skip
 
 BEGIN = """# Validated against other codes
@@ -30,8 +30,7 @@ and compare every number below.
 
 *Theirs* is written with the digits that were published. *How* is their origin: printed in a
 documentation, a program or the reference file of a test, known in closed form, or computed from
-their equations by an independent integrator. Times include compilation. The [woodpecker
-toy](../experiments/studies/woodpecker.md) of Siconos is a study.
+their equations by an independent integrator. Times include compilation.
 """
 
 

@@ -4,7 +4,7 @@ package.
 That is a closed form, an energy, a limit, a symmetry, or a run by SciPy (matrix exponentials
 between impacts for the ideal drive, `solve_ivp` with events for the motor). What is measured is
 the largest deviation from it, beside what is promised. `test_extremes.py` holds the package to
-these rows, and `experiments/studies/extremes.py` makes a table of them.
+these rows.
 """
 
 from . import frequency, gaps, motors, numbers, restitution

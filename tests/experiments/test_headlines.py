@@ -11,17 +11,17 @@ from tools.pictures import save_picture
 from tools.study import headlines
 
 from differences import quick
-from headline_numbers import benchmarks, machines, orbits, paper, records
+from headline_numbers import benchmarks, machines, orbits, paper
 from headline_numbers.closed_forms import Expected
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 PATHS = {p.stem: p for kind in ("studies", "benchmarks") for p in FOLDER.glob(f"{kind}/*.py")}
-# Of `extremes` the rows are tests of their own (`tests/flow/test_extremes.py`), `gpu` has times.
-NAMES = ["reproduction", *sorted(set(PATHS) - {"extremes", "gpu"})]
+# `gpu` has times only.
+NAMES = ["reproduction", *sorted(set(PATHS) - {"gpu"})]
 COMPUTED = {
     name: function
-    for module in (benchmarks, machines, orbits, paper, records)
+    for module in (benchmarks, machines, orbits, paper)
     for name, function in vars(module).items()
 }
 
@@ -44,8 +44,8 @@ def stale(kept: dict[str, float], computed: Expected) -> list[str]:
 
 # Their programs take longer to compile than the rest of this file.
 LONGER = {
-    "basins_map", "chains", "gradients", "identify", "learned_laws", "motors", "peers", "posterior",
-    "regime_maps", "relief_valve", "reproduction", "robustness", "woodpecker",
+    "basins_map", "chains", "gradients", "motors", "peers", "posterior",
+    "regime_maps", "relief_valve", "reproduction", "robustness",
 }  # fmt: skip
 
 

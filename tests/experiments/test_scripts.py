@@ -13,12 +13,12 @@ from differences import some
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
 # A table is all there is to see.
-WITHOUT_FIGURE = {"escape_from_2pi", "extremes", "identify", "gpu"}
-# `peers` and `chains` need the extra `bench`; the rows of `extremes` are tests of their own.
-RUN_ELSEWHERE = {"peers", "chains", "extremes"}
+WITHOUT_FIGURE = {"gpu"}
+# These need the extra `bench`.
+RUN_ELSEWHERE = {"peers", "chains"}
 # These run with the slow tests; the others, whose calls pyright has checked, before
 # a release. Headline numbers are tests of their own (`test_headlines.py`).
-SLOW = {"identify"}
+SLOW = {"relief_valve"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)

@@ -1,12 +1,8 @@
 """Of the studies of the paper and of its discrepancy, and of the motor."""
 
-from functools import partial
-
 import numpy as np
 import vi_jax as vi
 from scipy.optimize import brentq
-
-from one_impact import degenerate
 
 from .closed_forms import ROOT, XI, Expected, births, closed, doubling, fold, touch
 
@@ -85,35 +81,6 @@ def bifurcation_diagram() -> Expected:
         "4π motion touches the stop": touch(0.8, 0.0, 0.9937, 0.9939),
     }
     return {name: (value, ROOT) for name, value in numbers.items()}
-
-
-def codimension_two() -> Expected:
-    numbers: Expected = {}
-    for n, m in ((1, 2), (2, 5), (3, 7)):
-        lack = partial(_resonance, 2 * n / m)
-        xi = float(brentq(lack, 0.15, 0.2585, xtol=1e-15))
-        place = 2 * n / m * np.sqrt(1 - xi**2), xi
-        names = [f"resonant grazing n = {n}, m = {m}"]
-        if (n, m) == (1, 2):
-            names += ["fold that grazes", "period-doubling that grazes"]
-        for name in names:
-            for what, value in zip(("ζ", "ξ"), place, strict=True):
-                numbers[f"{name}, {what}"] = (float(value), 1e-8)
-    # By a map of closed forms, differentiated by differences.
-    for what, parameters, low, high, between in (
-        ("ξ", lambda xi: (0.5, xi), 0.13, 0.145, (0.775, 0.795)),
-        ("k", lambda k: (k, XI), 0.74, 0.76, (0.9, 0.975)),
-    ):
-        zeta, value = degenerate(parameters, low, high, between)
-        numbers[f"degenerate doubling in (ζ, {what}), ζ"] = (zeta, 2e-6)
-        numbers[f"degenerate doubling in (ζ, {what}), {what}"] = (value, 5e-6)
-    return numbers
-
-
-def _resonance(share: float, xi: float) -> float:
-    """What the steady vibration at ζ = share √(1 - ξ²) lacks to reach the stop, d = 2 away."""
-    zeta = share * np.sqrt(1 - xi**2)
-    return float(abs(1 - zeta**2 + 2j * xi * zeta) - 0.5)
 
 
 def regime_maps() -> Expected:

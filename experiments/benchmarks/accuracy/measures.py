@@ -3,7 +3,6 @@
 import time
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -79,8 +78,8 @@ def errors_of(seen: Seen, truth: Seen, calm: np.ndarray) -> dict[str, float]:
     }
 
 
-def timed(choice: Choice, drive: str, *, alone: bool = False) -> Program:
-    """A run of all lanes, or of one, for the clock."""
+def timed(choice: Choice, drive: str) -> Program:
+    """A run of all lanes, for the clock."""
 
     def lane(method, ratio):
         machine = machine_of(drive, ratio)
@@ -89,8 +88,6 @@ def timed(choice: Choice, drive: str, *, alone: bool = False) -> Program:
         )
         return run.last
 
-    if alone:
-        return carried(f"{drive} alone", choice, lane, np.array(0.9))
     return carried(f"{drive} timed", choice, jax.vmap(lane, in_axes=(None, 0)), ratios(LANES))
 
 
@@ -124,84 +121,3 @@ def regimes(choice: Choice, drive: str) -> tuple[np.ndarray, float]:
 
         once()
         return once()
-
-
-def cycle(choice: Choice, drive: str, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One drive cycle from eight section states, and its derivatives by state and ζ (or κ)."""
-
-    def one(method, ratio, state):
-        def after(numbers):
-            machine = machine_of(drive, numbers[-1])
-            names = ("Y", "V", "W")[: state.size]
-            start = machine.start(**dict(zip(names, numbers, strict=False)))
-            run = vi.simulate(machine, start, 1, method=method, record="sections", rests=False)
-            return jnp.stack(jtu.tree_leaves(run.last))
-
-        numbers = jnp.append(state, ratio)
-        return after(numbers), jax.jacfwd(after)(numbers)
-
-    batch = jax.vmap(one, in_axes=(None, 0, 0))
-    after, slope = carried(f"{drive} cycle", choice, batch, ON, states).run()
-    return np.asarray(after), np.asarray(slope)
-
-
-ON = np.linspace(1.05, 1.4, 8)
-
-
-def orbit_of(
-    choice: Choice, drive: str, states: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The 2π motions near `states` by Newton's method: states, multipliers, d(state)/dζ."""
-    slope = matrix = np.empty(0)
-    for _ in range(8):
-        after, slope = cycle(choice, drive, states)
-        matrix = np.eye(states.shape[1]) - slope[:, :, :-1]
-        states = states + np.linalg.solve(matrix, (after - states)[..., None])[..., 0]
-    multipliers = np.sort_complex(np.linalg.eigvals(slope[:, :, :-1]))
-    return states, multipliers, np.linalg.solve(matrix, slope[:, :, -1:])[..., 0]
-
-
-def guesses(drive: str) -> np.ndarray:
-    """The closed forms of the ideal drive."""
-    machines = [vi.Scene.ideal(frequency_ratio=x, restitution=0.8) for x in ON]
-    found = [vi.closed_form_orbits(machine, cycles=1) for machine in machines]
-    states = np.array([[float(x.Y[0]), float(x.V[0])] for x in found])
-    return states if drive == "ideal" else np.column_stack([states, ON])
-
-
-def undamped(machine: vi.Scene) -> vi.Scene:
-    """Without damping there is more chaos."""
-    return eqx.tree_at(lambda s: s.oscillator.damping_ratio, machine, jnp.zeros(()))
-
-
-def horizon(
-    choice: Choice, drive: str, at: float, truth: np.ndarray | None
-) -> tuple[np.ndarray, float]:
-    """States of 32 starts at one ζ (or κ), and the median cycle at which they leave the truth."""
-
-    def lane(method, ratio, Y):
-        machine = undamped(machine_of(drive, ratio))
-        run = vi.simulate(
-            machine, machine.start(Y=Y), 200, method=method, record="sections", rests=False
-        )
-        return jnp.stack([run.sections.Y, run.sections.V], axis=-1)
-
-    batch = jax.vmap(lane, in_axes=(None, 0, 0))
-    lanes = np.full(32, at), np.linspace(-1, 1, 32)
-    found = np.asarray(carried(f"{drive} chaos", choice, batch, *lanes).run())
-    if truth is None:
-        return found, np.nan
-    apart = np.abs(found - truth).max(axis=-1)
-    apart = np.where(np.isfinite(apart), apart, np.inf)
-    first = np.where((apart > 1e-3).any(axis=1), (apart > 1e-3).argmax(axis=1), 200)
-    return found, float(np.median(first))
-
-
-def most_chaotic(drive: str) -> tuple[float, float]:
-    """The ζ or κ of the greatest Lyapunov exponent (unit: ω), and that exponent."""
-    name = next(iter(AXES[drive]))
-    values = np.linspace(0.5, 1.9, 15 if QUICK else 141)
-    machine = undamped(jtu.tree_map(jnp.asarray, MACHINES[drive]))
-    data = vi.scan(machine, {name: values}, measure=vi.Exponent(), settle=200, progress=False)
-    best = int(np.argmax(data.exponent.values))
-    return float(values[best]), float(data.exponent[best])

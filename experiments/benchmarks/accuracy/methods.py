@@ -100,17 +100,6 @@ SINGLE_EXACT = EXACT._replace(family="ExactFlight, float32", double=False)
 CHOICES = {"ideal": [EXACT, SINGLE_EXACT, *CARRIED], "motor": CARRIED}
 
 
-if QUICK:
-    FEWER = CARRIED
-else:
-    FEWER = [
-        *(fixed("Verner9", n) for n in (6, 10, 16, 30)),
-        *(adaptive("Verner9", t) for t in (1e-6, 1e-9, 1e-12)),
-        series(16, 1e-9),
-        series(20, 1e-13),
-    ]
-"""Those whose orbits, chaotic motions and single lanes are looked at."""
-
 MACHINES = {drive: jtu.tree_map(np.asarray, TABLE.scene(drive=drive)) for drive in DRIVES}
 
 

@@ -1,13 +1,9 @@
 """The measurement of `peers.py`: codes set up on pinned workers, and their interleaved rounds."""
 
-import hashlib
-import json
 import statistics
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +12,6 @@ from .entries import (
     CYCLES,
     KAPPA,
     LANES,
-    QUICK,
     ROUNDS,
     Entry,
     derivative_entries,
@@ -26,8 +21,6 @@ from .pool import Worker, cores, together
 from .task import PARAMETERS, Task
 
 RESTITUTIONS = (0.5, 0.8)
-KEPT = Path(tempfile.gettempdir()) / f"vi_jax-peers-{'quick' if QUICK else 'full'}.json"
-_BENCHMARKS = Path(__file__).parents[1]
 
 
 def note(text: str) -> None:
@@ -171,44 +164,22 @@ def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: 
     return rows
 
 
-def sources() -> str:
-    """Fingerprint of all that decides the figures: what was measured with other code is stale."""
-    files = [*_BENCHMARKS.glob("peers.py"), *_BENCHMARKS.glob("peer_codes/*.py")]
-    files += [
-        file
-        for package in ("flow", "lanes", "machine")
-        for file in (_BENCHMARKS.parents[1] / "vi_jax" / package).iterdir()
-    ]
-    return hashlib.sha256(
-        b"".join(file.read_bytes() for file in sorted(files) if file.is_file())
-    ).hexdigest()
-
-
 def contest() -> dict[str, dict]:
-    """All sections, taken from where an earlier run left off."""
-    stamp = sources()
-    kept: dict[str, Any] = {}
-    if KEPT.exists() and "--fresh" not in sys.argv:
-        kept = json.loads(KEPT.read_text())
-        if kept.get("stamp") != stamp:
-            kept = {}
-    kept["stamp"] = stamp
+    """All sections."""
+    found: dict[str, dict] = {}
     bench = Bench()
     try:
         wanted = [(drive, k, False) for drive in ("motor", "ideal") for k in RESTITUTIONS]
         for drive, k, jacobian in [*wanted, ("motor", 0.5, True)]:
-            task, truth = Task(drive, k, CYCLES), None
+            task = Task(drive, k, CYCLES)
+            truth = reference(bench, task, jacobian=jacobian)
             for all_cores in (False, True):
                 kind = "derivatives" if jacobian else "states"
                 key = f"{kind}, {drive}, {k}, {'all' if all_cores else 'one'}"
-                if key in kept:
-                    continue
                 note(key)
-                truth = truth or reference(bench, task, jacobian=jacobian)
                 listed = derivative_entries() if jacobian else entries(drive, all_cores)
                 rows = measure(bench, task, listed, truth, all_cores=all_cores)
-                kept[key] = {"rows": rows, "regular": int(truth[1].sum())}
-                KEPT.write_text(json.dumps(kept))
+                found[key] = {"rows": rows, "regular": int(truth[1].sum())}
     finally:
         bench.close()
-    return {key: value for key, value in kept.items() if key != "stamp"}
+    return found
