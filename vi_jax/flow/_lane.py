@@ -126,7 +126,7 @@ class Lane(NamedTuple):
     spent: Scalar
     """Steps tried in the interval on its way."""
     rejected: Scalar
-    shaken: Scalar | None = None
+    last_impulse: Scalar | None = None
     """The time of the interval at the last impulse of noise; absent where impulses come at times
     that are known beforehand."""
     completed: Flag | None = None

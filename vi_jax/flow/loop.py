@@ -90,7 +90,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         steps=zero,
         spent=zero,
         rejected=zero,
-        shaken=zero if plan.noise is not None and plan.noise.timed else None,
+        last_impulse=zero if plan.noise is not None and plan.noise.timed else None,
     )
 
 

@@ -285,7 +285,7 @@ def words_of(key: Any) -> UInt32[Array, "2"]:
     return jnp.asarray(data)
 
 
-def kicked(
+def with_impulse(
     noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State,
     elapsed: Scalar | None,
 ) -> State:  # fmt: skip

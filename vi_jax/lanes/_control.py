@@ -98,7 +98,7 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
     others: list[Any] = [None] * len(found) if otherwise is None else otherwise
     for x, y, r in zip(found, others, rooms, strict=True):
         if r is not None:
-            laid.append(_laid(t, x, y, r, args, mask))
+            laid.append(_branch_result(t, x, y, r, args, mask))
         else:
             laid.append(x if y is None else selected(t, mask, x, y))
     end = t.block
@@ -125,7 +125,9 @@ def _branch_if_any(write: Write, t: Text, jaxpr, args, mask: Value, otherwise) -
     ]
 
 
-def _laid(t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value) -> Array:
+def _branch_result(
+    t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value
+) -> Array:
     """A branch's large result in the lanes of `mask`, and that of the others in theirs. Nothing is
     copied that need not be: a derivative's branches hand on whole matrices, or zeros in their
     place.

@@ -225,7 +225,7 @@ class _Writer:
             "lane": [_LANE],  # its number; -1 for a slot without one
             "count": [_LANE],  # its iterations
             "inputs": self._own(self.inputs),
-            "spoilt": [_FLAG],  # whether a cotangent that was given makes all others NaN
+            "undefined": [_FLAG],  # whether a cotangent that was given makes all others NaN
             "to_inputs": self.varied,  # cotangents so far
             "to_carry": self.carried,
         }
@@ -301,7 +301,7 @@ class _Writer:
 
         def read() -> list[Array]:
             found = self._weights(t, self.results, avals, lane, place, mask)
-            self._spoil_by_no_numbers(t, found)
+            self._undefine_by_weights(t, found)
             return found
 
         if not all(isinstance(x, Registers) for x in none):
@@ -310,22 +310,22 @@ class _Writer:
             found = read()
         return [mapped(t, fork.joined, a, b) for a, b in zip(found, none, strict=True)]
 
-    def _spoil_by_no_numbers(self, t: Text, arrays: list[Array]) -> None:
+    def _undefine_by_weights(self, t: Text, arrays: list[Array]) -> None:
         """NaN and infinity as a cotangent: 0 times it is NaN."""
 
         def is_no_number(x: Value) -> Value:
             return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
 
-        self._spoil(t, [mapped(t, is_no_number, x, kind="i1") for x in arrays])
+        self._undefine(t, [mapped(t, is_no_number, x, kind="i1") for x in arrays])
 
-    def _spoil(self, t: Text, flags: list[Array]) -> None:
+    def _undefine(self, t: Text, flags: list[Array]) -> None:
         """The lanes in which one of these flags holds have no derivative."""
-        spoilt = self.frame.number(t, "spoilt")
+        undefined = self.frame.number(t, "undefined")
         for x in flags:
-            spoilt = t.binary("or", spoilt, any_in(t, x))
-        self.frame.store_number(t, "spoilt", spoilt)
+            undefined = t.binary("or", undefined, any_in(t, x))
+        self.frame.store_number(t, "undefined", undefined)
 
-    def _spoil_by_missing_rows(self, t: Text, lane: Value, rows: Value, present: Value) -> None:
+    def _undefine_by_missing_rows(self, t: Text, lane: Value, rows: Value, present: Value) -> None:
         """Rows that a lane did not come to are NaN, so that none of them may have a weight."""
         avals = self.program.weight_avals[self.results :]
         if not avals:
@@ -334,7 +334,7 @@ class _Writer:
         def weighs(place: Value, mask: Value) -> None:
             read = self._weights(t, self.results, avals, lane, place, mask)
             weighs = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
-            self._spoil(t, [mapped(t, weighs, x, kind="i1") for x in read])
+            self._undefine(t, [mapped(t, weighs, x, kind="i1") for x in read])
 
         over_rows(t, rows, self.base.rows, present, weighs)
 
@@ -401,9 +401,9 @@ class _Writer:
         *carry, rows = self.frame.load(t, "now")
         avals = self.program.weight_avals[: self.results]
         weights = self._weights(t, 0, avals, lane, None, present)
-        self.frame.store_number(t, "spoilt", t.constant(False, "i1"))
-        self._spoil_by_no_numbers(t, weights)
-        self._spoil_by_missing_rows(t, lane, rows.item(), present)
+        self.frame.store_number(t, "undefined", t.constant(False, "i1"))
+        self._undefine_by_weights(t, weights)
+        self._undefine_by_missing_rows(t, lane, rows.item(), present)
         args = [*inputs, *carry, *weights]
         to_inputs, to_carry = self._back(t, self.program.end.backward, args, present)
         self.frame.store(t, "to_inputs", to_inputs)
@@ -442,10 +442,10 @@ class _Writer:
         args = [*inputs, *self.frame.load(t, "to_carry"), *weights]
         more, _ = self._back(t, self.program.begin.backward, args, present)
         total = add_all(t, self.frame.load(t, "to_inputs"), more)
-        spoilt = self.frame.number(t, "spoilt")
+        undefined = self.frame.number(t, "undefined")
         nan = lambda v: t.constant(float("nan"), v.kind)
         nothing = [mapped(t, nan, x) for x in total]
-        total = select_all(t, spoilt, nothing, total)
+        total = select_all(t, undefined, nothing, total)
         for i, x in enumerate(total):
             start = t.binary("mul", lane, t.constant(x.size, "i64"))
             scatter(t, load_pointer(t, "outputs", i), start, x, present)

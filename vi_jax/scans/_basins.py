@@ -49,8 +49,8 @@ from ._geometry import (
     largest_ball,
     uncertainty_of,
 )
+from ._lane_noise import START
 from ._scan import LanesFailed, scan
-from ._shaken import START
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
 from .regime import CODES, REGIMES, flags, size_of

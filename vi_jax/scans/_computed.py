@@ -34,7 +34,7 @@ from .._types import xr
 from ..flow import compiling
 from ..machine import attributes as units_of
 from ._describe import attributes_of, description_of, unit_on_axis, variables_of
-from ._shaken import lane_numbers
+from ._lane_noise import lane_numbers
 from .grid import Blocks
 from .program import ScanProgram, check_corners
 from .store import MemoryStore, Where, ZarrStore, check_writable
@@ -174,7 +174,7 @@ def in_blocks(
         lanes = math.ceil(min(count("lanes", lanes, least=1), total) / step) * step
     points = program.cycles * max(1, program.options.samples) + 1
     fits_records(at_fault, lanes * points, 12)
-    if program.shaken is not None and numbers is None:
+    if program.lane_noise is not None and numbers is None:
         numbers = lane_numbers(total)
     return Blocks(grid, lanes, paired=paired, numbers=numbers)
 

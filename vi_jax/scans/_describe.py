@@ -20,7 +20,7 @@ import numpy as np
 from .._messages import installed_version
 from ..flow import REASON_NAMES
 from ..machine import AbstractMachine, attributes, leaf, leaf_names, outcomes_of, unit_of
-from ._shaken import NOISE, START, part_of
+from ._lane_noise import NOISE, START, part_of
 from .grid import LANE, Blocks
 from .program import ScanProgram
 from .regime import flags
@@ -67,8 +67,8 @@ def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
         "precision": str(jnp.result_type(float)),
         "code of": _codes(program),
     }
-    if program.shaken is not None:
-        about["noise"] = program.shaken.described()
+    if program.lane_noise is not None:
+        about["noise"] = program.lane_noise.described()
     return about
 
 
@@ -81,8 +81,8 @@ def _codes(program: ScanProgram) -> dict[str, str]:
     """What tells the user's own functions and classes from others of the same name."""
     parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
     parts |= {"start": program.start, "method": program.method}
-    if program.shaken is not None and program.shaken.noise.functions:
-        parts["noise"] = program.shaken.noise.functions
+    if program.lane_noise is not None and program.lane_noise.noise.functions:
+        parts["noise"] = program.lane_noise.noise.functions
     for i, measure in enumerate(program.measures):
         parts[f"measure {i + 1}"] = measure
     return {name: identity(part) for name, part in parts.items()}

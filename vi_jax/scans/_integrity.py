@@ -31,7 +31,7 @@ from ._basins import (
     starts_in,
 )
 from ._computed import ScanInterrupted
-from ._shaken import START
+from ._lane_noise import START
 from .grid import axes_of
 
 # From one value to the next a section of one motion moves by less than this part of the region.

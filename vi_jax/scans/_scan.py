@@ -15,7 +15,7 @@ from .._types import State, xr
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
 from ..machine import AbstractMachine
 from ._computed import ScanInterrupted, Workplace, computed, in_blocks, workplace
-from ._shaken import lane_numbers
+from ._lane_noise import lane_numbers
 from .grid import Blocks, axes_of
 from .program import ScanProgram, make_program
 
@@ -148,7 +148,7 @@ def _verified(
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
     numbers = lane_numbers(total)[drawn]  # each has its own path
-    numbers = None if program.shaken is None else numbers
+    numbers = None if program.lane_noise is None else numbers
     again = in_blocks(program, axes, place, paired=True, numbers=numbers)
     kept = functools.partial(ScanInterrupted, data, store)
     with at_work("verification", kept, progress=False):

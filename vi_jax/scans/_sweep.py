@@ -52,7 +52,7 @@ from ..machine import (
     with_unit,
     with_units,
 )
-from ._shaken import Shaken, shaken_by
+from ._lane_noise import LaneNoise, lane_noise_of
 from .grid import LANE
 from .measures import Regime, Usual
 from .regime import CODES, REGIMES, flags
@@ -267,12 +267,12 @@ def sweep(
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
     if numbers is not None:
         check_start(with_leaf(machine, parameter, numbers[0]), bare(start))
-    shaken = shaken_by(noise, key, (), (), ())
-    if shaken is not None:
+    lane_noise = lane_noise_of(noise, key, (), (), ())
+    if lane_noise is not None:
         check_noise(machine, bare(start), noise)
-    options = (settle, cycles, method, rests, tolerance, max_steps, shaken, bare(start))
-    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, tolerance, shaken):
-        return _sweep(machine, parameter, values, _counted(start, shaken), *options)[1]
+    options = (settle, cycles, method, rests, tolerance, max_steps, lane_noise, bare(start))
+    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, tolerance, lane_noise):
+        return _sweep(machine, parameter, values, _counted(start, lane_noise), *options)[1]
     # All by one program: the last part is filled up by what ends at once.
     size, missing = values.size, -values.size % _AT_ONCE
     rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
@@ -286,14 +286,14 @@ def sweep(
         return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
     return in_parts(
-        "sweep", step, _counted(start, shaken), pieces, joined, progress=progress, unit="value",
+        "sweep", step, _counted(start, lane_noise), pieces, joined, progress=progress, unit="value",
         total=size,
     )  # fmt: skip
 
 
-def _counted(start: State, shaken: Shaken | None) -> Any:
+def _counted(start: State, lane_noise: LaneNoise | None) -> Any:
     """The start, with noise beside the number of the value, by which each has its own path."""
-    return start if shaken is None else (start, jnp.uint32(0))
+    return start if lane_noise is None else (start, jnp.uint32(0))
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
@@ -327,8 +327,8 @@ def taken_along(machine: AbstractMachine, state: State) -> State:
 
 @compiled
 def _sweep(
-    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps, shaken,
-    first,
+    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps,
+    lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
     """The state after the last value, and what was found at each.
 
@@ -339,9 +339,9 @@ def _sweep(
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}
-        state, number = (state, None) if shaken is None else state
-        if shaken is not None:
-            noise = dict(zip(("noise", "key"), shaken.lane({LANE: number}), strict=True))
+        state, number = (state, None) if lane_noise is None else state
+        if lane_noise is not None:
+            noise = dict(zip(("noise", "key"), lane_noise.lane({LANE: number}), strict=True))
         state = taken_along(here, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,

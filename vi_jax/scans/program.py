@@ -44,7 +44,7 @@ from ..machine import (
     replaced,
     with_leaf,
 )
-from ._shaken import MACHINE, NOISE, START, Shaken, part_of, shaken_by
+from ._lane_noise import MACHINE, NOISE, START, LaneNoise, lane_noise_of, part_of
 from .grid import Blocks
 from .measures import MEASURES, AbstractMeasure, Average, Numbers
 from .statistics import Escape
@@ -67,7 +67,7 @@ class ScanProgram(eqx.Module):
     """Cycles observed."""
     options: RunOptions
     """How each lane is run, checked; its method is one, no name."""
-    shaken: Shaken | None = None
+    lane_noise: LaneNoise | None = None
     """Noise, where there is some."""
 
     @property
@@ -156,8 +156,8 @@ class ScanProgram(eqx.Module):
 
         options = dataclasses.replace(self.options, clock=None)  # `lane` has seen to it
         noise_of = None
-        if self.shaken is not None:
-            noise_of = functools.partial(self.shaken.lane, names=self.derivatives, nudge=nudge)
+        if self.lane_noise is not None:
+            noise_of = functools.partial(self.lane_noise.lane, names=self.derivatives, nudge=nudge)
         run = simulate_pool(lane_of, values, self.cycles, options, wanted, noise_of)
 
         def measured(values, run):
@@ -239,7 +239,7 @@ def make_program(
     method, rests, averages = known
     measures = measures_of(measure, averages)
     derivatives = tuple_of_names("derivatives", derivatives)
-    shaken = shaken_by(noise, key, names, derivatives, measures)
+    lane_noise = lane_noise_of(noise, key, names, derivatives, measures)
     cycles = cycles_for(measures, cycles)
     settle = count("settle", options.settle)
     first = start
@@ -247,7 +247,7 @@ def make_program(
         first = template.start()
     if template is not None:
         for name in names:
-            check_leaf_name(template, first, name, "axes", shaken)
+            check_leaf_name(template, first, name, "axes", lane_noise)
     measures = tuple(measure.under(method) for measure in measures)
     motion = any(measure.record == "motion" for measure in measures)
     options = dataclasses.replace(
@@ -263,7 +263,7 @@ def make_program(
         measures=_as_arrays(measures),
         cycles=cycles,
         options=dataclasses.replace(_as_arrays(options), settle=jnp.asarray(settle)),
-        shaken=shaken,
+        lane_noise=lane_noise,
     )
 
 
@@ -340,11 +340,11 @@ def _as_arrays(tree: Any) -> Any:
 
 
 def check_leaf_name(
-    machine: AbstractMachine, start: State, name: str, argument: str, shaken: Shaken | None
+    machine: AbstractMachine, start: State, name: str, argument: str, lane_noise: LaneNoise | None
 ) -> None:
     """**Raises:** `ValueError` for a name that no number of the machine, of its start or of the
     noise has."""
-    if part_of(name) == NOISE and shaken is not None:
+    if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
     tree, own = (
         (bare(start), name.removeprefix(START)) if part_of(name) == START else (machine, name)
@@ -391,13 +391,13 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         check_again(machine)
         rests = rests or may_rest(machine)
         for name in program.derivatives:
-            check_leaf_name(machine, start, name, "derivatives", program.shaken)
+            check_leaf_name(machine, start, name, "derivatives", program.lane_noise)
         program.method.check(machine)
         start = adopt(machine, start)
         check_reals("start", start)
         check_values(machine, start)
-        if program.shaken is not None:
-            check_noise(machine, start, program.shaken.noise_of(lane))
+        if program.lane_noise is not None:
+            check_noise(machine, start, program.lane_noise.noise_of(lane))
     if program.build is not None:
         return program
     return dataclasses.replace(program, options=dataclasses.replace(program.options, rests=rests))

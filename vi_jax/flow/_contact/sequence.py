@@ -198,8 +198,8 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
         for struck, V in zip(x.struck, velocities, strict=True)
     ]
-    new, pushed = _thrown(instant, state, velocities, slow, hits, rebounds)
-    lane = _accounted(instant, lane._replace(state=new), state, pushed)
+    new, pushed = _pushed_state(instant, state, velocities, slow, hits, rebounds)
+    lane = _with_losses(instant, lane._replace(state=new), state, pushed)
     struck, approaches = list(x.struck), list(x.approach)
     for number, hit in hits.items():
         stop, i = stops[number], instant.limited.index(stops[number].coordinate)
@@ -245,7 +245,7 @@ def _each_by_itself(
     return stop_gradient(pulls | (gained > _EQUAL * size_of))
 
 
-def _thrown(
+def _pushed_state(
     instant: _Instant, state: State, velocities: list[Scalar], slow: list[Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
 ) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
@@ -302,7 +302,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
     return found
 
 
-def _accounted(
+def _with_losses(
     instant: _Instant, lane: Lane, before: State, pushed: list[tuple[Coordinate, Scalar]]
 ) -> Lane:
     """With the energy that the impacts have lost: the work of each force at the mean velocity of

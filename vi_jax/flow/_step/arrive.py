@@ -25,7 +25,7 @@ from ..labelled import EventKind
 from ..smooth import exact, holding
 from .faults import may_end
 from .guards import Crossing, furthest_landing
-from .happen import disarmed_itself, happened, let_go, set_off, with_outcome
+from .happen import disarmed_itself, happened, release_pulled, set_off, with_outcome
 from .trial import Situation, Trial
 
 
@@ -260,7 +260,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     if lane.contact is None or len(blows) == 1:
         return lane
     # What rests on other stops may be let go of by it. A stop may have changed the modes already.
-    return let_go(plan, lane, at.taken, met, (there, before.modes), before.contact)
+    return release_pulled(plan, lane, at.taken, met, (there, before.modes), before.contact)
 
 
 def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:

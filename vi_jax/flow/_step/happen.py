@@ -150,7 +150,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     clock = plan.clock(lane.s, old)
     lane = lane.noting(taken & happens, clock, kind, listed, value)
     lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
-    lane = let_go(plan, lane, taken, happens, (old, modes_before))
+    lane = release_pulled(plan, lane, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)
     if others_of(machine):
         lane, off, near = set_off(plan, lane, happens, before, turns, near)
@@ -190,7 +190,7 @@ def _turned_over(
     return when & (was <= slack) & (now > slack)
 
 
-def let_go(
+def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], resting: Scalars | None = None,
 ) -> Lane:  # fmt: skip
@@ -232,7 +232,7 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
     """
     if stops_of(plan.machine) and others_of(plan.machine):
         lane = lane.ended(jumps, beyond_a_stop(plan.machine, lane.state), "bad_reset")
-        lane = lane._replace(contact=unheld(plan, lane, jumps, old))
+        lane = lane._replace(contact=contacts_after_jump(plan, lane, jumps, old))
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
     when = jumps if has_velocity(plan.machine, lane.state) else happens
     if others_of(plan.machine) or when is happens:
@@ -246,11 +246,11 @@ def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
 
     **Arguments:** `when`, where the state was replaced; `old`, the state before.
     """
-    lane = lane._replace(contact=unheld(plan, lane, when, old))
+    lane = lane._replace(contact=contacts_after_jump(plan, lane, when, old))
     return lane._replace(direction=_directions(plan, lane, when, old))
 
 
-def unheld(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
+def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
     """The stops rested on after the state was replaced: what was moved rests no longer.
 
     **Arguments:** as `after_jump`.

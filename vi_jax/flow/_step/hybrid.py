@@ -22,12 +22,12 @@ from ...lanes import pin_flag
 from ...machine import SoftStop, rewound, section_in, stops_of, struck_modes, switches_of
 from .._lane import FREE, Lane, Plan, Record, select, to_event
 from ..integrals import TIME, carried
-from ..noise import kicked
+from ..noise import with_impulse
 from ..smooth import holding
 from .aim import aim_ahead, aim_at
 from .arrive import arrive
 from .faults import faults
-from .happen import after_jump, let_go, unheld
+from .happen import after_jump, contacts_after_jump, release_pulled
 from .trial import Trial, attempt
 
 # Of a cycle, a step that is long enough to tell by it whether anything moves. A choice.
@@ -130,7 +130,7 @@ def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scala
         lane = after_jump(plan, lane._replace(state=renewed), turned, state)
         lane = lane._replace(state=select(turned, renewed, state))
     if plan.noise is not None:
-        lane = shaken(plan, lane, reached, completed)
+        lane = after_impulse(plan, lane, reached, completed)
     record = select(completed, plan.fresh(lane.state), lane.record)
     return lane._replace(part=part, record=record)
 
@@ -153,26 +153,26 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
     return jnp.where(taken, grown, jnp.where(rejected, shrunk, lane.length))
 
 
-def shaken(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
+def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
     """The lane behind the impulse at the end of a piece of its cycle.
 
     **Arguments:** whether that end is `reached`; whether an interval is `completed` with it.
     """
     assert plan.noise is not None
     old, since = lane, None
-    if lane.shaken is not None:
+    if lane.last_impulse is not None:
         time = lane.record.integrals[TIME]
-        since, reading = time - lane.shaken, jnp.where(completed, 0.0, time)
-        lane = lane._replace(shaken=jnp.where(reached, reading, lane.shaken))
+        since, reading = time - lane.last_impulse, jnp.where(completed, 0.0, time)
+        lane = lane._replace(last_impulse=jnp.where(reached, reading, lane.last_impulse))
     where = stop_gradient((plan.cycle_of(lane.done), lane.part))
-    lane = lane._replace(state=kicked(plan.noise, reached, *where, old.state, since))
+    lane = lane._replace(state=with_impulse(plan.noise, reached, *where, old.state, since))
     if _may_change_modes(plan):
         # A body that was moved rests no longer, which friction on its stop has to know.
-        contact = unheld(plan, lane, reached, old.state) or ()
+        contact = contacts_after_jump(plan, lane, reached, old.state) or ()
         modes = struck_modes(plan.machine, lane.s, lane.state, lane.modes, contact=contact)
         lane = lane._replace(modes=select(reached, modes, old.modes))
     lane = after_jump(plan, lane, reached, old.state)
-    freed = let_go(plan, lane, reached, reached, (old.state, old.modes))
+    freed = release_pulled(plan, lane, reached, reached, (old.state, old.modes))
     return freed._replace(record=lane.record)  # where nothing is logged of impulses
 
 

@@ -32,7 +32,9 @@ _ALONE, _SEVERAL = 5, 10
 _BEND = tuple((-1) ** n * n / factorial(2 * n + 1) for n in range(1, 10))
 
 
-def flown(machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State) -> Any:
+def modal_flight(
+    machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State
+) -> Any:
     """The state a time h after that at s, exact to rounding for any h.
 
     Free flight of uncoupled modes is the closed form of each. All else is a matrix exponential:
@@ -190,7 +192,7 @@ def _by_series(
 
     The force turns with the motion, as two numbers more.
 
-    **Arguments:** `contact` as in `flown`; `state`, q and p.
+    **Arguments:** `contact` as in `modal_flight`; `state`, q and p.
     """
     length = stop_gradient(jnp.abs(h)) * machine.fastest
     count = stop_gradient(jnp.where(wanted, jnp.maximum(jnp.ceil(length / _LONGEST), 1.0), 0.0))

@@ -28,7 +28,7 @@ from ...machine import (
 )
 from ..integrals import Integrals, rate_of_integrals
 from ..smooth import SmoothMachine
-from ._linear import clear, flown, longest
+from ._linear import clear, longest, modal_flight
 from .base import AbstractMethod
 
 # Series of the cosine and of sin(x)/x in x²: on an arc, of up to 2π/5, the next term is below
@@ -132,11 +132,11 @@ def _linear(
     begin = way.inward(state)
 
     def along(share: float) -> State:
-        return way.outward(flown(way.machine, smooth.contact, s0, share * h, begin))
+        return way.outward(modal_flight(way.machine, smooth.contact, s0, share * h, begin))
 
     if beside:
         beside = _integrated(smooth, s0, s1, state, along, beside)
-    new = way.outward(flown(way.machine, smooth.contact, s0, h, begin))
+    new = way.outward(modal_flight(way.machine, smooth.contact, s0, h, begin))
     return new, beside, jnp.zeros_like(s0)
 
 

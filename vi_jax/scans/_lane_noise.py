@@ -41,7 +41,7 @@ def lane_numbers(total: int) -> np.ndarray:
     return np.arange(total, dtype=np.uint32)
 
 
-class Shaken(eqx.Module):
+class LaneNoise(eqx.Module):
     """The noise of a scan."""
 
     noise: WhiteNoise
@@ -81,13 +81,13 @@ class Shaken(eqx.Module):
         return {"amplitudes": sizes, "impulses": self.noise.impulses, "key": " ".join(words)}
 
 
-def shaken_by(
+def lane_noise_of(
     noise: object,
     key: object,
     axes: Iterable[str],
     derivatives: Iterable[str],
     measures: Iterable[AbstractMeasure],
-) -> Shaken | None:
+) -> LaneNoise | None:
     """The noise of a scan, `None` for none.
 
     **Arguments:** `noise` and `key` as for `scan`; the names of the axes, and of the numbers by
@@ -120,4 +120,4 @@ def shaken_by(
                 "noise: a motion that is shaken has no period, and what it looks at beyond the "
                 'cycles observed is not shaken. Give others, such as `measure="extremes"`.'
             )
-    return Shaken(noise, words_of(key))
+    return LaneNoise(noise, words_of(key))
