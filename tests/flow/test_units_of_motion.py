@@ -15,8 +15,6 @@ UNITS = np.array(
      *((1, 10.0**n) for n in (-9, -6, -3, 3, 6)), (1e-9, 1e-9), (1e9, 1e6), (1e-4, 1e-7),
      (1e-3, 1e-6)]
 )  # fmt: skip
-# Where several bodies meet, or one sticks, speeds of 1e-9 are too close to what counts as none.
-USUAL = UNITS[:, 0] < 1e9
 
 
 class Body(vi.AbstractMachine):
@@ -117,7 +115,7 @@ def test_a_body_that_rubs_and_counts():
         return (z.x / length, z.u * time / length, z.count), run.successful
 
     found, successful = in_all_units(lane, BODIES[[0, 1, 4, 9]])
-    assert_alike([x[:, USUAL] for x in found], successful[:, USUAL], 1e-8)
+    assert_alike(found, successful, 1e-8)
     assert np.any(found[2][:, 0, -1] > 0)
 
 
@@ -128,6 +126,7 @@ class Stack(vi.Mechanical):
     mass = (1.0, 2.0)
     unit: Any
     restitution: Any
+    shaken: Any
 
     @property
     def cycle(self):
@@ -142,22 +141,28 @@ class Stack(vi.Mechanical):
 
     def force(self, t, q, v):
         time, length = self.unit
-        push = (1 + 0.3 * jnp.sin(t / time)) * length / time**2
-        return {"a": push, "b": 2 * push}
+        a = 1 + 0.3 * jnp.sin(t / time)
+        b = a + self.shaken * jnp.sin(3 * t / time)
+        return {"a": a * length / time**2, "b": 2 * b * length / time**2}
 
 
 def test_bodies_that_meet():
-    def lane(restitution, unit):
+    def lane(numbers, unit):
         time, length = unit
-        machine = Stack((time, length), restitution)
+        machine = Stack((time, length), *numbers)
         start = machine.at(a=0.1 * length, b=0.5 * length, v={"a": 0.2 * length / time})
         run = vi.simulate(machine, start, 3, method=vi.Adaptive(), record="sections")
         z = run.sections
         places, speeds = (z.a / length, z.b / length), (z.v.a, z.v.b)
         return (*places, *(x * time / length for x in speeds)), run.impacts, run.successful
 
-    found, impacts, successful = in_all_units(lane, np.array([0.0, 0.3, 0.5, 0.7]))
-    assert_alike([x[:, USUAL] for x in found], successful[:, USUAL], 1e-8)
+    # Of the last four some ended as chatter, in milliseconds and micrometres too.
+    rows = np.array([
+        (0.0, 0.0), (0.3, 0.0), (0.5, 0.0), (0.7, 0.0), (0.217, 0.41), (0.34, 0.743),
+        (0.623, 0.193), (0.614, 0.648),
+    ])  # fmt: skip
+    found, impacts, successful = in_all_units(lane, rows)
+    assert_alike(found, successful, 1e-8)
     assert np.all(impacts[:, 0].sum(axis=1) > 0)
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float, UInt32
 
 from .._types import Flag, Scalar, Scalars, State
@@ -28,7 +29,7 @@ from .integrals import TIME, Integrals
 from .labelled import EventKind
 from .methods import AbstractMethod
 from .results import code
-from .smooth import unit_of
+from .smooth import rounding, unit_of
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0
@@ -252,6 +253,19 @@ class Plan(eqx.Module):
     def extent(self, k: int) -> Scalar | float:
         """A length by which those of coordinate number k are judged."""
         return 1.0 if self.extents is None else self.extents[k]
+
+    def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
+        """What rounding leaves of place and velocity of coordinate number k (see `rounding`)."""
+        return rounding(self.machine, k, state, self.extent(k), self.unit)
+
+    def beyond_a_stop(self, state: State) -> Flag:
+        """Whether a coordinate is beyond one of its stops by more than rounding."""
+        found = jnp.zeros((), bool)
+        for stop in stops_of(self.machine):
+            place = self.machine.coordinates[stop.coordinate].position(state)
+            slack, _ = self.rounding(stop.coordinate, state)
+            found = found | (stop_gradient(stop.beyond(place)) > slack)
+        return found
 
     def guard_extent(self, place: int) -> Scalar | float:
         """A size by which the guard of one of `others` is judged, by its place among them."""

@@ -1,5 +1,6 @@
 """How small the numbers of a motion are, by which the errors of its steps are judged."""
 
+import functools
 from collections.abc import Callable
 from math import pi
 
@@ -10,7 +11,14 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Scalar, Scalars, State
-from ..machine import AbstractMachine, events_of, guard_of, scales_known
+from ..machine import (
+    AbstractMachine,
+    Friction,
+    events_of,
+    guard_of,
+    mode_number,
+    scales_known,
+)
 from ._lane import Plan
 from .smooth import in_modes
 
@@ -71,7 +79,11 @@ def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
     s, start = stop_gradient((s, start))
     found = [_small(_spread(body.position, start, sizes)) for body in machine.coordinates]
     for number in plan.others(start):
-        if events_of(machine)[number].holds_mode:  # its guard is another quantity in each mode
+        event = events_of(machine)[number]
+        if isinstance(event, Friction):
+            found.append(_small(_size_of_friction(plan, number, s, start, modes, sizes)))
+            continue
+        if event.holds_mode:  # its guard is another quantity in each mode
             found.append(jnp.ones_like(s))
             continue
 
@@ -83,6 +95,27 @@ def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
         spread = _spread(lambda x, guard=guard: guard(s, x), start, sizes)
         found.append(_small(jnp.maximum(own, spread)))
     return stop_gradient(tuple(found))
+
+
+def _size_of_friction(
+    plan: Plan, number: int, s: Scalar, start: State, modes: Scalars, sizes: State
+) -> Scalar:
+    """The larger of the slip and of the force that holds a body, where each is a guard of friction.
+
+    **Arguments:** as `extents_of`; `number`, that of the friction among the events.
+    """
+    machine, event = plan.machine, events_of(plan.machine)[number]
+    assert isinstance(event, Friction)
+    own = mode_number(machine, number)
+    held = (*modes[:own], jnp.zeros_like(s), *modes[own + 1 :])
+    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
+
+    def force(x: State) -> Scalar:
+        return guard_of(machine, number, s, x, held, contact)
+
+    parts = force, lambda x: event.speed_of_slip(machine, s, x)
+    each = (jnp.maximum(jnp.abs(x(start)), _spread(x, start, sizes)) for x in parts)
+    return functools.reduce(jnp.maximum, each)
 
 
 def _small(size: Scalar) -> Scalar:

@@ -287,10 +287,10 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         machine.check_start(start)
     if isinstance(start, eqx.Module):
         require_ranges(start)
-    slack = concrete(rounding(machine, start))
     for i, stop in enumerate(stops_of(machine)):
         gap = concrete(stop.gap)
         Y = concrete(machine.coordinates[stop.coordinate].position(start))
+        slack = concrete(rounding(machine, stop.coordinate, start)[0])
         if Y is None or gap is None or slack is None:
             continue
         depth = np.max(stop.sign * Y - gap)

@@ -30,7 +30,7 @@ from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
-from .smooth import in_modes, rounding
+from .smooth import in_modes
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -42,9 +42,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = bad | ~is_in_range(machine, start)
     for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
         bad = bad | jnp.any(jnp.isnan(number))  # infinite is allowed: no limit
-    slack = rounding(machine, start)
-    for stop in stops_of(machine):
-        bad = bad | (stop.beyond(machine.coordinates[stop.coordinate].position(start)) > slack)
+    bad = bad | plan.beyond_a_stop(start)
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
@@ -57,7 +55,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     if plan.rests:
         growth = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
         both = enumerate(zip(here, growth, strict=True))
-        contact = tuple(_rests_on(plan, k, *x, slack) for k, x in both)
+        contact = tuple(_rests_on(plan, k, *x, *plan.rounding(k, start)) for k, x in both)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
             for x, j, along in zip(here, growth, direction, strict=True)
@@ -94,14 +92,16 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     )
 
 
-def _rests_on(plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float) -> Scalar:
+def _rests_on(
+    plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float, slow: Scalar | float
+) -> Scalar:
     """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
-    be by a force that grows; place and velocity are known to within `slack`."""
+    be by a force that grows; its place is known to within `slack`, its velocity to `slow`."""
     contact = jnp.zeros_like(here.x)
     for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
             pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
-            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slack) & pressed
+            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow) & pressed
             contact = jnp.where(rests, to_event(i), contact)
     return contact
 

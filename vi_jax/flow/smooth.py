@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jax.extend.core import Jaxpr
 from jax.lax import stop_gradient
 
-from .._types import Flag, Scalar, Scalars, State
+from .._types import Scalar, Scalars, State
 from ..lanes import called, walked
 from ..machine import (
     AbstractMachine,
@@ -148,19 +148,25 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     return not others
 
 
-def rounding(machine: AbstractMachine, state: State) -> Scalar | float:
-    """How far a coordinate may be beyond its stop, or its velocity from zero, by rounding alone:
-    not at all where it is a number of the state itself."""
+def rounding(
+    machine: AbstractMachine, k: int, state: State, least: Scalar | float = 1.0,
+    unit: Scalar | float = 1.0,
+) -> tuple[Scalar | float, Scalar | float]:  # fmt: skip
+    """How far coordinate number k may be beyond its stop, and its velocity from zero, by rounding
+    alone: not at all where the place is a number of the state itself.
+
+    **Arguments:** `least`, the size of a place at least; `unit`, that of `s`.
+    """
     if exact(machine, state):
-        return 0.0
-    size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(1.0))
+        return 0.0, 0.0
+    body = machine.coordinates[k]
+    return _rounding(body.position, state, least), _rounding(body.velocity, state, least / unit)
+
+
+def _rounding(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
+    """The rounding of a number that is computed from those of a state."""
+    state = stop_gradient(state)
+    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
+    terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)
+    size = sum(jtu.tree_leaves(terms), start=jnp.asarray(least))
     return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
-
-
-def beyond_a_stop(machine: AbstractMachine, state: State) -> Flag:
-    """Whether a coordinate is beyond one of its stops by more than rounding."""
-    found, slack = jnp.zeros((), bool), rounding(machine, state)
-    for stop in stops_of(machine):
-        place = machine.coordinates[stop.coordinate].position(state)
-        found = found | (stop_gradient(stop.beyond(place)) > slack)
-    return found

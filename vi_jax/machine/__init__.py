@@ -80,6 +80,7 @@ from .field import field_in as field_in
 from .field import shown_modes as shown_modes
 from .friction import ContactFriction as ContactFriction
 from .friction import DryFriction as DryFriction
+from .friction import Friction as Friction
 from .hybrid_state import HybridState as HybridState
 from .hybrid_state import bare as bare
 from .hybrid_state import begun as begun

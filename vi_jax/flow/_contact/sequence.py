@@ -17,7 +17,6 @@ from jax.lax import stop_gradient
 from ..._types import Flag, Scalar, Scalars, State
 from ...machine import Coordinate, forces, push_of, rubbed, rubbing_on, rubs, shares, stops_of
 from .._lane import Lane, Plan, select, to_event
-from ..smooth import rounding
 from .impact import Blow, gains_speed, recorded
 
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
@@ -74,8 +73,8 @@ class _Instant(NamedTuple):
     coupled: list[Flag]
     """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
     closed."""
-    slack: Scalar | float
-    """What of a velocity is rounding."""
+    slow: list[Scalar | float]
+    """Of each coordinate, how much of its velocity is rounding."""
 
 
 def strike_in_turn(
@@ -144,7 +143,7 @@ def _instant(
     before = [body.velocity(there) for body in bodies]
     return _Instant(
         plan, taken, lane.s, met, there, limited, bodies, before, gains_, landed, touches,
-        coupled, rounding(plan.machine, there),
+        coupled, [plan.rounding(k, there)[1] for k in limited],
     )  # fmt: skip
 
 
@@ -297,7 +296,7 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
         speed = stop.approach(velocities[i])
         size = stop_gradient(speed)
         changed = jnp.abs(stop_gradient(velocities[i] - instant.before[i])) > _NONE * x.most
-        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slack))
+        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slow[i]))
         found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
     return found
 

@@ -28,7 +28,7 @@ from .._step.trial import Situation
 from ..drift import drifted
 from ..events import force_rate, rates
 from ..labelled import EventKind
-from ..smooth import SmoothMachine, beyond_a_stop, holding, in_modes, rounding
+from ..smooth import SmoothMachine, holding, in_modes
 from .impact import Blow
 from .rest import allowed
 
@@ -92,7 +92,7 @@ def _held(
     way = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
-        clear = ~beyond_a_stop(plan.machine, still)
+        clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
     any_rests = any_of(taken, rests.values())
@@ -229,11 +229,12 @@ def _broken(plan: Plan, lane: Lane, there: State, met: Flag, blows: dict[int, Bl
     were to each coordinate.
     """
     assert lane.contact is not None
-    contact, slack = list(lane.contact), rounding(plan.machine, there)
+    contact = list(lane.contact)
     for k, blow in blows.items():
         body = plan.machine.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, there))
-        apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slack))
+        _, slow = plan.rounding(k, there)
+        apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slow))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)
 

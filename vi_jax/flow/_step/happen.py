@@ -28,7 +28,7 @@ from .. import results
 from .._lane import Lane, Plan, in_place, select, to_event
 from ..events import rates
 from ..labelled import EventKind
-from ..smooth import beyond_a_stop, holding, rounding
+from ..smooth import holding
 from .faults import comes_back
 from .guards import JUMPED, Crossing
 
@@ -231,7 +231,7 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
     whether one that may move the state, as it `jumps`; `old`, the state before.
     """
     if stops_of(plan.machine) and others_of(plan.machine):
-        lane = lane.ended(jumps, beyond_a_stop(plan.machine, lane.state), "bad_reset")
+        lane = lane.ended(jumps, plan.beyond_a_stop(lane.state), "bad_reset")
         lane = lane._replace(contact=contacts_after_jump(plan, lane, jumps, old))
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
     when = jumps if has_velocity(plan.machine, lane.state) else happens
@@ -257,13 +257,14 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
     """
     if lane.contact is None:
         return None
-    contacts, slack = list(lane.contact), rounding(plan.machine, lane.state)
+    contacts = list(lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
         (place, before), (there, after) = (
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, lane.state)
         )
         if not (there is place and after is before):
-            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slack)
+            slack, slow = plan.rounding(k, lane.state)
+            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slow)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     return tuple(contacts)
 
