@@ -31,6 +31,7 @@ def _described(y_min, period, impacts, zeta=None):
         impacts=jnp.array(impacts),
         frequency_ratio=None if zeta is None else jnp.array(zeta),
         impact_speed=zeros,
+        impact_energy=zeros,
         sections=None,
         result=vi.RESULTS.successful,
         labels=SCENE.labels,

@@ -62,7 +62,9 @@ from .regime import CODES, REGIMES, flags
 _JUMP, _NOTED = 3.0, 0.01
 
 # What is a number at each value of every sweep.
-COLUMNS = "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed"
+COLUMNS = (
+    "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed", "impact_energy",
+)  # fmt: skip
 
 
 class Sweep(Summarized):
@@ -85,6 +87,8 @@ class Sweep(Summarized):
     """ζ: mean speed of the drive; `None` for machines that are not driven."""
     impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the cycles observed."""
+    impact_energy: Float[Array, "..."]
+    """Energy lost in impacts, mean of the cycles observed (see `Run.impact_energy`)."""
     sections: State
     """Section states of the cycles observed; leaves (values, cycles)."""
     result: RESULTS
@@ -349,7 +353,7 @@ def _sweep(
         )  # fmt: skip
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
         onward = state if number is None else (state, number + jnp.uint32(1))
-        assert run.duration is not None
+        assert run.duration is not None and run.impact_energy is not None
         found = Usual("extremes")(here, run) | regime.begun(first)(here, run)
         return onward, Sweep(
             parameter=parameter,
@@ -360,6 +364,7 @@ def _sweep(
             impacts=jnp.where(run.successful, found["impacts"], jnp.nan),
             frequency_ratio=frequency_ratio(here, jnp.mean(run.duration)),
             impact_speed=found["impact_speed"],
+            impact_energy=jnp.mean(run.impact_energy),
             sections=jtu.tree_map(lambda x: x[1:], run.sections),
             result=run.result,
             averages=run.mean_averages(),
