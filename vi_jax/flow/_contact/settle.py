@@ -25,7 +25,6 @@ from ...machine import (
 from .._flow_to_event import FlowToEvent
 from .._lane import Lane, Plan, any_of, in_place, select
 from .._step.trial import Situation
-from ..drift import drifted
 from ..events import force_rate, rates
 from ..labelled import EventKind
 from ..smooth import SmoothMachine, holding, in_modes
@@ -90,7 +89,7 @@ def _held(
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
     resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
     way = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
-    later, still, passed = drifted(way.rate, pin(wait), way.moving, way.fixed, way.rest)
+    later, still, passed = way.drifted(pin(wait))
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}

@@ -19,7 +19,6 @@ from .._contact.sequence import strike_in_turn
 from .._contact.settle import settle, stilled
 from .._flow_to_event import FlowToEvent
 from .._lane import Lane, Plan, any_of, in_place, select, to_event, to_turn_of
-from ..drift import drifted, height_of_turn, met_after, unmoved
 from ..events import Rates, to_turn
 from ..labelled import EventKind
 from ..smooth import exact, holding
@@ -96,7 +95,7 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         offset = jnp.zeros_like(lane.s)
         for c in trial.crossings:
             offset = jnp.where(c.landed, _offset(at, c), offset)
-        _, there, passed = drifted(way.rate, offset, way.moving, way.fixed, way.rest)
+        _, there, passed = way.drifted(offset)
         met = any_of(at.taken, landed.values())
         integrals = select(met, passed, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
@@ -175,7 +174,7 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
     s = stop_gradient(lane.s) + moved
     moving = lane.s, lane.state, lane.record.integrals
     way = FlowToEvent(at.plan, smooth, lane.part, moving)
-    _, state, integrals = unmoved(way.rate, s - lane.s, way.moving, way.fixed, way.rest)
+    _, state, integrals = way.unmoved(s - lane.s)
     return lane._replace(s=s, state=state).recording(integrals=integrals)
 
 
@@ -187,9 +186,9 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     plan, way, contact = at.plan, at.way, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
-    offset = met_after(way.rate, way.force(k), offset, way.moving, way.fixed, way.rest)
+    offset = way.met_after(way.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
-    _, state, integrals = drifted(way.rate, offset, moving, way.fixed, way.rest)
+    _, state, integrals = way.drifted(offset, moving)
     if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
         limited = sorted({stop.coordinate for stop in stops_of(plan.machine)})
@@ -220,7 +219,7 @@ def _offset(at: Situation, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(at.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # With the derivatives of what is met, which mean nothing where nothing is.
-    met = met_after(way.rate, way.guard(c.number), offset, way.moving, way.fixed, way.rest)
+    met = way.met_after(way.guard(c.number), offset)
     return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
@@ -295,6 +294,4 @@ def _top(trial: Trial, k: int, way: FlowToEvent) -> Scalar:
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)
     height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
-    return height_of_turn(
-        way.rate, way.place(k), height, path.at_turn, to_turn(end), way.moving, way.fixed, way.rest
-    )
+    return way.height_of_turn(k, height, path.at_turn, to_turn(end))
