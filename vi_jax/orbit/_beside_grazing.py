@@ -16,7 +16,6 @@ from ._forecast import (
     LOOKED,
     Settled,
     impacts_in,
-    is_local,
     kick_sizes,
     local_depths,
     periods_in,
@@ -109,14 +108,10 @@ def _method(problem: Shooting) -> AbstractMethod:
     return dataclasses.replace(problem.method, steps_per_cycle=steps)
 
 
-def alike(forecast: Settled, near: np.ndarray, machine: Simulated) -> np.ndarray:
-    """Whether forecast and machine settle on the same period, with the same impacts in it.
-
-    **Arguments:** the forecast, and which of its lanes stay near; the machine's motions.
-    """
-    period = np.where(near, forecast.period, -1)
-    counted = np.isnan(machine.impacts) | (period <= 0) | (forecast.impacts == machine.impacts)
-    return (period == machine.period) & counted
+def alike(forecast: Settled, machine: Simulated) -> np.ndarray:
+    """Whether forecast and machine settle on the same period, with the same impacts in it."""
+    counted = np.isnan(machine.impacts) | (forecast.impacts == machine.impacts)
+    return (forecast.period == machine.period) & (counted | (forecast.period <= 0))
 
 
 # Decades below the greatest depth that are looked at: a choice.
@@ -165,28 +160,20 @@ def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarr
 
 
 def beside_grazing(
-    graze: Graze, offsets: np.ndarray, found: Settled, near: np.ndarray
+    graze: Graze, offsets: np.ndarray, found: Settled
 ) -> tuple[Motions, tuple[np.ndarray, np.ndarray], tuple[int, int] | None]:
     """What the machine does at the same values; whether that is alike there, and (at some of them)
     on the other side; and period and impacts of what it settles on if it goes far away.
 
-    **Arguments:** the parameter's offsets; what the local map settles on there, and where near.
+    **Arguments:** the parameter's offsets; what the local map settles on there.
     """
-    sparse = offsets[::_SPARSE]
+    sparse, n = offsets[::_SPARSE], len(offsets)
     machine = simulated(graze, np.concatenate([offsets, -sparse]))
-    n = len(offsets)
-    seen = Simulated(*(part[:n] for part in machine))
-    beyond = Motions(offsets, seen.period, seen.impacts, positions(graze, offsets, seen.places))
-    other = settled(graze.map, -sparse)
-    stays = is_local(graze.map, -sparse, other)
-    return (
-        beyond,
-        (
-            alike(found, near, seen),
-            alike(other, stays, Simulated(*(part[n:] for part in machine))),
-        ),
-        _far(seen, graze.problem.cycles),
-    )
+    here, there = (Simulated(*(part[which] for part in machine))
+                   for which in (slice(n), slice(n, None)))  # fmt: skip
+    same = alike(found, here), alike(settled(graze.map, -sparse), there)
+    beyond = Motions(offsets, here.period, here.impacts, positions(graze, offsets, here.places))
+    return beyond, same, _far(here, graze.problem.cycles)
 
 
 def _far(seen: Simulated, cycles: int) -> tuple[int, int] | None:

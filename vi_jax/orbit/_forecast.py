@@ -1,6 +1,6 @@
 """What the local map of a grazing settles on: iterated over decades of the parameter, and named."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,11 +56,11 @@ class SCENARIOS(NamedEnumeration):
 
 
 class Settled(NamedTuple):
-    """What a map settles on, lane by lane."""
+    """What the map settles on near the grazing, lane by lane."""
 
     period: np.ndarray
-    """In periods of the motion that grazes; 0 where there is none up to `LONGEST`, -1 where the
-    lane left."""
+    """In periods of the motion that grazes; 0 where there is none up to `LONGEST`, -1 where what
+    attracts is not near."""
     impacts: np.ndarray
     """At the touches, in a period; a mean over one where there is no period."""
     places: np.ndarray
@@ -98,6 +98,18 @@ def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
 
 
 def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
+    """What the local map settles on, at each offset of the parameter."""
+    found = _iterated(local, offsets)
+    near = found.depth <= local_depths(local, offsets)
+    return found._replace(period=np.where(near, found.period, -1))
+
+
+def lanes_of(found: Settled, which: Any) -> Settled:
+    """Some of the lanes."""
+    return Settled(*(part[which] for part in found))
+
+
+def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
     """The local map iterated from the smooth motion on, at each offset of the parameter."""
     z = np.zeros((len(offsets), local.matrices.shape[1]))
     settle = settling(local)
@@ -142,16 +154,11 @@ def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
     sense = -np.sign(local.slopes[0])
     tiny = sense * np.geomspace(*_TINY, _PROBES) * scale**2 / np.abs(local.slopes[0])
     shallow = np.sqrt(np.abs(np.outer(tiny, local.slopes)).max(axis=1))
-    found = settled(local, tiny)
+    found = _iterated(local, tiny)
     if (found.depth <= _LOCAL * shallow).mean() > 0.5:
         return _LOCAL * first
     near = (found.depth <= _LOCAL * np.sqrt(scale * shallow)) & (found.period >= 0)
     return _LOCAL * np.sqrt(scale * first) if near.mean() > 0.5 else _LOCAL * first
-
-
-def is_local(local: LocalMap, offsets: np.ndarray, found: Settled) -> np.ndarray:
-    """Whether each lane stayed near."""
-    return (found.period >= 0) & (found.depth <= local_depths(local, offsets))
 
 
 def natural_depth(local: LocalMap) -> float:
@@ -168,7 +175,7 @@ def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[s
     **Arguments:** the map; offsets of the parameter on the side of the impacts, evenly spaced by
     their logarithm; what it settles on there.
     """
-    near = is_local(local, offsets, found)
+    near = found.period >= 0
     close = np.abs(offsets) <= np.median(np.abs(offsets))
     if near[close].mean() < 0.5:
         folds = local.orders[0] == 0.5 and len(local.kicks) == 1 and _sum_of_entries(local) < 0

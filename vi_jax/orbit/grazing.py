@@ -16,7 +16,7 @@ from ._forecast import (
     SCENARIOS,
     Settled,
     Windows,
-    is_local,
+    lanes_of,
     natural_depth,
     scenario_of,
     settled,
@@ -176,18 +176,18 @@ def grazing(
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)
-    unchecked, size, settles, near = _unchecked(graze, periods)
+    unchecked, settles = _unchecked(graze, periods)
     if not check:
         return unchecked
+    offsets = unchecked.forecast.offset[::ASKED]
     with at_work(
         "grazing", lambda: Interrupted("check of the grazing", unchecked),
-        progress=progress, unit="value", total=len(size[::ASKED]),
+        progress=progress, unit="value", total=len(offsets),
     ) as tell:  # fmt: skip
-        asked = slice(None, None, ASKED)
-        some = Settled(*(part[asked] for part in settles))
-        beside, same, far = beside_grazing(graze, unchecked.side * size[asked], some, near[asked])
-        checked, agreement = stretch(size[asked], *same)
-        tell(len(size[asked]))
+        some = lanes_of(settles, slice(None, None, ASKED))
+        beside, same, far = beside_grazing(graze, offsets, some)
+        checked, agreement = stretch(np.abs(offsets), *same)
+        tell(len(offsets))
     found = dataclasses.replace(
         unchecked, machine=beside, checked=checked, agreement=agreement, far=far
     )
@@ -201,17 +201,14 @@ def _within(
     local map may go through other things than the machine does."""
     size = np.abs(found.forecast.offset)
     inside = (size >= checked[0]) & (size <= checked[1])
-    some = Settled(*(part[inside] for part in settles))
+    some = lanes_of(settles, inside)
     outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[inside], some)
     return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)
 
 
-def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled, np.ndarray]:
-    """What the local map forecasts of a grazing, not yet compared with the machine.
-
-    **Returns:** that; distances from it in the parameter, and at each of them what the map settles
-    on and whether that is near enough for the map to hold.
-    """
+def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
+    """What the local map forecasts of a grazing, not yet compared with the machine; and what it
+    settles on at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     natural, brief = natural_depth(local), _brief_depth(graze)
@@ -223,10 +220,9 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled
         )
     deepest = _DEEPEST * min(natural, brief)
     side = -1 if first.slope > 0 else 1
-    size = deepest / abs(first.slope) * np.logspace(-DECADES, 0, DECADES * _EACH + 1)
-    found = settled(local, side * size)
-    outcome, aperiodic = scenario_of(local, side * size, found)
-    near = is_local(local, side * size, found)
+    offsets = side * deepest / abs(first.slope) * np.logspace(-DECADES, 0, DECADES * _EACH + 1)
+    found = settled(local, offsets)
+    outcome, aperiodic = scenario_of(local, offsets, found)
     single = len(graze.touches) == 1 and first.kick.order == 0.5
     values = np.linalg.eigvals(local.matrix)
     names = sorted({_called(graze, t.number) for t in graze.touches})
@@ -248,8 +244,8 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled
         aperiodic=aperiodic,
         windows=windows(local, deepest, periods) if single else None,
         forecast=Motions(
-            side * size, np.where(near, found.period, -1), found.impacts,
-            positions(graze, side * size, found.places @ graze.section.matrix.T),
+            offsets, found.period, found.impacts,
+            positions(graze, offsets, found.places @ graze.section.matrix.T),
         ),
         machine=None,
         checked=None,
@@ -258,7 +254,7 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, np.ndarray, Settled
         labels=machine.labels,
         units=stated(machine),
     )  # fmt: skip
-    return unchecked, size, found, near
+    return unchecked, found
 
 
 def _called(graze: Graze, number: int) -> str:
