@@ -44,8 +44,8 @@ def located(
     """The point between two, along the first one's tangent, at which a test is zero; `None` if
     there is none.
 
-    **Arguments:** `here` and `new`, the points; `scale`, the size of each unknown; `test`, a
-    function of a point that changes its sign between them.
+    **Arguments:** `here` and `new`, the points, which may lie against that tangent; `scale`, the
+    size of each unknown; `test`, a function of a point that changes its sign between them.
     """
     length = way(here, new, scale)
     at: dict[float, Step] = {0.0: here, length: new}
@@ -101,16 +101,6 @@ def located(
         return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
     return min(good, key=off)[1] if good else None
-
-
-def between(
-    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
-) -> Step | None:
-    """As `located`, between two points that follow each other in a finished curve: its steps
-    follow its sense, except in its backward half, which is turned."""
-    if way(here, new, scale) < 0:
-        here, new = new, here
-    return located(problem, here, new, scale, test)
 
 
 def zero_near(

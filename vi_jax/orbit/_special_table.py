@@ -31,7 +31,7 @@ from ._conditions import Special, is_defective, minors
 from ._corrector import Step, advance, halves_apart, jacobian_at, way
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
-from ._locate import BESIDE, MOST, between, crossing
+from ._locate import BESIDE, MOST, crossing, located
 from ._motion_table import pulled, room
 from ._observed import ROUNDING
 from ._shooting import Shooting
@@ -281,7 +281,7 @@ def _resonances(
         for i, (before, after) in enumerate(itertools.pairwise(values)):
             if not before * after < 0:
                 continue
-            step = between(problem, steps[i], steps[i + 1], scale, test)
+            step = located(problem, steps[i], steps[i + 1], scale, test)
             if step is None or not bool(step.good):
                 continue
             small = _ENTRY * max(abs(before), abs(after))
@@ -439,12 +439,10 @@ def _zero(
 ) -> Step | None:  # fmt: skip
     """The point between two at which a test is zero; `None` where it has a pole. `most` is the
     larger of its values at both."""
-    at = between(problem, here, new, scale, test)
+    at = located(problem, here, new, scale, test)
     if at is None or abs(test(at)) <= _ZERO * most:
         return at
     # Where another curve crosses this one the corrector has no answer.
-    if way(here, new, scale) < 0:
-        here = new
 
     def admits(step: Step, length: float) -> bool:
         return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most

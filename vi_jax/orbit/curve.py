@@ -24,7 +24,7 @@ from ..machine import (
 )
 from ._conditions import Special, held_in_words
 from ._corrector import Step
-from ._locate import between
+from ._locate import located
 from ._observed import Observed
 from ._shooting import Shooting
 from ._solution import Counted, counted_of, orbit_at, orbit_of, sections_of
@@ -319,7 +319,7 @@ class Curve(InWords, abc.ABC):
                 if i == 0 or new is not None or "closed" not in self.ends:
                     found.append(here)
             elif new is not None and apart(here) * apart(new) < 0:
-                found.append(between(self.problem, here, new, self.scale, apart))
+                found.append(located(self.problem, here, new, self.scale, apart))
         return [orbit_of(self.problem, step) for step in found if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
