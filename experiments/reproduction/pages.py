@@ -3,7 +3,7 @@
 import json
 from typing import Any, NamedTuple
 
-from tools.tables import or_dash, table
+from tools.tables import table
 from vi_jax.orbit import ORBIT_RESULTS
 
 from .claims import Claim
@@ -96,7 +96,8 @@ def _orbits(orbits: list[TableRow]) -> str:
             rows.append([name, "", "", "none found", *[""] * 6, f"{float(orbit.residual):.1e}"])
             continue
         rows.append([
-            name, or_dash(kappa, ".6f"), f"{mean_ratio(orbit):.6f}", f"{2 * int(orbit.cycles)}π",
+            name, "–" if kappa is None else f"{kappa:.6f}", f"{mean_ratio(orbit):.6f}",
+            f"{2 * int(orbit.cycles)}π",
             *(f"{float(x):.6f}" for x in (orbit.state.Y, orbit.state.V, orbit.y_min)),
             ", ".join(f"{float(v):.5f}" for v in orbit.impact_speed),
             f"{abs(complex(orbit.multipliers[0])):.6f}", "yes" if orbit.stable else "no",

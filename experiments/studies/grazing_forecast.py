@@ -344,7 +344,7 @@ def picture(shown: dict[str, dict[str, Any]]) -> Figure:
         for axis, values in ((ax.xaxis, lanes.offset), (ax.yaxis, lanes.distance)):
             axis.set_minor_formatter(NullFormatter())  # else labels overlap within a decade
             low, high = values.min(), values.max()
-            axis.set_view_interval(min(low / 1.3, 0.2 * high), max(high * 1.3, 5 * low))
+            axis.set_view_interval(min(low / 1.3, 0.1 * high), max(high * 1.3, 10 * low))
     axes[0].set_ylabel("distance of the motion", fontsize=8)
     open_frames(axes)
     marks = by_period(np.zeros(1))

@@ -191,23 +191,22 @@ COLORS = dict(zip((100.0, 10.0, 2.0, 0.5, 0.2, 0.1, 0.05), "k #0072b2 #56b4e9 #8
 MARKS = {WAYS[0]: {"marker": "o", "mfc": "none", "ms": 4.5}, WAYS[1]: {"marker": "x", "ms": 3.6}}
 
 
-def draw(ax: Any, keys: list[Key], y: str, x: str) -> None:
+def draw(ax: Any, keys: list[Key]) -> None:
     """Draw the branches and sweeps of some motors."""
     for key in keys:
         for (name, _), branch in branches.items():
             if name == key:
-                vi.plot_branch(branch, ax=ax, y=y, x=x, special=False, legend=False,
-                               color=COLORS[key[0]], lw=1.8)  # fmt: skip
+                look = {"color": COLORS[key[0]], "lw": 1.8, "special": False, "legend": False}
+                vi.plot_branch(branch, ax=ax, y="frequency_ratio", **look)
         for way in WAYS:
             look = {"color": COLORS[key[0]], "mew": 0.7, "markevery": 6, "alpha": 0.8}
-            vi.plot_sweep(sweeps[key, way], ax=ax, y=y, x="values" if x == "parameter" else x,
-                          **look, **MARKS[way])  # fmt: skip
+            vi.plot_sweep(sweeps[key, way], ax=ax, y="frequency_ratio", **look, **MARKS[way])
         ax.plot([], [], color=COLORS[key[0]], lw=2.5, label=f"T0 = {key[0]:g} N·m")
 
 
 far, near = ([key for key in HIGHEST if key[1] == gap] for gap in (FAR, NEAR))
 for ax, keys in ((axes[0], far), (axes[1], [key for key in near if key[0] < 2])):
-    draw(ax, keys, "frequency_ratio", "parameter")
+    draw(ax, keys)
     ax.axline((1, 1), slope=1, color="0.6", lw=0.9, ls=":")
     ax.set(xlim=(0.5, max(HIGHEST[key] for key in keys)), ylim=(0.4, 3.2))
     ax.set_ylabel("mean frequency ratio ζ")

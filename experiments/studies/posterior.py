@@ -6,9 +6,7 @@
 # ratio ξ is their posterior. It is sampled here by the no-U-turn sampler of BlackJAX, with
 # gradients that go through the impacts, and kept for ArviZ.
 #
-# Whether such intervals are honest is tested as Talts et al. (arXiv 1804.06788) do: numbers are
-# drawn from the prior, a record is simulated with each, and the rank of the true number among the
-# posterior's draws must be uniform.
+# Whether such intervals are honest is tested by ranks as Talts et al. (arXiv 1804.06788) do.
 #
 # Run with `python experiments/studies/posterior.py` (`--quick` for few records, writes nothing).
 # It needs the extra `bayes`: `pip install 'vi_jax[bayes]'`.

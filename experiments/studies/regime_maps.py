@@ -9,10 +9,6 @@
 # and the births by grazing lie where the steady vibration without impacts just reaches the stop,
 # 1/|1 - ζ² + 2iξζ| = d. So each checks the other.
 #
-# Without damping a motion without impacts never settles: the free vibration that the start left
-# stays for good. The map says "unsettled" (or a period, where free and driven vibration happen to
-# have one in common), and rightly so.
-#
 # Run with `python experiments/studies/regime_maps.py` (`--quick` for coarse maps).
 
 # %%

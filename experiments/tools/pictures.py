@@ -18,14 +18,11 @@ def open_frames(panels: Iterable[Axes]) -> None:
         ax.spines[["top", "right"]].set_visible(False)
 
 
-def gridded(panels: Iterable[Axes], titles: Iterable[str | None] = ()) -> None:
-    """Panels with a pale grid, and their titles where there are some."""
-    listed = list(panels)
-    for ax in listed:
+def gridded(panels: Iterable[Axes], titles: Iterable[str]) -> None:
+    """Panels with a pale grid and a title each."""
+    for ax, title in zip(panels, titles, strict=True):
         ax.grid(alpha=0.3)
-    for ax, title in zip(listed, titles, strict=False):
-        if title is not None:
-            ax.set_title(title)
+        ax.set_title(title)
 
 
 def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any) -> None:

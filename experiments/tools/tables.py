@@ -22,8 +22,3 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _line(cells: Sequence[object]) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
-
-
-def or_dash(value: float | None, form: str) -> str:
-    """A number in a format, or a dash where there is none."""
-    return "–" if value is None else format(value, form)

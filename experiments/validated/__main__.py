@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
 PAGE = HERE.parents[1] / "docs" / "validated.md"
 SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
 # In the order of the page: what most people know first.

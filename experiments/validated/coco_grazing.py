@@ -6,15 +6,10 @@ A² = (1 - ω²)² + (0.1 ω)².
 """
 
 # %%
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 import vi_jax as vi
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from tools.validated import Comparison
+from _comparison import Comparison
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,15 +6,10 @@ and of a misfit (x - 10.123)² there.
 """
 
 # %%
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import vi_jax as vi
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from tools.validated import Comparison
+from _comparison import Comparison
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,15 +6,12 @@ its seat at small q. The bifurcation is taken from the study `relief_valve`.
 """
 
 # %%
-import sys
 from pathlib import Path
 
 import jax
 import vi_jax as vi
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
+from _comparison import Comparison
 from tools.study import headlines
-from tools.validated import Comparison
 
 jax.config.update("jax_enable_x64", True)
 

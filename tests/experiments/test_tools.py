@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from tools.tables import or_dash, table
+from tools.tables import table
 from tools.timing import side_by_side
 
 
@@ -12,7 +12,6 @@ def test_table():
     assert text == "| | ζ |\n|---|---|\n| 2π | 0.9 |\n|  | – |"
     with pytest.raises(ValueError, match="1 cells under 2 headings"):
         table(["a", "b"], [("alone",)])
-    assert (or_dash(None, ".2f"), or_dash(0.125, ".2f")) == ("–", "0.12")
 
 
 def test_programs_run_in_turn():

@@ -4,8 +4,8 @@ import re
 from math import floor, log10
 
 import pytest
-from tools.validated import Comparison, last_digit
 from validated.__main__ import ORDER, SCRIPTS, comparison_of, described, section
+from validated._comparison import Comparison, last_digit
 
 from differences import quick
 from gallery_page import rows, sections

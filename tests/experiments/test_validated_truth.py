@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
-from tools.validated import last_digit
+from validated._comparison import last_digit
 
 from gallery_page import rows, sections
 

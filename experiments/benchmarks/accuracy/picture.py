@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
-from tools.pictures import gridded
 from vi_jax.plot.colors import BLUE, GREEN, MORE_IMPACTS, ORANGE, PERIODS, RED
 
 from .measures import LANES, MANY, TIMED
@@ -64,8 +63,8 @@ def picture(results: dict[str, tuple[list[Row], About]]) -> Figure:
         )
         bottom.set(xlabel="share of regimes labelled wrongly (left edge: none)")
         for ax in (top, bottom):
+            ax.grid(alpha=0.3)
             ax.set(ylabel=f"{LANES} lanes, {TIMED} cycles: run time (ms)")
-    gridded(panels.flat)
     handles, _ = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8)
     return figure

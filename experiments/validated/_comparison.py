@@ -1,10 +1,13 @@
 """Numbers of other people's examples beside those that vi_jax gives: what the gallery shares."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from .tables import table
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tools.tables import table
 
 
 @dataclass(frozen=True)
