@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from vi_jax.orbit._forecast import scenario_of, settled, windows
+from vi_jax.orbit._forecast import _next_to_each_other, scenario_of, settled, windows
 from vi_jax.orbit._local_map import LocalMap
 
 
@@ -51,3 +51,10 @@ def test_signs_of_the_entries_decide():
     assert (settled(turned, offsets).period < 0).any()
     smooth = LocalMap(np.array([[[-0.5]]]), ones, ones, np.array([1.5]), np.ones(1))
     assert scenario_of(smooth, offsets, settled(smooth, offsets))[0] == "persistence"
+
+
+def test_periods_are_added_only_if_some_follow_each_other():
+    """5 and 7 without 6, as between two stops, are no period adding; nor are periods that fall."""
+    offsets = np.geomspace(1e-3, 1e-7, 30)
+    for kinds, adding in (((5, 6, 7), True), ((5, 7, 9), False), ((7, 6, 5), False)):
+        assert _next_to_each_other(offsets, np.repeat(kinds, 10)) == adding

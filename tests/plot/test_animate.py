@@ -90,6 +90,9 @@ def test_a_body_is_where_it_is(run):
     dot = below.lines[-1]
     assert float(dot.get_xdata()[0]) == pytest.approx(4.0)  # 2 cycles, in units of π
     assert float(dot.get_ydata()[0]) == pytest.approx(float(run.last.Y))
+    shown.draw(len(shown) // 2)
+    passed = np.asarray(below.lines[-2].get_xdata())
+    assert passed[0] == pytest.approx(0.0, abs=1e-8) and passed.max() == below.lines[-1].get_xdata()
     limits = above.get_xlim(), above.get_ylim()
 
     def body():

@@ -6,46 +6,32 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+from kicked import at, polynomial
+
 pytestmark = pytest.mark.slow
 
 
-class Bent(vi.AbstractMachine):
-    """x' = x + b y², y' = -y + c x²: with c = 0 the stable manifold of the origin is x = -b y²/3,
-    with b = 0 the unstable one is y = c x²/3."""
-
-    b: jax.Array | float = 0.0
-    c: jax.Array | float = 0.0
-
-    @property
-    def cycle(self):
-        return 1.0
-
-    def field(self, s, z):
-        return vi.OscillatorState(z.Y + self.b * z.V**2, -z.V + self.c * z.Y**2)
-
-
-@pytest.fixture(scope="module")
-def method():
-    return vi.Adaptive(rtol=1e-11)
-
-
-@pytest.mark.parametrize(("which", "bend"), [("stable", 0.8), ("unstable", 0.8)])
-def test_bent_manifolds_of_a_machine_with_closed_forms(which, bend, method):
-    stable = which == "stable"
-    machine = Bent(b=bend if stable else 0.0, c=0.0 if stable else bend)
-    saddle = vi.find_orbit(
-        machine, vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0)), method=method
-    )
+@pytest.mark.parametrize("which", ["stable", "unstable"])
+@pytest.mark.parametrize("growth", [2.0, -2.0])
+def test_bent_manifolds_of_a_map_with_closed_forms(which, growth):
+    """Of (x, y) → (g x + b y², y/2 + c x²) they are x = b y²/(1/4 - g) where c = 0, and
+    y = c x²/(g² - 1/2) where b = 0; each branch on its side, also if a multiplier is negative."""
+    bent, straight = {(0, 2, 0, 0): 0.8}, {(2, 0, 0, 0): 0.8}
+    bends = (bent, {}) if which == "stable" else ({}, straight)
+    rows = {(1, 0, 0, 0): growth} | bends[0], {(0, 1, 0, 0): 0.5} | bends[1]
+    saddle = vi.find_orbit(polynomial(0.0, 0.0, *rows), at(0.0, 0.0), throw=True)
     found = vi.manifold(saddle, which=which, length=1.5, spacing=0.1)
     assert found.lengths == pytest.approx((1.5, 1.5), abs=1e-9)
-    ends = []
+    sides = []
     for branch in found.branches:
-        Y, V = np.asarray(branch.Y), np.asarray(branch.V)
-        off = Y + bend * V**2 / 3 if stable else V - bend * Y**2 / 3
+        x, y = map(np.asarray, branch)
+        off = x - 0.8 * y**2 / (0.25 - growth) if which == "stable" else y - 0.8 * x**2 / 3.5
         assert np.abs(off).max() < 1e-9
-        assert np.hypot(np.diff(Y), np.diff(V)).max() < 0.1 + 1e-9
-        ends.append((V if stable else Y)[-1])
-    assert ends[0] * ends[1] < 0  # one to each side
+        assert np.hypot(np.diff(x), np.diff(y)).max() < 0.1 + 1e-9
+        along = np.sign((y if which == "stable" else x)[1:])
+        assert (along == along[0]).all()
+        sides.append(along[0])
+    assert sides[0] * sides[1] < 0
 
 
 @pytest.fixture(scope="module")

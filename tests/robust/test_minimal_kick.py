@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.robust import _minimal_kick
 
 from belts import Belt
 
@@ -84,17 +85,24 @@ def test_the_edge_is_the_saddle(motions, result):
 
 
 @pytest.mark.slow
-def test_one_component_and_weights(motions, two_impacts):
-    """A kick of the speed alone is the first change along a line; a weight scales the norm."""
+def test_a_weight_scales_the_norm(motions, two_impacts, monkeypatch):
+    """Of the velocity: all around, on the ellipse of the norm, no smaller kick leads elsewhere. A
+    kick that two rays lead to is listed once."""
+    names, best = ["V", "Y"], _minimal_kick._best
+    monkeypatch.setattr(_minimal_kick, "_best", lambda *arguments: 2 * best(*arguments))
+    result = vi.minimal_kick(SCENE, motions[0], components=names, weights={"V": 3.0}, candidates=1)
+    assert sorted(result.kick) == ["V", "Y"] and result.exact and result.confirmed
+    assert not result.others
+    kick = np.array([float(result.kick["Y"]), 3 * float(result.kick["V"])])
+    assert float(result.norm) == pytest.approx(np.linalg.norm(kick))
+    angle = np.arctan2(*kick[::-1]) + np.append(
+        np.linspace(0, 2 * np.pi, 4096), np.linspace(-0.01, 0.01, 512)
+    )
+    around = np.stack([np.cos(angle), np.sin(angle) / 3], axis=1) * float(result.norm)
     begin = row_of(motions[0].state)
-    kicks = np.linspace(-1, 1, 2**15)
-    rows = begin + np.stack([0 * kicks, kicks], axis=1)
-    elsewhere = kicks[np.asarray(two_impacts(rows))]
-    nearest = elsewhere[np.argmin(np.abs(elsewhere))]
-    result = vi.minimal_kick(SCENE, motions[0], components=["V"], weights={"V": 3.0})
-    assert list(result.kick) == ["V"] and result.confirmed
-    assert float(result.kick["V"]) == pytest.approx(nearest, abs=2 / 2**15)
-    assert float(result.norm) == pytest.approx(3.0 * abs(float(result.kick["V"])))
+    for size in (1 - 1e-7, 0.5):
+        assert not np.asarray(two_impacts(begin + size * around)).any()
+    assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
 @pytest.mark.slow
