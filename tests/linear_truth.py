@@ -26,9 +26,9 @@ class LinearTruth:
     fastest period are looked at, at both ends and at the turn between them, and events found by
     halving. A contact without restitution rests on its stop until its force turns."""
 
-    def __init__(self, matrices, loads, frequency, contacts):
+    def __init__(self, matrices, loads, frequency, contacts, most=60):
         mass, damping, stiffness = (np.asarray(x, float) for x in matrices)
-        n, self.contacts, self.frequency = len(mass), contacts, frequency
+        n, self.contacts, self.frequency, self.most = len(mass), contacts, frequency, most
         self.n, self.inverse = n, np.linalg.inv(mass)
         self.free = np.zeros((2 * n + 3, 2 * n + 3))
         self.free[:n, n : 2 * n] = np.eye(n)
@@ -128,7 +128,7 @@ class LinearTruth:
                 resting = tuple(j for j in resting if j != i)
                 continue
             impacts, behind = impacts + 1, 0
-            if impacts > 60:
+            if impacts > self.most:
                 raise Chatters
             c = self.contacts[i]
             push = self.inverse @ c.row
