@@ -1,7 +1,7 @@
 # %% [markdown]
 """# Two frames pound each other, shaken by an unbalanced motor
 
-At the resonance of its frame the motor lags, then jumps: sooner if it hits the other frame (blue).
+A motor lags at the resonance of its frame (△), then jumps: sooner if it hits a neighbour (blue).
 """
 
 # %%
@@ -20,7 +20,7 @@ class Frames(vi.Mechanical):
     speed: float = 40.0
     contacts = property(lambda m: vi.RigidStop(m.gap, 0.6, on=lambda q: q.near - q.far))
 
-    def mass(self, q):
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
         across = -0.2 * jnp.sin(q.phi)
         return [[500.0, 0.0, across], [0.0, 400.0, 0.0], [across, 0.0, 0.1]]
 

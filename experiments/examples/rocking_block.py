@@ -35,6 +35,6 @@ class Block(vi.AbstractMachine):
 axes = {"frequency": jnp.linspace(0.4, 2.5, 100), "peak": jnp.linspace(0.26, 2.0, 100)}
 start = vi.State(tilt=0.0, rate=0.0, time=0.0)
 data = vi.scan(Block(), axes, start=start, measure="steps", settle=0, cycles=200, progress=False)
-drawn = data["outcome"].plot(x="frequency", figsize=(8, 4), cmap="cividis", add_colorbar=False)
+drawn = data["outcome"].plot(x="frequency", figsize=(8, 4), add_colorbar=False)  # pyright: ignore
 drawn.axes.set(xlabel="frequency of the ground (Hz)", ylabel="its greatest acceleration (g)")
 drawn.figure.savefig("rocking_block.png")

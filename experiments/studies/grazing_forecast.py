@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 from vi_jax.machine import leaf, with_leaf
 from vi_jax.plot.colors import BLUE, GREEN, ORANGE, RED
@@ -348,8 +349,8 @@ def picture(shown: dict[str, dict[str, Any]]) -> Figure:
     axes[0].set_ylabel("distance of the motion", fontsize=8)
     open_frames(axes)
     marks = by_period(np.zeros(1))
-    look = {"marker": "o", "ms": 4, "ls": "none"}
-    handles = [axes[0].plot([], [], color=color, label=word, **look)[0] for word, color, _ in marks]
+    look: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none"}
+    handles = [Line2D([], [], color=color, label=word, **look) for word, color, _ in marks]
     legend_below(figure, handles, 5)
     return figure
 
