@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.methods._linear import clear, flown
+from vi_jax.flow.methods._linear import clear, modal_flight
 
 from linear_truth import Chatters
 from structures import KINDS, machine_and_truth
@@ -283,7 +283,7 @@ def test_what_is_said_to_be_clear_is():
         length = jnp.minimum(clear(way.machine, s, begin), machine.cycle)
 
         def beyond(share):
-            there = flown(way.machine, free, s, share * length, begin)
+            there = modal_flight(way.machine, free, s, share * length, begin)
             return jnp.stack([
                 stop.beyond(way.machine.coordinates[stop.coordinate].position(there))
                 for stop in way.machine.stops
