@@ -41,6 +41,17 @@ def test_directions_share_one_motion():
     assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
 
 
+def test_arrays_without_a_number():
+    """Their gradients have none; whole numbers stay whole numbers beside them."""
+    value = lambda x, y: lanes.once(lambda v: jnp.sum(v[0]) + jnp.sum(v[1] ** 2), (x, y))
+    slopes = jax.vmap(jax.grad(value, (0, 1)))(jnp.zeros((3, 0)), jnp.ones((3, 2)))
+    assert slopes[0].shape == (3, 0)
+    np.testing.assert_array_equal(slopes[1], np.full((3, 2), 2.0))
+    assert jax.grad(lambda x: value(x, jnp.ones(2)))(jnp.zeros(0)).shape == (0,)
+    joined = lanes.once(jnp.concatenate, (jnp.zeros(0, jnp.int32), jnp.array([1, 2], jnp.int32)))
+    np.testing.assert_array_equal(joined, np.array([1, 2], np.int32), strict=True)
+
+
 INNER = {
     "scan": lambda x: jax.lax.scan(lambda a, b: (a * b, a), x, jnp.stack([x, 2 * x]))[0],
     "fori_loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, a: a * a, x),
