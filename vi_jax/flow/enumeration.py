@@ -86,7 +86,7 @@ def names_of(kind: Any) -> np.ndarray:
 
 def in_names(member: Any) -> np.ndarray:
     """The names of members, one for each lane."""
-    return names_of(member.kind)[np.asarray(member.number)]
+    return np.asarray(names_of(member.kind)[np.asarray(member.number)])
 
 
 def number_of(member: Any) -> Int[Array, "..."]:

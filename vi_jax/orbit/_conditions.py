@@ -315,7 +315,7 @@ class Special(AbstractCondition):
         return zero * jnp.prod(seen.approach)
 
 
-def minors(matrix: Array) -> Array:
+def minors(matrix: Array | np.ndarray) -> Array:
     """The sum of the principal minors of one row less: the product of all eigenvalues but one,
     where that one is zero, and smooth, unlike them."""
     if len(matrix) == 1:

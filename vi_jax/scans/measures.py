@@ -265,7 +265,7 @@ class Regime(AbstractMeasure):
     longest: int = eqx.field(static=True, default=64)
     observed: int = eqx.field(static=True, default=256)
     tolerance: float | None = eqx.field(default=None)
-    threshold: float = eqx.field(default=2e-3)
+    threshold: Any = eqx.field(default=2e-3)
     lasting: int = eqx.field(static=True, default=4000)
     wander: Any = eqx.field(default=0.0, kw_only=True)
     """What sections wander by under the method; a scan puts its own method's here."""
