@@ -96,6 +96,16 @@ def test_a_density_of_two_is_numpys():
     assert data.density.dims == ("noise.path", *(f"{name}_bin" for name in names))
 
 
+def test_a_body_on_the_last_edge_is_in_the_last_bin():
+    """As NumPy counts: one that rests on a stop was in no bin."""
+    pressed = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.0, gap=-2.0)
+    start = pressed.start(Y=-2.0)
+    density = vi.Density({"Y": np.linspace(-3.0, -2.0, 3)})
+    data = vi.scan(pressed, {"start.Y": [-2.0]}, measure=density, start=start, progress=False)
+    np.testing.assert_allclose(data.density[0], [0.0, 2.0])
+    assert float(data.outside[0]) == 0
+
+
 class Reflected(Free):
     """The same with an elastic stop at 0."""
 

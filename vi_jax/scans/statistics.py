@@ -221,6 +221,8 @@ class Density(_Observed):
         place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
         for row, edges, size in zip(rows, self.edges, sizes, strict=True):
             mine = jnp.searchsorted(edges, row, side="right") - 1
+            # The last bin has its upper edge, on which a body may rest.
+            mine = jnp.where(row == edges[-1], size - 1, mine)
             inside = inside & (mine >= 0) & (mine < size)
             place = place * size + jnp.clip(mine, 0, size - 1)
             area = area[..., None] * jnp.diff(edges)
