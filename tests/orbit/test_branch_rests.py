@@ -150,6 +150,9 @@ def test_a_motor_remembers_its_speed_through_a_rest():
         orbit, parameter="stops.0.gap", bounds=(0.95 * gap, gap), max_step=0.3
     )
     there = branch.orbit(0)
+    # Both are crank angles, not clocks since the section.
+    turns = (branch.impact_phase[0, 0] - float(there.impact_phase[0])) / (2 * np.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-12)
     x, unravel = ravel_pytree(there.state)
 
     def mapped(x):

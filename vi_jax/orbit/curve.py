@@ -20,6 +20,7 @@ from ..machine import (
     cycles_in_words,
     frequency_ratio,
     in_unit,
+    phase_at,
     with_units,
 )
 from ._conditions import Special, held_in_words
@@ -139,10 +140,12 @@ class Curve(InWords, abc.ABC):
 
     @cached_property
     def impact_phase(self) -> np.ndarray:
-        """Clock of each impact since the section, in the machine's units (of a `Scene` the crank
-        angle in radians); (points, impacts). Of a chatter that ends in a rest only the first one:
-        `orbit(i)` lists all."""
-        return np.stack([step.x[list(self.problem.impacts)] for step in self.steps])
+        """Clock of each impact, as `Orbit.impact_phase`, but it may lie beyond the period of the
+        motion; (points, impacts). Of a chatter that ends in a rest only the first one: `orbit(i)`
+        lists all."""
+        problem, places = self.problem, list(self.problem.impacts)
+        phases = (phase_at(problem.at(jnp.asarray(x.x)), x.x[places]) for x in self.steps)
+        return np.stack([np.asarray(phase) for phase in phases])
 
     @cached_property
     def impact_speed(self) -> np.ndarray:
