@@ -80,7 +80,12 @@ def test_a_rest_that_is_divided():
     branch = vi.continue_orbit(settled(Coupled()), parameter="omega", bounds=bounds, method=finer)
     assert branch.ends == ("rest", "rest") and (branch.rests == 1).all()
     point = branch.special[0]
-    assert "divided" in point.detail and point.switch().rests == 2
+    divided = point.switch()
+    assert "divided" in point.detail and divided.rests == 2
+    back = vi.continue_orbit(divided, parameter="omega", bounds=(0.3465, 0.355), method=finer)
+    joined = back.special[-1]
+    assert "become one" in joined.detail and joined.switch().rests == 1
+    assert joined.parameter == pytest.approx(point.parameter, abs=1e-5)
     assert point.parameter == pytest.approx(0.34710711379082, abs=1e-11)
     multipliers = branch.at(0.35)[0].multipliers
     np.testing.assert_allclose(multipliers, [-0.4504246148, -0.2437666313, 0, 0], atol=1e-8)
