@@ -168,7 +168,8 @@ def _beside(
         if np.all(np.isfinite(place.x)):
             guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, place.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
-    n, options = problem.cycles, {"method": problem.method}
+    n = problem.cycles
+    options: Any = {"method": problem.method}
     for side in (sense, -sense):
         value = point.parameter + side * distance * float(point.scale[-1])
         machine = with_leaf(problem.machine, problem.parameters[-1], value)
