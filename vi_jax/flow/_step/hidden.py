@@ -23,9 +23,9 @@ _BRIEF = 1e-3
 _PARTS = 16
 _EDGE = 0.1
 
-# Steps shorter than this (in s, for a cycle of about 2π) are not shortened any more, and for a dip
-# of the velocity.
-_SHORTEST, _SHORTEST_DIP = 1e-6, 1e-3
+# Steps shorter than this (in s, for a cycle of about 2π) are not shortened any more, in double and
+# in single precision, whose landings are that much coarser; and for a dip of the velocity.
+_SHORTEST, _SHORTEST_SINGLE, _SHORTEST_DIP = 1e-6, 1e-3, 1e-3
 
 
 def _corner(
@@ -54,7 +54,7 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     seen = rises & (bound > 0) & (place > brief) & (h - place > brief)
     dips = (begin.x <= 0) & (end.x < 0) & (begin.v < 0) & (end.v < 0) & (begin.a > 0)
     least = -begin.v / jnp.where(dips, begin.a, 1.0)
-    dips = dips & (least < 0.5 * h) & (h > plan.in_units(_SHORTEST))
+    dips = dips & (least < 0.5 * h) & _is_long(plan, h)
     return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
@@ -124,7 +124,12 @@ def _crest(
     above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
-    return (above | (first < 1)) & (h > plan.in_units(_SHORTEST)), place * h
+    return (above | (first < 1)) & _is_long(plan, h), place * h
+
+
+def _is_long(plan: Plan, h: Scalar) -> Flag:
+    """Whether a step is long enough to be shortened."""
+    return h > plan.in_units(_SHORTEST if h.dtype == jnp.float64 else _SHORTEST_SINGLE)
 
 
 def _inner(shares: tuple[float, ...]) -> list[int]:
