@@ -24,6 +24,10 @@ BESIDE = 1e-3
 # At most so many times as far on each side.
 MOST = 8
 
+# A neighbour whose tangent is so many times as far from the middle one as half of them are lies on
+# the curve that crosses: a choice, where equal distances leave 3 at most.
+_ASTRAY = 10.0
+
 # A zero beside a solution is not further from it (in the parameter's scale): a choice.
 _CLOSE = 1e-2
 
@@ -165,6 +169,10 @@ def crossing(
                 found[n * side] = step
     if len(found) < 6:
         return None
+    tangents = np.stack([step.tangent for step in found.values()])
+    aside = np.linalg.norm(tangents - np.median(tangents, axis=0), axis=1)
+    along_it = aside <= _ASTRAY * np.median(aside) + 1e-9
+    found = {x: step for (x, step), keep in zip(found.items(), along_it, strict=True) if keep}
     places, beside = np.array(list(found)), list(found.values())
 
     def through(values: Any) -> np.polynomial.Polynomial:
