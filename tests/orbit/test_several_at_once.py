@@ -12,6 +12,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+from kicked import Kicked, at
+
 OMEGA = 1.2
 
 
@@ -192,3 +194,40 @@ def test_numbers_that_a_user_watches():
     for wrong in ({"amplitude": 1.3}, {"amplitude": lambda orbit: orbit.state}, ["amplitude"]):
         with pytest.raises(TypeError, match="`watch` must"):
             vi.continue_orbit(orbit, watch=wrong, **options)
+
+
+class Turning(Kicked):
+    """x ← x + 0.3 x (a - (x - b)²): the fold at a = 0 is b beside the crossing with x = 0."""
+
+    def kick(self, x, y):
+        return x + 0.3 * x * (self.a - (x - self.b) ** 2), 0.3 * y
+
+
+@pytest.mark.parametrize("apart", [0.02, 0.001])
+def test_a_fold_and_a_branch_point_in_one_step(apart):
+    """One branch point was named, at the place of the fold. A branch that begins at the fold has
+    the other point, too."""
+    orbit = vi.find_orbit(Turning((0.5 - apart) ** 2, apart), at(0.5, 0.0), throw=True)
+    way = {"parameter": "a", "bounds": (-1.0, 0.6), "max_step": 0.3}
+    branch = vi.continue_orbit(orbit, **way)
+    assert [point.kind for point in branch.special] == ["branch-point", "fold"]
+    places = [point.parameter for point in branch.special]
+    np.testing.assert_allclose(places, [apart**2, 0.0], atol=1e-12)
+    begun = vi.continue_orbit(branch.special[1].orbit, **way)
+    assert [point.kind for point in begun.special] == ["branch-point"]
+
+
+@pytest.mark.slow
+def test_a_curve_of_touches_ends_where_the_other_stop_is_touched():
+    """The amplitude of the linear oscillator is then the other gap."""
+    stops = vi.RigidStop(9.0, 0.5), vi.RigidStop(10.0, 0.5, "left")
+    scene = vi.Scene(oscillator=vi.Oscillator(0.005), drive=vi.IdealDrive(0.9), stops=stops)
+    orbit = vi.find_orbit(scene, scene.start(Y=5.2, V=0.2), throw=True)
+    branch = vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=(3.0, 9.5))
+    (touch,) = branch.special
+    bounds = (3.0, 30.0), (0.7, 1.2)
+    curve = vi.boundary(touch, parameter="drive.frequency_ratio", bounds=bounds)
+    gap, zeta = curve.parameters.T
+    amplitude = 1 / abs(1 - zeta**2 + 0.01j * zeta)
+    np.testing.assert_allclose(gap, amplitude, rtol=1e-12)
+    assert gap.max() == pytest.approx(10.0, abs=1e-6) and gap.min() == pytest.approx(3.0)

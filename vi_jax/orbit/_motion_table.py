@@ -336,8 +336,13 @@ class MotionTable(Table):
         explain how many there are more, or less, the step is halved, as two that cross together
         leave no sign.
         """
-        found, crossed = [], 0
-        for kind in _changed(here, last, held=bool(self.problem.conditions)):
+        held = bool(self.problem.conditions)
+        kinds, found, crossed = _changed(here, last, held=held), [], 0
+        # A fold and a branch point within one step look as if the branch turned back alone.
+        halved = self._halved(here, last, halves_left) if TURNS in kinds and not held else None
+        if halved is not None:
+            return halved
+        for kind in kinds:
             at = self._bifurcation(kind, here, last)
             found, crossed = [*found, *at], crossed + len(at) * _CROSS[kind]
         before, after = _outside(here), _outside(last)
@@ -346,9 +351,14 @@ class MotionTable(Table):
         more = abs(after - before)
         if more <= crossed and (crossed - more) % 2 == 0:
             return found
+        halved = self._halved(here, last, halves_left)
+        return self._twice(here, last) or found if halved is None else halved
+
+    def _halved(self, here: Step, last: Step, halves_left: int) -> Passed | None:
+        """The bifurcations in both halves of a step; `None` where it is not halved any more."""
         middle = self._on_the_way(here, last, 0.5) if halves_left else None
         if middle is None or not bool(middle.good):
-            return self._twice(here, last) or found
+            return None
         return [
             *self._bifurcations(here, middle, halves_left - 1),
             *self._bifurcations(middle, last, halves_left - 1),
