@@ -343,8 +343,9 @@ class Regime(AbstractMeasure):
 
 
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
-    **{name: functools.partial(Usual, name) for name in _KINDS},
+    "extremes": functools.partial(Usual, "extremes"),  # first what most users ask for
     "regime": Regime,
     "sections": Sections,
     "exponent": Exponent,
+    **{name: functools.partial(Usual, name) for name in _KINDS if name != "extremes"},
 }
