@@ -203,7 +203,7 @@ class Turning(Kicked):
         return x + 0.3 * x * (self.a - (x - self.b) ** 2), 0.3 * y
 
 
-@pytest.mark.parametrize("apart", [0.02, 0.001])
+@pytest.mark.parametrize("apart", [0.02, 0.005])
 def test_a_fold_and_a_branch_point_in_one_step(apart):
     """One branch point was named, at the place of the fold. A branch that begins at the fold has
     the other point, too."""

@@ -103,6 +103,9 @@ _PASSES = 1e-5
 # A step is halved so often to tell bifurcations in it apart: a 100,000th of it is left.
 _HALVES = 17
 
+# Cosine of the angle between tangents of one branch so close to each other: a choice.
+_SAME_WAY = 0.99
+
 # A number that is watched passes zero where it is less than this share of what it is beside; else
 # it has a pole or jumps.
 _ZERO = 1e-6
@@ -338,10 +341,11 @@ class MotionTable(Table):
         """
         held = bool(self.problem.conditions)
         kinds, found, crossed = _changed(here, last, held=held), [], 0
-        # A fold and a branch point within one step look as if the branch turned back alone.
-        halved = self._halved(here, last, halves_left) if TURNS in kinds and not held else None
-        if halved is not None:
-            return halved
+        apart = self._turn_apart(here, last) if TURNS in kinds and not held else ()
+        if apart:
+            ends = (here, *apart, last)
+            parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(ends))
+            return list(itertools.chain.from_iterable(parts))
         for kind in kinds:
             at = self._bifurcation(kind, here, last)
             found, crossed = [*found, *at], crossed + len(at) * _CROSS[kind]
@@ -353,6 +357,23 @@ class MotionTable(Table):
             return found
         halved = self._halved(here, last, halves_left)
         return self._twice(here, last) or found if halved is None else halved
+
+    def _turn_apart(self, here: Step, last: Step) -> tuple[Step, ...]:
+        """Two points beside the place where the branch turns back between two others, if a
+        multiplier passes 1 there: it is a fold, and a branch point lies within the same step. They
+        are told apart down to `BESIDE`; closer ones count as one branch point."""
+        at = self.where(here, last, lambda step: tests_of(step)[TURNS])
+        if at is None:
+            return ()
+        root, length = (way(here, step, self.scale) for step in (at, last))
+        if not BESIDE < root < length - BESIDE:
+            return ()
+        sides = [self.advance(here.x, here.tangent, root + x) for x in (-BESIDE, BESIDE)]
+        passes = [tests_of(step)[CROSSING] for step in sides]
+        # One that lies on the branch that crosses has another tangent.
+        alike = np.dot(sides[0].tangent, sides[1].tangent) > _SAME_WAY
+        real = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
+        return tuple(sides) if real else ()
 
     def _halved(self, here: Step, last: Step, halves_left: int) -> Passed | None:
         """The bifurcations in both halves of a step; `None` where it is not halved any more."""

@@ -159,6 +159,8 @@ def _parts(thing: Any) -> list[Any]:
         used = inspect.getclosurevars(thing)
         if not own:
             return [*name, used.nonlocals]
+        if inspect.getfile(thing) == "<string>":  # Python 3.13 has that of `python -c` for all
+            raise OSError("it was made by `exec`")
         source = inspect.getsource(thing)
         return [source, thing.__defaults__, thing.__kwdefaults__, used.nonlocals, used.globals]
     return [type(thing), *thing.__reduce_ex__(2)[1:3]]
