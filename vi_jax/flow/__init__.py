@@ -2,7 +2,6 @@
 
 from ._lane import has_fixed_cycle as has_fixed_cycle
 from ._own import check_parts as check_parts
-from ._simulate import collect as collect
 from ._simulate import simulate as simulate
 from ._simulate import simulate_pool as simulate_pool
 from .arguments import as_floats as as_floats
@@ -31,7 +30,6 @@ from .labelled import batch_names as batch_names
 from .labelled import present as present
 from .labelled import states as states
 from .labelled import tidy as tidy
-from .loop import run_lane as run_lane
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import ExactFlight as ExactFlight

@@ -81,7 +81,7 @@ def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
     for number in plan.others(start):
         event = events_of(machine)[number]
         if isinstance(event, Friction):
-            found.append(_small(_size_of_friction(plan, number, s, start, modes, sizes)))
+            found.append(_small(_size_of_friction(plan, number, s, start, modes, contact, sizes)))
             continue
         if event.holds_mode:  # its guard is another quantity in each mode
             found.append(jnp.ones_like(s))
@@ -98,17 +98,18 @@ def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
 
 
 def _size_of_friction(
-    plan: Plan, number: int, s: Scalar, start: State, modes: Scalars, sizes: State
-) -> Scalar:
+    plan: Plan, number: int, s: Scalar, start: State, modes: Scalars, contact: Scalars,
+    sizes: State,
+) -> Scalar:  # fmt: skip
     """The larger of the slip and of the force that holds a body, where each is a guard of friction.
 
-    **Arguments:** as `extents_of`; `number`, that of the friction among the events.
+    **Arguments:** as `extents_of`; `number`, that of the friction among the events; `contact`, of
+    bodies of which none rests.
     """
     machine, event = plan.machine, events_of(plan.machine)[number]
     assert isinstance(event, Friction)
     own = mode_number(machine, number)
     held = (*modes[:own], jnp.zeros_like(s), *modes[own + 1 :])
-    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
 
     def force(x: State) -> Scalar:
         return guard_of(machine, number, s, x, held, contact)

@@ -46,7 +46,10 @@ def by_columns(
         if x is None:
             places[i] = slice(number, number + aval.size)
             number += aval.size
-    size = max(1, min(number, DIRECTIONS))
+    if not number:  # arrays without one
+        avals = {i: program.in_avals[i] for i in places}
+        return {i: jnp.zeros((*batch, *x.shape), x.dtype) for i, x in avals.items()}
+    size = min(number, DIRECTIONS)
     units = jnp.eye(-(-number // size) * size, number)  # filled up: one program for all
     along = jax.vmap(
         functools.partial(lanes_p.bind, program=program, backend=backend),
@@ -62,11 +65,8 @@ def by_columns(
             given[i] = some.reshape(size, *aval.shape)
         columns = along(*given)
         found.append(sum(_weighted(columns[k], x, 1 + len(batch)) for k, x in weights.items()))
-    out = {}
-    if not found:  # of arrays without a number
-        avals = {i: program.in_avals[i] for i in places}
-        return {i: jnp.zeros((*batch, *x.shape), x.dtype) for i, x in avals.items()}
     each = jnp.concatenate(found)[:number]  # (numbers, *batch)
+    out = {}
     for i, place in places.items():
         aval = program.in_avals[i]
         x = jnp.moveaxis(each[place], 0, -1)

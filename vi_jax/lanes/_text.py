@@ -336,7 +336,7 @@ class Skipped:
     before: str
     """The block from which they are skipped."""
     end: str = ""
-    """The last of them."""
+    """The last of the blocks that may be skipped."""
 
     def joined(self, a: Value, b: Value) -> Value:
         """a, which was computed in these blocks; b where they were skipped."""

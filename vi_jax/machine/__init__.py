@@ -113,7 +113,6 @@ from .own import by_default as by_default
 from .own import changed as changed
 from .own import clock_of as clock_of
 from .own import coordinate_on as coordinate_on
-from .own import has_own_modes as has_own_modes
 from .own import is_own as is_own
 from .own import others_of as others_of
 from .own import outcomes_of as outcomes_of

@@ -105,7 +105,7 @@ def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
 
 
 def lanes_of(found: Settled, which: Any) -> Settled:
-    """Some of the lanes."""
+    """Some of the lanes, by number or by flag."""
     return Settled(*(part[which] for part in found))
 
 

@@ -14,10 +14,10 @@ from .._flow_to_event import FlowToEvent
 from .._lane import FREE, Lane, Plan, to_event, to_turn_of, total
 from ..events import Rates, force_rate, rates, turns_within
 from ..integrals import Integrals, carried, elapsed
-from ..methods import Foreseen
+from ..methods import Foreseen, stages_to_step_to
 from ..smooth import SmoothMachine, exact, holding
 from .guards import Crossing, Side, crossings, leniency, turn_tolerance
-from .within import Within, apart, foreseen_stages, guards_error, looks_within, within
+from .within import SHARES, Within, apart, guards_error, looks_within, within
 
 # A window of force shorter than this share of the longest step moves the body by its third power,
 # 1e-9 of what a whole step does.
@@ -114,7 +114,7 @@ def attempt(
     stages, looks = [], looks_within(plan, lane.state)
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
-        stages = foreseen_stages(lane.s, h) if looks else stages
+        stages = stages_to_step_to(SHARES, lane.s, h) if looks else stages
     elif looks:
         there = lane.s, s1, lane.state
         new, beside, error, stages = method.step_with_stages(smooth, *there, beside)

@@ -25,7 +25,7 @@ from ..methods import Stage
 from ..smooth import SmoothMachine, exact, is_affine
 
 # Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
-_SHARES = tuple(n / 8 for n in range(1, 8))
+SHARES = tuple(n / 8 for n in range(1, 8))
 
 # Stages that are closer to each other than this share of a step show the same. A choice.
 _APART = 0.08
@@ -65,11 +65,6 @@ def events_looked_at(plan: Plan, state: State) -> list[int]:
         stops = [i for i, stop in enumerate(stops_of(machine)) if not known[stop.coordinate]]
     others = [number for number in plan.others(state) if events[number].looked_at_within]
     return [*stops, *others]
-
-
-def foreseen_stages(s: Scalar, h: Scalar) -> list[Stage]:
-    """Places within a step of a motion that is known beforehand."""
-    return [Stage(share, s + share * h, None) for share in _SHARES]
 
 
 def guards_error(

@@ -3,6 +3,7 @@
 from .base import AbstractMethod as AbstractMethod
 from .base import Foreseen as Foreseen
 from .base import Stage as Stage
+from .base import stages_to_step_to as stages_to_step_to
 from .choice import MethodLike as MethodLike
 from .choice import chosen as chosen
 from .choice import preset as preset

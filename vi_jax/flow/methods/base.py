@@ -1,7 +1,7 @@
 """What the hybrid step asks of a method, which is an argument of every verb."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -47,6 +47,11 @@ class Stage(NamedTuple):
     """`None` of a method that can tell it by another step, where it is asked for."""
     weight: float = 0.0
     """Of the stage in the error estimate of the step; static, 0 of a method that has none."""
+
+
+def stages_to_step_to(shares: Sequence[float], s: Scalar, h: Scalar) -> list[Stage]:
+    """Places within a step at which the state is asked for by another step."""
+    return [Stage(share, s + share * h, None) for share in shares]
 
 
 def fading_is_known(machine: AbstractMachine, s: Scalar, state: State) -> bool:
@@ -143,7 +148,7 @@ class AbstractMethod(eqx.Module):
         new, beside, error = self.step(smooth, s0, s1, state, beside)
         if not self.holds(smooth.machine):
             return new, beside, error, []
-        return new, beside, error, [Stage(x, s0 + x * (s1 - s0), None) for x in QUARTERS]
+        return new, beside, error, stages_to_step_to(QUARTERS, s0, s1 - s0)
 
     def guard_error(
         self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool,
