@@ -165,13 +165,13 @@ CALLS = {
     "an own scene without start": (scan({"x": [1.0]}, lambda x: Own()), "`start` must be given"),
     "a measure of 5": (scan(measure=lambda scene, run: 5), "must return a mapping of names"),
     "a measure of texts": (measured(a="b"), "its 'a' is 'b'"),
-    "a measure named result": (measured(result=1.0), "must not give 'result'"),
+    "a measure named result": (measured(result=1.0), "must not return 'result'"),
     "a measure named like an axis": (measured(**{ZETA: 1.0}), "another name than the axis"),
     "a dimension named like an axis": (
         scan({"cycle": [0.8, 0.9]}, lambda cycle: SCENE, measure="sections", cycles=16),
         "another name than the axis 'cycle'"),
     "two measures of one name": (
-        scan(measure=("extremes", lambda scene, run: {"y_min": 1.0})), "must not give 'y_min'"),
+        scan(measure=("extremes", lambda scene, run: {"y_min": 1.0})), "must not return 'y_min'"),
     "a measure with a path": (measured(**{"a/b": 1.0}), "must name its numbers by words"),
     "derivatives=5": (scan(derivatives=5), "`derivatives` must be a tuple"),
     "store=5": (scan(store=5), "`store` must be a path"),

@@ -135,7 +135,7 @@ def test_8_an_if_on_a_traced_number():
 def test_9_a_field_that_returns_no_state():
     nothing, row = (refused(lambda kind=kind: simulate(kind())) for kind in (NoReturn, Tuple))
     assert "its `return` is missing" in nothing and "but returned (f64[], f64[])" in row
-    assert all("must return what is like its state" in said for said in (nothing, row))
+    assert all("must return the components of its state" in said for said in (nothing, row))
 
 
 def test_10_a_guess_of_no_stable_motion():
@@ -182,7 +182,7 @@ class Assigns(Machine):
         (lambda: Unlisted(), "must list its contacts as `contacts`"),
         (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),
         (lambda: basins_of(resolutions=9), "`basins` has no argument `resolutions`; near names: r"),
-        (lambda: basins_of(cycles=9), "`cycles` is not to be given to `basins`"),
+        (lambda: basins_of(cycles=9), "`cycles` must not be given to `basins`"),
         (
             lambda: instance_of("machine", Machine, vi.AbstractMachine, "one"),
             "`Machine(…)`, for one",

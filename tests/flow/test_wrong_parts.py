@@ -129,13 +129,13 @@ class Flywheel(vi.AbstractDrive):
 
 def test_drives():
     ideal = vi.Scene.ideal(frequency_ratio=0.9)
-    with pytest.raises(TypeError, match="`Flywheel` must say in `state`"):
+    with pytest.raises(TypeError, match="`Flywheel` must define `state`"):
         dataclasses.replace(ideal, drive=Flywheel())
 
     class Timeless(Flywheel):
         state = vi.MotorState
 
-    with pytest.raises(TypeError, match=r"`Timeless` has the speed .* say in `timed_state`"):
+    with pytest.raises(TypeError, match=r"`Timeless` has no .* must define `timed_state`"):
         dataclasses.replace(ideal, drive=Timeless())
 
     class Bare(Timeless):
@@ -196,7 +196,7 @@ ROWS = Rows(jnp.zeros(2), jnp.ones(2))
         (Springs(gap=jnp.array([9.0])), r"must have one number as `gap`, but has shape \(1,\)"),
         (Springs(restitution=jnp.ones(2)), r"one number as `restitution`, but has shape \(2,\)"),
         (Springs(cycle=jnp.ones(1)), r"`cycle` of a Springs must be one number, but has shape"),
-        (Unplaced(), r"shape \(2,\). Of a state of arrays a machine of your own says by"),
+        (Unplaced(), r"shape \(2,\). A machine whose state holds arrays must define"),
         (Squares(), "`quantities` of a Squares must be numbers, but 'square' is an array"),
     ],
 )

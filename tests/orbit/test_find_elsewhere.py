@@ -56,7 +56,7 @@ def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
     speeds = [float(orbit.state.v), float(orbit.state.w)]
     assert speeds == pytest.approx(sledge_speeds(0.3), abs=1e-10)
     assert float(orbit.state.x + orbit.state.y) == pytest.approx(0.7, abs=1e-10)
-    with pytest.raises(ValueError, match="one of its multipliers is 1"):
+    with pytest.raises(ValueError, match="has a multiplier of exactly 1"):
         vi.continue_orbit(orbit, parameter="damping", bounds=(0.2, 0.5))
     found = jax.jacrev(lambda c: vi.find_orbit(Coupled(c), guess).state)(jnp.asarray(0.3))
     h = 1e-6

@@ -75,5 +75,5 @@ def test_tables_are_checked(branch):
     counts = itertools.count()
     with pytest.raises(TypeError, match="same names and shapes"):
         branch.table(lambda at: np.zeros(next(counts)))
-    with pytest.raises(TypeError, match="call no number `parameter`"):
+    with pytest.raises(TypeError, match="must not return `parameter`"):
         branch.table(lambda at: {"parameter": 0.0})

@@ -161,7 +161,7 @@ def test_curves_of_branch_points():
         for i in range(0, len(curve.steps), 15):
             values = np.linalg.eigvals(monodromy(SimpleNamespace(orbit=curve.orbit(i))))
             assert np.abs(values - 1).min() < 1e-6
-    with pytest.raises(ValueError, match="but with another excess they come apart"):
+    with pytest.raises(ValueError, match="but they separate when excess changes"):
         vi.boundary(point, parameter="excess", bounds=((0.02, 0.25), (-0.1, 0.1)))
 
 

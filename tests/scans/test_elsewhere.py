@@ -127,7 +127,7 @@ def test_a_cluster_that_loses_its_scheduler_says_how_to_go_on(tmp_path, monkeypa
         done = int(re.search(told, str(lost.value))[1])
         assert 1 <= done < 12
         assert (_stored(store)["result"] != -1).sum() in (256 * done, 256 * done - 72)
-        with pytest.raises(ConnectionError, match="Nothing is kept: give the scan a `store`"):
+        with pytest.raises(ConnectionError, match=r"Nothing was stored. Pass a `store`"):
             vi.scan(scene, axes, **options, cluster=client)
         client.close(timeout=1)
     finally:

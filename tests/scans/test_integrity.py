@@ -88,7 +88,7 @@ def test_refused_before_any_work():
         ask(scales={"start.W": 1.0})
     with pytest.raises(ValueError, match="`resolution` must be at least 2"):
         ask(resolution=1)
-    with pytest.raises(TypeError, match="`samples` is not to be given"):
+    with pytest.raises(TypeError, match="`samples` must not be given"):
         ask(samples=100)
     with pytest.raises(ValueError, match="frequency"):
         vi.integrity_profile(SCENE, "drive.frequency", [0.9], REGION)

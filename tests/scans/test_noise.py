@@ -129,14 +129,14 @@ def test_a_sweep_is_shaken_by_the_number_of_each_value():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"measure": "regime"}, "must be without Regime where there is noise"),
-        ({"measure": "exponent"}, "must be without Exponent"),
+        ({"measure": "regime"}, "must not contain Regime with noise"),
+        ({"measure": "exponent"}, "must not contain Exponent"),
         ({"noise": 0.5}, "must be a `WhiteNoise`"),
         ({"key": None}, "Argument `key` must be one key"),
         ({"noise": None}, "Argument `key` needs noise"),
         ({"noise": None, "key": None}, "names 'noise.V', needs noise"),
-        ({"noise": vi.WhiteNoise({"W": 0.5})}, r"has \(noise.W, noise.path\), but got 'noise.V'"),
-        ({"derivatives": "noise.path"}, r"has \(noise.V\), but got 'noise.path'"),
+        ({"noise": vi.WhiteNoise({"W": 0.5})}, r"number of the noise \(noise.W, noise.path\), but got 'noise.V'"),
+        ({"derivatives": "noise.path"}, r"number of the noise \(noise.V\), but got 'noise.path'"),
     ],
 )
 def test_what_does_not_fit_is_refused(options, message):

@@ -100,5 +100,5 @@ def test_blocks_are_computed_by_any_executor():
         found = vi.scan(SCENE, axes, **options, cluster=pool)
         assert pool.submit(int).result() == 0  # it is not shut down
     xr.testing.assert_identical(found, vi.scan(SCENE, axes, **options))
-    with pytest.raises(ConnectionError, match=r"was lost, .* Nothing is kept"):
+    with pytest.raises(ConnectionError, match=r"was lost, .* Nothing was stored"):
         vi.scan(SCENE, axes, **options, cluster=pool)

@@ -246,7 +246,7 @@ def test_extremes_tell_of_passages_between_sections():
     "make, message",
     [
         (lambda: vi.Statistics("V", batches=1), "Argument `batches`"),
-        (lambda: vi.Density({"Y": [0.0, 0.0]}), "edges that rise"),
+        (lambda: vi.Density({"Y": [0.0, 0.0]}), "in rising order"),
         (lambda: vi.Density({"Y": [0, 1], "V": [0, 1], "W": [0, 1]}), "one name or two"),
         (lambda: vi.Escape("Y"), "one of them finite"),
         (lambda: vi.Escape("Y", low=1.0, high=0.0), "ends of an interval"),

@@ -68,7 +68,7 @@ def test_what_is_damaged_is_told_and_computed_again(
     work = importlib.import_module("vi_jax.scans._computed")
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
-    with pytest.warns(UserWarning, match=f"lost or damaged, and is computed again: {words}[.]"):
+    with pytest.warns(UserWarning, match=f"lost or damaged, and are computed again: {words}[.]"):
         found = scanned(path)
     assert len(computed) == blocks
     for name, numbers in whole[1].items():

@@ -74,7 +74,7 @@ def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
     before, thing = [], machine
     what, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
     if not isinstance(table, dict):
-        raise InputError(f"missing table {place}, which says what to do")
+        raise InputError(f"missing table {place}, which holds the arguments")
     what.check(table, place)
     if verb == "continue":  # its parameter is looked at before the orbit is sought
         with errors_in(place):

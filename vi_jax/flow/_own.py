@@ -77,11 +77,13 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             ) from None
         raise
     if flow is None:
-        raise TypeError(f"{whose} must return what is like its state: its `return` is missing.")
+        raise TypeError(
+            f"{whose} must return the components of its state, but its `return` is missing."
+        )
     wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
     if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
         raise TypeError(
-            f"{whose} must return what is like its state, {in_short(state)}, but returned "
+            f"{whose} must return the components of its state, {in_short(state)}, but returned "
             f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
         )
     _traced(f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state)
@@ -253,8 +255,8 @@ def _guards_below(machine: AbstractMachine, start: State, modes: Scalars) -> Arr
 def _warn_of_period(kind: type, name: str, cycle: float) -> None:
     warn(
         f"The `field` of a {kind.__name__} is not the same at `s` = 0 and at `s` = `cycle` = "
-        f"{cycle:.6g}: the rate of its {name} differs. `s` begins again from 0 with each cycle, so "
-        "that `cycle` must be a period of the field, unless it is meant to jump there."
+        f"{cycle:.6g}: the rate of its {name} differs. `s` restarts from 0 in each cycle, so "
+        "`cycle` must be a period of the field, unless the field is meant to jump there."
     )
 
 

@@ -65,7 +65,7 @@ def simulate(
 
     Works under `jit`, under `vmap` over any leaf of machine and start, and is differentiable
     through impacts to any order, forward and in reverse. A gradient with respect to more than four
-    numbers goes back along the kept motion and costs about five simulations. Otherwise, on XLA's
+    numbers goes back along the stored motion and costs about four simulations. Otherwise, on XLA's
     backend, or if a step has no transpose (a loop of varying length), it runs forward along each
     number. Outside of a transformation it compiles itself, once for each structure.
 
@@ -73,14 +73,14 @@ def simulate(
 
     - `machine`: a `Scene`, or an `AbstractMachine` of your own.
     - `start`: the state on the first section, from `machine.start(...)`; or `last` of another run,
-      which goes on from there, in the machine's own modes too (see `HybridState`).
+      to continue it with its discrete modes (see `HybridState`).
     - `cycles`: number of drive cycles to record, at least 1; static.
-    - `settle`: drive cycles before them, of which nothing is kept; another number is not another
-      program.
+    - `settle`: drive cycles simulated before them, which are not recorded; a new value does not
+      compile again.
     - `method`: `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, `ExactFlight()`, or the name of a
       `preset`, by default `"standard"`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the machine's own. The phase clock needs a crank
-      that turns forward; the time clock carries a start from rest and a stall.
+      that turns forward; the time clock also allows a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
       that they have the method's own accuracy.
     - `impact_log`: number of impacts to log in each cycle; with it comes `Run.clearance`.
@@ -88,7 +88,7 @@ def simulate(
       rest, releases, changes of mode.
     - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds
       (then `None`), which is faster.
-    - `estimate`: run it again by a tighter method (`AbstractMethod.tighter`) and give the
+    - `estimate`: repeat the run with a tighter method (`AbstractMethod.tighter`) and return the
       differences as `Run.errors`, for two to three times the work.
     - `rests`: whether the body may come to rest on a stop; `False` leaves that out of the program,
       which is a fifth faster. By default it is left out if all gaps are known and greater than 1,
@@ -103,8 +103,8 @@ def simulate(
     **Returns:** a `Run`.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be run, before any work.
-    Starts and parameters that are being traced cannot be looked at; such a lane ends with
-    `RESULTS.bad_start` and harms no other.
+    Traced starts and parameters cannot be checked before; an invalid one ends its lane as
+    `RESULTS.bad_start`, without effect on the others.
     """
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
     options = RunOptions(

@@ -163,8 +163,7 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
         if settle + cycles > most:
             raise ValueError(
                 f"Arguments `settle` and `cycles` must add up to at most {most} cycles (of {parts} "
-                f"interval(s) each), up to which numbers of type {dtype} count, but got "
-                f"{settle} + {cycles}."
+                f"interval(s) each), the most that {dtype} can count, but got {settle} + {cycles}."
             )
         return jnp.asarray(settle, dtype)
     settle = jnp.asarray(settle)
@@ -274,9 +273,9 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
-            f"and velocity are numbers, but there they have shape {shape}. Of a state of arrays a "
-            "machine of your own says by `position` and `velocity`, or by `coordinates`, which "
-            "numbers these are."
+            f"and velocity are numbers, but there they have shape {shape}. A machine whose state "
+            "holds arrays must define `position` and `velocity`, or `coordinates`, which pick "
+            "these numbers."
         )
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)

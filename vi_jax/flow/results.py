@@ -53,8 +53,7 @@ class RESULTS(NamedEnumeration):
     )
     switch_unresolved = "The event of a switch could not be located within the step."
     section_unresolved = (
-        "The end of a cycle, where the machine's section or clock says, could not be located "
-        "within the step."
+        "The end of a cycle (an event, or the clock) could not be located within the step."
     )
     turn_unresolved = (
         "A turning point, or the release of a body from rest, could not be located within the step."
@@ -64,12 +63,12 @@ class RESULTS(NamedEnumeration):
         "values in [0, 1]."
     )
     simultaneous = (
-        "The impacts of bodies that touch each other, or the events that set each other off, did "
+        "The impacts of bodies that touch each other, or the events that trigger each other, did "
         "not come to an end within one instant."
     )
     sliding = (
-        "The field on both sides of a switch points at its surface, so that the motion would have "
-        "to slide along it, which is no mode of the machine."
+        "The field on both sides of a switch points at its surface, so the motion would have to "
+        "slide along it. A `Switch` allows this with `slides=True`."
     )
     reset_unresolved = "The event of a reset could not be located within the step."
     bad_reset = "A reset put a body beyond a stop."

@@ -46,19 +46,19 @@ class Tried(NamedTuple):
 
 
 class Suggestion(NamedTuple):
-    """The method that `suggest_method` found, and what it measured of the others."""
+    """The method that `suggest_method` found, and the measurements of all methods."""
 
     method: AbstractMethod
-    """The fastest that keeps to the error, or the most accurate if none does."""
+    """The fastest method within the error, or the most accurate if none is."""
     reached: bool
-    """Whether it keeps to the error."""
+    """Whether its error is small enough."""
     error: float
-    """What was measured of it."""
+    """Its measured error."""
     tried: tuple[Tried, ...]
 
     def __str__(self) -> str:
         best = next(t for t in self.tried if t.method is self.method)
-        kept = "" if self.reached else "; no method tried keeps to the error asked for"
+        kept = "" if self.reached else "; no method tried is within the error allowed"
         lines = [f"{best.name}: error {self.error:.1e}{kept}", "  tried:"]
         for t in self.tried:
             took = "" if np.isnan(t.seconds) else f", {1e3 * t.seconds:.3g} ms"
@@ -85,11 +85,12 @@ def suggest_method(
 
     **Arguments:**
 
-    - `machine`: the machine, its numbers known.
-    - `error`: the error asked for, relative to 1 + |x|, for 95 of 100 lanes.
-    - `quantity`: of what: `"state"` (on the last section), `"extremes"` (in each cycle),
-      `"impacts"` (phase and speed of the first 32 in each cycle; a missed one is an infinite
-      error) or `"derivative"` (of the last section state by the first velocity).
+    - `machine`: the machine; its parameters may not be traced.
+    - `error`: the largest error allowed, relative to 1 + |x|, for 95 of 100 lanes.
+    - `quantity`: the quantity of which the error is meant: `"state"` (on the last section),
+      `"extremes"` (in each cycle), `"impacts"` (phase and speed of the first 32 in each cycle; a
+      missed one is an infinite error) or `"derivative"` (of the last section state by the first
+      velocity).
     - `start`: the first state; by default the machine's own.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
     - `lanes`: lanes of a batch such as it will be used in; 1 for a single motion.
@@ -127,8 +128,8 @@ def suggest_method(
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
         raise ValueError(
-            f"Argument `machine` must be one that runs for {cycles} cycles, but {failed} of "
-            f"{lanes} lanes of the calibration failed: look at `simulate(...).result` for why."
+            f"Argument `machine` must run for {cycles} cycles, but {failed} of {lanes} lanes of "
+            "the calibration failed. See `simulate(...).result`."
         )
     if exact:
         tried = [bench.tried(best, "ExactFlight()")]

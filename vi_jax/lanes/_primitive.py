@@ -59,7 +59,7 @@ def _compiled(program: LaneProgram, backend: str) -> Any:
 
 
 # The most directions of a derivative that one lane carries along. Six of them took 19 ms
-# so, and 48 ms as lanes of their own (`docs/internals/lanes.md`).
+# so, and 48 ms as lanes of their own.
 DIRECTIONS = 8
 
 

@@ -31,7 +31,8 @@ class Emitted(NamedTuple):
 
 
 def backend(name: str) -> AbstractContextManager:
-    """Trace lanes for `"xla"` within this context, or for what suits the machine (`"auto"`).
+    """Trace lanes for `"xla"` within this context, or for the backend that suits the machine
+    (`"auto"`).
 
     Programs that are already compiled keep their backend.
     """

@@ -56,7 +56,7 @@ def threads(number: int) -> AbstractContextManager:
 
     **Arguments:** `number` of threads, from 1 to 1,024.
 
-    **Raises:** `TypeError` or `ValueError` for what is no such number.
+    **Raises:** `TypeError` or `ValueError` for any other number.
     """
     if isinstance(number, bool) or not isinstance(number, int | np.integer):
         raise TypeError(f"Argument `number` must be an integer, but got {number!r}.")

@@ -80,7 +80,7 @@ class AbstractMachine(Shown):
     | `coordinates` | several coordinates by number |
     | `averages` | means over a cycle: a power, a mean force |
     | `quantities` | functions of the state, by name, shown in results |
-    | `renewed` | a drift, counted by the cycle |
+    | `renewed` | a drifting component, set back in each cycle |
     | `mirrored` | the symmetry of the machine, for branches |
     | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
     | `pace` | d(time)/ds, if `s` is not time |
@@ -182,7 +182,10 @@ class AbstractMachine(Shown):
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """An autonomous machine observed at equal intervals of `s` instead of on its section."""
         if counter_of(self) is None and not any(x.ends_cycle for x in _events_in(self)):
-            raise ValueError(f"A {type(self).__name__} is driven: its cycle is its drive's.")
+            raise ValueError(
+                f"`observed_every` needs a machine without a drive, but a {type(self).__name__} is "
+                "driven."
+            )
         require("interval", number("interval", interval), low=0.0, open_low=True)
         return at_intervals(self, interval)
 
@@ -206,12 +209,12 @@ class AbstractMachine(Shown):
 
     @by_default
     def renewed(self, state: State) -> State:
-        """The state at the begin of the next cycle, for a number that is counted by the cycle: a
-        drift becomes the progress in the last cycle, and begins again from zero."""
+        """The state at the beginning of the next cycle, for a component that drifts: set back to
+        zero here, it is the progress in each cycle."""
         return state
 
     def mirrored(self, state: State) -> State | None:
-        """The image of a state under the symmetry of this machine, of which each motion has an
+        """The image of a state under the symmetry of this machine, by which every motion has an
         image half a cycle later; `None` without such a symmetry."""
         return None
 

@@ -15,14 +15,15 @@ class Coordinate(NamedTuple):
 
     position: Callable[[State], Scalar]
     velocity: Callable[[State], Scalar]
-    """What an impact reverses; of the sign of d(position)/ds."""
+    """The velocity that an impact reverses; of the sign of d(position)/ds."""
     placed: Callable[[State, Any, Any], State]
-    """A state with another position and velocity, and with all that an impact changes besides."""
+    """The state with another position and velocity, and with everything else that an impact
+    changes."""
     mass: Any = 1.0
-    """What an impact acts on, in the machine's unit of mass: of two bodies the reduced mass. A
-    number, or a function `mass(s, state)`."""
+    """The effective mass of an impact, in the machine's unit of mass: for two bodies the reduced
+    mass. A number, or a function `mass(s, state)`."""
     push: Callable[[State], State] | None = None
-    """How the state changes by as much of a force as changes the velocity by one; by default the
+    """The change of the state by an impulse that changes the velocity by one; by default the
     derivative of `placed` with respect to the velocity."""
 
     def mass_at(self, s: Scalar, state: State) -> Any:

@@ -33,8 +33,8 @@ class Counter:
         if self.usual is not None:
             return self.usual(machine) if callable(self.usual) else self.usual
         raise ValueError(
-            f"Argument `usual` must be given to what counts the cycles of a "
-            f"{type(machine).__name__}: about how long a cycle takes."
+            f"Argument `usual` must be given with the `cycle` of a {type(machine).__name__}: about "
+            "how long a cycle takes."
         )
 
 
@@ -54,8 +54,8 @@ class Turn(Counter):
         if speed is None or (known is not None and not known.all()):
             raise ValueError(
                 f"Argument `usual` must be given to `turn_of({self.name!r})` of a "
-                f"{type(machine).__name__}, about how long a turn takes, or a `start` that turns "
-                "must be defined: its own does not."
+                f"{type(machine).__name__}, about how long a turn takes, because its `start` does "
+                "not turn."
             )
         return 2 * pi / jnp.abs(speed)
 
@@ -120,7 +120,7 @@ def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
     start from rest in time; its orbits, branches and exponents are those of its turns. An angle
     that turns backward ends no cycle.
 
-    **Arguments:** `name`, of the angle in the state, of a `Mechanical` a coordinate; `start`, the
+    **Arguments:** `name`, of the angle in the state, in a `Mechanical` a coordinate; `start`, the
     angle (radians) at which a cycle begins; `usual`, about how long a turn takes, by default as
     long as at the speed with which the machine's own `start` turns.
     """
@@ -132,7 +132,7 @@ def rising(name: str | Callable[..., Any], *, usual: Any) -> Any:
     `cycle = vi.rising("v", usual=6.3)`.
 
     **Arguments:** `name`, of the number, or a function: `lambda m, z: z.x - m.level`; `usual`,
-    about how long a cycle takes, by which steps are sized: a number, or a function of the machine.
+    about how long a cycle takes, for the length of steps: a number, or a function of the machine.
     """
     return Passing(name, 1.0, usual)
 

@@ -75,11 +75,11 @@ class Slide(NamedTuple):
 
 
 class AbstractCrank(Shown):
-    """A crank asks for one method, `slide(phase)`."""
+    """The kinematics of a crank; a subclass defines one method, `slide(phase)`."""
 
     @property
     def is_odd(self) -> bool:
-        """Whether the slider half a turn later is where its image is: U(φ + π) = -U(φ)."""
+        """Whether the slider is at the opposite place half a turn later: U(φ + π) = -U(φ)."""
         return False
 
     @property
@@ -170,11 +170,11 @@ class AbstractDrive(Shown):
         """
 
     def rate(self) -> Float[Array, "..."] | None:
-        """The fastest rate, by τ, at which something in the drive fades; `None` if nothing does."""
+        """The fastest rate of decay in the drive, with respect to τ; `None` if nothing decays."""
         return None
 
     def usual(self, name: str, known: dict[str, Any]) -> Any:
-        """A component of the drive's own where a start leaves it out; `known` are the components
+        """The value of a component of the drive that a start leaves out; `known` are the components
         before it."""
         raise ValueError(
             f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
@@ -186,18 +186,17 @@ class AbstractDrive(Shown):
         kind, state = type(self), getattr(self, "state", None)
         if not isinstance(state, type):
             raise TypeError(
-                f"Drive `{kind.__name__}` must say in `state` of which class its states are."
+                f"Drive `{kind.__name__}` must define `state`, the class of its states."
             )
         if self.fixed_speed is None and not isinstance(kind.timed_state, type):
             raise TypeError(
-                f"Drive `{kind.__name__}` has the speed of the crank in its state, as it has no "
-                "`fixed_speed`: it must say in `timed_state` of which class its states are by "
-                "time, with the crank angle `phase` as their last component."
+                f"Drive `{kind.__name__}` has no `fixed_speed`, so it must define `timed_state`: "
+                "the class of its states by time, with the crank angle `phase` as last component."
             )
 
     def begin(self, **given: Any) -> dict[str, Any]:
-        """The drive's own components of a start, by name; what is not given, or `None`, is the
-        `usual`.
+        """The drive's components of a start, by name; a component that is not given, or `None`, has
+        its `usual` value.
 
         **Raises:** `ValueError` if a number is not finite, or no component of its state.
         """
@@ -359,7 +358,7 @@ class DCMotor(Motor):
     M² w0/τ0 into heat and holds the energy τe M² w0/(2 τ0), and the shaft gets the power M W.
 
     Explicit methods are kept to steps of about τe, so that a motor of small τe costs more the
-    smaller it is: below 0.05 use `Motor`, unless the current itself is asked for.
+    smaller it is: below 0.05 use `Motor`, unless you need the current itself.
     """
 
     electrical_time: Float[Array, "..."] = eqx.field(

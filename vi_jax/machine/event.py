@@ -35,8 +35,8 @@ class AbstractEvent(Shown):
     that mode behind the state, and returns it; another gets all modes of the machine, as its field
     does, and returns them all.
 
-    A kind of one's own is a subclass with `guard` and `after`; a machine lists its events in
-    `events`. Simulations, orbits, branches, logs and pictures ask nothing else of it.
+    A subclass defines `guard` and `after`; a machine lists its events in `events`. Simulations,
+    orbits, branches, logs and pictures need nothing else.
     """
 
     word: ClassVar[str] = "event"
@@ -47,11 +47,11 @@ class AbstractEvent(Shown):
     name: str = eqx.field(static=True, kw_only=True, default="")
     """What messages call it; static."""
     ends: str = eqx.field(static=True, kw_only=True, default="")
-    """The outcome with which the motion ends there, by name; it goes on without one; static."""
+    """The name of the outcome with which the motion ends there; "" if it continues; static."""
 
     @property
     def holds_mode(self) -> bool:
-        """Whether one of the machine's modes is this event's; then it has `begin` and `struck`."""
+        """Whether the event holds one of the machine's modes; then it has `begin` and `struck`."""
         return False
 
     @property
@@ -67,20 +67,21 @@ class AbstractEvent(Shown):
 
     @property
     def may_slide(self) -> bool:
-        """Whether the field may point at the guard's surface from both sides, so that a motion has
-        to slide along it, which is no mode yet: a lane that would ends, and says so."""
+        """Whether the field may point at the guard's surface from both sides. A motion would have
+        to slide along it, but the event has no mode for that: such a lane ends as
+        `RESULTS.sliding`."""
         return False
 
     @property
     def from_below(self) -> bool:
-        """Whether the event happens only once its guard has been below zero since the last jump. It
-        need not ask for that if its guard is another function after the event."""
+        """Whether the event happens only once its guard has been below zero since the last jump.
+        That is not required if its guard is another function after the event."""
         return True
 
     @property
     def looked_at_within(self) -> bool:
-        """Whether the guard may be positive for a part of a step only, and has to be evaluated
-        within each one; static. Not where the length of a step is chosen by it already."""
+        """Whether the guard may be positive for a part of a step only and must be evaluated within
+        each step; static. It need not be if the length of steps depends on it already."""
         return True
 
     @abc.abstractmethod
@@ -107,7 +108,7 @@ class AbstractEvent(Shown):
         return None
 
     def value(self, machine: Machine, s: Scalar, state: State, *modes: Any) -> Any:
-        """A number that the log of events keeps of it, of the state in which it is met."""
+        """A number for the event log, a function of the state before the event."""
         return jnp.nan
 
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
@@ -120,32 +121,32 @@ class AbstractEvent(Shown):
         return self.begin(machine, s, state)
 
     def speed(self, machine: Machine, state: State, rate: Scalar) -> Scalar:
-        """How fast the event is met, in the machine's words: by default `rate`, how fast its guard
-        rises by s."""
+        """How fast the event is approached, in the machine's unit: by default `rate`, the
+        derivative of its guard with respect to s."""
         return rate
 
 
 class AbstractSwitch(AbstractEvent):
     """A mode, and the event that changes it without a jump.
 
-    Within a step the mode is constant, so that what a method integrates is smooth; the step ends
-    where the guard rises through zero, and there the mode changes. That is how a method keeps its
-    order across a kink, and how a body can stick. `after` returns the state and the mode; it may
-    correct the state by rounding (a velocity set to zero where it vanishes), no more.
+    Within a step the mode is constant, so the method integrates a smooth field. The step ends where
+    the guard rises through zero, and there the mode changes. So a method keeps its order across a
+    kink, and a body can stick. `after` returns the state and the mode; it may correct the state by
+    rounding (a velocity set to zero where it vanishes), no more.
 
-    A hump of the guard within one step is seen if the guard is as smooth as the machine's first
-    coordinate; shorter ones are passed by, as by every method of steps (`step_limit` bounds them).
+    A hump of the guard within one step is detected if the guard is as smooth as the machine's first
+    coordinate. Every method may step over shorter ones (`step_limit` bounds the steps).
     """
 
     word: ClassVar = "switch"
 
     acts: bool = eqx.field(static=True, kw_only=True, default=False, repr=False)
-    """Whether it adds its own force to the machine's field, which gets no mode of it then: so does
-    each one that is listed in `contacts`; static."""
+    """Whether it adds its own force to the machine's field, which then does not receive its mode:
+    true for everything that is listed in `contacts`; static."""
 
     @property
     def holds_mode(self) -> bool:
-        """True: each switch has a mode."""
+        """True, since each switch has a mode."""
         return True
 
     @property
@@ -155,7 +156,7 @@ class AbstractSwitch(AbstractEvent):
 
     @property
     def analytic(self) -> bool:
-        """Whether what a mode adds to the field has power series up to the event that ends it."""
+        """Whether the force of a mode has a power series up to the event that ends it."""
         return True
 
     @property
@@ -173,7 +174,7 @@ class AbstractSwitch(AbstractEvent):
 
     @property
     def rubs_on(self) -> int | None:
-        """The number of the stop that this is friction on, whose impacts rub too (see
+        """The number of the stop on which this is friction, also in its impacts (see
         `ContactFriction`)."""
         return None
 
@@ -186,8 +187,8 @@ class AbstractSwitch(AbstractEvent):
     def push_in(
         self, machine: Machine, s: Scalar, state: State, mode: Scalar
     ) -> tuple[Any, State] | None:
-        """The push of a switch that `acts`, and how much of it there is, by time; `None` for a
-        force that is found with others."""
+        """The push of a switch that `acts`, and its amount with respect to time; `None` for a force
+        that is solved for together with others."""
         raise NotImplementedError(f"A {type(self).__name__} adds nothing by itself.")
 
 

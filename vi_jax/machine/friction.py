@@ -164,13 +164,13 @@ class DryFriction(Friction):
     - `on`: the name of the velocity that it acts on, `"u"`; of a `Mechanical` a coordinate, or a
       function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
     - `mass`: of that body, 1 by default; a `Mechanical` knows it.
-    - `slip(z)` or `slip(t, z)`: the velocity against what it rubs on, where that moves:
+    - `slip(z)` or `slip(t, z)`: the velocity relative to a surface that moves, such as
       `slip=lambda z: z.u - belt`.
-    - `push`: in the place of `on` and `mass`, by how much a unit of force changes the rate of each
-      component, by name, where it changes several.
+    - `push`: instead of `on` and `mass`, the change of the rate of each component by a unit of
+      force, by name, if the friction acts on several.
     - `load(z)`, `load(t, z)` or `load(machine, t, z)`: what the level is multiplied by, not
-      negative: the force N that presses the surfaces together, where it varies, `level` then being
-      μ. One if left out.
+      negative: the force N that presses the surfaces together, if it varies; `level` is then μ. 1
+      by default.
     - `static_ratio`: μ_s/μ, at least 1.
     """
 
@@ -195,11 +195,13 @@ class DryFriction(Friction):
     def __check_init__(self):
         require_ranges(self)
         if self.push is not None and self.slip is None:
-            raise ValueError("Argument `slip` must be given with `push`: what comes to rest.")
+            raise ValueError(
+                "Argument `slip` must be given with `push`: the velocity that friction stops."
+            )
 
     @property
     def is_dry(self) -> bool:
-        """True: it may hold a body anywhere."""
+        """True, since it may hold a body anywhere."""
         return True
 
     def speed_of_slip(self, machine, s, state):
@@ -208,8 +210,8 @@ class DryFriction(Friction):
         return coordinate_on(machine, self.on, self.mass).velocity(state)
 
     def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
-        """How the state changes by as much of the force as changes the slip by one, and the mass
-        that the force acts on."""
+        """The change of the state by an impulse that changes the slip by one, and the mass that the
+        force acts on."""
         if self.push is None:
             body = coordinate_on(machine, self.on, self.mass)
             push, mass = push_of(body, state), body.mass_at(s, state)
@@ -235,8 +237,8 @@ class DryFriction(Friction):
         return force, self.sticking(machine, s, state), mass
 
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
-        """The size of friction on a body that slides forward or backward; in mode 0 on one that
-        begins to."""
+        """The friction force on a body that slides forward or backward; in mode 0 on one that
+        begins to slide."""
         level = self.level
         if callable(level):
             level = level(mode * self.speed_of_slip(machine, s, state))
@@ -268,22 +270,23 @@ class DryFriction(Friction):
 class ContactFriction(Friction):
     """Coulomb friction between a body and a stop that it hits, or rests on.
 
-    In an impact the body sticks or slips along the stop: it sticks, with its velocity along the
-    stop reversed and scaled by `restitution`, if that takes an impulse of no more than `level`
-    times the stop's, and slips against that much else. While it rests on the stop it slips forward
-    or backward (mode +1, -1) against `level` times the force that presses it on, or sticks (mode
-    0), which may jam it. That force follows from what else acts, other contacts included; the
-    machine's field says nothing of it, and gets the mode like those of all switches.
+    In an impact the body sticks or slips along the stop. It sticks if the required impulse is at
+    most `level` times that of the stop; its velocity along the stop is then reversed and scaled by
+    `restitution`. Otherwise it slips against `level` times the stop's impulse. While it rests on
+    the stop, it slips forward or backward (mode +1, -1) against `level` times the force that
+    presses it on, or sticks (mode 0), which may jam it. That force follows from all other forces
+    and contacts. The machine's field does not contain the friction, and receives the mode like
+    those of all switches.
 
     Newton's and Coulomb's laws together may gain energy where the velocities across and along a
-    stop are coupled (T. R. Kane): an impact that would ends its lane as `RESULTS.bad_impact`.
+    stop are coupled (T. R. Kane): such an impact ends its lane as `RESULTS.bad_impact`.
 
     **Arguments:**
 
     - `level`: μ, not negative.
     - `stop`: the number of the stop among the machine's.
-    - `along`: the number of the coordinate that the body slips along, with its `mass`: no stop need
-      limit it, and of its position nothing is asked.
+    - `along`: the number of the coordinate that the body slips along, with its `mass`. No stop need
+      limit it, and its position is not used.
     - `restitution`: along the stop, in [0, 1].
     """
 
@@ -337,7 +340,7 @@ class ContactFriction(Friction):
         return force, self.level * pressing, mass
 
     def push_in(self, machine, s, state, mode):
-        """`None`: the force is found with that which presses on the stop (`held_flow`)."""
+        """`None`, since the force is solved for together with that of the stop (`held_flow`)."""
         return None
 
 

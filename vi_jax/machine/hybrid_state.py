@@ -14,7 +14,7 @@ from .shown import Shown
 
 
 class HybridState(Shown):
-    """A state, and the machine's own modes in it: a start that goes on where another motion ended.
+    """A state together with the machine's discrete modes, a start that continues another motion.
 
     A machine with discrete modes (`AbstractMachine.modes`) is not determined by its state alone.
     `Run.last` and `Orbit.state` of such a machine are of this class. Its components are those of
@@ -22,8 +22,8 @@ class HybridState(Shown):
 
     **Arguments:**
 
-    - `state`: as the machine's field gets it.
-    - `modes`: the machine's own modes, a tuple in the order of its `modes`.
+    - `state`: the state, as the machine's field receives it.
+    - `modes`: the machine's discrete modes, a tuple in the order of its `modes`.
     """
 
     state: Any

@@ -14,12 +14,13 @@ from .shown import Shown
 class AbstractContactLaw(Shown):
     """Force away from a `SoftStop` by the depth δ > 0 and its rate δ'.
 
-    A law of one's own is a subclass with `force`. Its numbers may be those of the stop, stiffness K
-    and damping α, or its own leaves.
+    A subclass defines `force`. It may use the stiffness K and the damping α of the stop, or
+    parameters of the law.
     """
 
     exponent: float = eqx.field(static=True, default=1.0, converter=float)
-    """p, of the depth in the spring's force, at least 1; by it steps are sized. Static."""
+    """p, the power of the depth in the spring's force, at least 1; the step length depends on it.
+    Static."""
 
     def __check_init__(self):
         require("exponent", self.exponent, low=1.0)

@@ -32,22 +32,23 @@ _FADES = 4 * pi
 
 
 class Mechanical(AbstractMachine):
-    """A machine of masses, by its coordinates, its masses and the forces between contacts.
+    """A machine of masses, defined by coordinates, masses and the forces between contacts.
 
     Its state has the coordinates by their names, and their velocities as `v`: `z.y`, `z.v.y`;
     `machine.at(y=0.1, v=dict(y=1.0))` makes one.
 
-    | it says | |
+    | definition | meaning |
     |---|---|
     | `q` | the names of its coordinates |
     | `mass` | the mass of each, or a mass matrix: numbers, or a method `mass(q)` |
     | `force(t, q, v)` | the applied force on each, by name |
-    | `prescribed(t)` | by name, places of coordinates whose motion is given: moving walls |
+    | `prescribed(t)` | the places of coordinates whose motion is given, by name: moving walls |
     | `cycle`, `contacts`, `events`, `modes` | as of every machine |
 
     A contact is `on` a coordinate, `on="y"`, or a gap of several, `on=lambda q: q.left - q.right`.
     The momentum of an impact, the mass that it acts on (`Run.impact_energy`) and inertial terms
-    follow from the masses. `mass` and `force` are of those coordinates only whose motion is free.
+    follow from the masses. `mass` and `force` have entries only for coordinates whose motion is not
+    given.
     """
 
     q: ClassVar[tuple[str, ...]]
@@ -55,8 +56,8 @@ class Mechanical(AbstractMachine):
 
     @abc.abstractmethod
     def force(self, *args: Any, **kwargs: Any) -> Any:
-        """`force(t, q, v)`: the applied force on each coordinate, by name; behind them it gets the
-        machine's own modes."""
+        """`force(t, q, v)`: the applied force on each coordinate, by name. Discrete modes of the
+        machine are further arguments."""
 
     def prescribed(self, t: Scalar) -> dict[str, Any]:
         """The places of coordinates whose motion is given, as functions of time."""
@@ -234,8 +235,8 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
     gain = sum(x * y for x, y in zip(slopes, push, strict=True) if not _is_zero(x))
     if _is_zero(gain):
         raise ValueError(
-            f"A contact of a {type(machine).__name__} is `on` nothing that it could move: its gap "
-            "must depend on a coordinate that is not prescribed."
+            f"A contact of a {type(machine).__name__} is `on` no coordinate that it could move. "
+            "Its gap must depend on a coordinate that is not prescribed."
         )
     by = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
     return [by.get(name, 0.0) for name in machine.q_names], 1 / gain

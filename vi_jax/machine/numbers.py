@@ -121,8 +121,8 @@ def check_name(names: list[str], name: str, argument: str, machine: object = Non
     untyped = getattr(type(machine), str(name), None)
     if isinstance(untyped, int | float):
         raise ValueError(
-            f"Argument `{argument}` must be a number of the machine, which {name!r} is once it has "
-            f"a type in the class: `{name}: float = {untyped!r}`."
+            f"Argument `{argument}` must be a number of the machine, but {name!r} has no type in "
+            f"the class. Write `{name}: float = {untyped!r}`."
         )
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
     ending = [other for other in names if str(name).split(".")[-1] in other]

@@ -38,7 +38,7 @@ class derived:
 
     def __get__(self, part: Any, owner: type) -> Any:
         if part is None:
-            raise AttributeError(f"`{owner.__name__}` does not say it by itself.")
+            raise AttributeError(f"`{owner.__name__}` has it only as an object: make one first.")
         return self.found(part)
 
 

@@ -19,34 +19,34 @@ class Reset(AbstractEvent):
 
     All functions get `(machine, s, state, *modes)`, with the modes as the machine's field gets
     them. A reset happens where its guard rises through zero, once it has been negative since the
-    last time. A motion that begins on the guard's surface begins behind it.
+    last time. A motion that begins on the guard's surface begins after the event.
 
-    Events of one instant happen in the order in which the machine lists them. One whose guard a
-    jump takes from below zero to above happens at that instant, too; but an event does not set off
-    itself, and a jump onto the surface sets off nothing. Two resets with the same guard both
-    happen, the second in the state that the first leaves. An event that is listed after one that
-    ends a cycle belongs to the next cycle.
+    Events of one instant happen in the order in which the machine lists them. A jump that takes a
+    guard from below zero to above triggers that event at the same instant. An event does not
+    trigger itself, and a jump onto the surface triggers nothing. Two resets with the same guard
+    both happen, the second in the state that the first leaves. An event that is listed after one
+    that ends a cycle belongs to the next cycle.
 
-    A guard may jump, `where(x > 1, 1.0, -1.0)` say. The place is found by bisection, to 1e-12 in
-    `s`, in many steps; its time has no derivative.
+    A guard may jump, such as `where(x > 1, 1.0, -1.0)`. The place is found by bisection, to 1e-12
+    in `s`, in many steps; its time has no derivative.
 
     **Arguments:**
 
-    - `guard`: what rises through zero: negative before the event, positive after it.
+    - `guard`: the function that rises through zero: negative before the event, positive after it.
     - `reset`: the state afterwards, or a dictionary of the components that change; the state stays
       as it is if left out.
-    - `when`: a flag, asked for only at the instant at which the guard rises through zero. If it is
+    - `when`: a flag, evaluated only at the instant at which the guard rises through zero. If it is
       false the reset does not happen, and the guard must fall below zero before it can rise again.
       For a reset as soon as two conditions hold take the smaller of two guards, or of a mode and a
       guard: `jnp.where(on == 1, z.T - 296, -1.0)`.
-    - `modes`: the machine's own modes afterwards, one number, a tuple, or a dictionary of those
-      that change; they stay as they are if left out. Switches are then in the modes that they have
-      behind an impact.
-    - `value`: a number that the log of events keeps of it, of the state before.
+    - `modes`: the machine's discrete modes afterwards: one number, a tuple, or a dictionary of
+      those that change; by default all stay. Switches then have the modes that they have after an
+      impact.
+    - `value`: a number for the event log, a function of the state before.
     - `ends_cycle`: whether a cycle ends with it.
-    - `ends`: the name of an outcome with which the motion ends there, `"overturned"` say.
+    - `ends`: the name of an outcome with which the motion ends there, such as `"overturned"`.
     - `direction`: `"rising"`, or `"falling"` for a guard that falls through zero, or `"both"`.
-    - `name`: what messages call it.
+    - `name`: its name in messages.
     """
 
     _guard: Callable[..., Any] = eqx.field(static=True)

@@ -46,12 +46,12 @@ class Oscillator(Shown):
 class Scene(ShaftMachine):
     """A body on a spring, shaken by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
 
-    Every number is a leaf, so that any of them can be a `vmap` axis or be differentiated; what is
-    absent (a stop, the drive's equation, a clock component) is absent from the compiled program.
+    Every number is a leaf, so that it can be a `vmap` axis or be differentiated. Absent parts (a
+    stop, the drive's equation, a clock component) are left out of the compiled program.
 
     The clock is `"phase"` (crank angle as the independent variable: the drive cycle is exactly 2π
-    long, and the crank must keep turning forward) or `"time"` (anything, a start from rest
-    included). An ideal drive makes both the same up to the factor ζ.
+    long, and the crank must keep turning forward) or `"time"` (any motion, also a start from rest).
+    For an ideal drive both agree up to the factor ζ.
     """
 
     oscillator: Oscillator
@@ -171,7 +171,7 @@ class Scene(ShaftMachine):
         the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
 
         **Arguments:** position `Y` (unit: a), velocity `V` (a ω), crank speed `W` (ω) and the
-        torque `M` of a `DCMotor` (J ω²); `others` are what a drive of one's own has besides.
+        torque `M` of a `DCMotor` (J ω²); `others` are further components of your own drive.
 
         **Raises:** `ValueError` if a number is not finite, or is given to a drive that has none.
         """

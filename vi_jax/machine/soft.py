@@ -62,8 +62,8 @@ class SoftStop(Wall, AbstractSwitch):
     - `law`: `"power"` or `"hunt-crossley"`, and `exponent` p, at least 1 (1 by default); or any
       `AbstractContactLaw`, which has its own.
     - `prestress` F0: the force at first touch, not negative; none by default.
-    - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` lets the body go
-      where the force falls to zero. Static.
+    - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` releases the body
+      when the force falls to zero. Static.
     - `side`: `"right"` or `"left"`.
     - `on`: the coordinate that it limits, as of a `RigidStop`.
     - `mass` on which the force acts: 1 by default; a `Mechanical` knows it.
@@ -169,8 +169,8 @@ class SoftStop(Wall, AbstractSwitch):
         return self.contribution(machine, s, state, mode), push_of(body, state)
 
     def begin(self, machine, s, state):
-        """The mode of a motion that begins: touching, unless the body is apart or has been let go
-        of."""
+        """The mode of a motion that begins: touching, unless the body is apart or has been
+        released."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         holds = TOUCHING
@@ -179,7 +179,7 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(inside, holds, APART)
 
     def guard(self, machine, s, state, mode):
-        """Going in, coming out, or let go of."""
+        """The guard of touching, leaving, or being released."""
         depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
@@ -188,7 +188,7 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
 
     def after(self, machine, s, state, mode):
-        """Touching, released or apart, by what has risen to zero."""
+        """Touching, released or apart, after the guard that rose to zero."""
         if self.adhesive:
             return state, -mode
         depth, _ = self.depth(machine, state)
@@ -236,8 +236,8 @@ def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractConta
     instance_of("law", law, AbstractContactLaw, f"one of {list(_LAWS)} or an `AbstractContactLaw`")
     if exponent is not None:
         raise ValueError(
-            f"Argument `exponent` must be left out where `law` is an object, which has its own, "
-            f"but got {exponent!r} beside {law!r}."
+            "Argument `exponent` must be left out if `law` is an object, which has its own, but "
+            f"got {exponent!r} with {law!r}."
         )
     return law
 

@@ -35,7 +35,7 @@ class State:
         return _state(vars(self) | components)
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"A state is not changed: take `state.replace({name}=...)`.")
+        raise AttributeError(f"A state cannot be changed. Use `state.replace({name}=...)`.")
 
     def __getattr__(self, name: str) -> Any:  # of names that are not there
         known = ", ".join(vars(self))

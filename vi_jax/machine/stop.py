@@ -95,15 +95,16 @@ class RigidStop(Wall, AbstractEvent):
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
     on: Any = eqx.field(static=True, default=None, kw_only=True)
-    """The names of position and velocity, or what a `Mechanical` takes for them."""
+    """The names of position and velocity, or the coordinate or function of a `Mechanical`."""
     mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
-    """What an impact acts on, for `Run.impact_energy`: 1 by default; a `Mechanical` knows it."""
+    """The effective mass of an impact, for `Run.impact_energy`: 1 by default; a `Mechanical`
+    computes it."""
     friction: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("friction")
     )
     """μ, Coulomb's coefficient of friction (dimensionless); none by default."""
     along: Any = eqx.field(static=True, default=None, kw_only=True)
-    """What names the coordinate that the body slips along."""
+    """The coordinate that the body slips along, given as in `on`."""
     tangential_restitution: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("tangential_restitution")
     )
@@ -112,12 +113,11 @@ class RigidStop(Wall, AbstractEvent):
     """Index into the machine's `coordinates`."""
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
     """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state,
-    one number, a tuple, or a dictionary of those that change; they stay as they are if left
-    out."""
+    one number, a tuple, or a dictionary of those that change; by default all stay."""
     at: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("at")
     )
-    """c, by how much each displacement of a linear machine enters; `None` for other machines."""
+    """c, the coefficient of each displacement of a linear machine; `None` for other machines."""
     ranges: ClassVar = {
         "gap": REAL, "restitution": SHARE, "at": REAL, "mass": POSITIVE, "friction": NOT_NEGATIVE,
         "tangential_restitution": SHARE,

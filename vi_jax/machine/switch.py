@@ -15,8 +15,8 @@ from .field import field_in, rate_of
 class Switch(AbstractSwitch):
     """A mode that is the sign of a function: +1 where `function(machine, s, state)` is positive.
 
-    At zero it is the sign that the function is about to take by `rate(machine, s, state)`, if that
-    is given, else +1.
+    At zero it is the sign of `rate(machine, s, state)`, the derivative of the function, if that is
+    given, else +1.
 
     If the fields of both modes point at the surface on which the function vanishes, the motion
     cannot leave it. With `slides=True` it slides along (mode 0) by Filippov's rule: its field is
@@ -63,8 +63,8 @@ class Switch(AbstractSwitch):
         return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
-        """The function, falling from above or rising from below; while the motion slides, that
-        field which is the first to point away."""
+        """The function, falling from above or rising from below; while the motion slides, the rate
+        of the field that points away first."""
         value = -mode * self.function(machine, s, state)
         if around is None:
             return value

@@ -39,7 +39,7 @@ def check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
         if value.shape not in ((n,), (n, n)):
             raise ValueError(
                 f"Argument `{name}` must have the shape ({n}, {n}), or ({n},) for a diagonal "
-                f"matrix, as `mass` says, but has {value.shape}."
+                f"matrix, like `mass`, but has {value.shape}."
             )
         _check_numbers(name, value)
     _check_positive(mass)
@@ -120,8 +120,8 @@ def check_contacts(contacts: tuple[RigidStop, ...], n: int) -> None:
         if stop.at is None:
             if stop.coordinate >= rows:
                 raise ValueError(
-                    f"Argument `contacts` must say of stop {i} which sum of the displacements it "
-                    f"limits, by `RigidStop(..., at=c)` with {n} numbers."
+                    f"Stop {i} in argument `contacts` must name the sum of displacements that it "
+                    f"limits: `RigidStop(..., at=c)` with {n} numbers."
                 )
             continue
         rows += 1

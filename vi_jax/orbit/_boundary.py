@@ -52,7 +52,7 @@ def boundary(
       their intervals.
 
     **Returns:** a `Boundary`, whose `special` are its points of codimension two. It ends where the
-    motion ceases to be one (another impact grazes, another rest is lost).
+    motion changes (another impact grazes, another rest is lost).
 
     **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
     unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
@@ -138,8 +138,8 @@ def _special_motion(
         exchange = exchange_at(problem, x, problem.scale([0.5 * (b - a) for a, b in bounds]))
         if exchange is None:
             raise ValueError(
-                "Argument `parameter` must leave the machine its symmetry, or what else makes "
-                f"branches cross, but with another {parameter} they come apart."
+                "Argument `parameter` must keep the symmetry, or other property, by which the "
+                f"branches cross, but they separate when {parameter} changes."
             )
     double = point.kind == FOLD and not is_defective(point.problem, point.step, 1.0)
     condition = Special(point.kind, impact, exchange, double=double)

@@ -63,21 +63,22 @@ def continue_orbit(
     - `extrema`: names of numbers whose largest and least values along the branch are located, as
       special points: `"y_min"`, `"y_max"`, `"clearance"`, `"duration"`, `"frequency_ratio"`,
       `"fastest_impact"`, `"slowest_impact"`, `"multiplier"` (the greatest modulus), an average of
-      the machine's own, and of the section `"section_Y"` and the like. They cost a program more.
-    - `watch`: functions of the orbit, by names of one's own, whose zeros along the branch are
-      located, as special points of kind `"watched"`:
+      the machine's own, and of the section `"section_Y"` and the like. They need one more compiled
+      program.
+    - `watch`: functions of the orbit, by names of your choice, whose zeros along the branch are
+      located as special points of kind `"watched"`:
       `{"limit": lambda orbit: orbit.impact_speed.max() - 2.0}`.
-    - `free`: further numbers of the machine that are to vary, with the interval of each:
+    - `free`: further parameters that vary, with the interval of each:
       `{"stops.0.gap": (1.0, 3.0)}`.
-    - `fixed`: for each of them a number of the motion, of the names above, that is held instead:
-      `{"y_min": -3.0}`; `None` holds it where the orbit has it. The orbit must have about the
-      value, and what the free numbers do not change cannot be held (`"y_max"` of a motion that
-      hits its right stop, unless the gap is free). The special point `turn` is one where the
+    - `fixed`: for each of them a property of the motion, one of the names above, that is held:
+      `{"y_min": -3.0}`; `None` holds the orbit's own value. A given value must be near that of the
+      orbit. A property that the free parameters do not change cannot be held (`"y_max"` of a motion
+      that hits its right stop, unless the gap is free). The special point `turn` is one where the
       parameter turns back; a `fold` is then where a multiplier passes 1. Hopf points are not
       sought.
     - `method`: a method of fixed steps: by default that of the orbit if its steps are fixed, else
-      `ExactFlight()` if it applies, else 20 steps of `Verner9` a cycle. An implicit solver, as
-      `Adaptive(diffrax.Kvaerno5())`, takes equal steps.
+      `ExactFlight()` if it applies, else 20 steps of `Verner9` a cycle. An implicit solver, such as
+      `Adaptive(diffrax.Kvaerno5())`, then takes equal steps.
     - `progress`: count the points found, in a terminal or a notebook.
 
     **Returns:** a `Branch`.
@@ -128,7 +129,9 @@ def _check_orbit(orbit: Orbit) -> None:
         )
     if not bool(orbit.successful):
         reason = ORBIT_RESULTS[orbit.result]
-        raise ValueError(f"Argument `orbit` must be an orbit, but is: {reason}")
+        raise ValueError(
+            f"Argument `orbit` is an orbit whose search failed: {reason} Pass a converged orbit."
+        )
 
 
 def _freed(
@@ -226,9 +229,9 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
         start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
     if moved > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
         raise ValueError(
-            "Argument `orbit` must be alone at its parameter, but one of its multipliers is 1: "
-            "branches cross there, or something in its state is neutral, as a place that is free "
-            "or a number carried along. Leave that out of the state to follow it."
+            "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
+            "of its state is neutral, such as a free position or a counter. Leave such a "
+            "component out of the state to follow the orbit."
         )
     if moved > _SAME:
         raise ValueError(

@@ -151,12 +151,11 @@ def cycle_map(
     **Arguments:**
 
     - `machine`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
-      whose independent variable counts its cycles. One in the time clock is taken by the angle of
-      its shaft.
+      whose independent variable counts its cycles. A machine in the time clock is observed by the
+      angle of its shaft.
     - `cycles`: number of drive cycles n, at least 1; static.
-    - `method`: how the machine is carried: by default as by `simulate`, with the `"standard"`
-      preset; but a `Scene` with a motor, whose preset has fixed steps, with
-      `Adaptive(Tsit5(), rtol=1e-11)`.
+    - `method`: how the motion is computed: by default by the `"standard"` preset, as in `simulate`,
+      but for a `Scene` with a motor by `Adaptive(Tsit5(), rtol=1e-11)`.
     - `section`: crank angle of the section (radians) instead of the machine's own, which is 0.
 
     **Returns:** a `CycleMap`: call it on a state from `machine.start(...)`.

@@ -64,8 +64,8 @@ def soft_kick(
         back = rate + float(fast @ change)
         if back <= 0:
             raise ValueError(
-                "Argument `point` must be a grazing of something that lets the motion go again, "
-                "but beyond the surface it would stick or go on: d²h/ds² changes from "
+                "Argument `point` must be a grazing at which the motion leaves the surface again, "
+                "but beyond the surface it would stick or continue: d²h/ds² changes from "
                 f"{rate:.3g} to {back:.3g}."
             )
         return Kick(2 * np.sqrt(2 * rate) / back * change, 0.5)
@@ -146,7 +146,7 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     out = next((i for i in range(first, len(values)) if values[i] >= 0), None)
     if out is None:
         raise ValueError(
-            "Argument `point` must be a grazing of something that lets the motion go again, but "
+            "Argument `point` must be a grazing at which the motion leaves the surface again, but "
             "a brief contact does not end."
         )
     leaves = places[out]

@@ -248,8 +248,8 @@ def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way
             if abs(float(guard_at(before, event, jnp.asarray(place), state))) > _OFF_ZERO:
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
-                    f"{event.called(machine)} does, with another event or as a cycle begins. Let "
-                    "one event do what two do at one instant; begin cycles where nothing jumps."
+                    f"{event.called(machine)} does, with another event or as a cycle begins. "
+                    "Combine simultaneous events in one, and begin cycles where no guard jumps."
                 )
         last = place
 

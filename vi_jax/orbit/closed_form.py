@@ -65,9 +65,9 @@ class ClosedFormOrbits(Shown):
 def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> ClosedFormOrbits:
     """Return all motions of an ideal scene with one impact in `cycles` drive cycles (Eq. 14 to 21).
 
-    **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right,
-    whose numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of
-    the motion in drive cycles.
+    **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right, whose
+    numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of the
+    motion in drive cycles.
 
     **Returns:** `ClosedFormOrbits`, stable and unstable motions alike. Differentiable if a motion
     exists; derivatives grow without bound towards a fold or a grazing. Resonance (ζ = 1, ξ = 0) is

@@ -290,7 +290,7 @@ class Curve(InWords, abc.ABC):
                 )
         if "parameter" in shapes:
             raise TypeError(
-                "Argument `function` must call no number `parameter`, which is the branch's own."
+                "Argument `function` must not return `parameter`, which is a column of the branch."
             )
         own = self.names[0]
         data: dict[str, Any] = {name: ("point", self.parameter) for name in (own, "parameter")}
@@ -359,19 +359,19 @@ class Curve(InWords, abc.ABC):
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Branch(Curve):
-    """A branch of periodic motions in one parameter, with others that are free where something is
-    held: host arrays with one row for each point, in their order, in the machine's units (see
+    """A branch of periodic motions in one parameter, and in further free parameters if properties
+    are held. NumPy arrays with one row for each point, in order, in the machine's units (see
     `AbstractMachine.units`).
 
     It ends on each side at the "bounds", by "grazing" (an impact is lost or a stop touched), one of
     the four sliding bifurcations ("crossing-sliding", …; see `Point.kind`), "period-doubling" (it
-    springs there from a motion of half its period), "symmetry-breaking" (from a symmetric one),
-    "hopf" (it shrinks to rest), "rest" (a rest on a stop is lost or divided), "closed" (it has come
-    back to its first point, which is its last one as well: an isola), "multiplier" (another becomes
-    as large as the one that is held, or those of a held complex pair turn real), "stalled" (the
-    corrector finds no motion further on, however close), "max_points", "interrupted", "long" (an
-    autonomous motion takes four times as long as that from which the branch began, for which its
-    steps are: begin another one there)."""
+    begins there, at a motion of half its period), "symmetry-breaking" (from a symmetric one),
+    "hopf" (it shrinks to an equilibrium), "rest" (a rest on a stop is lost or divided), "closed"
+    (it has come back to its first point, which is its last one as well: an isola), "multiplier"
+    (another multiplier becomes as large as a held one, or a held complex pair becomes real),
+    "stalled" (no further motion was found, even with the smallest step), "max_points",
+    "interrupted", "long" (the period of an autonomous motion is four times the first one, for which
+    the steps were chosen: begin another branch there)."""
 
     special: list[Point]
 
@@ -408,14 +408,14 @@ class Branch(Curve):
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Boundary(Curve):
-    """A curve in two parameters along which an orbit bifurcates: host arrays with one row for each
-    point, in their order, in the machine's units (see `AbstractMachine.units`).
+    """A curve in two parameters along which an orbit bifurcates. NumPy arrays with one row for each
+    point, in order, in the machine's units (see `AbstractMachine.units`).
 
-    It ends on each side at the "bounds", by "grazing" (an impact more or less), "rest" (a rest more
-    or less), "closed" (it has come back to its first point, which is its last one as well), of a
-    curve of Neimark–Sacker points by "resonance-1:1" and "resonance-1:2" (the two multipliers
-    become real), of a curve of motions without symmetry by "symmetry-breaking" (they become
-    symmetric), "stalled", "max_points", "interrupted"."""
+    It ends on each side at the "bounds", by "grazing" (an impact is gained or lost), "rest" (a rest
+    is gained or lost), "closed" (it has come back to its first point, which is its last one as
+    well), of a curve of Neimark–Sacker points by "resonance-1:1" and "resonance-1:2" (the two
+    multipliers become real), of a curve of motions without symmetry by "symmetry-breaking" (they
+    become symmetric), "stalled", "max_points", "interrupted"."""
 
     @property
     def condition(self) -> Special:
@@ -430,8 +430,8 @@ class Boundary(Curve):
 
     @cached_property
     def special(self) -> list[Point]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The points of codimension two on the curve, in its order, each located to rounding; they
-        are looked for when they are first asked for."""
+        """The points of codimension two on the curve, in order, each located to rounding at the
+        first access."""
         return points_of(self.problem, self.condition, self.steps, self.ends, self.scale)
 
     @property
@@ -444,7 +444,7 @@ class Boundary(Curve):
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        """As of any curve; of Neimark–Sacker points also the `angle`."""
+        """The columns of any curve; for Neimark–Sacker points also the `angle`."""
         return (*super().column_names, *(("angle",) if self.kind == TORUS else ()))
 
     def _about(self) -> dict[str, Any]:

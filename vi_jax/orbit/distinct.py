@@ -58,8 +58,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     largest component, at most 1).
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
-    each on the section on which it was first found; and for each the number of searches that found
-    it.
+    each on the section on which it was first found; and for each of them the number of searches
+    that found it.
     """
     if not isinstance(orbits, Orbit):
         raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {short(orbits)}.")

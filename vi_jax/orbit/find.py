@@ -78,21 +78,20 @@ def find_orbit(
       one leading axis in it, every guess is searched from in one compiled call.
     - `cycles`: period in drive cycles; static.
     - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
-    - `method`: how the machine is carried: by default as by `simulate`, with the `"standard"`
-      preset; but a `Scene` with a motor, whose preset has fixed steps, with
-      `Adaptive(Tsit5(), rtol=1e-11)`.
+    - `method`: how the motion is computed: by default by the `"standard"` preset, as in `simulate`,
+      but for a `Scene` with a motor by `Adaptive(Tsit5(), rtol=1e-11)`.
     - `section`: crank angle of the section (radians) instead of the machine's own, which is 0. The
-      guess and the orbit's states are on it; the search itself is done in eighths of a cycle
-      away from it, where the guess's motion is farthest from its impacts, because the map jumps
-      where an impact falls on the section.
+      guess and the orbit's states are on it. The search uses a section some eighths of a cycle
+      later, where the guess's motion is farthest from its impacts, because the map jumps where an
+      impact falls on the section.
     - `impact_log`: impacts of one cycle that the orbit can list.
-    - `throw`: raise an error if no orbit is found, instead of only saying so in `result`.
+    - `throw`: raise an error if no orbit is found, instead of only reporting it in `result`.
 
     **Returns:** an `Orbit`. Its `result` distinguishes an orbit of a smaller period, a search that
     found none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess
-    that cannot be simulated. If a component is neutral (a multiplier is exactly 1), as the place of
-    a body that slides freely, the orbits are a family: the one nearest to the guess is found, and
-    derivatives are those across the family.
+    that cannot be simulated. If a component is neutral (a multiplier is exactly 1), such as the
+    position of a body that slides freely, the orbits are a family. The search then returns the one
+    nearest to the guess, with derivatives across the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """

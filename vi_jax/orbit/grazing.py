@@ -36,8 +36,8 @@ _VANISHES = 1e-14
 
 
 class Grazing(Summarized):
-    """The attractor beyond a grazing, from `grazing`. Arrays of the host, in the machine's units,
-    for m touches in a period (usually one) and n states."""
+    """The attractor beyond a grazing, from `grazing`. NumPy arrays in the machine's units, for m
+    touches in a period (usually one) and n states."""
 
     parameter: str = eqx.field(static=True)
     """Name of the branch's parameter."""
@@ -60,7 +60,7 @@ class Grazing(Summarized):
     """Change of the state by an impact, over the depth to the power of `order`; -√(2a) W for a
     rigid stop, whose impact adds W·dh/ds."""
     order: Float[np.ndarray, " m"]
-    """1/2 for rigid and prestressed stops, 3/2 for a spring that is relaxed when touched."""
+    """1/2 for rigid and prestressed stops, 3/2 for a spring without prestress."""
     slope: Float[np.ndarray, " m"]
     """Derivative of the least distance by the parameter, along the motion without impact."""
     entries: Float[np.ndarray, " 12"]
@@ -69,24 +69,24 @@ class Grazing(Summarized):
     side: int
     """1 if impacts appear as the parameter rises, -1 if as it falls."""
     outcome: SCENARIOS
-    """What follows on that side, at the values in `checked`, or at all looked at without it."""
+    """The scenario on that side, at the values in `checked`, or without a check at all values."""
     aperiodic: float
     """Share of these values, evenly spaced by their logarithm, without a period."""
     windows: Windows | None
     """Motions with one impact in n periods; `None` where there are several touches or no root."""
     forecast: Motions
-    """What the local map settles on."""
+    """The attractors of the local map."""
     machine: Motions | None
-    """What the machine settles on at some of these values; `None` if it was not asked."""
+    """The attractors of the machine at some of these values; `None` without a check."""
     checked: tuple[float, float] | None
     """Distances from the grazing, in the parameter, between which the machine agrees with the
-    forecast on both sides, but for edges of windows; `None` if nowhere or not asked."""
+    forecast on both sides, except at edges of windows; `None` if nowhere, or without a check."""
     agreement: float
     """Share of the values there at which period and impacts are the same; NaN if none."""
     far: tuple[int, int] | None
-    """Period in cycles, 0 for none up to 64 of those of the motion that grazes, and rigid impacts
-    in it (0 where it has none) of what the machine settles on where nothing near attracts, at most
-    of the values; `None` where it stays near or was not asked."""
+    """Period in cycles and number of rigid impacts of the motion on which the machine settles, at
+    most values, if no attractor is near. The period is 0 if none was found up to 64 periods of the
+    motion that grazes. `None` if the machine stays near, or without a check."""
     labels: tuple[str, str] = eqx.field(static=True)
     """What pictures write beside position and velocity, in the machine's words."""
     units: Stated = eqx.field(static=True)
@@ -168,9 +168,9 @@ def grazing(
     **Returns:** a `Grazing`.
 
     **Raises:** `TypeError` if this is no special point; `ValueError` if it is of another kind, if
-    nothing is touched there, if what is touched is an event whose jump does not fade with the
-    speed, or if the motion without the impact turns back there; on Ctrl-C while the machine is
-    simulated `Interrupted`, whose `partial` is what `check=False` gives.
+    nothing is touched there, if an event is touched whose jump does not vanish with the speed, or
+    if the motion without the impact has a fold there; on Ctrl-C while the machine is simulated
+    `Interrupted`, whose `partial` is what `check=False` gives.
     """
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
     check, periods = flag("check", check), count("periods", periods, least=1)

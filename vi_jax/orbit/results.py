@@ -77,7 +77,7 @@ class ORBIT_RESULTS(NamedEnumeration):
 
 
 class Orbit(Summarized):
-    """A periodic motion, from `find_orbit`; look at `result` before you use it.
+    """A periodic motion, from `find_orbit`; check `result` before you use it.
 
     Under `vmap` every array has the batch axes in front, and the impact arrays are padded with
     NaN (stops: -1). Numbers are in the machine's units (see `AbstractMachine.units`): those of a
@@ -85,7 +85,7 @@ class Orbit(Summarized):
     """
 
     machine: AbstractMachine
-    """What moves; in the phase clock."""
+    """The machine, in the phase clock."""
     method: AbstractMethod
     state: State
     """State on the section, a pytree like a start; a `HybridState` for a machine with modes of its
@@ -108,7 +108,7 @@ class Orbit(Summarized):
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
     rests: Int[Array, "..."]
-    """Times that a body comes to rest on a stop in the period; 0 too of one that lies there all the
+    """How often a body comes to rest on a stop in the period; 0 also if it lies there all the
     time."""
     y_min: Float[Array, "..."]
     """Smallest position of the period (of the first coordinate)."""
@@ -123,7 +123,7 @@ class Orbit(Summarized):
     multipliers: Complex[Array, "... states"]
     """Floquet multipliers over the period, the largest modulus first."""
     residual: Float[Array, "..."]
-    """Largest component of what the motion lacks to be periodic."""
+    """Largest component of P(x) - x, the difference of the state after one period."""
     error: Float[Array, "..."]
     """Estimated error of `state`: largest component of Newton's next step."""
     iterations: Int[Array, "..."]
@@ -138,7 +138,7 @@ class Orbit(Summarized):
 
     @property
     def successful(self) -> Bool[Array, "..."]:
-        """Whether this is an orbit, of the period asked for or a smaller one."""
+        """Whether an orbit was found, of the given period or a smaller one."""
         return (self.result == ORBIT_RESULTS.successful) | (
             self.result == ORBIT_RESULTS.smaller_period
         )

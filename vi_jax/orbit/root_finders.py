@@ -29,7 +29,7 @@ Residual = Callable[[Unknowns], Unknowns]
 
 
 class AbstractRootFinder(eqx.Module):
-    """A way to a zero of a residual, taken in steps by `find_root`."""
+    """An iteration towards a zero of a residual, used by `find_root`."""
 
     tolerance: eqx.AbstractVar[Any]
     max_steps: eqx.AbstractVar[int]
@@ -69,11 +69,11 @@ class Newton(AbstractRootFinder):
 
     - `tolerance`: largest residual component of a found orbit, relative to the largest component of
       its state where that is below 1; by default 1e-10 in double and 1e-4 in single precision. The
-      search goes on below it while that still gains.
+      search continues below it as long as the residual decreases.
     - `max_steps`: steps after which it gives up; static.
     - `arcs`: 1 for single shooting. With more, the period is cut into that many arcs, whose
-      starting states are all unknowns (multiple shooting): for motions so unstable that a
-      perturbation is amplified beyond use within one period. Must divide the cycles; static.
+      starting states are all unknowns (multiple shooting): for motions that amplify perturbations
+      too much within one period. Must divide the cycles; static.
     """
 
     tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)

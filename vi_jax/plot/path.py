@@ -72,7 +72,7 @@ def motion_path(
     coordinate = coordinate_of(machine, coordinate)
     samples = motion.samples if isinstance(motion, Run) else motion
     if samples is None:
-        raise ValueError("Argument `motion` must have samples: simulate with `samples=64`, say.")
+        raise ValueError("Argument `motion` must have samples. Simulate with `samples=64`.")
     cycles = np.asarray(samples.cycles, float)
     if cycles.ndim != 1:
         raise ValueError(

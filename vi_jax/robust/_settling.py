@@ -220,9 +220,7 @@ class Settling:
         """
         machine, method = self.the_map.machine, self.the_map.method
         if _stands_still(machine, self.state(start)):
-            raise ValueError(
-                "Argument `phase` must be 0 for an equilibrium, which is always the same."
-            )
+            raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
         row = self.motion[distance(start, self.motion, self.unit).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
@@ -342,7 +340,7 @@ def _refuse_other_modes(other: Any) -> None:
     if np.any(other):
         raise ValueError(
             "Argument `machine` must have modes that follow from its state on the section (see "
-            "`AbstractMachine.modes`), but a motion comes to it in other modes than one begins in."
+            "`AbstractMachine.modes`), but a motion arrives there in other modes than it begins in."
         )
 
 

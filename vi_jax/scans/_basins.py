@@ -198,7 +198,7 @@ class Basins(NamedTuple):
         if names == ["sample"] or min(label.shape) < 2:
             raise ValueError(
                 "The geometry of basins needs starts on a grid, two at least along each axis, but "
-                f"there are {dict(label.sizes)}: ask `basins` for a `resolution`."
+                f"there are {dict(label.sizes)}. Pass `resolution` to `basins`."
             )
         return np.asarray(label), np.asarray(self.data["result"]) != _BEYOND, names
 
@@ -419,7 +419,7 @@ def check_options(
     own, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
         if name in {*_SET, *refused}:
-            raise TypeError(f"Argument `{name}` is not to be given to `{who}`.")
+            raise TypeError(f"Argument `{name}` must not be given to `{who}`.")
         if name not in of_scan:
             near = difflib.get_close_matches(name, sorted(own | of_scan - _SET))
             hint = f"near names: {', '.join(near)}" if near else f"see `help(vi_jax.{who})`"

@@ -59,7 +59,7 @@ class ScanInterrupted(Interrupted):
     def __init__(self, data: "xr.Dataset", store: str | Path | None):
         kept = "what was computed is in `.data`"
         if store is not None:
-            kept = f"what was computed is in {store}, and the same call goes on from there"
+            kept = f"what was computed is in {store}, and the same call continues from there"
         super().__init__("scan", data, kept)
         self.data = data
 
@@ -307,13 +307,13 @@ def _x64() -> bool:
 
 def _how_to_go_on(kept: MemoryStore) -> str:
     """What is left of a scan whose cluster is lost."""
-    how = "Nothing is kept: give the scan a `store`, from which the same call goes on."
+    how = "Nothing was stored. Pass a `store`, from which the same call can continue."
     if isinstance(kept, ZarrStore):
         number = len(kept.blocks)
         done = number - len(kept.open_blocks())
         how = (
-            f"{done:,} of {number:,} blocks are computed and kept in {kept.path}: the same call "
-            "goes on from there, with a new client or without `cluster`."
+            f"{done:,} of {number:,} blocks are computed and stored in {kept.path}. The same "
+            "call continues from there, with a new client or without `cluster`."
         )
     return f"The cluster was lost, or its scheduler. {how}"
 

@@ -110,14 +110,14 @@ def lane_noise_of(
         offered = [NOISE + x for x in (*noise.amplitudes, *([_PATH] if which == "axes" else []))]
         if name not in offered:
             raise ValueError(
-                f"Argument `{which}` must name of the noise what it has ({', '.join(offered)}), "
-                f"but got {name!r}."
+                f"Argument `{which}` must name a number of the noise ({', '.join(offered)}), but "
+                f"got {name!r}."
             )
     for measure in measures:
         if is_own(type(measure).refine):
             raise ValueError(
-                f"Argument `measure` must be without {type(measure).__name__} where there is "
-                "noise: a motion that is shaken has no period, and what it looks at beyond the "
-                'cycles observed is not shaken. Give others, such as `measure="extremes"`.'
+                f"Argument `measure` must not contain {type(measure).__name__} with noise: a "
+                "motion under noise has no period, and the cycles that the measure adds have no "
+                'noise. Use others, such as `measure="extremes"`.'
             )
     return LaneNoise(noise, words_of(key))

@@ -303,7 +303,7 @@ def _known_of_made(
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
         raise ValueError(
-            "Argument `axes` must give the function in argument `machine` what it takes, but: "
+            "Argument `axes` must match the arguments of the function in argument `machine`, but: "
             f"{error}."
         ) from None
     except ValueError:
@@ -327,9 +327,9 @@ def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[s
     who = getattr(who, "__name__", type(who).__name__)
     for name in new:
         if not isinstance(name, str) or not name or "/" in name or name.startswith("__"):
-            raise ValueError(f"Measure {who} must name its numbers by words, but gives {name!r}.")
+            raise ValueError(f"Measure {who} must name its numbers by words, but has {name!r}.")
         if name in taken:
-            raise ValueError(f"Measure {who} must not give {name!r}, which is another's name.")
+            raise ValueError(f"Measure {who} must not return {name!r}, a name in use.")
 
 
 def _as_arrays(tree: Any) -> Any:

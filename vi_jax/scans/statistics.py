@@ -193,8 +193,8 @@ class Density(_Observed):
         for name, row in edges.items():
             if row.size < 2 or not np.all(np.diff(row) > 0):
                 raise ValueError(
-                    f"Argument `of` must have for {name!r} edges that rise, two at least, but got "
-                    f"{row}."
+                    f"Argument `of` must have at least two edges for {name!r}, in rising order, "
+                    f"but got {row}."
                 )
         self.of = tuple(edges)
         self.edges = tuple(jnp.asarray(x, jnp.result_type(float)) for x in edges.values())
@@ -345,7 +345,7 @@ def escape_rate(
     require("confidence", confidence, low=0.0, high=1.0, open_low=True, open_high=True)
     if not {"escape_cycle", "escaped"} <= set(getattr(data, "data_vars", ())):
         raise ValueError(
-            "Argument `data` must be what `scan` found with the measure `Escape`, but has no "
+            "Argument `data` must be from `scan` with the measure `Escape`, but has no "
             "`escape_cycle` and `escaped`."
         )
     time = data["escape_cycle"]

@@ -150,7 +150,7 @@ class ZarrStore(MemoryStore):
         if self.lost:
             more = f" and {len(self.lost) - 5:,} more" if len(self.lost) > 5 else ""
             warn(
-                f"In {self.path} what was computed is lost or damaged, and is computed again: "
+                f"Blocks in {self.path} are lost or damaged, and are computed again: "
                 f"{', '.join(self.lost[:5])}{more}."
             )
         return found

@@ -75,7 +75,7 @@ class AbstractMethod(eqx.Module):
     @property
     def wander(self) -> Any:
         """How far the states of a periodic motion may differ from one period to the next, relative
-        to 1 + |state|; 0 where only by rounding, as the steps are the same in each period."""
+        to 1 + |state|; 0 if only by rounding, since the steps are the same in each period."""
         return 0.0
 
     def with_sizes(self, sizes: State) -> "AbstractMethod":
@@ -84,8 +84,8 @@ class AbstractMethod(eqx.Module):
         return self
 
     def holds(self, machine: AbstractMachine) -> bool:
-        """Whether a step holds the bodies that rest, as one does that evaluates the field; else the
-        whole state stays as it is while a body rests."""
+        """Whether a step moves the rest of the machine while a body rests, as methods that evaluate
+        the field do; otherwise the whole state is constant then."""
         return True
 
     def resolves(self, machine: AbstractMachine) -> bool:
@@ -121,8 +121,8 @@ class AbstractMethod(eqx.Module):
         return limit * (5 / self.steps_per_cycle)
 
     def clear(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | None:
-        """A length of motion from here in which no stop can be met; a step may be as long, and is
-        not searched. `None` for a method that knows none."""
+        """A length of the motion from here in which no stop can be met, so that a step of this
+        length is not searched for events; `None` if the method has no such bound."""
         return None
 
     @abc.abstractmethod
@@ -166,14 +166,14 @@ class AbstractMethod(eqx.Module):
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: State, beside: Integrals
     ) -> Foreseen | None:
-        """The motion from here, of a method that knows it before a step is taken (see `Taylor`): a
-        step then ends at the first event on it, and is `Foreseen.at` instead of `step`."""
+        """The motion from here, for a method that computes it before a step is taken (see
+        `Taylor`). A step then ends at the first event on it, and `Foreseen.at` replaces `step`."""
         return None
 
     @abc.abstractmethod
     def tighter(self) -> "AbstractMethod":
-        """A method of the same kind and much smaller error, by which this one's is estimated. Its
-        steps are at most half as long, so that it sees what is briefer than a step, too."""
+        """A method of the same kind with a much smaller error, for an estimate of this method's
+        error. Its steps are at most half as long, so that it also resolves shorter inputs."""
 
     def resize(self, error: Scalar) -> Scalar:
         """Factor from one step's length to the next one's."""

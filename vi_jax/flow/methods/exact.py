@@ -70,7 +70,7 @@ class ExactFlight(AbstractMethod):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
 
     def tighter(self):
-        """Twice as many arcs: the difference is what rounding has grown to."""
+        """Twice as many arcs: the difference is accumulated rounding."""
         return ExactFlight(2 * self.steps_per_cycle)
 
     def holds(self, machine):
@@ -96,8 +96,7 @@ class ExactFlight(AbstractMethod):
         return longest(machine, s, state) * (5 / self.steps_per_cycle)
 
     def clear(self, machine, s, state):
-        """By a bound of what all modes can do; a share of a cycle at most, as a step of one mode
-        is."""
+        """A bound from the amplitudes of all modes, limited to a fixed part of a cycle."""
         if not isinstance(machine, ModalMachine):
             return None
         return jnp.minimum(clear(machine, s, state), machine.cycle / self.steps_per_cycle)

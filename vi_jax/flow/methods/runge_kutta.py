@@ -82,11 +82,10 @@ class Adaptive(_RungeKutta):
     An implicit one (`diffrax.Kvaerno5()`) is for machines of which a part fades much faster than
     the rest moves, such as a strong motor: its steps need not follow what has faded.
 
-    **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol`
-    and `atol`, tolerances relative to each state component and absolute; `atol` defaults to `rtol`,
-    and for numbers of the state that are smaller than 0.01 where a motion begins to as much less
-    (a machine in SI units); `steps_per_cycle`, the fewest steps in a cycle
-    (at least 5, the default).
+    **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol` and
+    `atol`, tolerances relative to each state component and absolute; `atol` defaults to `rtol`,
+    reduced in proportion for components that are smaller than 0.01 at the start (a machine in SI
+    units); `steps_per_cycle`, the fewest steps in a cycle (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
     `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
@@ -155,8 +154,8 @@ class Adaptive(_RungeKutta):
         return rtol, atol, floor
 
     def guard_error(self, stages, values, h, longest, *, acts, size):
-        """As the error of a number of the state whose rate is the guard: the impulse of a force
-        that holds a body, say. A guard that does not act needs to be known to 1e-6 only."""
+        """The error of a component whose rate is the guard, such as the impulse of a force that
+        holds a body. A guard that is not such a force has the tolerance 1e-6."""
         rtol, atol, _ = self._tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
@@ -190,8 +189,8 @@ class FixedStep(_RungeKutta):
     makes it shorter. Lanes of a machine that does not define its `relaxation` end as `unstable` at
     a step whose error is about as large as the state.
 
-    **Arguments:** `solver` (default `Verner9()`), `steps_per_cycle` (at least 5; what the
-    default, 10, was measured to err is said at `preset`).
+    **Arguments:** `solver` (default `Verner9()`), `steps_per_cycle` (at least 5, default 10;
+    `preset` has its measured error).
 
     **Raises:** `TypeError` if the solver is not explicit Runge–Kutta, as the stages of an implicit
     one may have no solution in a step that cannot be shortened; `ValueError` for fewer than 5

@@ -93,16 +93,16 @@ class Expansion(NamedTuple):
 class Taylor(AbstractMethod):
     """Power series of the motion, their coefficients by recursion over the machine's own field.
 
-    A step knows the motion all along it, so that an event is found where it lies and met at once.
-    The method of choice for smooth fields at small errors; `NotImplementedError` names what a field
-    uses that has no recursion, or that is not smooth where the state says (`jnp.where`, `jnp.abs`).
+    The series gives the motion within a step, so that an event is located directly. The method of
+    choice for smooth fields at small errors; `NotImplementedError` names the operation of a field
+    that has no recursion, or that is not smooth in the state (`jnp.where`, `jnp.abs`).
 
     **Arguments:** `order` of the series (at least 4, default 16); `steps_per_cycle` (at least 5,
     default 8), as for `FixedStep`, and the fewest: a step is shortened where its series would
     diverge; `rtol`, if given, sizes each step by its last terms instead.
 
-    **Raises:** `ValueError` for numbers out of range; when it is to carry a `SoftStop` of another
-    exponent than 1, whose force has no series at first touch.
+    **Raises:** `ValueError` for numbers out of range, and for a `SoftStop` with an exponent other
+    than 1, whose force has no series at first touch.
     """
 
     order: int = eqx.field(static=True, default=16)

@@ -90,5 +90,5 @@ class Verner9(diffrax.AbstractERK):
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
-        """9, that of the solution that is carried on."""
+        """9, the order of the solution that is continued."""
         return 9
