@@ -135,7 +135,10 @@ def test_a_sweep_is_shaken_by_the_number_of_each_value():
         ({"key": None}, "Argument `key` must be one key"),
         ({"noise": None}, "Argument `key` needs noise"),
         ({"noise": None, "key": None}, "names 'noise.V', needs noise"),
-        ({"noise": vi.WhiteNoise({"W": 0.5})}, r"number of the noise \(noise.W, noise.path\), but got 'noise.V'"),
+        (
+            {"noise": vi.WhiteNoise({"W": 0.5})},
+            r"of the noise \(noise.W, noise.path\), but got 'noise.V'",
+        ),
         ({"derivatives": "noise.path"}, r"number of the noise \(noise.V\), but got 'noise.path'"),
     ],
 )
