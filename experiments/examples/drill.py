@@ -16,7 +16,7 @@ import vi_jax as vi
 
 # %% A soft stop between bit and rock, and dry friction that holds the rock; SI units, 50 Hz
 class Drill(vi.Mechanical):
-    q, mass, cycle = ("bit", "rock"), (5.0, 0.5), 0.02
+    q, mass, cycle, units = ("bit", "rock"), (5.0, 0.5), 0.02, {"shaking": "N"}
     feed: float = 300.0
     shaking: float = 1000.0
     contacts = (

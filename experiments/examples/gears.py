@@ -20,7 +20,7 @@ INERTIA, RADIUS, PLAY = 1e-3, 0.04, 1e-4  # kg m², m, m
 class Gears(vi.AbstractMachine):
     drag: float = 0.3
     ripple: float = 800.0
-    cycle = 0.02
+    cycle, units = 0.02, {"drag": "N m"}
     contacts = vi.RigidStop(0.0, 0.6, "left"), vi.RigidStop(PLAY, 0.6)
 
     def field(self, t, z):
