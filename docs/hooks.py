@@ -24,6 +24,8 @@ FORMULA = re.compile(
     r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</(?:span|div)>',
     re.DOTALL,
 )
+# Upright letters, which the converter writes as numbers or in a variant that browsers do not draw.
+UPRIGHT = re.compile(r'<mi>(&#x000[4-7][0-9A-F];)</mi>|<mi mathvariant="sans-serif">(\w)</mi>')
 BESIDE = re.compile(r"\]\(((?:\.\./)+)(experiments/|CHANGELOG\.md)")
 
 
@@ -63,4 +65,5 @@ def _set(formula: re.Match[str]) -> str:
         html.unescape(formula[2]).strip(),
         display="block" if block else "inline",
     )
+    drawn = UPRIGHT.sub(lambda m: f'<mi mathvariant="normal">{m[1] or m[2]}</mi>', drawn)
     return f'<div class="formula">{drawn}</div>' if block else drawn
