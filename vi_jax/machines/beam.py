@@ -49,7 +49,7 @@ def _tilt(modes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Beam(LinearMachine):
-    """A slender beam, clamped at one end and free at the other, that hits a stop, by its modes:
+    """A slender beam, clamped at one end and free at the other, that hits a stop; in its modes:
 
         EI ∂⁴w/∂x⁴ + ρA ∂²w/∂s² = load,   w = Σ φᵢ(x/L) qᵢ(s),   ωᵢ = βᵢ² √(EI/(ρA L⁴))
 
@@ -57,10 +57,10 @@ class Beam(LinearMachine):
     the mean 1 (R. D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979). Its state is a
     `StructureState` of the modes' coordinates q; `deflection` gives w.
 
-    The clamp moves as a cos ωs, w being seen from it, or a force F cos ωs acts on the tip. An
+    The clamp moves as a cos ωs, and w is relative to it, or a force F cos ωs acts on the tip. An
     impact acts on all modes at once (F. C. Moon and S. W. Shaw, International Journal of Non-Linear
-    Mechanics 18, 1983, had one): the more of them, the smaller the mass that is hit, and the
-    shorter the steps while they ring. A cycle is 2π/ω.
+    Mechanics 18, 1983, had one): more modes make the effective mass of an impact smaller, and the
+    steps shorter while they ring. A cycle is 2π/ω.
 
     **Arguments:**
 

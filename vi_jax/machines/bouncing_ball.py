@@ -25,10 +25,10 @@ class BallState(Shown):
 class BouncingBall(PhaseMachine):
     """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
 
-    The independent variable is ωt, a cycle 2π. One bounce in n cycles is born at
-    Γ = nπ (1 - e)/(1 + e), and doubles its period at Γ² = [nπ (1 - e)/(1 + e)]² +
-    [2 (1 + e²)/(1 + e)²]² (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear
-    Dynamics 10, 1996).
+    The independent variable is ωt, a cycle 2π. The motion with one bounce in n cycles begins at Γ =
+    nπ (1 - e)/(1 + e), and doubles its period at Γ² = [nπ (1 - e)/(1 + e)]² + [2 (1 + e²)/(1 +
+    e)²]² (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear Dynamics 10,
+    1996).
 
     **Arguments:** `acceleration` Γ, the table's largest acceleration (unit: g), not negative;
     `restitution` e in [0, 1].

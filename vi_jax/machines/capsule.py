@@ -32,8 +32,8 @@ class CapsuleState(Shown):
 
 
 class Capsule(ForcedMachine):
-    """A mass m on a spring k in a capsule of mass M, driven against a rigid stop of the capsule,
-    which rubs on the ground and so moves along.
+    """A mass m on a spring k in a capsule of mass M, driven against a rigid stop of the capsule.
+    The capsule slides on the ground with friction, and its impacts move it forward.
 
     With lengths in F/k and times in √(m/k), where F is the unit of force (that of friction with
     `friction=1`; Liu and Páez Chávez, Nonlinear Dynamics 88, 2017, where the stop is elastic):
@@ -41,14 +41,13 @@ class Capsule(ForcedMachine):
         x1'' = α cos ωt - p - 2 ξ p',   γ x2'' = p + 2 ξ p' - friction,   p = x1 - x2 ≤ δ
 
     for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e and
-    the momentum of both is kept. The independent variable is ωt, a cycle 2π. How far the capsule
-    went in the last cycle is the component `progress` of the state; where it stands is the sum of
-    these.
+    the momentum of both is kept. The independent variable is ωt, a cycle 2π. The component
+    `progress` of the state is the distance that the capsule moved in the last cycle.
 
     **Arguments:** `amplitude` α of the force on the mass, any number; `frequency` ω, positive;
     `damping_ratio` ξ, not negative; `mass_ratio` γ = M/m, positive; `gap` δ, any number;
     `restitution` e in [0, 1]; `friction` of the sliding capsule, not negative, and `static_ratio`,
-    how much more it can be while it sticks, at least 1.
+    that of static to sliding friction, at least 1.
     """
 
     amplitude: Any = number_field("amplitude", 1.6, REAL, "F")

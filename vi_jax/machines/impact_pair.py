@@ -73,8 +73,8 @@ class ImpactPair(PhaseMachine):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The place of the ball. Its impacts act on its mass, per unit of which energy is then
-        counted; in a box that is free on the reduced mass, in units of the box's."""
+        """The place of the ball. Impacts act on its mass, the unit of mass; in a free box on the
+        reduced mass, in units of the box's mass."""
         if self.mass_ratio is None:
             return super().coordinates
         reduced = self.mass_ratio / (1 + self.mass_ratio)

@@ -57,12 +57,12 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     Vibrational Mechanics, 2000). Gravity is left out, as for a shaft that stands upright or turns
     fast.
 
-    A stop gives the body a push and so the shaft a jerk: the velocity of the body is reversed and
-    scaled, and what is kept is the momentum of the shaft P = W - ε Y' sin φ, a component of the
-    state. The energy ½Y'² + ½Y² - W Y' sin φ + W²/(2ε) then falls by ½(1 - k²)(1 - ε sin²φ)V⁻².
+    An impact changes the velocity of the body and the speed of the shaft: the former is reversed
+    and scaled, and the momentum of the shaft P = W - ε Y' sin φ, a component of the state, is
+    conserved. The energy ½Y'² + ½Y² - W Y' sin φ + W²/(2ε) then falls by ½(1 - k²)(1 - ε sin²φ)V⁻².
 
-    The independent variable is φ, a cycle 2π, which the rotor must turn through forward;
-    `simulate(..., clock="time")` has time instead, and starts from rest.
+    The independent variable is φ, a cycle 2π, and the rotor must turn forward; `simulate(...,
+    clock="time")` has time instead, and starts from rest.
 
     **Arguments:**
 

@@ -68,8 +68,8 @@ def animate(
 
     **Returns:** a `MotionAnimation`, which is one of matplotlib's.
 
-    **Raises:** `TypeError` for what is no motion, `ValueError` for a motion without samples, a
-    batch or one that failed, or numbers out of range.
+    **Raises:** `TypeError` if `motion` is no motion; `ValueError` for a motion without samples, a
+    batch, a failed motion, or numbers out of range.
     """
     instance_of("motion", motion, (Run, Orbit), "a `Run` or an `Orbit`")
     fps = count("fps", fps, least=1, most=100)

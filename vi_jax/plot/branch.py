@@ -34,12 +34,12 @@ def plot_branch(
     Its colour is that of its period, as in all pictures; a motion of two cycles with several
     impacts has another than one with a single impact.
 
-    **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of what is a
-    number at each point, `Branch.column_names`: `"duration"`, `"section_Y"`, or an average of the
-    machine's such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that is
-    not fixed by a stop); `special`, whether to mark the special points; `legend`, whether to
-    draw one: the period and the impacts that the colour stands for (or the branch's `label`), what
-    solid and dashed lines are, and the marks; options of `Axes.plot`.
+    **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of columns of the
+    branch (`Branch.column_names`): `"duration"`, `"section_Y"`, or an average of the machine's such
+    as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that is not fixed by a stop);
+    `special`, whether to mark the special points; `legend`, whether to draw one: the period and the
+    impacts that the colour stands for (or the branch's `label`), what solid and dashed lines are,
+    and the marks; options of `Axes.plot`.
 
     **Returns:** the axes.
 

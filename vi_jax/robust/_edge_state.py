@@ -54,7 +54,7 @@ class EdgeState(Summarized):
     """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (as
     `tolerance` of `edge_state`) of the boundary."""
     machine: AbstractMachine
-    """What moves."""
+    """The machine."""
 
     def summary(self) -> str:
         """The edge state in words."""
@@ -92,11 +92,11 @@ def edge_state(
     - `inside`: a stable `Orbit`, or a state from which the machine settles on a motion that repeats
       within `longest` cycles; for a machine without a drive also an equilibrium.
     - `outside`: an `Orbit` or a state from which it settles on any other motion.
-    - `settle`: cycles after which a start that has not come back to the motion of `inside` counts
-      as being elsewhere.
-    - `tolerance`: a start has come back once a section state lies so near to one of the motion's,
-      relative to u + |state|, u the largest component of the motion, at most 1. Less than the size
-      of its basin.
+    - `settle`: cycles after which a start that has not returned to the motion of `inside` counts as
+      settling elsewhere.
+    - `tolerance`: a start has returned once a section state is this close to one of the motion,
+      relative to u + |state|, with u the largest component of the motion, at most 1. It must be
+      smaller than the basin.
     - `longest`: longest period of the edge state that is looked for, in cycles.
     - `rounds`: bisections after which the edge is called irregular.
     - `method`: as for `cycle_map`.

@@ -54,9 +54,9 @@ class Manifold(Summarized):
     """Section states along each branch from the saddle on, arrays of shape (points,); NaN where a
     curve is cut at a jump of the section map."""
     lengths: tuple[float, float] = eqx.field(static=True)
-    """Of each branch, in the units of the state; less than was asked for where it ends."""
+    """Length of each branch, in the units of the state; less than `length` if the branch ends."""
     machine: AbstractMachine
-    """What moves."""
+    """The machine."""
 
     def summary(self) -> str:
         """The branches in words."""
@@ -79,10 +79,11 @@ def manifold(
 
     The stable manifold, the states from which the machine goes to the saddle, is the boundary of
     basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the
-    zero of w·(Pⁿ(x) - xₛ) is taken, w the saddle's left unstable eigenvector (no inverse of the
-    section map is needed, and no derivative, so that it passes kinks at grazings). The unstable
-    manifold, the states that come from the saddle, is the image of a short stretch along its
-    eigenvector, with points set closer where the images part or turn. Host-side: not to be traced.
+    zero of w·(Pⁿ(x) - xₛ) is taken, with w the saddle's left unstable eigenvector. This needs
+    neither an inverse nor a derivative of the section map, so the manifold continues through kinks
+    at grazings. The unstable manifold, the states that come from the saddle, is the image of a
+    short stretch along its eigenvector, with points set closer where the images part or turn.
+    Host-side: not to be traced.
 
     **Arguments:**
 

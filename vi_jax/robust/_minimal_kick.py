@@ -43,38 +43,38 @@ class MinimalKick(Summarized):
     """The smallest change of a state after which a machine settles elsewhere."""
 
     kick: dict[str, Any]
-    """What is added to each component of the state that is kicked."""
+    """The change of each component that is kicked."""
     norm: Any
     """√(Σ (weight·kick)²)."""
     start: State
     """The state just after the kick, on the boundary of the basin."""
     cycle: int = eqx.field(static=True)
-    """In which cycle of its period the motion is kicked."""
+    """The cycle of the period in which the motion is kicked."""
     phase: Any
-    """How long after the section of that cycle, in the machine's clock."""
+    """The time of the kick after the section of that cycle, in the machine's clock."""
     settles: Orbit | None
-    """The motion that the machine settles on after a slightly harder kick; `None` where it is none
-    that repeats within `longest` cycles and that `find_orbit` finds, as an equilibrium of a machine
-    without a drive."""
+    """The motion on which the machine settles after a slightly harder kick; `None` if it does not
+    repeat within `longest` cycles or `find_orbit` fails, as for an equilibrium of a machine without
+    a drive."""
     edge: EdgeState
-    """What a motion on the boundary, where the kick leads to, settles on."""
+    """The edge state: the attractor of motions on the boundary at which the kick ends."""
     residual: Any
-    """Relative to the norm: how far the kick is from the saddle's stable manifold, or from standing
-    at a right angle on it, whichever is more. Where no saddle gives a gradient (`exact` is false)
-    how far the last kick that comes back and the first one that does not are apart."""
+    """Relative to the norm: the larger of the distance from the saddle's stable manifold and the
+    deviation from a right angle to it. If `exact` is false, the distance between the last kick that
+    returns and the first one that does not."""
     exact: bool = eqx.field(static=True)
-    """Whether the kick is exact, by the saddle and Newton's method; else only by simulations in
-    ever more directions: its norm is good to `residual` and a little more, its direction to about
-    1e-4."""
+    """Whether the kick was made exact by the saddle and Newton's method. Otherwise it was found by
+    simulations in more and more directions: its norm is accurate to about `residual`, its direction
+    to about 1e-4."""
     confirmed: bool = eqx.field(static=True)
-    """Whether by simulation the machine comes back after a kick smaller by 1e-6 of it, and settles
-    elsewhere after one larger by 1e-6 of it."""
+    """Whether simulations of 1 - 1e-6 of the kick return and those of 1 + 1e-6 of it settle
+    elsewhere."""
     others: tuple["MinimalKick", ...]
-    """Kicks in other directions that none near them undercuts, the smallest first."""
+    """Local minima of the norm in other directions, the smallest first."""
     lanes: int = eqx.field(static=True)
-    """Simulations by which starts were judged."""
+    """Number of simulations."""
     machine: AbstractMachine
-    """What moves."""
+    """The machine."""
 
     def summary(self) -> str:
         """The kick and where it leads, in words."""
@@ -138,10 +138,10 @@ def minimal_kick(
       that repeats; for a machine without a drive also an equilibrium.
     - `components`: names of the numbers of the state that are kicked, such as `["V"]`; all of them
       by default.
-    - `weights`: of some of them, by which they count in the norm, above 0; 1 by default. With
-      velocities weighed by √(m/2) and no places the norm squared is an energy.
+    - `weights`: factors of some of them in the norm, positive; 1 by default. If velocities have the
+      weight √(m/2) and positions are not kicked, the norm squared is an energy.
     - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
-    - `cycle`: in which cycle of its period an orbit of several is kicked, from 0 on.
+    - `cycle`: the cycle of an orbit of several cycles in which it is kicked, from 0 on.
     - `phase`: the time after the section of that cycle, in the machine's clock (a crank angle, or a
       time).
     - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.

@@ -166,9 +166,9 @@ def all_orbits(
 
     For each period of 1 to `cycles` drive cycles `find_orbit` searches from random starts, all in
     one compiled call. The results are sorted into different motions with their least periods. A
-    random search proves nothing complete: the result has the number of searches, how many
-    converged, and Good and Turing's estimate of the share that has not been found. Host-side: not
-    to be traced; one compiled program for each period.
+    random search may miss orbits: the result has the number of searches, how many converged, and
+    the probability that the next one finds a new orbit (Good–Turing estimate). Host-side: not to be
+    traced; one compiled program for each period.
 
     **Arguments:**
 

@@ -59,7 +59,7 @@ _BEYOND = REASON_NAMES.index("bad_start")
 
 
 class Attractor(NamedTuple):
-    """A motion on which starts have ended."""
+    """A motion on which starts settle."""
 
     label: int
     period: int
@@ -93,28 +93,28 @@ class Integrity(NamedTuple):
     centre: dict[str, float]
     """Its centre, by the names of the region."""
     local_at_edge: bool
-    """Whether the edge of the region is what ends the ball of `local`: a larger region might give a
-    larger one."""
+    """Whether the edge of the region limits the ball of `local`, so that a larger region might give
+    a larger ball."""
     factor_at_edge: bool
-    """Whether the edge of the region ends the ball of `factor`."""
+    """Whether the edge of the region limits the ball of `factor`."""
     resolution: float
-    """What the radii may be off by: half a diagonal of the grid's cells."""
+    """The uncertainty of the radii: half a diagonal of the grid's cells."""
 
 
 class Basins(NamedTuple):
-    """Basins of attraction: which motion each start settles on, and the motions themselves."""
+    """Basins of attraction: the motion that each start settles on, and these motions."""
 
     data: "xr.Dataset"
-    """`label` over the region (or over `sample`): a number in `attractors`, or below 0 for
-    what is on none (`label.attrs` says which); `period`, `impacts`, `result`, and a section state
-    on which the lane ended."""
+    """`label` over the region (or over `sample`): an index into `attractors`, or below 0 for starts
+    that settle on no periodic motion (`label.attrs` has the reasons); `period`, `impacts`,
+    `result`, and a section state on which the lane ended."""
     attractors: list[Attractor]
     """The periodic motions, the largest basin first: label i is `attractors[i]`."""
     irregular: dict[str, float]
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
     transient (transiently chaotic, see `Regime`)."""
     machine: AbstractMachine | None = None
-    """What moves; its words name the periods."""
+    """The machine."""
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in the words of the machine."""
@@ -125,9 +125,9 @@ class Basins(NamedTuple):
         anywhere.
 
         A ball ends at a cell whose start settles elsewhere, or nowhere, and at the edge of the
-        region. A stop ends no ball, since no start lies beyond it: neither a start that would, nor
-        an edge that lies on a stop. Balls lie within the region's components: if other states of a
-        motion differ from those of the starts, sections count by their place in the region.
+        region. A stop does not limit a ball, since no start lies beyond it. Balls lie within the
+        region's components: if other components of a motion differ from those of the starts,
+        sections count by their place in the region.
 
         **Arguments:** `scales`, what counts as distance 1 along parts of the start, such as
         `{"start.V": 2.0}`; 1 where left out.
@@ -173,10 +173,10 @@ class Basins(NamedTuple):
 
     def uncertainty(self, *, confidence: float = 0.95) -> Uncertainty:
         """Uncertainty exponent of the basins' boundaries: how slowly the part of uncertain starts
-        shrinks as starts are known better. It is 1 for smooth boundaries.
+        decreases with the error of the starts. It is 1 for smooth boundaries.
 
         It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its interval is
-        the uncertainty by the grid: some ±0.05 at 512 starts along each of two axes.
+        the uncertainty due to the grid: about ±0.05 at 512 starts along each of two axes.
 
         **Arguments:** `confidence` of the intervals.
 
@@ -299,9 +299,9 @@ def basins(
 ) -> Basins:
     """Find the motions that starts in a region settle on, and which start goes to which.
 
-    No motion has to be known before: where each lane has ended is compared with the motions found
-    so far, phase shifts included, and a new motion is added where none is near. Starts beyond a
-    stop count as failed.
+    No motion must be known in advance: the final motion of each start is compared with those found
+    so far, including phase shifts, and a new motion is added if none is near. Starts beyond a stop
+    count as failed.
 
     **Arguments:**
 
@@ -319,8 +319,8 @@ def basins(
 
     **Returns:** `Basins`.
 
-    **Raises:** as `scan`; on Ctrl-C `ScanInterrupted`, whose `data` says of each start that was
-    followed where it ended (`period`, and a section state).
+    **Raises:** as `scan`; on Ctrl-C `ScanInterrupted`, whose `data` has the final period and
+    section state of each start that was simulated.
     """
     machine = machine_of(machine)
     check_options(basins, options, ())

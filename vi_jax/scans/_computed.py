@@ -54,7 +54,7 @@ _PATIENCE = 10.0
 
 
 class ScanInterrupted(Interrupted):
-    """Raised when a scan is interrupted: what was computed is not lost, but in `data`."""
+    """Raised when a scan is interrupted; `data` holds the finished part."""
 
     def __init__(self, data: "xr.Dataset", store: str | Path | None):
         kept = "what was computed is in `.data`"

@@ -19,24 +19,24 @@ class BasinEntropy(NamedTuple):
     total: float
     """S_b: mean over all boxes of -Σ p ln p, with p the shares of the outcomes in a box."""
     boundary: float
-    """S_bb: the same mean over the boxes with two outcomes at least; NaN if there is none. Above
+    """S_bb: the same mean over the boxes with at least two outcomes; NaN without such a box. Above
     ln 2 the boundary is fractal; below, it may be either."""
     boxes: int
-    """Boxes in which there are starts."""
+    """Number of boxes with starts."""
     boundary_boxes: int
-    """Those among them with two outcomes at least."""
+    """Number of boxes with at least two outcomes."""
     box: int
     """Starts along each side of a box."""
 
 
 class Uncertainty(NamedTuple):
     """Final-state sensitivity, after Grebogi, McDonald, Ott and Yorke, Physics Letters A 99, 415
-    (1983): the part of the starts that an error ε may send elsewhere grows as a power of ε.
+    (1983): the part of the starts whose outcome an error ε may change grows as a power of ε.
 
     The error is one of a single part of the start at a time. Across a smooth boundary the exponent
     is 1; across a fractal one it is the dimension of the starts less that of the boundary. A
-    boundary may be smooth in one direction and fractal in another: the smallest exponent is what
-    counts as ε → 0.
+    boundary may be smooth in one direction and fractal in another: the smallest exponent decides as
+    ε → 0.
     """
 
     exponents: np.ndarray

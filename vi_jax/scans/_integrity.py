@@ -49,8 +49,8 @@ class IntegrityProfile(NamedTuple):
     """Basins over one number of a machine: the share and the integrity of each motion, also called
     an erosion profile. Thompson's Dover cliff is where they fall off.
 
-    A motion is one and the same along the values while it keeps its period and its impacts, and its
-    sections move by less than a quarter of the region from one value to the next.
+    Motions at two neighbouring values count as the same if they have the same period and number of
+    impacts, and their sections differ by less than a quarter of the region.
     """
 
     parameter: str
@@ -73,12 +73,12 @@ class IntegrityProfile(NamedTuple):
     factor: np.ndarray
     """Integrity factor; NaN where no start settles on the motion."""
     local_at_edge: np.ndarray
-    """Whether the edge of the region is what ends the ball, so that a larger region might give a
-    larger one."""
+    """Whether the edge of the region limits the ball, so that a larger region might give a larger
+    one."""
     factor_at_edge: np.ndarray
-    """Whether the edge of the region ends the ball of `factor`."""
+    """Whether the edge of the region limits the ball of `factor`."""
     resolution: float
-    """What the radii may be off by; NaN if there is no motion."""
+    """The uncertainty of the radii; NaN if there is no motion."""
     basins: list[Basins]
     """The basins at each value."""
 

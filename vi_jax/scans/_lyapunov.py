@@ -146,16 +146,16 @@ def lyapunov(
     quasi-periodic motions converges faster than any power of the number of cycles, once these are
     some tens of the motion's periods. The exponent 0 along the motion itself is not among them,
     unless the machine is autonomous: it is observed at intervals of its usual `cycle` then. A
-    motion that rests on a stop forgets its past at once: -∞, or a few powers of ten below rounding
-    in each cycle, where the release is not met to the last digit. Clean under `jit` and `vmap`.
+    motion that rests on a stop forgets its past at once: its exponent is -∞, or very negative if
+    rounding remains at the release. Works under `jit` and `vmap`.
 
     **Arguments:**
 
     - `machine`, `start`: as for `simulate`; runs in the phase clock.
     - `cycles`: drive cycles observed, at least 8; static.
     - `settle`: drive cycles before that.
-    - `number`: how many exponents, the greatest ones; all by default. Each costs about as much
-      as the simulation itself.
+    - `number`: the number of exponents, greatest first; all by default. Each costs about as much as
+      the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
     - `progress`: show a bar where more than 1024 cycles are observed, in a terminal or a notebook;

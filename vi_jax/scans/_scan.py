@@ -55,8 +55,8 @@ def scan(
 
     **Arguments:**
 
-    - `machine`: the machine, or a function of the axes' values by name that makes it (define it
-      once: another function is another program).
+    - `machine`: the machine, or a function that makes it from the axes' values by name (define it
+      once, since another function compiles again).
     - `axes`: names of numbers of the machine (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
     - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
@@ -66,8 +66,8 @@ def scan(
     - `start`: the first state; by default the machine's own start at rest.
     - `settle`, `cycles`: drive cycles before observing, and observed (static; by default 32 or
       what the measures need); `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`.
-    - `derivatives`: names, as on the axes, by which every real variable is differentiated:
-      `d_y_min` and so on, with an axis `by`.
+    - `derivatives`: names, as on the axes, with respect to which every real variable is
+      differentiated: `d_y_min` and so on, with an axis `by`.
     - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's. Lane n of the
       grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is
       an axis of amplitudes, `"noise.path"` of paths. Measures that look for a period are refused.
@@ -85,8 +85,8 @@ def scan(
       the blocks there.
     - `progress`: show a bar, in a terminal or a notebook.
 
-    **Returns:** an `xarray.Dataset` over the axes, with units; `result` says of each lane how it
-    ended (0: well; -1: not computed). With a `store` it is read lazily from there.
+    **Returns:** an `xarray.Dataset` over the axes, with units; `result` is the reason why each lane
+    ended (0: completed; -1: not computed). With a `store` it is read lazily from there.
 
     **Raises:** `ValueError` or `TypeError` before any work for unusable arguments; on Ctrl-C
     `ScanInterrupted`; `ConnectionError`, with the number of stored blocks, if the cluster is lost.

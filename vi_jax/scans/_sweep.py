@@ -222,8 +222,8 @@ def sweep(
     """Sweep one parameter slowly: run-up with rising values, close-down with falling ones.
 
     At each value the motion continues from its state at the previous one (the paper's continuation
-    method). It keeps to its branch until that ends, so up and down show hysteresis. Works under
-    `jit` and `vmap` (over other parameters, starts, or values).
+    method). It stays on its branch until that ends, so sweeps up and down show hysteresis. Works
+    under `jit` and `vmap` (over other parameters, starts, or values).
 
     **Arguments:**
 
@@ -240,7 +240,8 @@ def sweep(
       sections.
     - `progress`: show a bar, in a terminal or a notebook; not within `jit` or `vmap`.
 
-    **Returns:** a `Sweep`. A value that fails is NaN, and the next goes on from the one before it.
+    **Returns:** a `Sweep`. A value that fails is NaN, and the next one continues from the value
+    before it.
 
     **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers; on
     Ctrl-C `Interrupted`, whose `partial` is the sweep so far.

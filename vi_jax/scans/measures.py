@@ -42,7 +42,7 @@ class AbstractMeasure(eqx.Module):
     states (see `AbstractMachine.units`)."""
 
     record: ClassVar[str] = "motion"
-    """What it must see of them, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
+    """The record that it needs, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
     of impacts and steps."""
 
     def described(self, start: State) -> About:
@@ -51,20 +51,20 @@ class AbstractMeasure(eqx.Module):
 
     @property
     def cycles(self) -> int:
-        """The fewest cycles that it must see."""
+        """The least number of cycles that it needs."""
         return 1
 
     @property
     def instants(self) -> int:
-        """Samples in a cycle that it must see (`Run.samples`); 0 for none."""
+        """The samples in a cycle that it needs (`Run.samples`); 0 for none."""
         return 0
 
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
-        """This measure for motions that are carried by a method; itself, if it is no matter how."""
+        """This measure for motions computed by a method; by default itself."""
         return self
 
     def begun(self, start: State) -> "AbstractMeasure":
-        """This measure for a motion that begins in `start`; itself, if it is no matter where."""
+        """This measure for a motion that begins in `start`; by default itself."""
         return self
 
     @abc.abstractmethod
@@ -257,9 +257,9 @@ class Regime(AbstractMeasure):
     transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers that
     stand for these in `period`.
 
-    While a chaotic transient lasts, nothing tells it from chaos; what is called chaotic may leave
-    off later still. The longer `lasting`, the fewer do, and the more the chaotic lanes cost; 0
-    leaves the second pass out.
+    A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
+    later. A longer `lasting` makes this rarer and chaotic lanes more expensive; 0 leaves the second
+    pass out.
     """
 
     longest: int = eqx.field(static=True, default=64)

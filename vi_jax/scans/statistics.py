@@ -98,8 +98,8 @@ class Statistics(_Observed):
     For `"V"` they are `V_mean`, `V_error`, `V_spread` (the standard deviation) and
     `V_spread_error`. Neighbouring cycles are not independent, so the errors are those of means over
     `batches` parts of the row (batch means): right if a part is long compared with the memory of
-    the motion, too small if not. Lanes with other paths give an error without this condition, the
-    scatter of their means.
+    the motion, else too small. The scatter of the means of lanes with other paths is an error
+    without this condition.
 
     **Arguments:**
 
@@ -171,7 +171,7 @@ class Density(_Observed):
 
     The density times the size of a bin is the share of the instants in it, of all instants, those
     outside included. The bins' edges are in the attributes of `density`, by the name of the part.
-    Lanes of their own paths give its error, the scatter of theirs.
+    The scatter of lanes with their own paths gives its error.
 
     **Arguments:**
 
@@ -320,18 +320,18 @@ def escape_rate(
 ) -> "xr.Dataset":
     """Estimate the rate at which lanes escape, per cycle, with its confidence interval.
 
-    Lanes that do not escape count with the time for which they were watched: the rate is the
+    Lanes that do not escape count with the time for which they were observed: the rate is the
     number of escapes over the time of all lanes until then (maximum likelihood for escapes at a
     constant rate), and its interval that of a Poisson number (Garwood 1936), from below to 0 where
-    none escapes. An escape that is seen at instants only, `step` apart, happened between two of
-    them, which is allowed for. Host-side: not to be traced.
+    none escapes. The estimate takes into account that an escape observed at instants, `step` apart,
+    happened between two of them. Host-side: not to be traced.
 
     **Arguments:**
 
     - `data`: what `scan` found with the measure `Escape`.
     - `over`: the dimensions whose lanes are taken together; by default all of them.
-    - `after`: cycles that are left out, with the lanes that escape in them: escapes come at a
-      constant rate only once the start is forgotten. Compare two of them.
+    - `after`: cycles that are left out, with the lanes that escape in them, since the rate is
+      constant only once the start is forgotten. Compare the results of two values.
     - `confidence` of the interval.
 
     **Returns:** an `xarray.Dataset` over the other dimensions: `rate`, `rate_low` and `rate_high`
