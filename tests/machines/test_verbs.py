@@ -153,7 +153,7 @@ def test_continue_orbit(case, orbit, branch):
 def test_boundary(case, branch):
     point = next(point for point in branch.special if point.kind == case.curved)
     bounds = (case.bounds, case.ends)
-    if "fall together" in point.detail:
+    if "coincide" in point.detail:
         with pytest.raises(ValueError, match="something is touched"):
             vi.boundary(point, parameter=case.second, bounds=bounds)
         return

@@ -103,7 +103,7 @@ def test_branches_of_4pi(family):
         beside_closed_forms(branch, 0.8)
     assert doubled.cycles == 2 and doubled.impact_speed.shape[1] == 2
     assert "period-doubling" in doubled.ends
-    springs = next(p for p in doubled.special if "springs" in p.detail)
+    springs = next(p for p in doubled.special if "begins at" in p.detail)
     at = the(single, "period-doubling").parameter
     assert springs.kind == "period-doubling" and springs.parameter == pytest.approx(at, abs=1e-11)
     assert float(springs.orbit.residual) < 1e-12

@@ -137,7 +137,7 @@ def test_grazing_of_the_paper():
     labels = [text.get_text() for text in vi.plot_grazing(found).get_legend().get_texts()]
     assert labels == [f"the machine, far away: {found.afar}", "grazing"]
     ax = vi.plot_grazing(dataclasses.replace(found, machine=None, far=None))
-    assert [text.get_text() for text in ax.texts] == ["forecast: nothing near attracts"]
+    assert [text.get_text() for text in ax.texts] == ["forecast: no attractor near"]
 
 
 @pytest.mark.slow

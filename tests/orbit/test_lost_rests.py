@@ -156,4 +156,4 @@ def test_an_event_before_a_chatter_is_over():
     assert branch.ends == ("grazing", "bounds") and (branch.rests == 1).all()
     (point,) = branch.special
     assert point.parameter == pytest.approx(0.5 * np.pi - 0.6 * 1.1788045220098, abs=1e-7)
-    assert "fall together" in point.detail
+    assert "coincide" in point.detail

@@ -37,9 +37,9 @@ _ENTRIES = 24
 class SCENARIOS(NamedEnumeration):
     """Scenarios beyond a grazing, on the side of the parameter on which impacts appear."""
 
-    persistence = "the motion goes on and stays stable, now with the impact"
+    persistence = "the motion continues and stays stable, now with the impact"
     nonsmooth_fold = (
-        "it meets an unstable motion with the impact and ends with it: what follows is far away"
+        "it meets an unstable motion with the impact, and both end: the next motion is far away"
     )
     period_adding = (
         "period adding: windows of motions with one impact in n periods lie next to each other, n "
@@ -52,7 +52,7 @@ class SCENARIOS(NamedEnumeration):
     chaos = "chaos at once, its size growing as the root of the parameter"
     periodic = "other periodic motions with impacts, near the old one"
     windows_and_chaos = "other periodic motions and chaos in turn, near the old one"
-    jump = "nothing near attracts any more: what follows is far away"
+    jump = "no attractor is near: the next motion is far away"
 
 
 class Settled(NamedTuple):

@@ -314,7 +314,7 @@ class MotionTable(Table):
                 # Else it has a pole, as a multiplier at a grazing.
                 real = sense * there >= max(sense * value, sense * other) - least
                 corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
-                detail = f"{name} = {there:.10g} is {most} of all close by{corner}"
+                detail = f"{name} = {there:.10g} is the {most} nearby{corner}"
             if real:
                 yield self._point(kind, at, detail, quantity=name), at
 

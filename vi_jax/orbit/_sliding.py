@@ -42,19 +42,19 @@ SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
 SLIDING = {
     CROSSING_SLIDING: (
         "{name} passes its surface {place}, and beyond is held there for a while",
-        "{name} is held {place} no longer, and beyond passes its surface there at once",
+        "{name} is no longer held {place}, and beyond passes its surface there at once",
     ),
     GRAZING_SLIDING: (
         "{name} just touches its surface {place}, and beyond is held there for a while",
-        "{name} is held {place} no longer, and beyond does not come to its surface there",
+        "{name} is no longer held {place}, and beyond does not come to its surface there",
     ),
     SWITCHING_SLIDING: (
         "{name} is held {place} at once, and beyond first passes and comes back",
-        "{name} passes and comes back {place} no longer, and beyond is held there at once",
+        "{name} no longer passes and comes back {place}, and beyond is held there at once",
     ),
     ADDING_SLIDING: (
         "{name} is just held {place}, and beyond leaves its surface and comes back",
-        "{name} leaves its surface {place} no longer, and beyond is held there throughout",
+        "{name} no longer leaves its surface {place}, and beyond is held there throughout",
     ),
 }
 

@@ -34,21 +34,21 @@ DETAILS = {
     CROSSING: "a multiplier passes 1 and another branch crosses",
     SYMMETRY: "a multiplier passes 1 and the motion loses its symmetry",
     TORUS: "a complex pair of multipliers leaves the unit circle",
-    TURN: "the parameter turns back where it is followed under conditions",
-    TURNS: "a multiplier touches 1: this branch leaves another one to both sides",
+    TURN: "the parameter turns back while other quantities are held",
+    TURNS: "a multiplier touches 1: this branch begins at another one, on both sides",
     HELD_FOLD: "a multiplier passes 1",
-    HOPF: "the motion shrinks to rest",
-    FROM_HALF: "the branch springs from a motion of half the period",
-    FROM_SYMMETRIC: "the branch springs from a symmetric motion",
-    REORDERED: "two of its events fall together, and come in another order beyond",
+    HOPF: "the motion shrinks to an equilibrium",
+    FROM_HALF: "the branch begins at a motion of half the period",
+    FROM_SYMMETRIC: "the branch begins at a symmetric motion",
+    REORDERED: "two of its events coincide, and happen in another order beyond",
     ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
 
 # How a branch words the end of a rest, by the event or the change at which it ends.
 RESTS = {
-    LANDS: "a rest on a stop is lost: its chatter takes until the stop lets go",
+    LANDS: "a rest on a stop is lost: its chatter lasts until the release",
     LEAVES: "a rest on a stop is divided {place}, where the force on the body falls to zero",
-    REORDERED: "two rests on a stop become one: the body leaves it {place} no longer",
+    REORDERED: "two rests on a stop become one: the body no longer leaves it {place}",
 }
 
 # What begins at a resonant grazing of a machine with more than two numbers in its state.

@@ -34,7 +34,7 @@ class Point(InWords):
     kind: str
     """On a branch "fold", "period-doubling", "neimark-sacker", "branch-point", "symmetry-breaking"
     (where motions that are their own image under the symmetry of their machine meet some that are
-    not), "grazing", "hopf" (an autonomous machine's motion shrinks to rest), "rest" (a rest on a
+    not), "grazing", "hopf" (a motion shrinks to an equilibrium), "rest" (a rest on a
     stop is lost, divided, or joined to another one), "crossing-sliding", "grazing-sliding",
     "switching-sliding" or "adding-sliding" (a part in which a switch is held on its surface, as by
     dry friction, vanishes or appears; see the `detail`), "extremum" (of a `quantity` that was asked

@@ -47,7 +47,7 @@ def plot_grazing(
         _draw_machine(ax, found, found.machine)
     period = found.forecast.period
     if found.far is None and not (period >= 0).any():
-        ax.text(0.5, 0.6, "forecast: nothing near attracts", transform=ax.transAxes, ha="center")
+        ax.text(0.5, 0.6, "forecast: no attractor near", transform=ax.transAxes, ha="center")
     for n in sorted(set(period[period >= 0]), key=lambda n: (n == 0, n)):
         lanes = period == n
         across, up = _dots(found.forecast.offset[lanes], found.forecast.position[lanes])
