@@ -121,7 +121,7 @@ def test_a_cluster_that_loses_its_scheduler_says_how_to_go_on(tmp_path, monkeypa
         client.wait_for_workers(1, timeout=60)
         with monkeypatch.context() as patched:
             patched.setattr(ZarrStore, "write", written)
-            told = r"was lost, or its scheduler. (\d+) of 12 blocks .* kept in .*store: the same"
+            told = r"was lost, or its scheduler. (\d+) of 12 blocks .* stored in .*store. The same"
             with pytest.raises(ConnectionError, match=told) as lost:
                 vi.scan(scene, axes, **options, cluster=client, store=store)
         done = int(re.search(told, str(lost.value))[1])
