@@ -204,7 +204,7 @@ def test_machines_of_ones_own(run, here, monkeypatch, head, period):
     out = run("scan", head + BODY)
     assert f"period {period}: 4 (100.0 %)" in out and is_png("s.png")
     said = run("simulate", 'machine = "mine.py:Body"\n' + BODY, 2)
-    assert said.count("\n") == 1 and "`start` must be given for a Body" in said
+    assert said.count("\n") == 1 and "`start` is missing, and Body has no method `start`" in said
     said = run("simulate", 'machine = "mine.py:Body"\n[start]\nY = 1\n' + BODY, 2)
     assert said.count("\n") == 1 and "State(Y=1)" in said
 

@@ -139,7 +139,7 @@ def test_a_machine_says_how_it_is_drawn():
     plain = vi.plot_sketch(own, start, ax=Figure().subplots())
     assert len(plain.patches) == 2  # a body, filled and outlined
     assert len(plain.lines) > 4  # two walls, the ground
-    with pytest.raises(ValueError, match="`start` must be given"):
+    with pytest.raises(ValueError, match="`start` is missing"):
         vi.plot_sketch(own)
     ax = Figure().subplots()
     sketch(drawn, vi.plot.Pen(ax), start, 0.25)

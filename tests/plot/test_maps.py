@@ -87,10 +87,25 @@ def test_axes_by_name_single_rows_and_what_was_not_computed():
     assert list(_legend(vi.plot_regimes(one, ax=_axes()))) == wanted
 
 
+def test_outcomes_have_colours():
+    """Lanes that an event ended, beside periods and without any."""
+    data = _data(PERIODS[:2], x=(0.5, 0.7), result=np.zeros((2, 3)))
+    ends = np.array([[-1, 0, 1], [-1, -1, 0]])
+    meanings = {"flag_values": [-1, 0, 1], "flag_meanings": "none fell_left fell_right"}
+    data["outcome"] = (data["period"].dims, ends.astype(np.int8), meanings)
+    beside, alone = data, data.drop_vars("period")
+    for data, others in ((beside, 2), (alone, 1)):
+        ax = vi.plot_regimes(data, ax=_axes())
+        cells, legend = _cells(ax)[0], _legend(ax)
+        assert len(legend) == others + 2 == len(set(legend.values()))
+        for number, name in enumerate(("fell_left", "fell_right")):
+            assert {tuple(c) for c in cells[ends == number]} == {legend[name]}
+
+
 def test_maps_need_two_axes():
     with pytest.raises(ValueError, match="two axes"):
         vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
-    with pytest.raises(ValueError, match="must hold `period`"):
+    with pytest.raises(ValueError, match="must hold `period` or `outcome`"):
         vi.plot_regimes(_data().drop_vars("period"))
     with pytest.raises(ValueError, match="two axes"):
         vi.plot_regimes(_data().isel({"stops.0.restitution": 0}))

@@ -24,6 +24,7 @@ from ..machine import (
     cycle_time,
     frequency_ratio,
     modes_of,
+    others_of,
     outcomes_of,
     stated,
 )
@@ -261,7 +262,9 @@ def _log(plan: Plan, entries: Any) -> ImpactLog:
 def _events(plan: Plan, entries: Any) -> EventLog:
     """The first `plan.events` events of each cycle, from those of its intervals."""
     phase, code, number, value = _by_cycle(plan, entries, used=1)
-    return EventLog(as_logged(plan.machine, phase), _numbers(code), _numbers(number), value)
+    names = tuple(event.name for event in others_of(plan.machine))
+    clock = as_logged(plan.machine, phase)
+    return EventLog(clock, _numbers(code), _numbers(number), value, names)
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:

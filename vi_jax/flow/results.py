@@ -189,15 +189,18 @@ class EventLog(Summarized):
     value: Float[Array, "cycles size"]
     """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
     of a reset what its `value` says; NaN for a release."""
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the machine's resets, by number; "" for one without a name."""
 
     def summary(self) -> str:
         """Events of the first cycles: what, of which stop, switch or event, where on the clock."""
 
         def word(i: int, j: int) -> str:
-            kind = EVENTS[int(self.kind[i, j])]
+            kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            return f"{kind} ({of} {self.number[i, j]}{after}) at {self.phase[i, j]:.6g}"
+            name = self.names[number] if kind == "reset" and self.names else None
+            return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
 
         return _listed("event", self.number >= 0, word)
 

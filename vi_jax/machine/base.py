@@ -156,8 +156,8 @@ class AbstractMachine(Shown):
         **Raises:** `ValueError` where this machine has none.
         """
         raise ValueError(
-            f"Argument `start` must be given for a {type(self).__name__}, which has no `start` of "
-            "its own."
+            f"Argument `start` is missing, and {type(self).__name__} has no method `start`. Pass a "
+            "state, or write `def start(self): return vi.State(...)` in the class."
         )
 
     @by_default

@@ -360,7 +360,7 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
     others = [kind == EventKind.mode, kind == EventKind.reset]
     number = number + np.select(others, [stops, stops + switches], 0)
     places = zip(*np.nonzero(kind >= 0), strict=True)
-    return [(n, float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
+    return [(int(n), float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
 
 
 @compiled

@@ -25,6 +25,9 @@ PERIODS = (
 # The 4π motions that hit more than once: darker, as they are another family.
 MORE_IMPACTS = "#a3480b"
 
+# Outcomes with which events end a motion, by number; no period has these.
+OUTCOMES = ("#009e73", "#aaaa00", "#ee8866", "#99ddff")
+
 # The less regular, the darker; what failed is white.
 IRREGULAR = {
     REGIMES.unsettled: "#b9b9b9",

@@ -19,7 +19,7 @@ from ..machine import AbstractMachine, by_name, cycles_in_words, in_brackets, un
 from ..scans import NOT_COMPUTED, REGIMES, Basins
 from . import colors as look
 from .branch import axis_name
-from .colors import IRREGULAR, PERIODS, color_of, shades
+from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, shades
 from .motion import new_axes
 
 # What was not computed lies below all regimes.
@@ -31,6 +31,8 @@ _OTHERS = {
 }
 # Added to a period, by impacts: none, one in two cycles, more than one in two cycles.
 _NONE, _ONE, _MORE = 100, 200, 300
+# Added to the number of an outcome; the code of a motion that none ended, if no period is known.
+_OUTCOME, _GOES_ON = 1000, 999
 
 # Motions named one by one in the legend; further ones share its last line.
 _NAMED = 12
@@ -45,40 +47,39 @@ def plot_regimes(
     y: str | None = None,
     legend: bool = True,
 ) -> Axes:
-    """Draw a map of the regimes of motion over two axes of a scan.
+    """Draw a map of the regimes of motion, or of outcomes, over two axes of a scan.
 
     Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
     chaotic, unsettled and failed lanes have different greys. If the data hold `impacts`, motions
     without any are paler, and motions of two cycles with one impact and with more have different
-    colours. The legend names the colours that occur.
+    colours. A lane that an event ended has the colour of its outcome. The legend names the colours
+    that occur.
 
-    **Arguments:** the data of a scan that measured `"regime"`; `machine`, whose words name the
+    **Arguments:** the data of a scan that measured `"regime"`, or of a machine whose events or
+    stops have outcomes (`ends="overturned"`); `machine`, whose words name the
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
     into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
     the second of the scan if left out; `legend`, whether to draw one, on the right of the axes.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if there is no period in the data, or not over two axes.
+    **Raises:** `ValueError` if there is no period and no outcome in the data, or not over two axes.
     """
     legend = flag("legend", legend)
-    if "period" not in data:
-        raise ValueError('Argument `data` must hold `period`: scan with measure="regime".')
-    period = data["period"]
-    x, y = _two_axes([str(name) for name in period.dims], x, y)
-    period = period.transpose(y, x)
-    codes = np.clip(np.asarray(period).astype(int), _LEAST + 1, len(PERIODS))
-    if "impacts" in data:
-        impacts = np.asarray(data["impacts"].transpose(y, x), float)
-        free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
-        codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
-    if "result" in data:
-        codes[np.asarray(data["result"].transpose(y, x)) == NOT_COMPUTED] = _LEAST
+    if "period" not in data and "outcome" not in data:
+        raise ValueError(
+            "Argument `data` must hold `period` or `outcome`, but holds "
+            f'{", ".join(str(name) for name in data.data_vars)}. Scan with measure="regime".'
+        )
+    kind = data["period" if "period" in data else "outcome"]
+    x, y = _two_axes([str(name) for name in kind.dims], x, y)
+    codes = _codes(data.transpose(y, x, ...))
     word = _word_of(data) if machine is None else partial(cycles_in_words, machine)
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
     present = sorted({int(code) for code in codes.flat}, key=_place)
-    names, colors = zip(*(_named(code, word) for code in present), strict=True)
+    outcomes = data["outcome"].attrs["flag_meanings"].split()[1:] if "outcome" in data else []
+    names, colors = zip(*(_named(code, word, outcomes) for code in present), strict=True)
     shown = np.searchsorted(np.sort(present), codes)
     order = np.argsort(present)
     _image(ax, across, up, shown, [colors[i] for i in order])
@@ -89,17 +90,43 @@ def plot_regimes(
     return ax
 
 
+def _codes(data: xr.Dataset) -> np.ndarray:
+    """The code of each lane: of its regime, or of its outcome."""
+    if "period" in data:
+        codes = np.clip(np.asarray(data["period"]).astype(int), _LEAST + 1, len(PERIODS))
+    else:
+        failed = np.isin(np.asarray(data["result"]), (0, NOT_COMPUTED), invert=True)
+        codes = np.where(failed, int(REGIMES.failed), _GOES_ON)
+    if "period" in data and "impacts" in data:
+        impacts = np.asarray(data["impacts"], float)
+        free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
+        codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
+    if "outcome" in data:
+        outcome = np.asarray(data["outcome"]).astype(int)
+        codes = np.where(outcome >= 0, _OUTCOME + outcome, codes)
+    if "result" in data:
+        codes[np.asarray(data["result"]) == NOT_COMPUTED] = _LEAST
+    return codes
+
+
 def _place(code: int) -> tuple[int, int]:
-    """Place of a code in the legend: by period, and by impacts within one."""
+    """Place of a code in the legend: by period, and by impacts within one; then outcomes."""
     if code <= 0:
-        return 1, list(_OTHERS).index(code)
+        return 2, list(_OTHERS).index(code)
+    if code >= _GOES_ON:
+        return 1, code
     return 0, 1000 * (code % 100) + code
 
 
-def _named(code: int, word: Callable[[int], str]) -> tuple[str, str]:
-    """Name and colour of a regime."""
+def _named(code: int, word: Callable[[int], str], outcomes: Sequence[str]) -> tuple[str, str]:
+    """Name and colour of a regime or an outcome."""
     if code <= 0:
         return _OTHERS[code]
+    if code == _GOES_ON:
+        return "goes on", IRREGULAR[REGIMES.unsettled]
+    if code >= _OUTCOME:
+        number = code - _OUTCOME
+        return outcomes[number], OUTCOMES[number % len(OUTCOMES)]
     cycles, most = code % 100, len(PERIODS)
     name = f"> {word(most - 1)}" if cycles == most else word(cycles)
     kind, impacts = {
@@ -201,8 +228,12 @@ def _basin_colors(found: Basins) -> list[str]:
 def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]:
     if len(names) != 2:
         raise ValueError(
-            f"A map needs two axes, but these data have {len(names)} ({', '.join(names)}). Select "
-            "from the others first, with `data.sel(...)`."
+            f"A map needs two axes, but these data have {len(names)} ({', '.join(names)}). "
+            + (
+                "Select from the others first, with `data.sel(...)`."
+                if len(names) > 2
+                else "Scan a second number, or draw this one by `vi.plot_sweep` of a `vi.sweep`."
+            )
         )
     if x is None:
         x = names[0] if y != names[0] else names[1]

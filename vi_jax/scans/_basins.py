@@ -53,6 +53,7 @@ from ._lane_noise import START
 from ._scan import LanesFailed, scan
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
+from .program import check_leaf_name
 from .regime import CODES, REGIMES, flags, size_of
 
 _BEYOND = REASON_NAMES.index("bad_start")
@@ -326,12 +327,14 @@ def basins(
     check_options(basins, options, ())
     given_number("apart", apart, low=0.0, open_low=True)
     axes = starts_in(region, resolution, samples, count("seed", seed))
+    begin = machine.start() if start is None else start
+    for name in axes:
+        check_leaf_name(machine, begin, name, "region", None)
     method = chosen(machine, method)
     data = followed(
         machine, axes, longest, tolerance, start=start, settle=settle, method=method,
         paired=samples is not None, progress=progress, **options,
     )  # fmt: skip
-    begin = machine.start() if start is None else start
     kept = partial(ScanInterrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
         return sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)

@@ -212,7 +212,8 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
     }
     machine, start = program.at(blocks, 0)
     if outcomes_of(machine):
-        outcomes = {name: i for i, name in enumerate(outcomes_of(machine))}
+        names = [name.replace(" ", "_") for name in outcomes_of(machine)]
+        outcomes = {name: i for i, name in enumerate(names)}
         known["outcome"] = {
             "long_name": "outcome with which an event ended the motion",
             **flags({"none": -1} | outcomes),

@@ -351,10 +351,10 @@ def check_leaf_name(
     )
     if own in leaf_names(tree):
         return
-    check_name(
-        [*components(machine), *(START + n for n in components(bare(start)))], name, argument,
-        machine,
-    )  # fmt: skip
+    names = [START + n for n in components(bare(start))]
+    if part_of(name) != START:
+        names = [*components(machine), *names]
+    check_name(names, name, argument, machine)
 
 
 def _corners(blocks: Blocks) -> np.ndarray:
