@@ -141,6 +141,8 @@ def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any
 
 def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
+    if along == "sample":  # the picture shows where between samples an impact is
+        options.setdefault("impact_log", 8)
     run, cut = _kept(run_in_parts, machine, machine.start() if start is None else start, **options)
 
     def table() -> Any:
