@@ -173,9 +173,28 @@ class Assigns(Machine):
         return x
 
 
+class Blind(Machine):
+    events = (vi.Reset(lambda m, s, x: x.Y), vi.Switch(lambda m, s, x: x.V))
+
+    def field(self, s, x, side):
+        return super().field(s, x)
+
+
+class Spare(Machine):
+    events = vi.Switch(lambda m, s, x, side: x.V)
+
+
 @pytest.mark.parametrize(
     ("call", "says"),
     [
+        (
+            lambda: simulate(Blind()),
+            "`guard` of a Reset of a Blind must take the machine, `s`, the",
+        ),
+        (
+            lambda: simulate(Spare()),
+            "of a Switch of a Spare must take the machine, `s`, the state: m",
+        ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
         (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),

@@ -224,8 +224,8 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
         )
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise TypeError(
-            f"Argument `{argument}` must be a state of this machine, but got {state!r}, of which "
-            f"its `field` says: {error}"
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}, whose "
+            f"rate cannot be computed: {error}"
         ) from None
 
 

@@ -1,5 +1,7 @@
 """The field of a machine in its modes, with the forces of its contacts."""
 
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,6 +19,22 @@ def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
     themselves. The modes of switches come first, in their order."""
     hidden = {i for i, x in enumerate(switches_of(machine)) if x.acts}
     return tuple(mode for i, mode in enumerate(modes) if i not in hidden)
+
+
+def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
+    """Return what a function of a machine's event returns.
+
+    **Raises:** `TypeError` that names the function, `whose`, if it takes other arguments.
+    """
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        modes = len(arguments) - 3
+        more = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
+        raise TypeError(f"{whose} must take the machine, `s`, the state{more}: {error}.") from None
+    except ValueError:
+        pass  # it has no signature
+    return function(*arguments)
 
 
 def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:

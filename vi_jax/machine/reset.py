@@ -8,7 +8,7 @@ import equinox as eqx
 from .._checks import one_of
 from .event import AbstractEvent
 from .events import modes_after, struck_modes
-from .field import shown_modes
+from .field import called, shown_modes
 from .own import with_static
 from .state import changed
 
@@ -77,7 +77,7 @@ class Reset(AbstractEvent):
 
     def guard(self, machine, s, state, *modes):
         """The function `guard` of this state."""
-        found = self._guard(machine, s, state, *shown_modes(machine, modes))
+        found = self._called("guard", self._guard, machine, s, state, modes)
         return -found if self.direction == "falling" else found
 
     def one_way(self) -> "tuple[Reset, ...]":
@@ -90,7 +90,7 @@ class Reset(AbstractEvent):
         """As `reset` and `modes` say."""
         own = None
         if self._modes is not None:
-            found = self._modes(machine, s, state, *shown_modes(machine, modes))
+            found = self._called("modes", self._modes, machine, s, state, modes)
             own = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
         return new, struck_modes(machine, s, new, modes, own)
@@ -99,8 +99,12 @@ class Reset(AbstractEvent):
         """The state that the function `reset` makes of this one."""
         if self._reset is None:
             return state
-        found = self._reset(machine, s, state, *shown_modes(machine, modes))
+        found = self._called("reset", self._reset, machine, s, state, modes)
         return changed(state, found, self._whose("reset", machine))
+
+    def _called(self, part, function, machine, s, state, modes):
+        whose = self._whose(part, machine)
+        return called(function, whose, machine, s, state, *shown_modes(machine, modes))
 
     def _whose(self, part: str, machine: Any) -> str:
         return f"`{part}` of {self.name or 'a Reset'} of a {type(machine).__name__}"
@@ -109,10 +113,10 @@ class Reset(AbstractEvent):
         """The result of the function `when` for this state, `None` without one."""
         if self._when is None:
             return None
-        return self._when(machine, s, state, *shown_modes(machine, modes))
+        return self._called("when", self._when, machine, s, state, modes)
 
     def value(self, machine, s, state, *modes):
         """The function `value` of this state, NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
-        return self._value(machine, s, state, *shown_modes(machine, modes))
+        return self._called("value", self._value, machine, s, state, modes)

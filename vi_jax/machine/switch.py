@@ -9,7 +9,7 @@ from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, Scalars, State
 from .event import AbstractSwitch, Around
-from .field import field_in, rate_of
+from .field import called, field_in, rate_of
 
 
 class Switch(AbstractSwitch):
@@ -46,7 +46,8 @@ class Switch(AbstractSwitch):
 
     def begin(self, machine, s, state):
         """The sign of the function."""
-        value = self.function(machine, s, state)
+        whose = f"The function of {self.name or 'a Switch'} of a {type(machine).__name__}"
+        value = called(self.function, whose, machine, s, state)
         rate = jnp.ones_like(value) if self.rate is None else self.rate(machine, s, state)
         positive = (value > 0) | ((value == 0) & (rate >= 0))
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
