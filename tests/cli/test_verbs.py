@@ -167,6 +167,7 @@ def test_orbit_and_its_branch(run):
     text = """[orbit]
         guess = { Y = 1.9, V = 1.54 }
         picture = "o.png"
+        output = "o.csv"
         root_finder = { class = "vi_jax:Newton", tolerance = 1e-9 }
         [continue]
         parameter = "drive.frequency_ratio"
@@ -177,6 +178,12 @@ def test_orbit_and_its_branch(run):
     out = run("continue", text)
     assert "Orbit of period 2π with 1 impact, stable" in out and "Branch of " in out
     assert is_png("o.png") and is_png("c.png")
+    (motion,) = rows("o.csv")
+    scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05)
+    speed = float(vi.closed_form_orbits(scene).impact_speed[0])
+    lost = 0.5 * (1 - float(scene.stops[0].restitution) ** 2) * speed**2
+    assert float(motion["impact_energy"]) == pytest.approx(lost, abs=1e-8)
+    assert motion["stability"] == "stable" and motion["impacts"] == "1"
     table = rows("c.csv")
     ends = sorted(float(row["drive.frequency_ratio"]) for row in (table[0], table[-1]))
     np.testing.assert_allclose(ends, [0.88, 0.92], atol=1e-12)

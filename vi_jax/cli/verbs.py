@@ -290,7 +290,16 @@ def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0
     draw = lambda figure: plot.plot_phase_portrait(
         found.trajectory(), machine, ax=figure.subplots()
     )
-    return Found([str(found)], lambda: found.to_xarray(along="section"), draw, result=found)
+
+    def table() -> Any:  # a row for each section state, with the numbers of the whole motion
+        whole = found.to_xarray().data_vars.items()
+        numbers = {name: x for name, x in whole if not x.dims}
+        energy = found.trajectory().impact_energy
+        if energy is not None:
+            numbers["impact_energy"] = xr.DataArray(float(energy.sum()))
+        return found.to_xarray(along="section").assign(numbers)
+
+    return Found([str(found)], table, draw, result=found)
 
 
 def _continue(orbit: Any, options: dict[str, Any], *, y: str | None = None) -> Found:
