@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.optimize import brentq
 
 
 class Oscillator(vi.AbstractMachine):
@@ -59,3 +60,28 @@ def test_a_curve_in_two_parameters_does_too():
     assert curve.ends == ("bounds", "bounds")
     gap, omega = curve.parameters.T
     np.testing.assert_allclose(gap, amplitude(omega), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_flights_of_a_long_period_have_the_steps_of_the_longest():
+    """Twelve impacts in sixteen cycles: its multipliers are those of the cycle map, and it begins
+    where a multiplier of the motion of eight cycles is -1, in each interval of the parameter."""
+    at = 2.2836
+    scene = vi.Scene.ideal(frequency_ratio=at, restitution=0.8, gap=0.2, damping_ratio=0.02)
+    last = vi.simulate(scene, scene.start(), 1, settle=3000).last
+    orbit = vi.find_orbit(scene, last, cycles=16, impact_log=16, throw=True)
+    followed = dict(parameter="drive.frequency_ratio", max_step=0.2)
+    for width in (1e-3, 1e-2):
+        branch = vi.continue_orbit(orbit, bounds=(at - width, at + width), **followed)
+        # The longest flight takes less than two cycles.
+        assert branch.problem.steps == 3 * 16
+        here = np.argmin(abs(branch.parameter - at))
+        assert abs(branch.parameter[here] - at) < 1e-12
+        np.testing.assert_allclose(branch.multipliers[here], orbit.multipliers, atol=1e-8)
+        assert branch.ends == ("bounds", "period-doubling")
+    half = branch.special[-1].orbit
+    assert int(half.cycles) == 8
+    halves = vi.continue_orbit(half, bounds=(at - 1e-3, at + 1e-3), **followed)
+    greatest = lambda there: float(halves.at(there)[0].multipliers[0].real)
+    place = brentq(lambda there: greatest(there) + 1, at + 6e-4, at + 6.3e-4, xtol=1e-14)
+    assert branch.special[-1].parameter == pytest.approx(place, abs=1e-11)

@@ -10,7 +10,7 @@ from ..machine import check_leaf, leaf
 from ._conditions import Special, exchange_at, is_defective
 from ._corrector import advance, tangent_at
 from ._follow import both_ways, check_walk
-from ._problem import check_parameter, steps_of
+from ._problem import check_parameter, flown, steps_of
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._special_table import Intervals, SpecialTable
@@ -129,7 +129,7 @@ def _special_motion(
         old, start, impact = without_part(old, point.step, change)
     two = dataclasses.replace(old, parameters=(parameter, *old.parameters))
     corners = two.corners(bounds)
-    steps = max(old.steps, steps_of(old.method, corners, old.like, old.cycles))
+    steps = max(old.steps, steps_of(old.method, corners, old.like, flown(old, start)))
     problem = dataclasses.replace(two, steps=steps)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)

@@ -15,7 +15,7 @@ from ._conditions import as_held, names_of, rates_at
 from ._corrector import Step, advance, tangent_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
-from ._problem import check_parameter, problem_of, sized, steps_of
+from ._problem import check_parameter, flown, problem_of, sized, steps_of
 from ._rest_legs import legs_of
 from ._shooting import Shooting
 from .curve import Branch
@@ -181,7 +181,8 @@ def _freed(
         problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
     )
     corners = wide.corners(ranges)
-    steps = max(problem.steps, steps_of(problem.method, corners, problem.like, problem.cycles))
+    needed = steps_of(problem.method, corners, problem.like, flown(problem, x))
+    steps = max(problem.steps, needed)
     wide = dataclasses.replace(wide, steps=steps)
     return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
 

@@ -128,7 +128,7 @@ def zero_near(
 
     try:
         shift, report = newton(  # pyright: ignore[reportAssignmentType]
-            value, 0.0, x1=1e-6, tol=1e-14, full_output=True, disp=False
+            value, 0.0, x1=1e-6, tol=1e-12, full_output=True, disp=False
         )
         near = report.converged and abs(shift) < _CLOSE and not np.isnan(value(float(shift)))
     except NoValueError:

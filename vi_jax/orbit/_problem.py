@@ -1,6 +1,7 @@
 """The equations of an orbit from impact to impact, made from one that was found."""
 
 import dataclasses
+from collections.abc import Sequence
 from math import ceil
 from typing import NamedTuple, TypeVar
 
@@ -42,7 +43,7 @@ from ..machine import (
     with_leaf,
 )
 from ._corrector import Unknowns, off_by
-from ._flight import Event, Flight, guard_at, section_of
+from ._flight import LANDS, Event, Flight, guard_at, section_of
 from ._shooting import Shooting
 from .results import Orbit
 
@@ -88,14 +89,35 @@ def fixed_step_method(
 def steps_of(
     method: AbstractMethod, machines: list[AbstractMachine], like: State, cycles: int
 ) -> int:
-    """Steps that a flight over the whole period needs, in the most demanding of the machines.
+    """Steps that a flight over so many cycles needs, in the most demanding of the machines.
 
     **Arguments:** the method; the machines at the ends of the interval of a parameter; a state, for
-    its structure; the period in cycles.
+    its structure; the cycles.
     """
     # Turning points are looked for between steps: more of them than flying needs.
     fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
     return max(method.steps_per_cycle, 16, *fewest) * cycles
+
+
+def cycles_flown(
+    places: Sequence[float], events: Sequence[Event], period: float, cycles: int
+) -> int:
+    """Cycles for which each leg gets steps: those of the longest leg, rounded up, and one more,
+    since legs grow along a branch; all, where a chatter takes its share of them.
+
+    **Arguments:** the clock at the events; the events; the period by the clock, and in cycles.
+    """
+    if not events or any(event.use == LANDS for event in events):
+        return cycles
+    longest = float(np.diff([*places, places[0] + period]).max())
+    return min(cycles, ceil(longest / period * cycles) + 1)
+
+
+def flown(problem: Shooting, x: Unknowns) -> int:
+    """The `cycles_flown` of a solution."""
+    x = jnp.asarray(x)
+    places = np.asarray(problem.parts(x)[0])
+    return cycles_flown(places, problem.events, float(problem.period(x)), problem.cycles)
 
 
 @compiled
@@ -179,10 +201,12 @@ def problem_of(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
             f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
-    steps = steps_of(carried, corners, bare(orbit.state), cycles)
-    found = events_in(orbit)
+    found, autonomous = events_in(orbit), is_autonomous(machine, bare(orbit.state))
+    period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
+    places, events = [place for place, _ in found], tuple(event for _, event in found)
+    needed = cycles_flown(places, events, period, cycles)
+    steps = steps_of(carried, corners, bare(orbit.state), needed)
     blank = Shooting(machine, carried, bare(orbit.state), cycles, (), (), steps, (parameter,))
-    period = float(orbit.duration) if blank.autonomous else float(machine.cycle) * cycles
     way = _followed(blank, orbit.state, found, period)
     _check_instants(blank, found, way)
     while sized_by_motion(blank):
@@ -194,9 +218,9 @@ def problem_of(
         blank, way = doubled, again  # the finer one: along the branch flights may ask for more
         if apart < _SETTLED:
             break
-    problem = dataclasses.replace(blank, events=tuple(event for _, event in found), modes=way.modes)
+    problem = dataclasses.replace(blank, events=events, modes=way.modes)
     states = way.states[:-1] if found else way.states
-    x = problem.pack([place for place, _ in found], states, [leaf(machine, parameter)], period)
+    x = problem.pack(places, states, [leaf(machine, parameter)], period)
     return sized(problem, x), np.asarray(x)
 
 

@@ -22,9 +22,12 @@ from ._solution import sections_of
 def several(old: Shooting, n: int) -> Shooting:
     """The equations of a motion that is gone through n times."""
     events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
+    steps = old.steps * n  # whole periods, of which a chatter takes a share
+    if events and not old.landings:
+        steps = old.steps  # the legs are as long as before
     return dataclasses.replace(
         old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),
-        steps=n * old.steps,
+        steps=steps,
     )  # fmt: skip
 
 
@@ -50,7 +53,8 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
     turn = float(problem.period(x)) / 2
     half = dataclasses.replace(
         problem, cycles=problem.cycles // 2, events=problem.events[:legs],
-        modes=problem.modes[: max(1, legs)], steps=problem.steps // 2,
+        modes=problem.modes[: max(1, legs)],
+        steps=problem.steps if legs else problem.steps // 2,
     )  # fmt: skip
     clock, states = (np.asarray(a) for a in problem.parts(x))
     if legs:
