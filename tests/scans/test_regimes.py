@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.scans import _basins
 from vi_jax.scans.regime import least_period
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
@@ -122,19 +123,25 @@ class Small(vi.AbstractMachine):
         return vi.State(x=0.3 * self.length, v=0.0 * self.length)
 
 
-def test_small_motions_are_compared_by_their_own_size():
-    """In any unit of length two frequencies do not repeat, and two wells are two motions."""
-    lengths, options = [1.0, 1e-6, 1e-9], {"settle": 60, "progress": False}
+def test_motions_are_compared_by_their_own_size(monkeypatch):
+    """In any unit of length two frequencies do not repeat, and two wells are two motions, told
+    apart by few comparisons."""
+    lengths, options = [1.0, 1e-6, 1e-9, 1e6], {"settle": 60, "progress": False}
+    compared, shares, distance = [], [], _basins.distance
+    monkeypatch.setattr(_basins, "distance", lambda *a: compared.append(a) or distance(*a))
     data = vi.scan(
         Small(1.0, 0.0, 0.0), {"length": lengths}, measure=vi.Regime(longest=8), **options
     )
-    assert data.period.values.tolist() == [vi.REGIMES.unsettled] * 3
+    assert data.period.values.tolist() == [vi.REGIMES.unsettled] * 4
     for length in lengths:
         swept = vi.sweep(Small(length, 0.0, 0.0), "damping", [0.0], cycles=16, **options)
         assert swept.period.tolist() == [vi.REGIMES.unsettled]
         region = {"start.x": (-length, length)}
-        found = vi.basins(Small(length), region, resolution=4, longest=2, **options)
-        assert len(found.attractors) == 2
+        found = vi.basins(Small(length), region, resolution=32, longest=2, **options)
+        shares.append([attractor.starts for attractor in found.attractors])
+        assert len(compared) < 16
+        compared.clear()
+    assert len(shares[0]) == 2 and sum(shares[0]) == 32 and shares == shares[:1] * 4
 
 
 class Turning(vi.AbstractMachine):
