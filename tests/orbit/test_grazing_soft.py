@@ -32,8 +32,8 @@ class Soft(vi.AbstractMachine):
 SWING = 1 / np.hypot(0.5, 0.4)
 
 
-def soft_grazing(**options):
-    machine = Soft(vi.SoftStop(1.1 * SWING, 30.0, **options))
+def soft_grazing(stiffness=30.0, **options):
+    machine = Soft(vi.SoftStop(1.1 * SWING, stiffness, **options))
     return grazing_of(machine, "stop.gap", (0.9 * SWING, 1.2 * SWING))
 
 
@@ -42,11 +42,14 @@ def test_soft_stops():
     """The impulse of a spring K over the parabola of the depth is K (4/3) √(2/a) y³. A prestressed
     one, at which the field jumps, turns the body back with a + F0 by its force F0. A dashpot that
     may not pull has an impulse of y²."""
-    found = vi.grazing(soft_grazing(), check=False)
-    assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
-    impulse = -30 * 4 / 3 * np.sqrt(2 / SWING)
-    np.testing.assert_allclose(found.kick[0], [0, impulse], rtol=2e-3, atol=2e-3 * -impulse)
+    for stiffness in (1e-3, 1e8, 30.0):
+        found = vi.grazing(soft_grazing(stiffness), check=False)
+        assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
+        impulse = -stiffness * 4 / 3 * np.sqrt(2 / SWING)
+        np.testing.assert_allclose(found.kick[0], [0, impulse], rtol=2e-3, atol=2e-3 * -impulse)
     assert found.outcome == vi.SCENARIOS.persistence
+    with pytest.raises(ValueError, match=r"a stop that is less stiff: .* Take a `RigidStop`"):
+        vi.grazing(soft_grazing(1e10), check=False)
     found = vi.grazing(soft_grazing(prestress=2.0))
     assert found.order[0] == 0.5
     kick = -2 * 2.0 * np.sqrt(2 * SWING) / (SWING + 2.0)

@@ -32,9 +32,17 @@ from .special import Point
 # touched: a choice.
 _CONTINUOUS = 1e-9
 
+# How far off a touch is located, as a share of the state: a choice, ten times what is promised.
+_PLACED = 1e-12
+
 # The first contact lasts so much of a cycle, each further one a quarter of that, at most so many of
 # them. Measured powers that agree within this are settled. Steps of a flight. Choices.
-_SHARE, _TRIES, _AGREE, _STEPS = 0.02, 6, 0.03, 8
+_SHARE, _TRIES, _AGREE, _STEPS = 0.02, 10, 0.03, 8
+
+# The first contact is so brief that what turns the motion back anyway does most: there a stop gives
+# less than this share of it. A deeper contact with a stiff stop is an impact, with powers of its
+# own. A choice, with which the kick of a spring is right to 1e-3.
+_WEAK = 0.03
 
 
 class Kick(NamedTuple):
@@ -57,10 +65,24 @@ def soft_kick(
     **Raises:** `ValueError` if the field beyond the surface does not turn the motion back.
     """
     at = jnp.asarray(x)
-    jump = np.asarray(_jump_of_field(problem, at, number, leg, jnp.asarray(clock), jnp.asarray(u)))
-    size = np.abs(jump[0]).max()
-    change = jump[1] - jump[0]
-    if np.abs(change).max() > _CONTINUOUS * size:
+
+    def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The field, and what it is more beyond the surface."""
+        places = jnp.asarray(clock), jnp.asarray(u)
+        before, after = np.asarray(_jump_of_field(problem, at, number, leg, *places))
+        return before, after - before
+
+    def greatest(length: float) -> tuple[float, np.ndarray]:
+        """The root of the depth of a contact of this length, and the state there."""
+        y = length * np.sqrt(rate / 8)
+        return y, u - gradient / (gradient @ gradient) * y * y
+
+    length = _SHARE * float(problem.period(at)) / problem.cycles
+    (field, change), (y, deep) = fields(u), greatest(length)
+    # A stiff stop pushes by rounding, as far as the place of the touch is known.
+    known = _PLACED * np.abs(gradient) @ np.abs(u) / y**2
+    rounded = max(_CONTINUOUS * np.abs(field).max(), known * np.abs(fields(deep)[1]).max())
+    if np.abs(change).max() > rounded:
         back = rate + float(fast @ change)
         if back <= 0:
             raise ValueError(
@@ -69,12 +91,14 @@ def soft_kick(
                 f"{rate:.3g} to {back:.3g}."
             )
         return Kick(2 * np.sqrt(2 * rate) / back * change, 0.5)
-    length = _SHARE * float(problem.period(at)) / problem.cycles
+    for _ in range(_TRIES):
+        if abs(fast @ fields(greatest(length)[1])[1]) <= _WEAK * rate:
+            break
+        length /= 4
     measured: list[tuple[float, np.ndarray]] = []
     orders: list[float] = []
     for _ in range(_TRIES):
-        y = length * np.sqrt(rate / 8)
-        deep = u - gradient / (gradient @ gradient) * y * y
+        y, deep = greatest(length)
         measured.append((y, _flown(problem, at, number, leg, clock, jnp.asarray(deep), length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
@@ -127,7 +151,14 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     unit = problem.radian
 
     def root(function: Any, low: float, high: float) -> float:
-        found: Any = brentq(lambda s1: float(function(s1)[1]), low, high, xtol=1e-15 * unit)
+        off = lambda s1: float(function(s1)[1])
+        if off(low) * off(high) > 0:
+            raise ValueError(
+                "Argument `point` must be a grazing of a stop that is less stiff: a contact so "
+                "brief that it bends the motion little is less deep than rounding. Take a "
+                "`RigidStop`."
+            )
+        found: Any = brentq(off, low, high, xtol=1e-15 * unit)
         return float(found)
 
     def apart(s1):
