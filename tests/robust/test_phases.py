@@ -88,3 +88,10 @@ def test_phases_that_cannot_be_asked(motion):
     rest = vi.OscillatorState(jnp.asarray(0.5 + 0.5 * np.exp(-3.0)), jnp.asarray(0.0))
     with pytest.raises(ValueError, match="`phase` must be 0 for an equilibrium"):
         ask(Belt(), rest, phase=1.0)
+    belt, coarse = Belt(jnp.asarray(1.5)), vi.FixedStep(steps_per_cycle=8)
+    sticks = vi.find_orbit(belt, belt.start(Y=-1.2), 1, method=coarse, throw=True)
+    runs = (vi.simulate(belt, sticks.state, 1, **by) for by in ({"method": coarse}, {}))
+    length, other = (f"{float(run.duration[0]):.9g}" for run in runs)
+    with pytest.raises(ValueError, match="`phase` must be less than the " + length) as refused:
+        ask(belt, sticks, phase=100.0, method=coarse)
+    assert other != length and other not in str(refused.value)

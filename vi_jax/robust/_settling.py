@@ -225,7 +225,7 @@ class Settling:
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
         if autonomous:
-            run = simulate(machine, state, 1)
+            run = simulate(machine, state, 1, method=method)
             assert run.duration is not None
             length = float(run.duration[0])
         if not phase < length:
