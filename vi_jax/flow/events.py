@@ -6,7 +6,7 @@ Taylor's series about its end removes what is left.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,9 +37,10 @@ def rates(field: Field, coordinate: Callable[[State], Scalar], s: Scalar, state:
 
 
 def guard_rates(
-    field: Field, guard: Callable[[Scalar, State], Scalar], s: Scalar, state: State
+    field: Field, guard: Callable[[Scalar, State], Any], s: Scalar, state: State
 ) -> Rates:
-    """Rates of `guard(s, state)` along the flow of `field`, by two forward derivatives."""
+    """`Rates` of `guard(s, state)` along the flow of `field`, by two forward derivatives; of a tree
+    of guards the rates of trees."""
     one = jnp.ones_like(s)
 
     def first(s, state):

@@ -1,9 +1,9 @@
 """The events of a machine as a step sees them."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array
@@ -155,21 +155,30 @@ def _others(
     `seen`, guards at the stages.
     """
     machine, found, below = plan.machine, [], []
+    numbers, around = plan.others(lane.state), (lane.modes, lane.contact or ())
+    clocked = clock_of(machine, lane.state) is not None
+    if not (numbers or clocked):
+        return [], ()
 
-    def ends(guard: Callable[[Scalar, State], Scalar]) -> tuple[Rates, Rates]:
-        begin = guard_rates(moving.field, guard, lane.s, lane.state)
-        return begin, guard_rates(moving.field, guard, *there)
+    def guards(s: Scalar, x: State) -> list[list[Scalar]]:
+        """Of each event its guard, or the sides of it, and how far the clock is beyond its end."""
+        values = [
+            sides_of(machine, i, s, x, *around)
+            if len(seen.events.get(i, ())) > 1
+            else [guard_of(machine, i, s, x, *around)]
+            for i in numbers
+        ]
+        values += [[clock_of(machine, x) - plan.end(lane.part)]] if clocked else []
+        return [[jnp.asarray(each) for each in of_one] for of_one in values]
 
-    around = lane.modes, lane.contact or ()
-    for place, number in enumerate(plan.others(lane.state)):
+    # All at once, so that the field along which they change is written once.
+    begins, arrives = (
+        jax.tree.map(Rates, *guard_rates(moving.field, guards, *place))
+        for place in ((lane.s, lane.state), there)
+    )
+    for place, number in enumerate(numbers):
         event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
-        if len(values) == 1:
-            both = [ends(lambda s, x, i=number: jnp.asarray(guard_of(machine, i, s, x, *around)))]
-        else:
-            both = [
-                ends(lambda s, x, i=number, j=j: sides_of(machine, i, s, x, *around)[j])
-                for j in range(len(values))
-            ]
+        both = zip(begins[place], arrives[place], strict=True)
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
         scale = plan.guard_extent(place) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
@@ -188,10 +197,10 @@ def _others(
             begin, end = select(greater, (side.begin, side.end), (begin, end))
         crossing = Crossing(event, number, begin, end, scale)
         found.append(crossing._replace(sides=tuple(sides)) if number in seen.events else crossing)
-    if clock_of(machine, lane.state) is not None:
-        number, bound = section_number(machine), plan.end(lane.part)
-        begin, end = ends(lambda _, x: jnp.asarray(clock_of(machine, x)) - bound)
-        found.append(Crossing(events_of(machine)[number], number, begin, end, bound))
+    if clocked:
+        number, (begin,), (end,) = section_number(machine), begins[-1], arrives[-1]
+        section = events_of(machine)[number]
+        found.append(Crossing(section, number, begin, end, plan.end(lane.part)))
     return found, tuple(below)
 
 
