@@ -1,7 +1,5 @@
 """`python -m vi_jax.cli`."""
 
-import sys
-
 from .entry import main
 
-sys.exit(main())
+raise SystemExit(main())

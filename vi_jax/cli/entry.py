@@ -12,8 +12,7 @@ from .._messages import Interrupted, installed_version
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
 from ..machines.named import InputError, check_keys, machine_of
-from .files import read
-from .verbs import VERBS, do
+from .verbs import VERBS, do, read
 
 _MACHINE = "a class or a function that makes the machine (module:name or path/to/file.py:name)"
 
@@ -85,7 +84,8 @@ def _explore(options: argparse.Namespace) -> int:
         ranges = {name: (float(low), float(high)) for name, low, high in options.range}
         if options.machine is not None:
             name, make = options.machine, lambda: Subject(machine_of(options.machine, {}), ranges)
-        serve(options.host, options.port, (name, make()), browser=options.browser, tell=_say)
+        say = lambda step: print(f"{step} …", file=sys.stderr, flush=True)
+        serve(options.host, options.port, (name, make()), browser=options.browser, tell=say)
     except ValueError as error:
         return _error(error, 2)
     except OSError as error:
@@ -128,7 +128,3 @@ def _parser() -> argparse.ArgumentParser:
         verb.add_argument("--machine", metavar="NAME", help=f"{_MACHINE}, instead of the file's")
         verb.set_defaults(run=_run_file)
     return parser
-
-
-def _say(step: str) -> None:
-    print(f"{step} …", file=sys.stderr, flush=True)

@@ -2,9 +2,12 @@
 
 import dataclasses
 import inspect
+import re
 import signal
+import tomllib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,11 +21,19 @@ from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted
 from ..flow import RESULTS, Run, RunOptions, planned, simulate
-from ..machine import AbstractMachine, check_leaf, cycles_in_words, is_autonomous
+from ..machine import (
+    AbstractMachine,
+    State,
+    check_leaf,
+    check_name,
+    cycles_in_words,
+    is_autonomous,
+    leaf_names,
+    with_leaf,
+)  # fmt: skip
 from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
-from .files import errors_in, start_of
 
 _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
 _LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}
@@ -316,3 +327,44 @@ VERBS: Mapping[str, Verb] = {
     "orbit": Verb("a periodic motion", find_orbit, _orbit, ("settle",)),
     "continue": Verb("the branch of the motion of [orbit]", continue_orbit, _continue, ("y",)),
 }
+
+
+def read(path: str) -> dict[str, Any]:
+    """Return the tables of a file. **Raises:** `InputError`."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+@contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Turn errors of the library about its arguments into a `InputError` that names the table."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        if isinstance(error, InputError) or not re.match(
+            "Argument|Axis|Method|Measure", str(error)
+        ):
+            raise
+        raise InputError(f"{place}: {error}") from None
+
+
+def start_of(machine: AbstractMachine, table: Any) -> Any:
+    """Return the state that `[start]` describes, by the arguments of the machine's `start`, by what
+    replaces parts of the default one, or whole for a machine without. **Raises:** `InputError`.
+    """
+    if not isinstance(table, dict):
+        return table
+    if type(machine).start is AbstractMachine.start:
+        return State(**table)
+    parameters = inspect.signature(machine.start).parameters
+    with errors_in("[start]"):
+        if parameters:
+            if not any(x.kind is x.VAR_KEYWORD for x in parameters.values()):
+                check_keys(table, parameters, "[start]")
+            return machine.start(**table)
+        state = machine.start()
+        for name, number in table.items():
+            state = with_leaf(state, check_name(leaf_names(state), name, "start"), number)
+        return state
