@@ -190,7 +190,7 @@ WRONG = {
     "force of another length": ({"force": [1.0]}, r"`force`.*\(2,\).*\(1,\)"),
     "row of another length": ({"contacts": (vi.RigidStop(1, 1, at=[1.0]),)}, r"contacts\[0\].at"),
     "row of zeros": ({"contacts": (vi.RigidStop(1, 1, at=[0.0, 0.0]),)}, "zero throughout"),
-    "no row": ({"contacts": (vi.RigidStop(1, 1),)}, r"stop 0 .*at=c"),
+    "no row": ({"contacts": (vi.RigidStop(1, 1),)}, r"Stop 0 .*at=c"),
     "frequency": ({"frequency": 0.0}, "`frequency`"),
 }
 
