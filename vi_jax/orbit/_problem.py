@@ -100,7 +100,7 @@ def steps_of(
 
 
 def cycles_flown(
-    places: Sequence[float], events: Sequence[Event], period: float, cycles: int
+    places: Sequence[float] | np.ndarray, events: Sequence[Event], period: float, cycles: int
 ) -> int:
     """Cycles for which each leg gets steps: those of the longest leg, rounded up, and one more,
     since legs grow along a branch; all, where a chatter takes its share of them.
