@@ -36,7 +36,7 @@ def test_of_the_linear_oscillator(orbit):
         (point,) = at[name]
         assert point.kind == "extremum" and point.parameter == pytest.approx(peak, abs=1e-11)
         assert float(getattr(point.orbit, name)) == pytest.approx(value, abs=1e-12)
-        assert f"is the {'largest' if name == 'y_max' else 'smallest'} nearby" in str(point)
+        assert f"is the {'largest' if name == 'y_max' else 'least'} nearby" in str(point)
     # Re 1/(1 - ζ² + 2iξζ) is extreme at ζ² = 1 ∓ 2ξ.
     places = [point.parameter for point in at["section_Y"]]
     np.testing.assert_allclose(places, np.sqrt([1 - 2 * XI, 1 + 2 * XI]), atol=1e-11)
