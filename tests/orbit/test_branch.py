@@ -223,6 +223,9 @@ def test_a_branch_as_data(short):
     assert data.y_min.attrs["units"] == "a" and data.attrs["parameter"] == ZETA
     assert data.attrs["ends"] == list(short.ends)
     assert "period-doubling at" in str(short)
+    restitution = float(short.orbit(0).machine.stops[0].restitution)
+    lost = 0.5 * (1 - restitution**2) * (short.impact_speed**2).sum(axis=1) / short.cycles
+    np.testing.assert_allclose(short.impact_energy, lost, rtol=1e-11, atol=1e-13)  # it grazes
     table = short.to_xarray(along="point").to_dataframe()
     assert table.y_min.tolist() == short.y_min.tolist()
     # Where stability changes, at points of the branch, it is neither.

@@ -79,6 +79,27 @@ def _simulated(problem: Shooting, x: Array, state: State) -> Counted:
     return Counted(jnp.sum(run.impacts), clock, log.speed.ravel(), log.stop.ravel())
 
 
+def energies_of(problem: Shooting, steps: Sequence[Step]) -> np.ndarray:
+    """The energy that impacts take in a cycle, in the mean of the period, at each step."""
+
+    def begin(step: Step) -> State:
+        state = jax.tree.map(lambda x: x[0], sections_of(problem, step.x)[0])
+        return with_modes(state, _own_modes(problem, jnp.asarray(step.x)))
+
+    states = jax.tree.map(lambda *x: jnp.stack(x), *map(begin, steps))
+    return np.asarray(_lost(problem, jnp.stack([jnp.asarray(step.x) for step in steps]), states))
+
+
+@compiled
+def _lost(problem: Shooting, xs: Array, states: State) -> Array:
+    def one(x, state):
+        run = simulate(problem.at(x), state, problem.cycles, method=problem.method)
+        assert run.impact_energy is not None
+        return jnp.mean(run.impact_energy)
+
+    return jax.vmap(one)(xs, states)
+
+
 def _impacts_of(
     problem: Shooting, step: Step, clock: np.ndarray, period: float, state: State
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:

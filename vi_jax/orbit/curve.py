@@ -28,7 +28,7 @@ from ._corrector import Step
 from ._locate import located
 from ._observed import Observed
 from ._shooting import Shooting
-from ._solution import Counted, counted_of, orbit_at, orbit_of, sections_of
+from ._solution import Counted, counted_of, energies_of, orbit_at, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
 from .floquet import stability_of
@@ -38,7 +38,7 @@ from .special import Point
 # What is a number at each point of every curve.
 COLUMNS = (
     "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
-    "fastest_impact", "slowest_impact", "multiplier", "stable",
+    "fastest_impact", "slowest_impact", "impact_energy", "multiplier", "stable",
 )  # fmt: skip
 
 
@@ -211,6 +211,13 @@ class Curve(InWords, abc.ABC):
     def slowest_impact(self) -> np.ndarray:
         """Smallest V⁻ in the period, at each point; infinite without impacts."""
         return np.array([x.min(initial=np.inf) for x in self._speeds])
+
+    @cached_property
+    def impact_energy(self) -> np.ndarray:
+        """Energy that impacts take in a cycle, in the mean of the period, at each point (see
+        `Run.impact_energy`); simulated when it is first asked for."""
+        hit = bool(self.problem.impacts)
+        return energies_of(self.problem, self.steps) if hit else np.zeros(len(self.steps))
 
     @property
     def _speeds(self) -> list[np.ndarray]:
