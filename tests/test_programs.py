@@ -25,6 +25,8 @@ def watch(monkeypatch):
     monkeypatch.setattr(_programs, "_watch", watch)
     monkeypatch.setattr(_programs, "_SELDOM", 0)
     monkeypatch.setattr(_programs, "_PAUSE", 0)
+    # Which takes seconds where earlier tests have left much, and whose effect is given here.
+    monkeypatch.setattr(_programs.gc, "collect", lambda: 0)
     return watch
 
 
