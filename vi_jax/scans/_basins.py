@@ -531,17 +531,19 @@ def _labelled(
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     motions: list[np.ndarray] = []
-    of_cell = np.empty(first.size, int)
+    of_cell, known = np.empty(first.size, int), {}
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
-        for j, motion in enumerate(motions):
-            near = nearest_images(angles, motion, state)
-            if len(motion) == p and distance(near, state, unit).min() <= apart:
-                of_cell[i] = j
-                break
-        else:
-            of_cell[i] = len(motions)
-            motions.append(followed(state, p))
+        # The motions of this period, (motions, period, components), and their numbers.
+        rows, numbers = known.get(p, (np.empty((0, p, len(names))), []))
+        away = distance(nearest_images(angles, rows, state), state, unit).min(axis=1)
+        close = np.flatnonzero(away <= apart)
+        if close.size:
+            of_cell[i] = numbers[close[0]]
+            continue
+        of_cell[i] = len(motions)
+        motions.append(followed(state, p))
+        known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, of_cell[i]]
     found = of_cell[inverse.ravel()]
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
