@@ -310,7 +310,7 @@ def test_a_picture_that_cannot_be_drawn_loses_nothing(run):
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
 def test_ready_files(path, monkeypatch):
-    from vi_jax.cli.verbs import read
+    from vi_jax.cli.entry import read
     from vi_jax.machines.named import machine_of
 
     tables = read(str(path))

@@ -4,7 +4,10 @@ import argparse
 import os
 import signal
 import sys
+import tomllib
 from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -12,7 +15,7 @@ from .._messages import Interrupted, installed_version
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
 from ..machines.named import InputError, check_keys, machine_of
-from .verbs import VERBS, do, read
+from .verbs import VERBS, do
 
 _MACHINE = "a class or a function that makes the machine (module:name or path/to/file.py:name)"
 
@@ -44,6 +47,14 @@ def main(argv: list[str] | None = None) -> int:
 def _error(problem: object, code: int) -> int:
     print(f"vi-jax: error: {problem}", file=sys.stderr)
     return code
+
+
+def read(path: str) -> dict[str, Any]:
+    """Return the tables of a file. **Raises:** `InputError`."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _run_file(options: argparse.Namespace) -> int:

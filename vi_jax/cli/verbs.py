@@ -1,10 +1,10 @@
 """The verbs of the command line: each calls the function of its name, prints, writes and draws."""
 
 import dataclasses
+import functools
 import inspect
 import re
 import signal
-import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -30,7 +30,7 @@ from ..machine import (
     is_autonomous,
     leaf_names,
     with_leaf,
-)  # fmt: skip
+)
 from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
@@ -298,16 +298,15 @@ def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0
     found = find_orbit(machine, guess, **options)
     if not bool(found.successful):
         return Found([str(found)], good=False)
-    draw = lambda figure: plot.plot_phase_portrait(
-        found.trajectory(), machine, ax=figure.subplots()
-    )
+    path = functools.cache(found.trajectory)  # of the table and the picture
+    draw = lambda figure: plot.plot_phase_portrait(path(), machine, ax=figure.subplots())
 
     def table() -> Any:  # a row for each section state, with the numbers of the whole motion
         whole = found.to_xarray().data_vars.items()
         numbers = {name: x for name, x in whole if not x.dims}
-        energy = found.trajectory().impact_energy
-        if energy is not None:
-            numbers["impact_energy"] = xr.DataArray(float(energy.sum()))
+        energy = path().impact_energy
+        assert energy is not None
+        numbers["impact_energy"] = xr.DataArray(float(energy.sum()))
         return found.to_xarray(along="section").assign(numbers)
 
     return Found([str(found)], table, draw, result=found)
@@ -327,14 +326,6 @@ VERBS: Mapping[str, Verb] = {
     "orbit": Verb("a periodic motion", find_orbit, _orbit, ("settle",)),
     "continue": Verb("the branch of the motion of [orbit]", continue_orbit, _continue, ("y",)),
 }
-
-
-def read(path: str) -> dict[str, Any]:
-    """Return the tables of a file. **Raises:** `InputError`."""
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 @contextmanager

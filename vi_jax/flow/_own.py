@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -29,6 +28,7 @@ from ..machine import (
     RigidStop,
     SoftStop,
     begin_modes,
+    check_takes,
     clock_of,
     event_of,
     events_of,
@@ -60,7 +60,7 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     arguments or returns no state; while the loop is traced, and at no cost where it runs."""
     whose = f"`field` of a {type(machine).__name__}"
     modes = shown_modes(machine, modes)
-    _check_arguments(machine, whose, s, state, modes)
+    check_takes(machine.field, whose, "`s`, the state", (s, state, *modes), len(modes))
 
     def asked(s, state, *modes):
         found = machine.field(s, state, *modes)
@@ -104,20 +104,6 @@ def in_short(tree: Any) -> str:
         return jnp.zeros(x.shape, x.dtype) if hasattr(x, "shape") else x
 
     return eqx.tree_pformat(jtu.tree_map(blank, tree), width=1000)
-
-
-def _check_arguments(
-    machine: AbstractMachine, whose: str, s: Scalar, state: State, modes: Scalars
-) -> None:
-    """**Raises:** `TypeError` for a field that does not take s, a state and its modes.
-
-    **Arguments:** `whose`, the field in words; `s`, `state` and `modes`, as it will be called.
-    """
-    try:
-        inspect.signature(machine.field).bind(s, state, *modes)
-    except TypeError as error:
-        more = f" and {len(modes)} modes (of its switches, and its own)" if modes else ""
-        raise TypeError(f"{whose} must take `s`, the state{more}: {error}.") from None
 
 
 def _runs(function: Callable[..., Any], *arguments: Any) -> bool:

@@ -53,7 +53,7 @@ class Suggestion(NamedTuple):
     reached: bool
     """Whether its error is small enough."""
     error: float
-    """Its measured error."""
+    """The error of that method, as measured in the calibration."""
     tried: tuple[Tried, ...]
 
     def __str__(self) -> str:

@@ -76,6 +76,7 @@ from .events import section_number as section_number
 from .events import sides_of as sides_of
 from .events import struck_modes as struck_modes
 from .events import value_of as value_of
+from .field import check_takes as check_takes
 from .field import field_in as field_in
 from .field import shown_modes as shown_modes
 from .friction import ContactFriction as ContactFriction

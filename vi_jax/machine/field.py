@@ -21,20 +21,33 @@ def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
     return tuple(mode for i, mode in enumerate(modes) if i not in hidden)
 
 
+def check_takes(
+    function: Callable[..., Any], whose: str, first: str, arguments: tuple[Any, ...], modes: int
+) -> None:
+    """**Raises:** `TypeError` for a function of a user's that does not take these arguments.
+
+    **Arguments:** `whose`, the function in words; `first`, the arguments before the modes in words;
+    how many of them are modes.
+    """
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        more = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
+        raise TypeError(f"{whose} must take {first}{more}: {error}.") from None
+    except ValueError:
+        pass  # it has no signature
+
+
 def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
     """Return what a function of a machine's event returns.
 
     **Raises:** `TypeError` that names the function, `whose`, if it takes other arguments.
     """
     try:
-        inspect.signature(function).bind(*arguments)
-    except TypeError as error:
-        modes = len(arguments) - 3
-        more = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
-        raise TypeError(f"{whose} must take the machine, `s`, the state{more}: {error}.") from None
-    except ValueError:
-        pass  # it has no signature
-    return function(*arguments)
+        return function(*arguments)
+    except TypeError:
+        check_takes(function, whose, "the machine, `s`, the state", arguments, len(arguments) - 3)
+        raise
 
 
 def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:

@@ -38,7 +38,7 @@ class derived:
 
     def __get__(self, part: Any, owner: type) -> Any:
         if part is None:
-            raise AttributeError(f"`{owner.__name__}` has it only as an object: make one first.")
+            raise AttributeError(f"A {owner.__name__} has this attribute, but its class does not.")
         return self.found(part)
 
 

@@ -79,9 +79,10 @@ def soft_kick(
 
     length = _SHARE * float(problem.period(at)) / problem.cycles
     (field, change), (y, deep) = fields(u), greatest(length)
+    push = fields(deep)[1]
     # A stiff stop pushes by rounding, as far as the place of the touch is known.
     known = _PLACED * np.abs(gradient) @ np.abs(u) / y**2
-    rounded = max(_CONTINUOUS * np.abs(field).max(), known * np.abs(fields(deep)[1]).max())
+    rounded = max(_CONTINUOUS * np.abs(field).max(), known * np.abs(push).max())
     if np.abs(change).max() > rounded:
         back = rate + float(fast @ change)
         if back <= 0:
@@ -92,9 +93,10 @@ def soft_kick(
             )
         return Kick(2 * np.sqrt(2 * rate) / back * change, 0.5)
     for _ in range(_TRIES):
-        if abs(fast @ fields(greatest(length)[1])[1]) <= _WEAK * rate:
+        if abs(fast @ push) <= _WEAK * rate:
             break
         length /= 4
+        push = fields(greatest(length)[1])[1]
     measured: list[tuple[float, np.ndarray]] = []
     orders: list[float] = []
     for _ in range(_TRIES):

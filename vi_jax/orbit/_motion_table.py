@@ -284,8 +284,9 @@ class MotionTable(Table):
             yield Event(along, ending)
 
     def stalled(self, steps: list[Step]) -> Ending:
-        """Close to where it springs from a motion of half its period, or between."""
-        sprung = self._sprung(steps[-1]) if self._halves(steps[-1]).any() else None
+        """At the motion of half its period from which the branch springs, if that is close."""
+        apart = np.linalg.norm(self._halves(steps[-1]))
+        sprung = self._sprung(steps[-1]) if apart > ROUNDED else None
         return super().stalled(steps) if sprung is None else Ending(sprung[0], DOUBLING, sprung[1])
 
     def _sprung(self, at: Step) -> tuple[Step, Point] | None:
@@ -377,8 +378,8 @@ class MotionTable(Table):
 
     def _turn_apart(self, here: Step, last: Step) -> tuple[Step, ...]:
         """Two points beside the place where the branch turns back between two others, if a
-        multiplier passes 1 there: it is a fold, and a branch point lies within the same step. They
-        are told apart down to `BESIDE`; closer ones count as one branch point."""
+        multiplier passes 1 there: it is a fold, and a branch point lies within the same step. If
+        they are closer to each other than `BESIDE`, they count as one branch point."""
         at = self.where(here, last, lambda step: tests_of(step)[TURNS])
         if at is None:
             return ()

@@ -62,10 +62,14 @@ def counted_of(problem: Shooting, step: Step, state: State | None = None) -> Cou
     **Arguments:** its bare state on the section, if that is known.
     """
     x = jnp.asarray(step.x)
-    if state is None:
-        state = jax.tree.map(lambda x: x[0], sections_of(problem, x)[0])
-    state = with_modes(state, _own_modes(problem, x))
+    state = _first(problem, x) if state is None else with_modes(state, _own_modes(problem, x))
     return jax.tree.map(np.asarray, _simulated(problem, x, state))
+
+
+def _first(problem: Shooting, x: Array) -> State:
+    """The state on the first section of a solution, with the machine's own modes."""
+    state = jax.tree.map(lambda x: x[0], sections_of(problem, x)[0])
+    return with_modes(state, _own_modes(problem, x))
 
 
 @compiled
@@ -81,13 +85,9 @@ def _simulated(problem: Shooting, x: Array, state: State) -> Counted:
 
 def energies_of(problem: Shooting, steps: Sequence[Step]) -> np.ndarray:
     """The energy that impacts take in a cycle, in the mean of the period, at each step."""
-
-    def begin(step: Step) -> State:
-        state = jax.tree.map(lambda x: x[0], sections_of(problem, step.x)[0])
-        return with_modes(state, _own_modes(problem, jnp.asarray(step.x)))
-
-    states = jax.tree.map(lambda *x: jnp.stack(x), *map(begin, steps))
-    return np.asarray(_lost(problem, jnp.stack([jnp.asarray(step.x) for step in steps]), states))
+    xs = [jnp.asarray(step.x) for step in steps]
+    states = jax.tree.map(lambda *x: jnp.stack(x), *(_first(problem, x) for x in xs))
+    return np.asarray(_lost(problem, jnp.stack(xs), states))
 
 
 @compiled

@@ -22,9 +22,8 @@ from ._solution import sections_of
 def several(old: Shooting, n: int) -> Shooting:
     """The equations of a motion that is gone through n times."""
     events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
-    steps = old.steps * n  # whole periods, of which a chatter takes a share
-    if events and not old.landings:
-        steps = old.steps  # the legs are as long as before
+    # Legs are as long as before, but the steps of a chatter are a share of those of the period.
+    steps = old.steps if events and not old.landings else n * old.steps
     return dataclasses.replace(
         old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),
         steps=steps,

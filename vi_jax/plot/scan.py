@@ -94,13 +94,13 @@ def _codes(data: xr.Dataset) -> np.ndarray:
     """The code of each lane: of its regime, or of its outcome."""
     if "period" in data:
         codes = np.clip(np.asarray(data["period"]).astype(int), _LEAST + 1, len(PERIODS))
+        if "impacts" in data:
+            impacts = np.asarray(data["impacts"], float)
+            free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
+            codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
     else:
         failed = np.isin(np.asarray(data["result"]), (0, NOT_COMPUTED), invert=True)
         codes = np.where(failed, int(REGIMES.failed), _GOES_ON)
-    if "period" in data and "impacts" in data:
-        impacts = np.asarray(data["impacts"], float)
-        free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
-        codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
     if "outcome" in data:
         outcome = np.asarray(data["outcome"]).astype(int)
         codes = np.where(outcome >= 0, _OUTCOME + outcome, codes)

@@ -54,7 +54,7 @@ class EdgeState(Summarized):
     """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (as
     `tolerance` of `edge_state`) of the boundary."""
     machine: AbstractMachine
-    """The machine."""
+    """The machine that the basins on both sides belong to."""
 
     def summary(self) -> str:
         """The edge state in words."""

@@ -56,7 +56,7 @@ class Manifold(Summarized):
     lengths: tuple[float, float] = eqx.field(static=True)
     """Length of each branch, in the units of the state; less than `length` if the branch ends."""
     machine: AbstractMachine
-    """The machine."""
+    """The machine that the saddle is a motion of."""
 
     def summary(self) -> str:
         """The branches in words."""

@@ -72,9 +72,9 @@ class MinimalKick(Summarized):
     others: tuple["MinimalKick", ...]
     """Local minima of the norm in other directions, the smallest first."""
     lanes: int = eqx.field(static=True)
-    """Number of simulations."""
+    """Number of simulations that the search took."""
     machine: AbstractMachine
-    """The machine."""
+    """The machine that is kicked."""
 
     def summary(self) -> str:
         """The kick and where it leads, in words."""

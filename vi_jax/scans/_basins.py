@@ -115,7 +115,7 @@ class Basins(NamedTuple):
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
     transient (transiently chaotic, see `Regime`)."""
     machine: AbstractMachine | None = None
-    """The machine."""
+    """The machine whose basins these are; it words the periods."""
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in the words of the machine."""

@@ -168,8 +168,8 @@ def _others(
             else [guard_of(machine, i, s, x, *around)]
             for i in numbers
         ]
-        clock = clock_of(machine, x)
-        values += [] if clock is None else [[clock - plan.end(lane.part)]]
+        if (clock := clock_of(machine, x)) is not None:
+            values.append([clock - plan.end(lane.part)])
         return [[jnp.asarray(each) for each in of_one] for of_one in values]
 
     # All at once, so that the field along which they change is written once.
