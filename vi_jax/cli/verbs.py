@@ -306,7 +306,7 @@ def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0
         numbers = {name: x for name, x in whole if not x.dims}
         energy = path().impact_energy
         assert energy is not None
-        numbers["impact_energy"] = xr.DataArray(float(energy.sum()))
+        numbers["impact_energy"] = xr.DataArray(float(energy.sum()) / int(found.cycles))
         return found.to_xarray(along="section").assign(numbers)
 
     return Found([str(found)], table, draw, result=found)
