@@ -89,19 +89,18 @@ def test_a_motor_lags_behind_and_may_stop(ideal):
     found = look(scene, scene.start(W=0.1), 300)
     assert found.regime == "failed" and "turning forward" in found.fault and not found.stability
     for which in MAPS:
-        assert MotionPicture(scene.labels).draw(found, scene, which)
+        assert MotionPicture(scene.labels).draw(found, which)
 
 
 def test_no_slider_compiles_and_redraws_are_quick(ideal):
     begin, picture, took = ideal.beginning(), MotionPicture(ideal.machine.labels), []
-    picture.draw(ideal.seen(begin), ideal.machine)
+    picture.draw(ideal.seen(begin))
     with compilations() as found:
         for name, control in ideal.controls.items():
             for part in (0.0, 0.4, 0.6, 1.0):
                 values = {**begin, name: control.low + part * (control.high - control.low)}
                 since = time.process_time()
-                machine, _ = ideal.at(values)
-                png = picture.draw(ideal.seen(values), machine)
+                png = picture.draw(ideal.seen(values))
                 took.append(time.process_time() - since)
                 width, height = Image.open(BytesIO(png)).size
                 assert height == 594 and width in (1007, 1008)  # 7.2 inches, by Matplotlib 3.9 less
@@ -127,10 +126,10 @@ def test_a_diagram_is_made_of_runs(ideal):
 
 def test_pictures(ideal):
     picture, found = MotionPicture(ideal.machine.labels), ideal.seen(ideal.beginning())
-    first = picture.draw(found, ideal.machine)
-    assert picture.draw(found, ideal.machine) == first  # within kept frames
-    assert len({picture.draw(found, ideal.machine, which) for which in MAPS}) == len(MAPS)
-    assert picture.draw(seen(ideal, zeta=0.902), ideal.machine) != first
+    first = picture.draw(found)
+    assert picture.draw(found) == first  # within kept frames
+    assert len({picture.draw(found, which) for which in MAPS}) == len(MAPS)
+    assert picture.draw(seen(ideal, zeta=0.902)) != first
 
 
 def test_requests_that_no_slider_makes_are_refused_in_a_sentence(ideal):
@@ -170,7 +169,7 @@ def test_machines_of_other_kinds(name):
     found = subject.seen(values)
     assert not found.fault and found.regime and subject.words(found)["position"]
     assert np.isfinite(found.path.Y).all()
-    assert gif_of(found, subject.machine).startswith(b"GIF")
+    assert gif_of(found).startswith(b"GIF")
     diagram = subject.diagram(values, subject.names[0])
     assert np.isfinite(diagram.position).any()
     run = vi.simulate(*subject.at(values), 256, settle=int(values[SETTLE]))

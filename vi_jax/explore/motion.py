@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from .._messages import so_many
 from .._programs import compiled
@@ -18,13 +17,13 @@ from ..flow import RESULTS, Run, chosen, simulate
 from ..machine import (
     AbstractMachine,
     adopt,
-    bare,
     cycles_in_words,
     is_autonomous,
+    raveled,
     unit_of,
     with_unit,
 )
-from ..orbit import STABILITY, complex_in_words, cycle_map, stability_of
+from ..orbit import STABILITY, complex_in_words, cycle_map, multipliers_of, stability_of
 from ..plot import MotionPath, motion_path
 from ..scans import REGIMES, Regime, lyapunov, taken_along
 
@@ -48,8 +47,9 @@ _MOST_STEPS = 400_000
 
 
 class Motion(NamedTuple):
-    """One motion as NumPy arrays and words."""
+    """One motion as NumPy arrays."""
 
+    machine: AbstractMachine
     path: MotionPath
     """The motion over `WINDOW` cycles, with its impacts."""
     impact_phase: np.ndarray
@@ -74,10 +74,6 @@ class Motion(NamedTuple):
     """Position and velocity on the sections of the cycles observed."""
     quantities: dict[str, float]
     """The machine's own quantities on the last section, and its averages over the cycles."""
-    lasting: str
-    """The period in the machine's words; where there is none, the longest that was looked for."""
-    rate: str
-    """The unit of exponents."""
     window: Run
     """What is drawn."""
 
@@ -86,13 +82,13 @@ class Motion(NamedTuple):
         """The regime in words: its period and impacts, or what has no period."""
         if self.period > 0:
             impacts = so_many(round(self.impacts), "impact")
-            return f"period {self.lasting} with {impacts}"
-        kinds: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
-        kind = kinds[self.period]
+            return f"period {cycles_in_words(self.machine, self.period)} with {impacts}"
+        kind = REGIMES(self.period).meaning
         if self.period == REGIMES.failed:
             return kind
         if self.period == REGIMES.unsettled:
-            kind = f"no period up to {self.lasting}: still settling, or quasi-periodic"
+            longest = cycles_in_words(self.machine, _REGIME.longest)
+            kind = f"no period up to {longest}: still settling, or quasi-periodic"
         return f"{kind}, {self.impacts:.2f} impacts in a cycle"
 
     @property
@@ -101,7 +97,8 @@ class Motion(NamedTuple):
         if self.period <= 0:
             if self.fault or not np.isfinite(self.exponent):
                 return ""
-            return with_unit(f"greatest Lyapunov exponent {self.exponent:.4f}", self.rate)
+            rate = unit_of(self.machine.units, "rate")
+            return with_unit(f"greatest Lyapunov exponent {self.exponent:.4f}", rate)
         if not np.isfinite(self.multipliers).all():
             return "no multipliers: an impact falls on the section"
         verdict = STABILITY[stability_of(jnp.asarray(self.multipliers))]
@@ -116,26 +113,20 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
 
     A start beyond a stop is moved onto it.
     """
-    run, window, found, monodromy, places = _seen(scene, start, jnp.asarray(float(settle)))
+    run, window, found, multipliers, places = _seen(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
     exponent = np.nan
     if period == REGIMES.unsettled:
         exponent = _exponent_of(scene, run.last)
         if exponent > _REGIME.threshold:
             period = int(REGIMES.chaotic)
-    multipliers = np.empty(0, complex)
-    if period > 0:
-        matrix = np.asarray(monodromy)
-        multipliers = np.full(len(matrix), complex(np.nan))
-        if np.isfinite(matrix).all():
-            multipliers = np.linalg.eigvals(matrix).astype(complex)
-            multipliers = multipliers[np.argsort(-abs(multipliers), kind="stable")]
     log, ratio = run.impact_log, run.frequency_ratio
     assert log is not None and run.y_min is not None and run.y_max is not None
     averages = {name: x.mean() for name, x in run.averages.items()}
     numbers = {name: x[-1] for name, x in run.quantities.items()} | averages
     met = np.asarray(log.stop) >= 0
     return Motion(
+        machine=scene,
         path=motion_path(window, machine=seen_evenly(scene, run.last)),
         impact_phase=np.asarray(log.phase)[met],
         impact_speed=np.asarray(log.speed)[met],
@@ -143,13 +134,11 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
         extremes=(float(np.min(run.y_min)), float(np.max(run.y_max))),
         period=period,
         impacts=float(found["impacts"]),
-        multipliers=multipliers,
+        multipliers=np.asarray(multipliers) if period > 0 else np.empty(0, complex),
         exponent=exponent,
         fault="" if bool(run.successful) else str(RESULTS[run.result]),
         places=(np.asarray(places[0]), np.asarray(places[1])),
         quantities={name: float(x) for name, x in numbers.items() if not np.ndim(x)},
-        lasting=cycles_in_words(scene, period if period > 0 else _REGIME.longest),
-        rate=unit_of(scene.units, "rate"),
         window=window,
     )
 
@@ -161,8 +150,8 @@ def prepare(scene: AbstractMachine, start: State) -> None:
 
 @compiled
 def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
-    """The run observed, its first cycles sampled, its regime, the derivative of its map, and
-    position and velocity on its sections."""
+    """The run observed, its first cycles sampled, its regime, its multipliers, and position and
+    velocity on its sections."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
     start = taken_along(scene, adopt(scene, start))
@@ -173,7 +162,8 @@ def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, 
     )
     found = _REGIME(scene, run)
     places = tuple(jax.vmap(f)(run.sections) for f in (scene.position, scene.velocity))
-    return run, window, found, _monodromy(scene, run, found["period"], method), places
+    multipliers = multipliers_of(_monodromy(scene, run, found["period"], method))
+    return run, window, found, multipliers, places
 
 
 def seen_evenly(machine: AbstractMachine, state: State) -> AbstractMachine:
@@ -192,7 +182,7 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
         place = OBSERVED - cycles + i
         return the_map.jacobian(jtu.tree_map(lambda x: x[place], run.sections)) @ product
 
-    row = ravel_pytree(bare(run.last))[0]
+    row = raveled(run.last)[0]
     return jax.lax.fori_loop(0, cycles, one, jnp.eye(row.size, dtype=row.dtype))
 
 

@@ -79,15 +79,14 @@ def _(across, menu, mo, moving, sliders, tab, upwards, which):
 @app.cell
 def _(html, mo, shown, sliders, time):
     since = time.perf_counter()
-    _fault, motion, machine = shown.fault(sliders.value), None, None
+    _fault, motion = shown.fault(sliders.value), None
     if _fault is None:
         try:
-            machine, _ = shown.at(sliders.value)
             motion = shown.seen(sliders.value)
         except ValueError as error:
             _fault = str(error)
     mo.stop(_fault is not None, mo.Html(f'<p id="fault">{html.escape(str(_fault))}</p>'))
-    return machine, motion, since
+    return motion, since
 
 
 @app.cell
@@ -116,10 +115,10 @@ def _(across, menu, pick, place, shown, sliders):
 
 
 @app.cell
-def _(b64encode, html, machine, mo, motion, picture, shown, since, tab, time, which):
+def _(b64encode, html, mo, motion, picture, shown, since, tab, time, which):
     mo.stop(tab.value == "Animation" or motion is None)
     assert motion is not None
-    _png = picture.draw(motion, machine, which.value)
+    _png = picture.draw(motion, which.value)
     _words = {"": motion.fault or motion.stability, **shown.words(motion)}
     _told = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
     _took = 1000 * (time.perf_counter() - since)
@@ -133,11 +132,11 @@ def _(b64encode, html, machine, mo, motion, picture, shown, since, tab, time, wh
 
 
 @app.cell
-def _(b64encode, gif_of, machine, mo, motion, moving, tab):
+def _(b64encode, gif_of, mo, motion, moving, tab):
     mo.stop(tab.value != "Animation" or motion is None)
     assert motion is not None
     mo.stop(not moving.value, mo.md("*Set the sliders, then let it move: some seconds of work.*"))
-    _gif = b64encode(gif_of(motion, machine)).decode()
+    _gif = b64encode(gif_of(motion)).decode()
     mo.Html(
         f'<img id="moving" style="max-width: 100%" alt="{motion.regime}" '
         f'src="data:image/gif;base64,{_gif}">'

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from ..machine import AbstractMachine, logged_turn, name_in, stops_of
+from ..machine import logged_turn, name_in, stops_of
 from ..plot import BLUE, GREEN, RED, animate
 from .motion import WINDOW, Motion, seen_evenly
 from .subject import SHOWN, Diagram
@@ -77,14 +77,11 @@ class MotionPicture:
             line.set_animated(True)  # left out where the frames are drawn
         return lines
 
-    def draw(self, motion: Motion, machine: AbstractMachine, which: str = MAPS[0]) -> bytes:
-        """Return the picture of a motion, as PNG.
-
-        **Arguments:** the motion; the machine, whose stops are drawn; `which`, out of `MAPS`.
-        """
-        self._set_motion(motion, machine)
-        self._set_map(motion, machine, which)
-        mu = np.asarray(motion.multipliers, complex)
+    def draw(self, motion: Motion, which: str = MAPS[0]) -> bytes:
+        """Return the picture of a motion, as PNG; the map is `which` out of `MAPS`."""
+        self._set_motion(motion)
+        self._set_map(motion, which)
+        mu = motion.multipliers
         self._lines["multipliers"].set_data(np.real(mu), np.imag(mu))
         self._notes[1].set_text("" if mu.size else "no period")
         axes = (self._course, self._portrait, self._map)
@@ -101,9 +98,9 @@ class MotionPicture:
         picture.save(out, "png", compress_level=1)
         return out.getvalue()
 
-    def _set_motion(self, motion: Motion, machine: AbstractMachine) -> None:
+    def _set_motion(self, motion: Motion) -> None:
         lines, path = self._lines, motion.path
-        stops = [stop for stop in stops_of(machine) if stop.coordinate == 0]
+        stops = [stop for stop in stops_of(motion.machine) if stop.coordinate == 0]
         places = [float(stop.place) for stop in stops] or [np.nan]
         lines["course"].set_data(path.cycles, path.Y)
         lines["portrait"].set_data(path.Y, path.V)
@@ -114,7 +111,7 @@ class MotionPicture:
         _fit(self._course, y=np.append(path.Y, places))
         _fit(self._portrait, x=np.append(path.Y, places), y=path.V)
 
-    def _set_map(self, motion: Motion, machine: AbstractMachine, which: str) -> None:
+    def _set_map(self, motion: Motion, which: str) -> None:
         (Y, V), note = motion.places, ""
         if which == MAPS[0]:
             x, y, names = Y, V, [f"{name} on the section" for name in self._names]
@@ -124,7 +121,7 @@ class MotionPicture:
         elif which == MAPS[1]:
             x, y = motion.impact_phase, motion.impact_speed
             names, note = ["phase of the impact", "speed before it"], "" if x.size else "no impact"
-            self._map.set_xlim(0, float(logged_turn(machine)))
+            self._map.set_xlim(0, float(logged_turn(motion.machine)))
             _fit(self._map, y=np.append(y, 0.0))
         else:
             y = motion.frequency_ratio
@@ -164,9 +161,9 @@ def _fit(
         setter(low - 0.1 * width, high + 0.1 * width)
 
 
-def gif_of(motion: Motion, machine: AbstractMachine) -> bytes:
+def gif_of(motion: Motion) -> bytes:
     """The machine moving through the cycles that are drawn, as a GIF that takes seconds to make."""
-    evenly = seen_evenly(machine, motion.window.last)
+    evenly = seen_evenly(motion.machine, motion.window.last)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "motion.gif"
         animate(motion.window, evenly, seconds=4, fps=15).save(path)

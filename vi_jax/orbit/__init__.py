@@ -22,6 +22,7 @@ from .distinct import in_one_line as in_one_line
 from .distinct import unit_of as unit_of
 from .find import find_orbit as find_orbit
 from .floquet import STABILITY as STABILITY
+from .floquet import multipliers_of as multipliers_of
 from .floquet import stability_of as stability_of
 from .grazing import Grazing as Grazing
 from .grazing import grazing as grazing
