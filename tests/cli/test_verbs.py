@@ -245,20 +245,21 @@ def short(monkeypatch):
 def test_a_run_in_parts_is_the_same_run(monkeypatch):
     short(monkeypatch)
     scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.02)
-    options = {"settle": 3, "samples": 4, "impact_log": 2}
+    options = {"settle": 3, "samples": 4, "impact_log": 2, "method": vi.Adaptive()}
     whole = vi.simulate(scene, scene.start(Y=0.3), 23, **options)
-    parts = verbs.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
+    parts, _ = verbs.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
     for name in ("sections", "y_min", "impacts", "duration", "samples", "impact_log", "clearance"):
         each = (jax.tree.leaves(getattr(run, name)) for run in (parts, whole))
         for x, y in zip(*each, strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
     assert bool(parts.successful) and int(parts.steps) >= int(whole.steps)
+    assert int(parts.rejected) >= int(whole.rejected) > 0
 
 
 def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
     short(monkeypatch)
     scene = vi.Parameters(control=-1.0).scene()  # its motor stalls
-    found = verbs.run_in_parts(scene, scene.start(W=0.1), 40)
+    found, _ = verbs.run_in_parts(scene, scene.start(W=0.1), 40)
     assert not bool(found.successful) and found.impacts.size == 10
 
 

@@ -35,8 +35,6 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader has closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except InputError as error:
-        return _error(error, 2)
     except OSError as error:
         return _error(error, 1)
     finally:
@@ -86,8 +84,7 @@ def _explore(options: argparse.Namespace) -> int:
     """Serve the page of a machine: that of the command, or the paper's scene."""
     if not 0 <= options.port <= 65535:
         return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
-    problem = missing()
-    if problem:
+    if problem := missing():
         return _error(problem, 1)
     jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
     name, make = next(iter(ready().items()))

@@ -20,15 +20,13 @@ from matplotlib.figure import Figure
 from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted
-from ..flow import RESULTS, Run, RunOptions, planned, simulate
+from ..flow import Run, RunOptions, planned, simulate
 from ..machine import (
     AbstractMachine,
     State,
     check_leaf,
-    check_name,
     cycles_in_words,
     is_autonomous,
-    leaf_names,
     with_leaf,
 )
 from ..machines.named import InputError, check_keys, value_of
@@ -154,7 +152,7 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
     if along == "sample":  # the picture shows where between samples an impact is
         options.setdefault("impact_log", 8)
-    run, cut = _kept(run_in_parts, machine, machine.start() if start is None else start, **options)
+    run, cut = run_in_parts(machine, machine.start() if start is None else start, **options)
 
     def table() -> Any:
         data = run.to_xarray(along=along)
@@ -180,17 +178,13 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
 
 def run_in_parts(
     machine: AbstractMachine, start: Any, cycles: int, *, samples: int = 0, **options: Any
-) -> Run:
-    """As `simulate` of one motion, which Ctrl-C ends with the cycles that were recorded.
-
-    **Raises:** `Interrupted`, whose `partial` is the shorter run, if a part of it was recorded;
-    as `simulate`.
-    """
+) -> tuple[Run, bool]:
+    """A run of one motion, as `simulate`, but Ctrl-C ends it with the cycles that were recorded;
+    whether that ended it."""
     length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
     planned(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
-    whole = not isinstance(cycles, int) or cycles <= length
-    if whole or options.keys() & {"estimate", "max_steps", "noise"}:
-        return simulate(machine, start, cycles, samples=samples, **options)
+    if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
+        return simulate(machine, start, cycles, samples=samples, **options), False
     try:
         for done in range(0, cycles, length):
             now = min(length, cycles - done)
@@ -202,19 +196,18 @@ def run_in_parts(
         if not runs:
             raise
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # nor while they are put together
-        raise Interrupted("run", _joined(runs)) from None
-    return _joined(runs)
+        return _joined(runs), True
+    return _joined(runs), False
 
 
 def _joined(runs: list[Run]) -> Run:
     """Parts of one run in a row; the first state of a part is the last of the part before it."""
-    cycles, time, length = 0, 0.0, runs[0].impacts.size
+    time, length = 0.0, runs[0].impacts.size
     for i, run in enumerate(runs):
         if run.samples is not None:
-            later = {"cycles": run.samples.cycles + cycles, "time": run.samples.time + time}
+            later = {"cycles": run.samples.cycles + i * length, "time": run.samples.time + time}
             runs[i] = dataclasses.replace(run, samples=dataclasses.replace(run.samples, **later))
             time = later["time"][-1]
-        cycles += run.impacts.size
 
     def row(*parts: Any) -> Any:
         if not jnp.ndim(parts[0]):
@@ -222,7 +215,8 @@ def _joined(runs: list[Run]) -> Run:
         begin = int(len(parts[0]) != length)
         return jnp.asarray(np.concatenate([parts[0], *(x[begin:] for x in parts[1:])]))
 
-    return dataclasses.replace(jtu.tree_map(row, *runs), steps=sum(run.steps for run in runs))
+    tried, rejected = (sum(getattr(run, name) for run in runs) for name in ("steps", "rejected"))
+    return dataclasses.replace(jtu.tree_map(row, *runs), steps=tried, rejected=rejected)
 
 
 def _sweep(
@@ -234,7 +228,7 @@ def _sweep(
     there, cut = _kept(sweep, machine, **options)
     found: dict[str, Sweep] = {ways[0]: there}
     if up_and_down and not cut:
-        good = np.flatnonzero(np.asarray(there.result == RESULTS.successful))
+        good = np.flatnonzero(there.successful)
         if good.size:
             last = int(good[-1])
             options["start"] = jtu.tree_map(lambda x: x[last, -1], there.sections)
@@ -255,7 +249,7 @@ def _sweep(
             plot.plot_sweep(run, ax=ax, y=y, label=way, **look)
         ax.legend(frameon=False)
 
-    good = any(bool((run.result == RESULTS.successful).any()) for run in found.values())
+    good = any(bool(run.successful.any()) for run in found.values())
     return Found([f"{way}: {run}" for way, run in found.items()], table, draw, good, cut)
 
 
@@ -274,11 +268,11 @@ def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
 def _regimes(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
     """How many motions there are of each period, in the machine's words."""
     period = np.asarray(data["period"]).astype(int)[np.asarray(data["result"]) == 0]
-    names: dict[int, str] = {regime: regime.meaning for regime in REGIMES}
     kinds, counts = np.unique(period, return_counts=True)
     lines = []
     for i in np.argsort(-counts)[:12]:
-        name = names.get(int(kinds[i])) or f"period {cycles_in_words(machine, int(kinds[i]))}"
+        n = int(kinds[i])
+        name = REGIMES(n).meaning if n < 0 else f"period {cycles_in_words(machine, n)}"
         lines.append(f"  {name}: {counts[i]:,} ({100 * counts[i] / data['result'].size:.1f} %)")
     return lines + [f"  {len(kinds) - 12} further periods"] * (len(kinds) > 12)
 
@@ -291,8 +285,7 @@ def _basins(machine: AbstractMachine, options: dict[str, Any]) -> Found:
 
 
 def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0) -> Found:
-    guess = options.pop("guess", None)
-    guess = machine.start() if guess is None else guess
+    guess = options.pop("guess") if "guess" in options else machine.start()
     if settle:
         guess = simulate(machine, guess, 1, settle=settle, method=options.get("method")).last
     found = find_orbit(machine, guess, **options)
@@ -334,9 +327,8 @@ def errors_in(place: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError) as error:
-        if isinstance(error, InputError) or not re.match(
-            "Argument|Axis|Method|Measure", str(error)
-        ):
+        about = re.match("Argument|Axis|Method|Measure", str(error))
+        if isinstance(error, InputError) or not about:
             raise
         raise InputError(f"{place}: {error}") from None
 
@@ -357,5 +349,5 @@ def start_of(machine: AbstractMachine, table: Any) -> Any:
             return machine.start(**table)
         state = machine.start()
         for name, number in table.items():
-            state = with_leaf(state, check_name(leaf_names(state), name, "start"), number)
+            state = with_leaf(state, check_leaf(state, name, argument="start"), number)
         return state
