@@ -123,7 +123,7 @@ def _basins(label, dims, **coords):
         ),
     ]
     data = xr.Dataset({"label": (dims, np.asarray(label, np.int8))}, coords=coords)
-    return vi.Basins(data, motions, {**IRREGULAR})
+    return vi.Basins(data, motions, {**IRREGULAR}, vi.Scene.ideal(frequency_ratio=0.9))
 
 
 def test_basins_on_a_grid():
@@ -165,8 +165,7 @@ def test_maps_of_a_machine_speak_its_words():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
     found = _basins([[0, 1], [1, 0]], dims, **starts)
-    paper = found._replace(machine=vi.Scene.ideal(frequency_ratio=0.9))
-    ax = vi.plot_basins(paper, ax=_axes())
+    ax = vi.plot_basins(found, ax=_axes())
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Y at the start (a)", "V at the start (a ω)")
     names = {"Y": "height", "V": "speed"}
     renamed = [

@@ -121,7 +121,7 @@ def disc_and_rest(size=40, *, beyond=0.8):
     sections = {"Y": np.array([0.1, 0.0]), "V": np.array([0.0, -0.3])}
     inside = vi.Attractor(0, 2, 1.0, sections, 1, 0.3, 0.01)
     outside = vi.Attractor(1, 1, 1.0, {"Y": np.array([5.0]), "V": np.array([0.0])}, 1, 0.7, 0.01)
-    return vi.Basins(data, [inside, outside], {})
+    return vi.Basins(data, [inside, outside], {}, vi.Scene.ideal(frequency_ratio=0.9))
 
 
 def test_integrity_of_motions():

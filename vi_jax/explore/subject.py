@@ -22,7 +22,7 @@ from ..machine import (
     components,
     in_brackets,
     unit_of,
-    with_leaf,
+    with_leaves,
     with_unit,
 )
 from ..plot import axis_name
@@ -122,14 +122,11 @@ class Subject:
 
         **Raises:** `ValueError` for numbers that the machine refuses.
         """
-        machine, start = self.machine, self.start
-        for name in self.names:
-            if values[name] != self.controls[name].value:
-                machine = with_leaf(machine, name, float(values[name]))
+        moved = [name for name in self.names if values[name] != self.controls[name].value]
+        machine = with_leaves(self.machine, {name: float(values[name]) for name in moved})
         check_again(machine)
-        for name in components(start):
-            start = with_leaf(start, name, float(values[START + name]))
-        return machine, start
+        begin = {name: float(values[START + name]) for name in components(self.start)}
+        return machine, with_leaves(self.start, begin)
 
     def seen(self, values: Mapping[str, Any]) -> Motion:
         """The motion at these values of the sliders."""
@@ -265,9 +262,7 @@ def _fitting(do: Callable[[int], Any]) -> int:
 @compiled
 def _settled(machine: Any, names: tuple[str, ...], rows: Any, start: Any, settle: Any) -> Any:
     def one(row):
-        here = machine
-        for i, name in enumerate(names):
-            here = with_leaf(here, name, row[i])
+        here = with_leaves(machine, dict(zip(names, row, strict=True)))
         run = simulate(here, taken_along(here, adopt(here, start)), CYCLES, settle=settle)
         assert run.y_min is not None and run.impact_speed is not None
         Y, V = (jax.vmap(f)(run.sections)[1:] for f in (here.position, here.velocity))

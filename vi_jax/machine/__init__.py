@@ -110,6 +110,7 @@ from .numbers import leaf_names as leaf_names
 from .numbers import plain as plain
 from .numbers import state_in_words as state_in_words
 from .numbers import with_leaf as with_leaf
+from .numbers import with_leaves as with_leaves
 from .own import by_default as by_default
 from .own import changed as changed
 from .own import clock_of as clock_of

@@ -92,6 +92,13 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
     return jtu.tree_unflatten(treedef, leaves)
 
 
+def with_leaves(tree: Any, values: Mapping[str, Any]) -> Any:
+    """The same machine with other numbers in place of those of these names."""
+    for name, value in values.items():
+        tree = with_leaf(tree, name, value)
+    return tree
+
+
 def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
     """The array that a number's name begins with, and its place in it: none of the number itself or
     of a whole array."""

@@ -193,12 +193,10 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _start_name(machine: AbstractMachine | None, name: str) -> str:
+def _start_name(machine: AbstractMachine, name: str) -> str:
     """The label of an axis of starts: the machine's words, with units, for what is a position or a
     velocity; else the name, with its unit if the machine states one."""
     name = name.removeprefix("start.")
-    if machine is None:
-        return f"{name} at the start"
     by_its_name = in_brackets(f"{name} at the start", unit_of(machine.units, name))
     try:
         start = machine.start()

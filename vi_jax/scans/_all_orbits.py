@@ -1,18 +1,18 @@
 """`all_orbits`: the periodic motions that searches from a region of starts find."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, given_number
 from .._messages import in_parts, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
-from ..machine import AbstractMachine, components, cycles_in_words, with_leaf, with_units
+from ..machine import AbstractMachine, components, cycles_in_words, with_units
 from ..orbit import (
     ORBIT_RESULTS,
     AbstractRootFinder,
@@ -24,7 +24,7 @@ from ..orbit import (
     in_one_line,
 )
 from ._basins import starts_in
-from .program import START, check_leaf_name
+from .program import start_with
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,33 +192,19 @@ def all_orbits(
     tolerance = given_number("tolerance", tolerance, low=0.0)
     begin = machine.start() if start is None else start
     # A draw for each period: longer ones do not change what shorter ones are searched from.
-    rows = [starts_in(region, 1, starts, (seed, n)) for n in range(1, cycles + 1)]
-    for name in rows[0]:
-        check_leaf_name(machine, begin, name, "region", None)
+    rows = [starts_in(region, machine, begin, 1, starts, (seed, n)) for n in range(1, cycles + 1)]
     ranges = {name: (float(low), float(high)) for name, (low, high) in region.items()}
 
     def step(_, piece):
         n, row = piece
-        options = {"root_finder": root_finder, "method": method}
-        return None, find_orbit(machine, _guesses(begin, row), n, **options)
+        guesses = jax.vmap(functools.partial(start_with, begin))(row)
+        return None, find_orbit(machine, guesses, n, root_finder=root_finder, method=method)
 
     def joined(_, batches: list[Orbit]) -> AllOrbits:
         return _sorted_out(machine, batches, tolerance, ranges)
 
     pieces = ((1, piece) for piece in enumerate(rows, 1))
     return in_parts("search for periodic motions", step, None, pieces, joined, progress=False)
-
-
-def _guesses(begin: State, row: Mapping[str, np.ndarray]) -> State:
-    """A start for each place in the rows of its parts."""
-
-    def one(values: Mapping[str, Any]) -> State:
-        here = begin
-        for name, value in values.items():
-            here = with_leaf(here, name.removeprefix(START), value)
-        return here
-
-    return jax.vmap(one)({name: jnp.asarray(x) for name, x in row.items()})
 
 
 def _sorted_out(

@@ -36,7 +36,7 @@ from ..machine import (
     state_in_words,
     summary_table,
     unit_of,
-    with_leaf,
+    with_leaves,
 )
 from ..orbit import distance
 from ._computed import ScanInterrupted
@@ -53,7 +53,7 @@ from ._lane_noise import START
 from ._scan import LanesFailed, scan
 from .grid import axes_of
 from .measures import AbstractMeasure, Regime
-from .program import check_leaf_name
+from .program import check_leaf_name, start_with
 from .regime import CODES, REGIMES, flags, size_of
 
 _BEYOND = REASON_NAMES.index("bad_start")
@@ -114,12 +114,12 @@ class Basins(NamedTuple):
     irregular: dict[str, float]
     """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
     transient (transiently chaotic, see `Regime`)."""
-    machine: AbstractMachine | None = None
+    machine: AbstractMachine
     """The machine whose basins these are; it words the periods."""
 
     def period_of(self, cycles: int) -> str:
         """A duration of so many cycles, in the words of the machine."""
-        return f"{2 * cycles}π" if self.machine is None else cycles_in_words(self.machine, cycles)
+        return cycles_in_words(self.machine, cycles)
 
     def integrity(self, *, scales: Mapping[str, float] | None = None) -> list[Integrity]:
         """How far the starts of each motion reach: the largest ball of them around the motion, and
@@ -218,20 +218,19 @@ class Basins(NamedTuple):
             values = [getattr(a, name) for a in self.attractors]
             variables[f"motion_{name}"] = "motion", np.asarray(values)
         longest = max((a.period for a in self.attractors), default=0)
-        units = {} if self.machine is None else self.machine.units
         for name in self.attractors[0].sections if self.attractors else ():
             rows = np.full((len(self.attractors), longest), np.nan)
             for row, a in zip(rows, self.attractors, strict=True):
                 row[: a.period] = a.sections[name]
-            about = attributes(unit_of(units, name))
+            about = attributes(unit_of(self.machine.units, name))
             variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
         return tidy(self.data.assign(variables), along)
 
     def __str__(self) -> str:
-        units = {} if self.machine is None else self.machine.units
         lines = [f"Basins of {so_many(len(self.attractors), 'periodic motion')}"]
         for a in self.attractors:
-            where = state_in_words({name: x[0] for name, x in a.sections.items()}, 6, units)
+            first = {name: x[0] for name, x in a.sections.items()}
+            where = state_in_words(first, 6, self.machine.units)
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "
                 f"{so_many(round(a.impacts), 'impact')}, {where}: "
@@ -326,10 +325,8 @@ def basins(
     machine = machine_of(machine)
     check_options(basins, options, ())
     given_number("apart", apart, low=0.0, open_low=True)
-    axes = starts_in(region, resolution, samples, count("seed", seed))
     begin = machine.start() if start is None else start
-    for name in axes:
-        check_leaf_name(machine, begin, name, "region", None)
+    axes = starts_in(region, machine, begin, resolution, samples, count("seed", seed))
     method = chosen(machine, method)
     data = followed(
         machine, axes, longest, tolerance, start=start, settle=settle, method=method,
@@ -357,9 +354,7 @@ def sorted_out(
     names = list(components(begin))
 
     def sections(state: np.ndarray, cycles: int) -> np.ndarray:
-        here = begin
-        for name, value in zip(names, state, strict=True):
-            here = with_leaf(here, name, value)
+        here = with_leaves(begin, dict(zip(names, state, strict=True)))
         # Always as many cycles, so that another period is not another program.
         run = simulate(machine, here, longest, method=method)
         return np.stack(
@@ -399,12 +394,10 @@ def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> lis
 
 def _can_be(machine: AbstractMachine, begin: object, values: Mapping[str, float]) -> bool:
     """Whether a start with these parts can be simulated."""
-    for name, value in values.items():
-        begin = with_leaf(begin, name.removeprefix(START), value)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            check_start(machine, begin)
+            check_start(machine, start_with(begin, values))
         except ValueError:
             return False
     return True
@@ -446,6 +439,8 @@ def followed(
 
 def starts_in(
     region: Mapping[str, tuple[float, float]],
+    machine: AbstractMachine,
+    begin: State,
     resolution: int | tuple[int, ...],
     samples: int | None,
     seed: int | tuple[int, ...],
@@ -466,6 +461,7 @@ def starts_in(
                 "Argument `region` must give ranges (low, high), low < high, of parts of the "
                 f'start, "start.Y" and such, but got {region[name]!r} for {name!r}.'
             )
+        check_leaf_name(machine, begin, name, "region", None)
     if samples is not None:
         samples = count("samples", samples, least=1)
         fits_records("samples", samples, len(ranges))

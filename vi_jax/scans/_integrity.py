@@ -102,8 +102,7 @@ class IntegrityProfile(NamedTuple):
         **Raises:** `ValueError` if there is no such dimension.
         """
         both = "motion", self.parameter
-        machine = self.basins[0].machine
-        unit = "1" if machine is None else unit_of(machine.units, self.parameter)
+        unit = unit_of(self.basins[0].machine.units, self.parameter)
         variables: dict[str, Any] = {
             name: (both, getattr(self, name)) for name in ("label", *_NUMBERS)
         }
@@ -181,7 +180,8 @@ def integrity_profile(
     check_options(integrity_profile, options, ("samples", "seed"))
     given_number("apart", apart, low=0.0, open_low=True)
     row = np.unique(axes_of({parameter: values}, "values")[parameter])
-    axes = starts_in(region, resolution, None, 0)
+    begin = machine.start() if start is None else start
+    axes = starts_in(region, machine, begin, resolution, None, 0)
     for x in axes.values():
         count("resolution", x.size, least=2)
     scales_along([*axes], scales)
@@ -236,7 +236,7 @@ def _followed(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray
     Of the motions of a kind those nearest to each other are one, the nearest pair first.
     """
     names = [name.removeprefix(START) for name in axes]
-    turning = getattr(type(found[0].machine).renewed, "angles", ()) if found[0].machine else ()
+    turning = getattr(type(found[0].machine).renewed, "angles", ())
     angles = np.array([name in turning for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
     last: list[Attractor] = []

@@ -43,13 +43,12 @@ from ..machine import (
     may_rest,
     replaced,
     with_leaf,
+    with_leaves,
 )
 from ._lane_noise import MACHINE, NOISE, START, LaneNoise, lane_noise_of, part_of
 from .grid import Blocks
 from .measures import MEASURES, AbstractMeasure, Average, Numbers
 from .statistics import Escape
-
-_USUAL = RunOptions()
 
 
 class ScanProgram(eqx.Module):
@@ -95,10 +94,8 @@ class ScanProgram(eqx.Module):
                     f"`AbstractMachine`, but it returned {machine!r}."
                 )
         else:
-            machine = self.machine
-            for name, value in of_machine.items():
-                machine = with_leaf(machine, name, value)
-        assert machine is not None
+            assert self.machine is not None
+            machine = with_leaves(self.machine, of_machine)
         machine = self._nudged(machine, MACHINE, nudge)
         if self.options.clock is not None:
             machine = in_clock(machine, self.options.clock)
@@ -208,7 +205,7 @@ class ScanProgram(eqx.Module):
 def make_program(
     machine: AbstractMachine | Callable[..., AbstractMachine],
     names: tuple[str, ...],
-    options: RunOptions = _USUAL,
+    options: RunOptions,
     *,
     measure: Any,
     start: State = None,
@@ -242,10 +239,8 @@ def make_program(
     lane_noise = lane_noise_of(noise, key, names, derivatives, measures)
     cycles = cycles_for(measures, cycles)
     settle = count("settle", options.settle)
-    first = start
-    if template is not None and start is None:
-        first = template.start()
     if template is not None:
+        first = template.start() if start is None else start
         for name in names:
             check_leaf_name(template, first, name, "axes", lane_noise)
     measures = tuple(measure.under(method) for measure in measures)
@@ -357,6 +352,11 @@ def check_leaf_name(
     check_name(names, name, argument, machine)
 
 
+def start_with(start: State, values: Mapping[str, Any]) -> State:
+    """The start with other numbers in place of those that these axes are of."""
+    return with_leaves(start, {name.removeprefix(START): x for name, x in values.items()})
+
+
 def _corners(blocks: Blocks) -> np.ndarray:
     """The lanes in which the axes have their least and greatest values, one in a row."""
     rows = list(blocks.axes.values())
@@ -378,13 +378,8 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
     """
     rests = False
     if blocks.paired and program.machine is not None:
-        lanes = {
-            name: jnp.asarray(x) for name, x in blocks.axes.items() if part_of(name) == MACHINE
-        }
-        machine = program.machine
-        for name, x in lanes.items():
-            machine = with_leaf(machine, name, x)
-        check_again(machine)  # all lanes at a time
+        rows = {name: x for name, x in blocks.axes.items() if part_of(name) == MACHINE}
+        check_again(with_leaves(program.machine, rows))  # all lanes at a time
     for values in _corners(blocks):
         lane = {name: jnp.asarray(x) for name, x in zip(blocks.axes, values, strict=True)}
         machine, start = program.lane(lane)
