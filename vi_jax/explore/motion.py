@@ -189,12 +189,6 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
 def _exponent_of(scene: AbstractMachine, state: State) -> float:
     """The greatest exponent; NaN for a machine that has none (a drift renewed on its section)."""
     try:
-        return float(_exponent(scene, state))
+        return float(lyapunov(scene, state, _REGIME.observed, settle=0, number=1).exponents[0])
     except ValueError:
         return float("nan")
-
-
-@compiled
-def _exponent(scene: AbstractMachine, state: State) -> jax.Array:
-    out = lyapunov(scene, state, _REGIME.observed, settle=0, number=1)
-    return out.exponents[0]

@@ -139,10 +139,8 @@ def first_exits(
     rays = spread(directions, kick.size, seed)
     reach = largest
     if reach is None:
-        reach = (
-            float(np.max(kick.weights * (settling.unit + np.abs(kick.start[list(kick.places)]))))
-            / 4
-        )
+        sizes = settling.unit + np.abs(kick.start[list(kick.places)])
+        reach = float(np.max(kick.weights * sizes)) / 4
     found = exits(settling, kick, rays, 0.0, reach, points)
     for _ in range(_DOUBLINGS if largest is None else 0):
         if np.isfinite(found.outside).any():
@@ -186,8 +184,7 @@ def nearer(
     best: tuple[Row, float, float] = unit, 0.0, radius
     for _ in range(rounds):
         around = _around(best[0], angle, rng)
-        inside = np.zeros(len(around))
-        coarse = exits(settling, kick, around, inside, best[2] * (1 + angle**2), 2 * AROUND)
+        coarse = exits(settling, kick, around, 0.0, best[2] * (1 + angle**2), 2 * AROUND)
         # A direction so far off is worse by the square of the angle, or better.
         bits = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
         found = narrowed(settling, kick, coarse, max(1, bits))

@@ -26,7 +26,6 @@ from .measures import AbstractMeasure as AbstractMeasure
 from .measures import Exponent as Exponent
 from .measures import Regime as Regime
 from .measures import Sections as Sections
-from .program import check_corners as check_corners
 from .program import make_program as make_program
 from .regime import REGIMES as REGIMES
 from .statistics import Density as Density

@@ -153,7 +153,8 @@ def _parts(thing: Any) -> list[Any]:
     if isinstance(thing, property):
         return [thing.fget]
     if isinstance(thing, type | types.FunctionType):
-        name, own = [thing.__module__, thing.__qualname__], _is_own(thing.__module__)
+        name = [thing.__module__, thing.__qualname__]
+        own = (thing.__module__ or "").partition(".")[0] not in _LIBRARIES
         if isinstance(thing, type):
             return [*name, *thing.__bases__, *_members(thing)] if own else name
         used = inspect.getclosurevars(thing)
@@ -164,10 +165,6 @@ def _parts(thing: Any) -> list[Any]:
         source = inspect.getsource(thing)
         return [source, thing.__defaults__, thing.__kwdefaults__, used.nonlocals, used.globals]
     return [type(thing), *thing.__reduce_ex__(2)[1:3]]
-
-
-def _is_own(module: str | None) -> bool:
-    return (module or "").partition(".")[0] not in _LIBRARIES
 
 
 def _members(kind: type) -> Iterator[Any]:
@@ -186,16 +183,10 @@ def _numbers(tree: Any) -> dict[str, Any]:
 
 def attributes_of(about: dict[str, Any], machine: AbstractMachine) -> dict[str, Any]:
     """The attributes of a scan's data, from its description and one of its machines."""
-    return {
-        "vi_jax": installed_version(),
-        "machine_class": type(machine).__name__,
-        "method": about["method"],
-        "settle": about["settle"],
-        "cycles": about["cycles"],
-        "machine": json.dumps(about["machine"]),
-        "start": json.dumps(about["start"]),
-        "precision": about["precision"],
-    } | ({"noise": json.dumps(about["noise"])} if "noise" in about else {})
+    found = {"vi_jax": installed_version(), "machine_class": type(machine).__name__}
+    found |= {name: about[name] for name in ("method", "settle", "cycles", "precision")}
+    tables = [name for name in ("machine", "start", "noise") if name in about]
+    return found | {name: json.dumps(about[name]) for name in tables}
 
 
 def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 # Tiles along each axis, of which one after the other is left out for the confidence interval, in
-# one dimension and in more; and the distances looked at if none are given, at most this part of
-# the grid. Choices.
+# more dimensions and in one; and the distances looked at, at most this part of the grid. Choices.
 _TILES, _TILES_OF_A_ROW = 8, 64
 _DISTANCES, _FARTHEST = 8, 1 / 16
 
@@ -112,28 +111,23 @@ def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
 
 
 def uncertainty_of(
-    label: np.ndarray,
-    *,
-    distances: np.ndarray | None = None,
-    confidence: float = 0.95,
-    there: np.ndarray | None = None,
+    label: np.ndarray, *, confidence: float = 0.95, there: np.ndarray | None = None
 ) -> Uncertainty:
     """Uncertainty exponents of the boundaries between labels on a grid of any dimension.
 
-    The same starts are looked at for all distances: those that have neighbours at the largest one.
+    The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, three at least.
+    The same starts are looked at for all of them: those that have neighbours at the largest one.
     An exponent is the slope of ln(fraction) over ln(distance) by least squares. Its interval has
     two parts, added in quadrature: what the slope varies by as one tile of the grid after the
     other is left out (jackknife), which is the chance of where the region lies, and the scatter
     about the straight line.
 
-    **Arguments:** `label`, an integer for each outcome; `distances`, in cells (left out: eight
-    from 1 on to a sixteenth of the shortest axis, three at least); `confidence` of the intervals;
-    `there`, which cells hold a start at all (all by default): one without is no other outcome.
+    **Arguments:** `label`, an integer for each outcome; `confidence` of the intervals; `there`,
+    which cells hold a start at all (all by default): one without is no other outcome.
     """
     there = np.ones(label.shape, bool) if there is None else there
-    if distances is None:
-        farthest = max(int(min(label.shape) * _FARTHEST), 3)
-        distances = np.unique(np.geomspace(1, farthest, _DISTANCES).round().astype(int))
+    farthest = max(int(min(label.shape) * _FARTHEST), 3)
+    distances = np.unique(np.geomspace(1, farthest, _DISTANCES).round().astype(int))
     margin = int(distances.max())
     exponents, intervals, fractions = [], [], []
     for axis in range(label.ndim):

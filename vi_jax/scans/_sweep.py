@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._checks import concrete, count, fits_records, flag, number, require
+from .._checks import concrete, count, fits_records, flag, number
 from .._messages import in_parts, so_many, warning_once
 from .._programs import compiled, is_outermost
 from .._types import State, xr
@@ -254,8 +254,6 @@ def sweep(
     if max_steps is not None:
         max_steps = count("max_steps", max_steps, least=1)
     fits_records("cycles", values.size * cycles, 4)
-    if tolerance is not None:
-        require("tolerance", tolerance, low=0.0, open_low=True)
     rests = True
     if numbers is not None:
         ends = [with_leaf(machine, parameter, value) for value in {numbers.min(), numbers.max()}]
@@ -265,6 +263,7 @@ def sweep(
     if start is None:
         start = with_leaf(machine, parameter, values[0]).start()
     method = chosen(machine, method)
+    regime = Regime(cycles // 2, tolerance=tolerance).under(method)
     if clock is not None:
         machine = in_clock(machine, clock)
     start = replaced(start, adopt(machine, bare(start)))
@@ -275,8 +274,8 @@ def sweep(
     lane_noise = lane_noise_of(noise, key, (), (), ())
     if lane_noise is not None:
         check_noise(machine, bare(start), noise)
-    options = (settle, cycles, method, rests, tolerance, max_steps, lane_noise, bare(start))
-    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, tolerance, lane_noise):
+    options = (settle, cycles, method, rests, regime, max_steps, lane_noise, bare(start))
+    if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
         return _sweep(machine, parameter, values, _counted(start, lane_noise), *options)[1]
     # All by one program: the last part is filled up by what ends at once.
     size, missing = values.size, -values.size % _AT_ONCE
@@ -332,15 +331,14 @@ def taken_along(machine: AbstractMachine, state: State) -> State:
 
 @compiled
 def _sweep(
-    machine, parameter, values, start, settle, cycles, method, rests, tolerance, max_steps,
+    machine, parameter, values, start, settle, cycles, method, rests, regime, max_steps,
     lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
     """The state after the last value, and what was found at each.
 
-    **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it; `first`, the state
-    at the first value of all.
+    **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it; `regime`, the
+    measure of periods; `first`, the state at the first value of all.
     """
-    regime = Regime(cycles // 2, tolerance=tolerance).under(method)
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}

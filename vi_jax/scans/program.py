@@ -429,11 +429,8 @@ def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[Abstract
 
     **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
     """
-    if isinstance(measure, str | AbstractMeasure) or callable(measure):
-        measure = (measure,)
-    if not isinstance(measure, Iterable):
-        raise TypeError(f"Argument `measure` must be a name or a function, but got {measure!r}.")
-    found = tuple(_measure(one, averages) for one in measure)
+    several = isinstance(measure, Iterable) and not isinstance(measure, str | AbstractMeasure)
+    found = tuple(_measure(one, averages) for one in (measure if several else (measure,)))
     if not found:
         raise ValueError("Argument `measure` must name at least one measure, but is empty.")
     return found

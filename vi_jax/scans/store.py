@@ -116,7 +116,7 @@ class ZarrStore(MemoryStore):
             raise
 
     def _open(self, description: Mapping[str, Any], *, new: bool) -> None:
-        with _chunks_of_nan():
+        with zarr.config.set({"array.write_empty_chunks": True}):
             try:
                 group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
             except Exception as error:
@@ -177,10 +177,6 @@ class ZarrStore(MemoryStore):
         """Return the data of the store, which are read when they are used."""
         data = xr.open_zarr(str(self.path), chunks=None, mask_and_scale=False)
         return data[[*data["result"].dims, *sorted(map(str, data.data_vars))]]
-
-
-def _chunks_of_nan() -> Any:
-    return zarr.config.set({"array.write_empty_chunks": True})
 
 
 def _read(array: Any, where: Any) -> np.ndarray | None:
