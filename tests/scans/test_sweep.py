@@ -35,6 +35,7 @@ def _described(y_min, period, impacts, zeta=None):
         sections=None,
         result=vi.RESULTS.successful,
         labels=SCENE.labels,
+        periods=tuple(f"{2 * n}π" for n in range(1, 9)),
         units=tuple(SCENE.units.items()),
     )
     return str(sweep).splitlines()[1:]

@@ -103,11 +103,8 @@ def animate(
 def _frames(
     run: Run, machine: AbstractMachine, path: Any, good: np.ndarray, number: int
 ) -> _Frames:
-    """Frames evenly spaced in time, states in between samples by interpolation.
-
-    **Arguments:** `path`, the motion as it is drawn; `good`, flags of its points to show; `number`
-    of frames.
-    """
+    """Frames evenly spaced in time, states in between samples by interpolation, for those points
+    of the path that are `good`."""
     samples = run.samples
     assert samples is not None
     cycles, time = (np.asarray(x, float) for x in (samples.cycles, samples.time))
@@ -142,8 +139,6 @@ class MotionAnimation(animation.FuncAnimation):
         self, figure: Figure | None, machine: AbstractMachine, run: Run, frames: _Frames, fps: int,
         history: bool,
     ):  # fmt: skip
-        """**Arguments:** `figure`, to draw in, `None` for a new one; `frames`, what each shows;
-        `fps`, frames a second; `history`, whether the history is drawn below."""
         self.fps = fps
         """Frames per second."""
         self._machine, self._frames = machine, frames

@@ -114,11 +114,7 @@ class Pen:
         self._along(start, end, [piston, length], [0, 0], lw=1.3)
 
     def _along(self, start: Point, end: Point, along: object, across: object, **look: Any) -> None:
-        """A line in coordinates along and across the way from one point to another.
-
-        **Arguments:** `along` and `across`, coordinates of its points; `look`, options of
-        matplotlib's `plot`.
-        """
+        """A line in coordinates along and across the way from one point to another."""
         way = np.subtract(end, start)
         length = np.hypot(*way)
         unit = way / length if length else np.array([1.0, 0.0])

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._messages import so_many
-from ..machine import AbstractMachine, by_name, cycles_in_words, in_brackets, unit_of
+from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins
 from . import colors as look
 from .branch import axis_name
@@ -202,12 +202,12 @@ def _start_name(machine: AbstractMachine, name: str) -> str:
         start = machine.start()
     except ValueError:  # a machine that has no start of its own
         start = None
-    if start is not None and name in by_name(start):  # not a number within an array
-        values = {key: float(i) + 2.5 for i, key in enumerate(by_name(start))}
-        leaves = [jnp.asarray(value) for value in values.values()]
-        probe = jtu.tree_unflatten(jtu.tree_structure(start), leaves)
+    names = [] if start is None else leaf_names(start)
+    if name in names:  # not a number within an array
+        probe = jtu.tree_unflatten(jtu.tree_structure(start), jnp.arange(len(names)) + 2.5)
+        value = names.index(name) + 2.5
         for read, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
-            if float(read(probe)) == values[name] and not words.startswith(f"{name} = "):
+            if float(read(probe)) == value and not words.startswith(f"{name} = "):
                 return f"{words} at the start"
     return by_its_name
 

@@ -47,15 +47,10 @@ def plot_sketch(
         phase = 0.3 * pi if isinstance(machine, ShaftMachine) else 0.0
     ax = new_axes(ax)
     sketch(machine, pen_for(machine, ax, _positions(machine, state), labels=True), state, phase)
-    frame_axes(ax)
-    return ax
-
-
-def frame_axes(ax: Axes) -> None:
-    """No ticks, and equal scales."""
     ax.set_aspect("equal", adjustable="datalim")
     ax.axis("off")
     ax.margins(0.06)
+    return ax
 
 
 def _positions(machine: AbstractMachine, state: State) -> np.ndarray:

@@ -213,17 +213,16 @@ def _sorted_out(
 ) -> AllOrbits:  # fmt: skip
     """The different motions in what searches for 1, 2, … cycles found."""
     orbits, found = distinct_among(batches, tolerance)
-    searched = []
-    for n, (batch, column) in enumerate(zip(batches, found.T, strict=True), 1):
-        searched.append(
-            Searched(
-                cycles=n,
-                starts=int(batch.residual.size),
-                simulated=int(np.isfinite(np.asarray(batch.residual)).sum()),
-                converged=int(column.sum()),
-                motions=int((column > 0).sum()),
-                once=int((column == 1).sum()),
-                still=int((np.asarray(batch.result == ORBIT_RESULTS.equilibrium)).sum()),
-            )
+    searched = tuple(
+        Searched(
+            cycles=n,
+            starts=int(batch.residual.size),
+            simulated=int(np.isfinite(np.asarray(batch.residual)).sum()),
+            converged=int(column.sum()),
+            motions=int((column > 0).sum()),
+            once=int((column == 1).sum()),
+            still=int((np.asarray(batch.result == ORBIT_RESULTS.equilibrium)).sum()),
         )
-    return AllOrbits(orbits, found, tuple(searched), region, machine)
+        for n, (batch, column) in enumerate(zip(batches, found.T, strict=True), 1)
+    )
+    return AllOrbits(orbits, found, searched, region, machine)

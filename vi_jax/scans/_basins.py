@@ -365,7 +365,19 @@ def sorted_out(
     size = partial(size_of, machine, begin, starts)
     label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), size)
     impacts = np.asarray(data["impacts"]).ravel()
-    attractors = [_attractor(i, m, names, label, impacts) for i, m in enumerate(motions)]
+    attractors = []
+    for number, motion in enumerate(motions):
+        here = label == number
+        share = float(np.mean(here))
+        attractors.append(Attractor(
+            label=number,
+            period=len(motion),
+            impacts=float(np.median(impacts[here])),
+            sections=dict(zip(names, motion.T, strict=True)),
+            starts=int(np.sum(here)),
+            fraction=share,
+            error=math.sqrt(share * (1 - share) / label.size),
+        ))  # fmt: skip
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
     about = {"long_name": "motion that the start settles on", **flags(CODES)}
     about["at_stop"] = _at_stop(data, machine, begin)
@@ -477,27 +489,6 @@ def starts_in(
         size = count("resolution", size, least=1)
         axes[name] = low + (high - low) * (np.arange(size) + 0.5) / size
     return axes
-
-
-def _attractor(
-    number: int, motion: np.ndarray, names: list[str], label: np.ndarray, impacts: np.ndarray
-) -> Attractor:
-    """A motion that starts came to, with its share of them.
-
-    **Arguments:** `number`, its label; `motion`, its section states, (period, states); `names` of
-    their components; `label` and `impacts`, of each start the motion it came to and its impacts.
-    """
-    here = label == number
-    fraction = float(np.mean(here))
-    return Attractor(
-        label=number,
-        period=len(motion),
-        impacts=float(np.median(impacts[here])),
-        sections=dict(zip(names, motion.T, strict=True)),
-        starts=int(np.sum(here)),
-        fraction=fraction,
-        error=math.sqrt(fraction * (1 - fraction) / label.size),
-    )
 
 
 def _labelled(

@@ -212,11 +212,7 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
-    """The exponents of one motion.
-
-    **Arguments:** `start`, a state on the section; `settle`, cycles before those observed; `number`
-    of exponents.
-    """
+    """The exponents of one motion that begins on the section."""
     carry = _begun(the_map, start, settle, number)
     window = _window(cycles) if number == 1 else 1
     carry, seen = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)

@@ -30,7 +30,6 @@ from ..flow import (
     tidy,
 )
 from ..machine import (
-    PLAIN,
     AbstractMachine,
     Stated,
     Summarized,
@@ -96,11 +95,11 @@ class Sweep(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the cycles observed, by name (see
     `AbstractMachine.averages`)."""
-    labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
+    labels: tuple[str, str] = eqx.field(static=True, kw_only=True)
     """What pictures write beside position and velocity, in the machine's words."""
-    periods: tuple[str, ...] = eqx.field(static=True, default=())
+    periods: tuple[str, ...] = eqx.field(static=True, kw_only=True)
     """Names of the periods of 1, 2, ... cycles, in the machine's words."""
-    units: Stated = eqx.field(static=True, default=())
+    units: Stated = eqx.field(static=True, kw_only=True)
     """In which units its quantities are, as the machine states it."""
 
     @property
@@ -163,10 +162,9 @@ class Sweep(Summarized):
             REGIMES.unsettled: "no period",
             REGIMES.failed: REGIMES.failed.meaning,
         }
-        periods = dict(enumerate(self.periods, 1))
         return [
             names.get(int(p))
-            or f"{periods.get(int(p), f'{2 * int(p)}π')} with {so_many(round(float(n)), 'impact')}"
+            or f"{self.periods[int(p) - 1]} with {so_many(round(float(n)), 'impact')}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
         ]
 

@@ -429,8 +429,9 @@ def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[Abstract
 
     **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
     """
-    several = isinstance(measure, Iterable) and not isinstance(measure, str | AbstractMeasure)
-    found = tuple(_measure(one, averages) for one in (measure if several else (measure,)))
+    if isinstance(measure, str) or callable(measure) or not isinstance(measure, Iterable):
+        measure = (measure,)
+    found = tuple(_measure(one, averages) for one in measure)
     if not found:
         raise ValueError("Argument `measure` must name at least one measure, but is empty.")
     return found

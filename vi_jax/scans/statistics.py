@@ -27,19 +27,6 @@ _OF_CYCLE = _COLUMNS[:5]
 Of = str | Callable[..., Any]
 
 
-def instants_of(run: Run, name: str, samples: int) -> Array | None:
-    """A part of the state, or a quantity of the machine, at all sections or samples of one lane
-    with the first; `None` for what is neither.
-
-    **Arguments:** the run; the name; samples in a cycle, 0 for sections.
-    """
-    states, quantities = run.sections, run.quantities
-    if samples:
-        assert run.samples is not None
-        states, quantities = run.samples.state, run.samples.quantities
-    return {**components(states, 1), **quantities}.get(name)
-
-
 class _Observed(AbstractMeasure):
     """A measure of one quantity on sections, at sampled instants or cycle by cycle."""
 
@@ -70,7 +57,11 @@ class _Observed(AbstractMeasure):
                     f"but returned shape {found.shape}."
                 )
             return found, found
-        found = instants_of(run, name, self.samples)
+        states, quantities = run.sections, run.quantities
+        if self.samples:
+            assert run.samples is not None
+            states, quantities = run.samples.state, run.samples.quantities
+        found = {**components(states, 1), **quantities}.get(name)
         if found is not None:
             return found, found[1:]
         columns = {} if self.samples else {n: getattr(run, n) for n in _COLUMNS} | run.averages
