@@ -36,6 +36,8 @@ def main() -> None:
             first = next(iter(client.run(os.getpid).values()))
             threading.Timer(8.0, os.kill, (first, 9)).start()
             vi.scan(scene, AXES, settle=1500, lanes=512, cluster=client, store=options.store)
+            print("ends", flush=True)
+            os._exit(0)  # Dask may wait for ever for a worker that it just started again
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,32 @@ def test_a_cluster_without_workers_is_waited_for(monkeypatch):
         with distributed.Client(cluster) as client:
             found = vi.scan(scene, axes, **options, cluster=client)
     assert said and "has no workers. The scan waits" in said[0]
+    xr.testing.assert_identical(found, vi.scan(scene, axes, **options))
+
+
+class _Forgetful(ThreadPoolExecutor):
+    """Stands for a Dask client that forgets the fifth of its blocks."""
+
+    status, given = "running", 0
+
+    def get_executor(self, **options):
+        return self
+
+    def scheduler_info(self):
+        return {"workers": {"one": {}}}
+
+    def submit(self, *task):
+        self.given += 1
+        return Future() if self.given == 5 else super().submit(*task)
+
+
+def test_a_block_that_a_cluster_forgets_is_given_to_it_again(monkeypatch):
+    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "_PATIENCE", 0.02)
+    scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 2000)}
+    options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
+    with _Forgetful(1) as client:
+        found = vi.scan(scene, axes, **options, cluster=client)
+    assert client.given == 8 + 1
     xr.testing.assert_identical(found, vi.scan(scene, axes, **options))
 
 

@@ -5,6 +5,7 @@ import functools
 import itertools
 import json
 import math
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -51,6 +52,10 @@ _ON_CLUSTER = 4096
 
 # Seconds without a new block after which a cluster is asked for its workers. A choice.
 _PATIENCE = 10.0
+
+# Dask's blocks are given to it again after so many times the longest wait for one so far (that for
+# the first one is not known, and taken to be as many times the patience). A choice.
+_LONG = 6
 
 
 class ScanInterrupted(Interrupted):
@@ -217,7 +222,9 @@ def run_blocks(
     """Compute the blocks `todo` in an executor, and write each when it is done.
 
     Local threads have one core and one block each; on an accelerator, or over several devices,
-    there is one thread. On Ctrl-C all blocks are written that have ended by then.
+    there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
+    cluster seems to have forgotten are given to it once more (a worker that is killed can leave
+    Dask waiting for ever: https://github.com/dask/distributed/issues/3196).
 
     **Raises:** `ClusterLost`; what a block raises.
     """
@@ -250,12 +257,17 @@ def run_blocks(
                 raise ClusterLost from error
 
         def finish(future: Future) -> None:
+            where = running[future]
             try:
-                write(running[future], future.result())
+                write(where, future.result())
             except (CancelledError, BrokenExecutor) as error:
                 raise ClusterLost from error
             del running[future]
+            for other in [x for x in running if twice and running[x] == where]:
+                other.cancel()
+                del running[other]
 
+        since, longest, twice = time.monotonic(), 0.0, False
         try:
             while True:
                 for where in itertools.islice(waiting, at_once - len(running)):
@@ -263,10 +275,17 @@ def run_blocks(
                 if not running:
                     return
                 done, _ = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
-                if not done:
-                    _warn_without_workers(place.cluster)
+                waited = time.monotonic() - since
+                if done:
+                    since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
+                elif _has_workers(place.cluster) and hasattr(place.cluster, "get_executor"):
+                    if not twice and waited > _LONG * (longest or _LONG * _PATIENCE):
+                        twice = True
+                        for where in list(running.values()):
+                            begin(where)
                 for future in done:
-                    finish(future)
+                    if future in running:
+                        finish(future)
         finally:
             wait([future for future in running if not future.cancel()])
             for future in list(running):
@@ -282,9 +301,12 @@ def _executor_of(cluster: Any) -> Executor:
     return cluster.get_executor(pure=False, retries=3)
 
 
-def _warn_without_workers(cluster: Any) -> None:
+def _has_workers(cluster: Any) -> bool:
+    """Whether a cluster has workers, with a warning where it has none."""
     if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
         warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
+        return False
+    return True
 
 
 def _task(
