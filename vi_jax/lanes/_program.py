@@ -313,6 +313,12 @@ def walked(
 def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool]:
     """Which results of a jaxpr may depend on its arguments `sources`; if `smooth`, only dependence
     that can have a derivative counts."""
+    return list(_dependent_results(jaxpr, tuple(sources), smooth))
+
+
+# A step calls the field, one jaxpr, some sixty times, and loops are gone through again and again.
+@functools.lru_cache(maxsize=1024)
+def _dependent_results(jaxpr: Jaxpr, sources: tuple[bool, ...], smooth: bool) -> list[bool]:
     return walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=smooth))
 
 

@@ -8,10 +8,12 @@ begins.
 import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Flag, Scalar, State
@@ -26,9 +28,10 @@ from ..machine import (
     raveled,
     with_modes,
 )
-from ._cycle_map import CycleMap, forward_jacobian
+from ._cycle_map import CycleMap, forward_jacobian, tied
 from ._neutral import smallest_solution
-from ._root import shooting_matrix
+from ._root import root_of, shooting_matrix
+from .root_finders import AbstractRootFinder, Found
 
 # Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
 _PLACES = 8
@@ -113,12 +116,16 @@ class ObservedArc(NamedTuple):
     """Of the machine's averages, over the time of each cycle."""
 
 
-def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
+def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> ObservedArc:
     """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
-    `forward_jacobian`)."""
+    `forward_jacobian`).
 
-    @forward_jacobian
-    def seen(arc, state):
+    **Arguments:** `second`, whether those of `jacobians` are, which are second derivatives of the
+    motion; zero if not.
+    """
+
+    # Apart from the motion: a program with second derivatives should hold no more than it must.
+    def jacobians_from(arc, state):
         x, unravel = raveled(state)
 
         def states(x):
@@ -128,8 +135,12 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
             )  # fmt: skip
             return in_rows(run.sections)[1:]
 
-        # Apart from the motion: a program with second derivatives should hold no more than it must.
-        jacobians = jax.jacfwd(states)(x)
+        return jax.jacfwd(states)(x)
+
+    @forward_jacobian
+    def seen(arc, state):
+        x, _ = raveled(state)
+        jacobians = jacobians_from(arc, state) if second else jnp.zeros((0,), x.dtype)
         run = _run(arc, state, impact_log)
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
@@ -147,7 +158,56 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int) -> ObservedArc:
             {name: mean * run.duration for name, mean in run.averages.items()},
         )  # fmt: skip
 
-    return seen(arc, state)
+    found = seen(arc, state)
+    still = jax.lax.stop_gradient((arc, state))
+    return found if second else found._replace(jacobians=jacobians_from(*still))
+
+
+@eqx.filter_custom_jvp
+def found_and_seen(
+    arc: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int, second: bool
+) -> tuple[Found, ObservedArc]:
+    """The root that is found from a guess (`root_of`), and what is observed on its arcs, in rows.
+
+    Differentiated by the numbers p of `arc`: the root x(p) of F has dx/dp = -(∂F/∂x)⁻¹ ∂F/∂p, by
+    the implicit function theorem, so that no step of the search is. All derivatives are those of
+    what is observed, by one program.
+    """
+    root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
+    see = lambda x: observe_arc(arc, unravel(x), impact_log, second)
+    return tied((root, jax.vmap(see)(root.x)), root.x)
+
+
+@found_and_seen.def_jvp
+def _(primals, tangents):
+    arc, guess, _, impact_log, second = primals
+    root, seen = found_and_seen(*primals)
+    _, unravel = raveled(guess)
+    still = jtu.tree_map(jnp.zeros_like, (root, seen))
+    if not jtu.tree_leaves(tangents[0]):
+        return (root, seen), still
+    given = jtu.tree_map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    moving, fixed = eqx.partition(arc, given)
+    numbers, as_numbers = ravel_pytree(moving)
+    count = numbers.size
+
+    def observed(both):
+        moved = eqx.combine(as_numbers(both[:count]), fixed)
+        return observe_arc(moved, unravel(both[count:]), impact_log, second)
+
+    slopes = jax.vmap(lambda x: jax.jacfwd(observed)(jnp.append(numbers, x)))(root.x)
+    ends, along = slopes.states[:, -1, -1], ravel_pytree(tangents[0])[0]
+    rate = (ends[..., :count] @ along).ravel()
+    move = -smallest_solution(shooting_matrix(ends[..., count:]), rate).reshape(root.x.shape)
+    # Where there is no orbit there is no derivative of one.
+    # A product, since the transpose of a choice would be zero.
+    move = move * jnp.where(root.converged > 0, 1.0, jnp.nan)
+
+    def rates(slope):
+        by_starts = jax.vmap(lambda own, x: own @ x)(slope[..., count:], move)
+        return slope[..., :count] @ along + by_starts
+
+    return (root, seen), (still[0]._replace(x=move), jtu.tree_map(rates, slopes))
 
 
 def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:

@@ -58,7 +58,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @eqx.filter_custom_jvp
     def wrapped(*args):
-        return _tied(f(*args), args)
+        return tied(f(*args), args)
 
     @wrapped.def_jvp
     def _(primals, tangents):
@@ -84,7 +84,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def _tied(out: object, args: object) -> Any:
+def tied(out: object, args: object) -> Any:
     """`out`, batched by `vmap` in every leaf as soon as one of `args` is.
 
     JAX mixes up the axes of a staged custom derivative whose values are batched in other leaves

@@ -1,13 +1,10 @@
-"""The root of the cycle map's residual, and its derivative by the implicit function theorem.
-
-With F(x, p) = what the arcs that begin in x lack to end where the next one begins, and p the
-numbers of the machine, the root x(p) of F has dx/dp = -(∂F/∂x)⁻¹ ∂F/∂p: no step of the search is
-differentiated. How a root is searched for is in `root_finders.py`.
+"""The root of the cycle map's residual: of F(x, p), what the arcs that begin in x lack to end where
+the next one begins, with p the numbers of the machine. How a root is searched for is in
+`root_finders.py`, its derivative in `_arcs.py`.
 """
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -18,7 +15,6 @@ from .._types import State, Vector
 from ..flow import simulate
 from ..machine import angles_in, bare, in_rows, nearest_images, raveled
 from ._cycle_map import CycleMap
-from ._neutral import smallest_solution
 from .root_finders import AbstractRootFinder, Found, find_root
 
 
@@ -31,9 +27,8 @@ def _missing(
     return nearest_images(angles, ends, after) - after
 
 
-@eqx.filter_custom_jvp
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
-    """Where a root finder comes to from a guess; differentiated by the numbers of `arc`.
+    """Where a root finder comes to from a guess.
 
     **Arguments:** `arc`, the map over one arc; `guess`, a state on its section, in which the first
     arc begins, the others where the motion from there is then; `root_finder`, which says how many
@@ -52,25 +47,6 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`
-
-
-@root_of.def_jvp
-def _(primals, tangents):
-    arc, guess, root_finder = primals
-    root = root_of(arc, guess, root_finder)
-    _, unravel = raveled(guess)
-    still = jtu.tree_map(jnp.zeros_like, root)
-    if not jtu.tree_leaves(tangents[0]):
-        return root, still
-
-    jacobians = jax.vmap(lambda x: arc.jacobian(unravel(x)))(root.x)
-    _, rate = eqx.filter_jvp(
-        lambda arc: _missing(arc, root.x, unravel).ravel(), (arc,), (tangents[0],)
-    )
-    move = -smallest_solution(shooting_matrix(jacobians), rate).reshape(root.x.shape)
-    # Where there is no orbit there is no derivative of one.
-    # A product, since the transpose of a choice would be zero.
-    return root, still._replace(x=move * jnp.where(root.converged > 0, 1.0, jnp.nan))
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:

@@ -33,12 +33,11 @@ from ._arcs import (
     ObservedArc,
     by_the_first_state,
     error_of,
+    found_and_seen,
     in_order,
     moved_from_impacts,
-    observe_arc,
 )
 from ._cycle_map import CycleMap, adopted, axes_of, cycle_map
-from ._root import root_of
 from .distinct import distance
 from .floquet import multipliers_of
 from .results import ORBIT_RESULTS, Orbit, trimmed
@@ -62,6 +61,7 @@ def find_orbit(
     method: MethodLike = None,
     section: Number | None = None,
     impact_log: int = 8,
+    multipliers: bool = True,
     throw: bool = False,
 ) -> Orbit:
     """Find the periodic motion of `machine` near `guess`.
@@ -85,6 +85,9 @@ def find_orbit(
       later, where the guess's motion is farthest from its impacts, because the map jumps where an
       impact falls on the section.
     - `impact_log`: impacts of one cycle that the orbit can list.
+    - `multipliers`: whether the orbit gets its multipliers and its monodromy matrix, else NaN.
+      Their derivatives are second derivatives of the motion: without them the first gradient of
+      anything else takes half the time.
     - `throw`: raise an error if no orbit is found, instead of only reporting it in `result`.
 
     **Returns:** an `Orbit`. Its `result` distinguishes an orbit of a smaller period, a search that
@@ -102,6 +105,7 @@ def find_orbit(
             f"{root_finder!r}. The integrator is the argument `method`."
         )
     impact_log, throw = count("impact_log", impact_log, least=1), flag("throw", throw)
+    multipliers = flag("multipliers", multipliers)
     the_map = cycle_map(machine, cycles, method=method, section=section)
     if the_map.cycles % root_finder.arcs:
         raise ValueError(
@@ -116,7 +120,7 @@ def find_orbit(
             "Argument `root_finder` must have one arc for a machine with discrete modes, but has "
             f"{root_finder.arcs}."
         )
-    orbit = _find(the_map, state, root_finder, impact_log)
+    orbit = _find(the_map, state, root_finder, impact_log, multipliers)
     if throw:
         orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
     return trimmed(orbit)
@@ -150,10 +154,11 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
 
 @compiled
 def _find(
-    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int
-) -> Orbit:
+    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
+    multipliers: bool,
+) -> Orbit:  # fmt: skip
     def one(guess):
-        return _judged(the_map, guess, root_finder, impact_log)
+        return _judged(the_map, guess, root_finder, impact_log, multipliers)
 
     first = jtu.tree_leaves(guess)[0]
     if not axes_of(the_map.machine, guess):
@@ -162,16 +167,16 @@ def _find(
 
 
 def _judged(
-    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int
-) -> Orbit:
+    the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
+    multipliers: bool,
+) -> Orbit:  # fmt: skip
     """The orbit found from one guess, with all that is said about it."""
     machine, cycles = the_map.machine, the_map.cycles
     guess = _in_later_modes(the_map, jax.lax.stop_gradient(guess))
     moved, start, place = moved_from_impacts(the_map, guess, impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
-    root = root_of(arc, start, root_finder)
-    x, unravel = root.x, raveled(start)[1]
-    seen = jax.vmap(lambda x: observe_arc(arc, unravel(x), impact_log))(x)
+    root, seen = found_and_seen(arc, start, root_finder, impact_log, multipliers)
+    x = root.x
     jacobians = by_the_first_state(seen.jacobians)
     angles = angles_in(machine, bare(guess))
     error, drifts = error_of(angles, seen, x)
@@ -187,7 +192,7 @@ def _judged(
     unit = jax.lax.stop_gradient(root.unit)
     least = _least_period(told, error, unit, angles)
     again = _comes_back(start, seen)
-    monodromy = jacobians[least - 1]
+    monodromy = jacobians[least - 1] if multipliers else jnp.full_like(jacobians[0], jnp.nan)
     within = jnp.arange(cycles) < least
     hit = (seen.listed.stop >= 0) & within[:, None]
     listed = in_order(seen, hit, least, machine, place if last else None)

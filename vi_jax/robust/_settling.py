@@ -254,6 +254,8 @@ def one_orbit(name: str, orbit: object) -> Orbit:
             f"Argument `{name}` must be one orbit that was found, but is a batch, a failed search "
             "or something else. See `Orbit.result`."
         )
+    if not np.isfinite(orbit.multipliers).all():
+        raise ValueError(f"Argument `{name}` must have multipliers, but they are not a number.")
     return orbit
 
 
