@@ -12,7 +12,7 @@ jax.config.update("jax_enable_x64", True)
 
 # These rooms run the code that users run; in the others programs are compiled without optimisation,
 # which takes a third of the time off and changes rounding only.
-_AS_SHIPPED = {"lanes", "robust", "docs", "experiments"}
+_AS_SHIPPED = {"lanes", "robust", "experiments"}
 
 # The lanes' many small functions, which write a program's text, would take three times as long with
 # checks of annotations; they have a test of their own (`lanes/test_types.py`).
