@@ -33,7 +33,10 @@ def draw_scene(machine: Any, pen: Any, state: State, phase: float) -> None:
         pen.wall(post, -1, low=low - 0.35 * size, high=low + 0.35 * size, color="0.5")
         pen.label((post + body) / 2, low - 0.42 * size, "$c$")
     for stop in (*machine.stops, *machine.soft_stops):
-        _stop(pen, stop, rest, size, rigid=stop in machine.stops)
+        back = pen.stop(stop, rest=rest, slot=0.34 * size)  # the spring passes through it
+        words = "soft stop" if stop in machine.soft_stops else "stop, $k$"
+        if stop.sign > 0 or stop in machine.soft_stops:
+            pen.label(back + stop.sign * 0.3 * size, 0.8 * size + 0.25, words, color=pen.green)
     pen.label(slider, -0.7, "$m_B$", color=pen.red)
     pen.label(body, 0.0, "$m_C$", color=pen.blue)
     pen.label(slider + 0.9, 0.2 * size + 0.3, "$k_0$")
@@ -65,22 +68,3 @@ def _crank(machine: Any, pen: Any, pin: tuple[float, float], slider: float) -> N
     pen.label((pin[0] + slider) / 2, pin[1] / 2 + 0.28, "$l$")
     pen.arrow((-0.15, 1.2), (-0.95, 0.75), bend=0.3)
     pen.label(0.1, 1.45, machine.drive.caption)
-
-
-def _stop(pen: Any, stop: Any, rest: float, size: float, *, rigid: bool) -> None:
-    """A wall that the body's face meets at the gap; a compliant one stands on a spring.
-
-    **Arguments:** `rest`, the place of the body's middle where its position is 0; `size`, its
-    width; `rigid`, whether the stop is.
-    """
-    sign = 1 if stop.side == "right" else -1
-    face = rest + sign * (float(stop.gap) + size / 2)
-    slot = 0.0 if sign > 0 else 0.34 * size  # the spring passes through a stop on the left
-    high, low = 0.8 * size, -0.5 * size
-    if rigid:
-        pen.wall(face, sign, low=low, high=high, slot=slot)
-        if sign > 0:
-            pen.label(face + 0.3 * size, high + 0.25, "stop, $k$", color=pen.green)
-        return
-    back = pen.soft_stop(face, sign, slot=slot)
-    pen.label(back + sign * 0.3 * size, high + 0.25, "soft stop", color=pen.green)

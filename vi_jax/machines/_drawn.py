@@ -56,10 +56,7 @@ def _supported(machine: Any, pen: Any, place: float) -> float:
     pen.damper((post, -0.24 * size), (back, -0.24 * size))
     pen.body(place, width=size)
     for stop in stops_of(machine):
-        face = float(stop.place) + stop.sign * size / 2
-        # Spring and damper pass through a stop on the left.
-        slot = 0.0 if stop.sign > 0 else 0.43 * size
-        pen.wall(face, stop.sign, low=-0.5 * size, high=0.8 * size, slot=slot)
+        pen.stop(stop, slot=0.43 * size)  # spring and damper pass through one on the left
     return post
 
 

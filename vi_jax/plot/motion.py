@@ -92,14 +92,18 @@ def _draw_stops(
 ) -> None:
     """Of a coordinate the rigid stops as thick lines, and the soft ones, which the body goes into,
     as thin dashed ones."""
-    look = {"color": STOP, "lw": thick(1.8)}
-    for stop in stops_of(machine):
-        if stop.coordinate == coordinate:
-            line(float(stop.place), **look, label=once(ax, "stop"))
-    for stop in switches_of(machine):
-        if isinstance(stop, SoftStop) and stop.coordinate == coordinate:
-            soft = {"lw": thick(1.2), "ls": "--", "label": once(ax, "soft stop")}
-            line(float(stop.place), **look | soft)
+    for stop in all_stops(machine, coordinate):
+        look = {"lw": thick(1.8), "label": once(ax, "stop")}
+        if isinstance(stop, SoftStop):
+            look = {"lw": thick(1.2), "ls": "--", "label": once(ax, "soft stop")}
+        line(float(stop.place), color=STOP, **look)
+
+
+def all_stops(machine: AbstractMachine, coordinate: int | str | None = None) -> list[Any]:
+    """The rigid and then the soft stops of a machine; of one coordinate, if it is given."""
+    soft = (switch for switch in switches_of(machine) if isinstance(switch, SoftStop))
+    both = (*stops_of(machine), *soft)
+    return [stop for stop in both if coordinate is None or stop.coordinate == coordinate]
 
 
 def _labels(

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
+from ..machine import SoftStop
 from .colors import BLUE, GREEN, RED
 
 INK, PALE = "0.15", "0.55"
@@ -95,6 +96,20 @@ class Pen:
         self.spring((face, row + 0.5 * size), (back, row + 0.5 * size), coils=3)
         self.wall(back, side, low=row - 0.5 * size, high=row + 0.8 * size, slot=slot)
         return back
+
+    def stop(self, stop: Any, *, rest: float = 0.0, row: float = 0.0, slot: float = 0.0) -> float:
+        """A stop that a body of the pen's size meets with its face, rigid or on a spring; return
+        the place of its wall.
+
+        **Arguments:** `rest`, where the body's middle is at position 0; `row`, its height; `slot`,
+        as for `wall`, of a stop on the left, where springs are.
+        """
+        face, slot = rest + float(stop.place) + stop.sign * self.size / 2, slot * (stop.sign < 0)
+        if isinstance(stop, SoftStop):
+            return self.soft_stop(face, stop.sign, row, slot)
+        low, high = row - 0.5 * self.size, row + 0.8 * self.size
+        self.wall(face, stop.sign, low=low, high=high, slot=slot)
+        return face
 
     def floor(self, left: float, right: float, y: float) -> None:
         """The ground from left to right."""

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of
 from .._types import State
-from ..machine import AbstractMachine, ShaftMachine, SoftStop, adopt, stops_of, switches_of
-from .motion import new_axes
+from ..machine import AbstractMachine, ShaftMachine, adopt
+from .motion import all_stops, new_axes
 from .pen import Pen
 
 
@@ -61,8 +61,7 @@ def pen_for(
     machine: AbstractMachine, ax: Axes, positions: np.ndarray, *, labels: bool = False
 ) -> Pen:
     """A pen whose reach holds these positions and the stops."""
-    soft = [switch for switch in switches_of(machine) if isinstance(switch, SoftStop)]
-    stops = [abs(float(stop.place)) for stop in (*stops_of(machine), *soft)]
+    stops = [abs(float(stop.place)) for stop in all_stops(machine)]
     reach = max(0.0, *map(float, np.abs(positions).ravel()), *stops) or 1.0
     return Pen(ax, reach=reach, size=0.35 * reach, labels=labels)
 
@@ -75,12 +74,8 @@ def _bodies(machine: AbstractMachine, pen: Pen, state: State) -> None:
         ends = pen.reach + 1.4 * size
         pen.floor(-ends, ends, row - 0.5 * size)
         pen.body(place, row, width=size)
-        for stop in (stop for stop in stops_of(machine) if stop.coordinate == i):
-            face = float(stop.place) + stop.sign * size / 2
-            pen.wall(face, stop.sign, low=row - 0.5 * size, high=row + 0.8 * size)
-        for stop in (stop for stop in switches_of(machine) if isinstance(stop, SoftStop)):
-            if stop.coordinate == i:
-                pen.soft_stop(float(stop.place) + stop.sign * size / 2, stop.sign, row)
+        for stop in all_stops(machine, i):
+            pen.stop(stop, row=row)
         pen.mark(0.0, row - 0.5 * size, row + 1.1 * size)
         pen.mark(place, row, row + 1.1 * size)
         if place:
