@@ -60,7 +60,7 @@ CASES = {
 
 
 # `tests/test_checks.py` runs the pair, with annotations checked.
-@pytest.fixture(scope="module", params=some(CASES, "capsule"))
+@pytest.fixture(scope="module", params=some(CASES))
 def case(request):
     return CASES[request.param]
 

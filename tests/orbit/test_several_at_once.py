@@ -14,22 +14,23 @@ from scipy.integrate import solve_ivp
 
 from kicked import Kicked, at
 
-OMEGA = 1.2
-
 
 class Twins(vi.AbstractMachine):
-    """Y'' + 0.15 Y' - Y + Y³ = f cos 1.2 s twice, coupled by κ (Y2 - Y1)."""
+    """Y'' + 0.15 Y' - Y + Y³ = f cos ωs twice, coupled by κ (Y2 - Y1)."""
 
     force: float = 0.15
     coupling: float = 0.0
     excess: float = 0.0
+    omega: float = 1.2
 
-    cycle = 2 * np.pi / OMEGA
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.omega
 
     def field(self, s, state):
         """Both oscillators; the second one's force is larger by a share."""
         y1, v1, y2, v2 = (state[name] for name in ("y1", "v1", "y2", "v2"))
-        push, pull = self.force * jnp.cos(OMEGA * s), self.coupling * (y2 - y1)
+        push, pull = self.force * jnp.cos(self.omega * s), self.coupling * (y2 - y1)
         return {
             "y1": v1, "v1": -0.15 * v1 + y1 - y1**3 + push + pull,
             "y2": v2, "v2": -0.15 * v2 + y2 - y2**3 + (1 + self.excess) * push - pull,
@@ -54,8 +55,8 @@ def places(branch, kind):
 def monodromy(point):
     """The monodromy matrix at a special point, by SciPy."""
     machine = point.orbit.machine
-    f, k, e = (float(x) for x in (machine.force, machine.coupling, machine.excess))
-    omega = float(getattr(machine, "omega", OMEGA))
+    numbers = machine.force, machine.coupling, machine.excess, machine.omega
+    f, k, e, omega = map(float, numbers)
 
     def rate(s, y):
         (y1, v1, y2, v2), M = y[:4], y[4:].reshape(4, 4)
@@ -114,30 +115,11 @@ def test_a_branch_that_leaves_another_to_both_sides():
     assert abs(float(again["y1"] - again["y2"])) < 1e-9
 
 
-class Swept(Twins):
-    """At another frequency."""
-
-    omega: float = OMEGA
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi / self.omega
-
-    def field(self, s, state):
-        """At the phase of the drive."""
-        return super().field(s * self.omega / OMEGA, state)
-
-
 @pytest.mark.slow
 def test_a_curve_of_folds_of_both_oscillators():
     """Two multipliers are 1 all along it. It is that of one oscillator: folds in (f, ω) that meet
     in a cusp, found by an independent shooting code."""
-    machine = Swept()
-    start = {"y1": 0.9, "v1": 0.2, "y2": 0.9, "v2": 0.2}
-    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 200).last, 1, throw=True)
-    bounds = (0.05, 0.25)
-    branch = vi.continue_orbit(orbit, parameter="force", bounds=bounds, progress=False)
-    fold = next(point for point in branch.special if point.kind == "fold")
+    fold = next(point for point in branch_of(0.0).special if point.kind == "fold")
     curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert curve.ends == ("bounds", "bounds")
     (cusp,) = curve.special

@@ -1,27 +1,11 @@
-"""The four sliding bifurcations of a driven body on a rough floor, from both sides, beside Den
-Hartog's closed form and motions that SciPy follows from event to event."""
+"""Sliding bifurcations of a driven body on a rough floor, from both sides, beside motions that
+SciPy follows from event to event. Den Hartog's closed form is in `test_sliding_boundaries`."""
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from den_hartog import den_hartog
 from rough_floor import SINCE, branch_of, on_both_sides, settled
-
-
-@pytest.mark.slow
-def test_sticking_begins_where_den_hartog_says():
-    omega = 0.75
-    limit = den_hartog(omega, 0.0)[1]
-    bounds = (0.6 * limit, 1.3 * limit)
-    branch = branch_of("level", bounds, omega=omega, level=0.7 * limit)
-    (point,) = branch.special
-    assert branch.ends == ("bounds", "crossing-sliding") and len(branch.problem.events) == 2
-    assert point.kind == "crossing-sliding" and "beyond is held there" in point.detail
-    assert point.parameter == pytest.approx(limit, abs=1e-10)
-    back = on_both_sides(point, "level", bounds)
-    assert back.kind == "crossing-sliding" and "no longer" in back.detail
-    assert back.parameter == pytest.approx(limit, abs=1e-10)
 
 
 def held_by(omega, numbers, near):

@@ -53,8 +53,13 @@ def test_sticking_begins_along_den_hartogs_curve():
     """From the motion that does not stop, and from the one that does."""
     limit = den_hartog(0.75, 0.0)[1]
     bounds = (0.6 * limit, 1.3 * limit)
-    (point,) = branch_of("level", bounds, omega=0.75, level=0.7 * limit).special
-    for side in (point, on_both_sides(point, "level", bounds)):
+    branch = branch_of("level", bounds, omega=0.75, level=0.7 * limit)
+    assert branch.ends == ("bounds", "crossing-sliding") and len(branch.problem.events) == 2
+    (point,) = branch.special
+    sides = point, on_both_sides(point, "level", bounds)
+    for side, words in zip(sides, ("beyond is held there", "no longer"), strict=True):
+        assert side.kind == "crossing-sliding" and words in side.detail
+        assert side.parameter == pytest.approx(limit, abs=1e-10)
         curve = vi.boundary(
             side, parameter="omega", bounds=((0.01, 2.0), (0.7, 0.8)), progress=False
         )
