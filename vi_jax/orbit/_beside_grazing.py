@@ -6,12 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from .._programs import compiled
 from ..flow import AbstractMethod, FixedStep, simulate
-from ..machine import stops_of, with_leaf
+from ..machine import in_rows, stops_of, with_leaf
 from ._forecast import (
     LOOKED,
     Settled,
@@ -60,7 +59,7 @@ def _lanes(problem, method, name: str, values, states, cycles: int, settle):
         run = simulate(
             machine, problem.unravel(u), cycles, settle=settle, method=method, record="sections"
         )
-        rows = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
+        rows = in_rows(run.sections)
         return rows[1:], run.impacts, run.successful
 
     return jax.vmap(one)(values, states)

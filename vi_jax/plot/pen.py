@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 from ..machine import SoftStop
 from .colors import BLUE, GREEN, RED
 
-INK, PALE = "0.15", "0.55"
+INK = "0.15"
 
 Point = tuple[float, float]
 

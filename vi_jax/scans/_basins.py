@@ -32,6 +32,7 @@ from ..machine import (
     attributes,
     components,
     cycles_in_words,
+    in_rows,
     nearest_images,
     state_in_words,
     summary_table,
@@ -265,12 +266,10 @@ class _Mark(AbstractMeasure):
     longest: int = eqx.field(static=True)
 
     def described(self, start):
-        """Each component of the state."""
         return {name: {"unit_of": name} for name in components(start)}
 
     @property
     def cycles(self):
-        """As many as are compared."""
         return self.longest
 
     def __call__(self, machine, run):
@@ -357,9 +356,7 @@ def sorted_out(
         here = with_leaves(begin, dict(zip(names, state, strict=True)))
         # Always as many cycles, so that another period is not another program.
         run = simulate(machine, here, longest, method=method)
-        return np.stack(
-            [np.asarray(x)[1 : cycles + 1] for x in components(run.sections, 1).values()], axis=1
-        )
+        return np.asarray(in_rows(run.sections))[1 : cycles + 1]
 
     starts = [data[name].values for name in data.coords if str(name).startswith(START)]
     size = partial(size_of, machine, begin, starts)

@@ -31,12 +31,12 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
-    HybridState,
     Stated,
     Summarized,
     attributes,
     bare,
     cycle_time,
+    in_rows,
     in_unit,
     is_autonomous,
     modes_of,
@@ -45,6 +45,7 @@ from ..machine import (
     renews,
     stated,
     unit_of,
+    with_modes,
     with_unit,
     with_units,
 )
@@ -198,9 +199,8 @@ def lyapunov(
             return carry, jtu.tree_map(lambda x: x[:windows], seen)
 
         def joined(carry, parts) -> Lyapunov:
-            return _ended(
-                carried, start, carry, jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-            )
+            seen = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+            return _ended(carried, start, carry, seen)
 
         return in_parts(
             "observation of exponents", step, _begun(carried, start, settle, number),
@@ -257,14 +257,13 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
     record = "sections" if plain else "motion"
 
     def image(x, modes):
-        state = unravel(x) if modes is None else HybridState(unravel(x), modes)
+        state = with_modes(unravel(x), modes)
         run = simulate(machine, state, window, method=method, rests=rests, record=record)
         duration = run.duration
         if duration is None:
             duration = jnp.full(window, cycle_time(machine), x.dtype)
-        sections = jax.vmap(lambda state: ravel_pytree(state)[0])(run.sections)
         integrals = {name: x * duration for name, x in run.averages.items()}
-        return sections[1:], (duration, integrals, run.result, modes_of(run.last))
+        return in_rows(run.sections)[1:], (duration, integrals, run.result, modes_of(run.last))
 
     def observe(carry, _):
         (x, modes), frame, result = carry
@@ -292,19 +291,16 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
     ((x, modes), _, result), (rates, duration, integrals) = carry, seen
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
-
-    def good_sum(x):
-        return jnp.where(result == RESULTS.successful, jnp.sum(x), jnp.nan)
-
-    mean = jnp.where(result == RESULTS.successful, mean, jnp.nan)
-    exponents, state = jnp.sort(mean, descending=True), ravel_pytree(bare(start))[1](x)
+    good = result == RESULTS.successful
+    exponents = jnp.sort(jnp.where(good, mean, jnp.nan), descending=True)
+    sums = jtu.tree_map(lambda x: jnp.where(good, jnp.sum(x), jnp.nan), integrals)
     return Lyapunov(
         exponents=exponents,
         per_cycle=exponents * jnp.mean(duration),
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
-        state=state if modes is None else HybridState(state, modes),
+        state=with_modes(ravel_pytree(bare(start))[1](x), modes),
         result=result,
-        averages=means(jax.tree.map(good_sum, integrals), jnp.sum(duration)),
+        averages=means(sums, jnp.sum(duration)),
         unit=unit_of(machine.units, "rate"),
         units=stated(machine),
     )

@@ -147,8 +147,7 @@ def _verified(
     if blocks.paired:
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
-    numbers = lane_numbers(total)[drawn]  # each has its own path
-    numbers = None if program.lane_noise is None else numbers
+    numbers = None if program.lane_noise is None else lane_numbers(total)[drawn]  # their own paths
     again = in_blocks(program, axes, place, paired=True, numbers=numbers)
     kept = functools.partial(ScanInterrupted, data, store)
     with at_work("verification", kept, progress=False):

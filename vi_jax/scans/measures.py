@@ -158,7 +158,6 @@ class Usual(AbstractMeasure):
 
     @property
     def record(self):  # pyright: ignore
-        """As the numbers need it."""
         return _KINDS[self.name].record
 
     def described(self, start):
@@ -334,12 +333,9 @@ class Regime(AbstractMeasure):
         )
         chaotic = out.exponents[0] > self.threshold
         # What cannot be continued is left as it was.
-        otherwise = jnp.where(
-            out.successful & (pass_number > 0), REGIMES.transient, found["period"]
-        )
-        return {
-            "period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(found["period"].dtype)
-        }
+        went_on, before = out.successful & (pass_number > 0), found["period"]
+        otherwise = jnp.where(went_on, REGIMES.transient, before)
+        return {"period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(before.dtype)}
 
 
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {

@@ -99,12 +99,9 @@ class ScanProgram(eqx.Module):
         machine = self._nudged(machine, MACHINE, nudge)
         if self.options.clock is not None:
             machine = in_clock(machine, self.options.clock)
-        start = self.start
-        if start is None:
-            start = machine.start()
-        for name, value in values.items():
-            if part_of(name) == START:
-                start = replaced(start, with_leaf(bare(start), name.removeprefix(START), value))
+        start = machine.start() if self.start is None else self.start
+        of_start = {name: x for name, x in values.items() if part_of(name) == START}
+        start = replaced(start, start_with(bare(start), of_start))
         return machine, self._nudged(start, START, nudge)
 
     def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
@@ -183,23 +180,21 @@ class ScanProgram(eqx.Module):
         `state`, after the cycles observed; `out`, the numbers so far; `pass_number`, for a measure
         that counts its passes.
         """
-        needs_refinement = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(
-            out
-        )
-        if needs_refinement is None:
+        needed = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(out)
+        if needed is None:
             return out
 
-        def one(values, state, out, needs_refinement):
+        def one(values, state, out, needed):
             machine, _ = self.lane(values)
             # Another lane ends at once, its start being no number.
-            state = jtu.tree_map(lambda x: jnp.where(needs_refinement, x, jnp.nan), state)
+            state = jtu.tree_map(lambda x: jnp.where(needed, x, jnp.nan), state)
             refined = measure.refine(
                 machine, state, self.method, out, *pass_number, rests=self.options.rests
             )
             new = {**out, **refined}
-            return jtu.tree_map(lambda a, b: jnp.where(needs_refinement, a, b), new, out)
+            return jtu.tree_map(lambda a, b: jnp.where(needed, a, b), new, out)
 
-        return jax.vmap(one)(values, state, out, needs_refinement & wanted & (out["result"] == 0))
+        return jax.vmap(one)(values, state, out, needed & wanted & (out["result"] == 0))
 
 
 def make_program(
@@ -341,15 +336,11 @@ def check_leaf_name(
     noise has."""
     if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
-    tree, own = (
-        (bare(start), name.removeprefix(START)) if part_of(name) == START else (machine, name)
-    )
-    if own in leaf_names(tree):
-        return
-    names = [START + n for n in components(bare(start))]
-    if part_of(name) != START:
-        names = [*components(machine), *names]
-    check_name(names, name, argument, machine)
+    of_start, names = part_of(name) == START, [START + n for n in components(bare(start))]
+    tree, own = (bare(start), name.removeprefix(START)) if of_start else (machine, name)
+    if own not in leaf_names(tree):
+        names = names if of_start else [*components(machine), *names]
+        check_name(names, name, argument, machine)
 
 
 def start_with(start: State, values: Mapping[str, Any]) -> State:

@@ -41,7 +41,6 @@ class _Observed(AbstractMeasure):
 
     @property
     def instants(self):
-        """As many as are asked for."""
         return self.samples
 
     def row(self, machine: Machine, run: Run, name: Of) -> tuple[Array, Array]:
