@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +52,7 @@ from ._geometry import (
 from ._lane_noise import START
 from ._scan import LanesFailed, scan
 from .grid import axes_of
-from .measures import AbstractMeasure, Regime
+from .measures import AbstractMeasure, Regime, Sections
 from .program import check_leaf_name, start_with
 from .regime import CODES, REGIMES, flags, size_of
 
@@ -260,23 +259,15 @@ def scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np
 _SET = {"measure", "paired", "cycles", "derivatives", "axes"}
 
 
-class _Mark(AbstractMeasure):
+class _Mark(Sections):
     """Of the last section states that of greatest position, the same for all lanes on a motion."""
-
-    longest: int = eqx.field(static=True)
 
     def described(self, start):
         return {name: {"unit_of": name} for name in components(start)}
 
-    @property
-    def cycles(self):
-        return self.longest
-
     def __call__(self, machine, run):
-        """The section with the highest position among the last of one lane."""
-        states = {name: x[-self.longest :] for name, x in components(run.sections, 1).items()}
-        highest = jnp.argmax(jax.vmap(machine.position)(run.sections)[-self.longest :])
-        return {name: x[highest] for name, x in states.items()}
+        highest = jnp.argmax(jax.vmap(machine.position)(run.sections)[-self.number :])
+        return {name: x[highest] for name, x in super().__call__(machine, run).items()}
 
 
 @warning_once
