@@ -63,7 +63,6 @@ def plot_integrity(
         ax.plot([], [], **open_circle, label="cut by the region's edge")
     if legend and ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize="small", frameon=False)
-    ax.set_xlabel(axis_name(profile.parameter, profile.basins[0].machine.units))
-    ax.set_ylabel(_WORDS[y])
-    ax.set_ylim(bottom=0.0)
+    parameter = axis_name(profile.parameter, profile.basins[0].machine.units)
+    ax.set(xlabel=parameter, ylabel=_WORDS[y], ylim=(0.0, None))
     return ax

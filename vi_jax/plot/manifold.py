@@ -32,6 +32,5 @@ def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> A
     state = found.orbit.state
     ax.plot(machine.position(state), machine.velocity(state), "kX", ms=7, mec="w", zorder=4)
     if own:
-        for set_label, words in zip((ax.set_xlabel, ax.set_ylabel), machine.labels, strict=True):
-            set_label(words)
+        ax.set(xlabel=machine.labels[0], ylabel=machine.labels[1])
     return ax

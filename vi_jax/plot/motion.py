@@ -172,6 +172,5 @@ def plot_phase_portrait(
     if machine is not None:
         _draw_stops(machine, coordinate_of(machine, coordinate), ax, ax.axvline)
     position, velocity = _labels(motion, machine, coordinate)
-    ax.set_xlabel(position)
-    ax.set_ylabel(velocity)
+    ax.set(xlabel=position, ylabel=velocity)
     return ax

@@ -36,6 +36,5 @@ def plot_multipliers(
         values = np.asarray(orbit.multipliers).ravel()
         ax.plot(np.real(values), np.imag(values), "o", **{"color": BLUE, "ms": 5, **style})
     ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel("Re μ")
-    ax.set_ylabel("Im μ")
+    ax.set(xlabel="Re μ", ylabel="Im μ")
     return ax

@@ -152,10 +152,8 @@ class _Saddle:
         values, right = np.linalg.eig(jacobian)
         order = np.argsort(-np.abs(values))
         growth = np.real(values[order])
-        self.along = {
-            "unstable": np.real(right[:, order[0]]),
-            "stable": np.real(right[:, order[1]]),
-        }
+        unstable, stable = (np.real(right[:, i]) for i in order)
+        self.unstable, self.stable = (x / np.linalg.norm(x) for x in (unstable, stable))
         self.across = np.real(np.linalg.inv(right)[order[0]])
         # A multiplier below zero changes sides: two periods do not.
         turns = 2 if growth[0] < 0 else 1
@@ -169,7 +167,7 @@ class _Saddle:
 
 def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """One branch of a stable manifold."""
-    ahead = side * saddle.along["stable"] / np.linalg.norm(saddle.along["stable"])
+    ahead = side * saddle.stable
     here, grown = saddle.place, 0.0
     step, periods = spacing * _CLOSEST * 4, 1
     most = max(1, int(np.log(_GROWTH) / np.log(saddle.growth)))
@@ -225,8 +223,7 @@ def _ahead(
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """One branch of an unstable manifold, with rows of NaN at jumps."""
-    unit = saddle.along["unstable"] / np.linalg.norm(saddle.along["unstable"])
-    begin = side * _BEGIN * saddle.map.unit * unit
+    begin = side * _BEGIN * saddle.map.unit * saddle.unstable
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
         periods += 1

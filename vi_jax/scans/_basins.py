@@ -52,7 +52,7 @@ from ._geometry import (
 from ._lane_noise import START
 from ._scan import LanesFailed, scan
 from .grid import axes_of
-from .measures import AbstractMeasure, Regime, Sections
+from .measures import Regime, Sections
 from .program import check_leaf_name, start_with
 from .regime import CODES, REGIMES, flags, size_of
 
@@ -430,11 +430,10 @@ def followed(
     **options: Any,
 ) -> "xr.Dataset":
     """What a scan finds of starts, for `sorted_out`; those that fail are no news."""
-    measure: tuple[AbstractMeasure, ...]
-    measure = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
+    measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
-        return scan(machine, axes, measure=measure, **options)
+        return scan(machine, axes, measure=measures, **options)
 
 
 def starts_in(

@@ -18,8 +18,6 @@ from .measures import AbstractMeasure
 # machine has no prefix.
 MACHINE, START, NOISE = "", "start.", "noise."
 
-_PATH = "path"
-
 # Lanes are told apart by 32 bits.
 _MOST = 2**32
 
@@ -107,7 +105,7 @@ def lane_noise_of(
     if not isinstance(noise, WhiteNoise):
         raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
     for which, name in names:
-        offered = [NOISE + x for x in (*noise.amplitudes, *([_PATH] if which == "axes" else []))]
+        offered = [NOISE + x for x in (*noise.amplitudes, *(["path"] if which == "axes" else []))]
         if name not in offered:
             raise ValueError(
                 f"Argument `{which}` must name a number of the noise ({', '.join(offered)}), but "

@@ -1,7 +1,7 @@
 """Measures of motions that do not repeat: means with errors, densities, times of escape."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from .._types import Machine, State, xr
 from ..flow import Run, has_quantities
 from ..machine import components
 from .grid import axes_of
-from .measures import About, AbstractMeasure
+from .measures import AbstractMeasure
 
 # What a run tells of each cycle, and not at an instant.
 _COLUMNS = (
@@ -241,11 +241,6 @@ class Escape(_Observed):
     empty or without ends.
     """
 
-    attributes: ClassVar[About] = {
-        "escape_cycle": {"units": "cycle", "long_name": "cycles until it escapes, or was watched"},
-        "escaped": {"units": "1", "long_name": "whether it escapes"},
-    }
-
     of: Of = eqx.field(static=True)
     low: Any = -jnp.inf
     high: Any = jnp.inf
@@ -264,10 +259,12 @@ class Escape(_Observed):
         count("samples", self.samples)
 
     def described(self, start):
-        """The attributes, with the time between two samples, in cycles."""
-        step = 1.0 / max(1, self.samples)
-        first = {**self.attributes["escape_cycle"], "step": step}
-        return {**self.attributes, "escape_cycle": first}
+        """With the time between two samples, in cycles."""
+        words, step = "cycles until it escapes, or was watched", 1.0 / max(1, self.samples)
+        return {
+            "escape_cycle": {"units": "cycle", "long_name": words, "step": step},
+            "escaped": {"units": "1", "long_name": "whether it escapes"},
+        }
 
     def leaves(self, machine: Machine, state: State, record: Any, first: Any) -> Any:
         """Whether a lane has left, seen from the loop at a record point, so that it need not go on;
