@@ -117,7 +117,11 @@ class Pen:
 
     def spring(self, start: Point, end: Point, *, coils: int = 6) -> None:
         """A spring between two points."""
-        self._along(start, end, *_zigzag(coils, 0.2 * self.size, start, end, self.size), lw=1.3)
+        length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+        lead = min(0.2 * self.size, 0.2 * length)  # straight at both ends
+        turns = np.tile([0.2 * self.size, -0.2 * self.size], coils)
+        along = [0.0, *np.linspace(lead, length - lead, turns.size + 2), length]
+        self._along(start, end, along, [0, 0, *turns, 0, 0], lw=1.3)
 
     def damper(self, start: Point, end: Point) -> None:
         """A dashpot between two points, its cylinder on the side of `start`."""
@@ -162,18 +166,3 @@ class Pen:
         """A dotted line from which a length is counted; only with labels."""
         if self.labels:
             self.ax.plot([x, x], [low, high], color="0.5", lw=0.8, ls=":")
-
-
-def _zigzag(
-    coils: int, half: float, start: Point, end: Point, size: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A spring as a line, along and across the way between its ends.
-
-    **Arguments:** `half`, half its width; `size`, the pen's, by which its straight ends are
-    measured.
-    """
-    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-    lead = min(0.2 * size, 0.2 * length)
-    turns = np.tile([half, -half], coils)
-    along = np.linspace(lead, length - lead, turns.size + 2)
-    return np.concatenate([[0.0], along, [length]]), np.concatenate([[0, 0], turns, [0, 0]])

@@ -177,7 +177,13 @@ def minimal_kick(
             kick = dataclasses.replace(kick, start=start)
         rays = first_exits(settling, kick, directions, points, largest, seed)
         angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
-        for ray in _best(rays, candidates):
+        best = nearest_first(rays, candidates)
+        if not best or not np.isfinite(rays.outside[best[0]]):
+            raise ValueError(
+                "No kick leads elsewhere, of those that `components`, `bounds` and `largest` "
+                "allow: the motion came back from all of them."
+            )
+        for ray in best:
             unit, radius = rays.directions[ray], float(rays.outside[ray])
             found = _exact(settling, kick, unit, radius, angle, longest, seed)
             new = _described(settling, kick, found, longest, cycle, phase)
@@ -190,20 +196,6 @@ def _smallest(kicks: list[MinimalKick], settling: Settling) -> MinimalKick:
     """The kick of the least norm, with the others."""
     first, *others = sorted(kicks, key=lambda one: float(one.norm))
     return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
-
-
-def _best(found: Exits, candidates: int) -> list[int]:
-    """Rays that leave sooner than their neighbours, the soonest first.
-
-    **Raises:** `ValueError` if none leaves.
-    """
-    best = nearest_first(found, candidates)
-    if not best or not np.isfinite(found.outside[best[0]]):
-        raise ValueError(
-            "No kick leads elsewhere, of those that `components`, `bounds` and `largest` allow: "
-            "the motion came back from all of them."
-        )
-    return best
 
 
 _Found = tuple[Row, float, bool, EdgeState]

@@ -55,7 +55,10 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     if not np.isfinite(normals).all():
         return None
     period = len(rows)
-    trail = settling.trail(kick.rows(z)[None], _longest(saddle) * period)[0]
+    # A motion that begins within rounding of the manifold stays near it for so many periods.
+    growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
+    longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
+    trail = settling.trail(kick.rows(z)[None], longest * period)[0]
     apart = distance(trail[1:, None], rows, settling.unit)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
@@ -83,12 +86,6 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
 def _stands(change: float, last: float) -> bool:
     """Whether a change, relative to the norm, is nothing, or nothing but the method's error."""
     return change <= _STANDS or last / 2 <= change <= _NOISE
-
-
-def _longest(saddle: Orbit) -> int:
-    """Periods for which a motion that begins within rounding of the manifold stays near it."""
-    growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
-    return int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:

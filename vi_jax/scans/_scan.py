@@ -93,7 +93,14 @@ def scan(
     """
     grid, verify = axes_of(axes), count("verify", verify)
     progress, paired = flag("progress", progress), flag("paired", paired)
-    _check_call(grid, paired, store)
+    if store is not None:
+        instance_of("store", store, (str, Path), "a path")
+    sizes = [x.size for x in grid.values()]
+    if paired and len({*sizes}) != 1:
+        raise ValueError(
+            "Argument `axes` must hold rows of one length if they are `paired`, but they have "
+            f"{sizes}."
+        )
     options = RunOptions(
         settle=settle, method=method, clock=clock, max_impacts=max_impacts, max_steps=max_steps
     )
@@ -108,17 +115,6 @@ def scan(
         data.attrs |= _verified(data, blocks, verify, better, place, store)
     _warn_of_failures(data)
     return data
-
-
-def _check_call(grid: Mapping[str, np.ndarray], paired: bool, store: Any) -> None:
-    """**Raises:** `TypeError` or `ValueError` for arguments of `scan` that are none."""
-    if store is not None:
-        instance_of("store", store, (str, Path), "a path")
-    if paired and len({x.size for x in grid.values()}) != 1:
-        raise ValueError(
-            "Argument `axes` must hold rows of one length if they are `paired`, but they have "
-            f"{[x.size for x in grid.values()]}."
-        )
 
 
 def _better(program: ScanProgram) -> AbstractMethod:

@@ -240,10 +240,13 @@ def make_program(
             check_leaf_name(template, first, name, "axes", lane_noise)
     measures = tuple(measure.under(method) for measure in measures)
     motion = any(measure.record == "motion" for measure in measures)
+    # A lane that has escaped ends before its time, where nothing else is asked.
+    alone = measures[0] if len(measures) == 1 and not derivatives else None
+    stop = jtu.Partial(Escape.leaves, alone) if isinstance(alone, Escape) else None
     options = dataclasses.replace(
         options, settle=settle, method=method, rests=rests,
         record="motion" if motion else "sections", samples=samples_for(measures),
-        stop=_stop_of(measures, derivatives),
+        stop=stop,
     ).checked(template)  # fmt: skip
     return ScanProgram(
         machine=_as_arrays(template),
@@ -255,14 +258,6 @@ def make_program(
         options=dataclasses.replace(_as_arrays(options), settle=jnp.asarray(settle)),
         lane_noise=lane_noise,
     )
-
-
-def _stop_of(measures: tuple[AbstractMeasure, ...], derivatives: tuple[str, ...]) -> Any:
-    """What ends a lane before its time: that it has escaped, where nothing else is asked."""
-    if len(measures) != 1 or not isinstance(measures[0], Escape) or derivatives:
-        return None
-    escape = measures[0]
-    return jtu.Partial(Escape.leaves, escape)
 
 
 class _Known(NamedTuple):
