@@ -88,8 +88,8 @@ def test_the_edge_is_the_saddle(motions, result):
 def test_a_weight_scales_the_norm(motions, two_impacts, monkeypatch):
     """Of the velocity: all around, on the ellipse of the norm, no smaller kick leads elsewhere. A
     kick that two rays lead to is listed once."""
-    names, best = ["V", "Y"], _minimal_kick._best
-    monkeypatch.setattr(_minimal_kick, "_best", lambda *arguments: 2 * best(*arguments))
+    names, best = ["V", "Y"], _minimal_kick.nearest_first
+    monkeypatch.setattr(_minimal_kick, "nearest_first", lambda *arguments: 2 * best(*arguments))
     result = vi.minimal_kick(SCENE, motions[0], components=names, weights={"V": 3.0}, candidates=1)
     assert sorted(result.kick) == ["V", "Y"] and result.exact and result.confirmed
     assert not result.others

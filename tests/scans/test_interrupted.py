@@ -133,9 +133,9 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
     places = ((1.283, 1.007), (1.528, 1.314), (1.26, 1.086))
     one, two, saddle = (vi.find_orbit(scene, scene.start(Y=Y, V=V), 2) for Y, V in places)
     kicks = importlib.import_module("vi_jax.robust._minimal_kick")
-    best = kicks._best
+    best = kicks.nearest_first
     # A second ray to be interrupted at, whichever there are.
-    monkeypatch.setattr(kicks, "_best", lambda *arguments: best(*arguments)[:1] * 2)
+    monkeypatch.setattr(kicks, "nearest_first", lambda *arguments: best(*arguments)[:1] * 2)
     struck(monkeypatch, "robust._minimal_kick._exact", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.minimal_kick(scene, one))
     assert error.partial.confirmed and error.partial.exact
