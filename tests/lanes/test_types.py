@@ -9,6 +9,7 @@ CHECKED = """
 import jax, jaxtyping
 import jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_disable_most_optimizations", True)
 hook = jaxtyping.install_import_hook("vi_jax.lanes", "beartype.beartype")
 import vi_jax as vi
 import vi_jax.lanes._kernel
@@ -28,7 +29,7 @@ def last(control, method):
 
 
 grid = jnp.linspace(0.7, 0.9, 5)
-for method in (vi.Taylor(), vi.Adaptive(), vi.FixedStep(steps_per_cycle=32)):
+for method in (vi.Taylor(), vi.Adaptive()):
     lanes = vi.jit(jax.vmap(lambda x: last(x, method)))(grid)
     slopes = vi.jit(jax.vmap(jax.jacfwd(lambda x: last(x, method)[0])))(grid)
     assert bool(lanes[1].all() & jnp.isfinite(slopes).all())

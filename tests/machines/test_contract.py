@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import matplotlib
@@ -123,7 +124,7 @@ def test_derivatives_of_two_bodies():
     i = int(np.flatnonzero(kinds.all(axis=0))[0])
 
     def last(x):
-        run = lane(x[:4], x[4:], 2, method=vi.FixedStep(steps_per_cycle=64))
+        run = lane(x[:4], x[4:], 2, method=vi.FixedStep(diffrax.Tsit5(), steps_per_cycle=200))
         return run.last, run.impacts
 
     at = [*numbers[:, i], *starts[:, i]]

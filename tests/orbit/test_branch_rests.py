@@ -197,6 +197,17 @@ def carried(half_gap, restitution=0.5):
     return found
 
 
+def widest(restitution):
+    """Half the greatest gap with which the hops are over before the wall would let go of the
+    ball."""
+    low, high = 0.1, 0.25
+    while high - low > 1e-12:
+        middle = 0.5 * (low + high)
+        over = carried(middle, restitution)[-1][1] < 1e-14
+        low, high = (middle, high) if over else (low, middle)
+    return low
+
+
 @pytest.mark.slow
 def test_chatter_and_rest_pass_over_the_section():
     """Both walls of a shaken box carry its ball for a while. On the section the ball flies at
@@ -218,13 +229,13 @@ def test_chatter_and_rest_pass_over_the_section():
         v += np.cos(s) - np.cos(1.0)
         np.testing.assert_allclose([places[i], speeds[i]], [y, v], atol=1e-9)
     assert carried(float(branch.parameter[0]))[0][0] < 1.0 < carried(0.1)[0][0]
-    # It is carried as long as its hops are over before the wall would let go of it.
     (point,) = branch.special
-    low, high = 0.15, 0.165
-    while high - low > 1e-12:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if carried(middle)[-1][1] < 1e-14 else (low, middle)
-    assert point.parameter == pytest.approx(low, abs=1e-9)
+    assert point.parameter == pytest.approx(widest(0.5), abs=1e-9)
+    bounds = (0.05, 0.3), (0.48, 0.52)
+    curve = vi.boundary(point, parameter="restitution", bounds=bounds, max_step=0.3)
+    assert curve.ends == ("bounds", "bounds")
+    for half_gap, restitution in curve.parameters[[0, -1]]:
+        assert half_gap == pytest.approx(widest(restitution), abs=1e-9)
 
 
 class Uneven(vi.AbstractMachine):
