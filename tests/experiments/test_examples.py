@@ -14,7 +14,7 @@ from differences import quick
 # The quickest of them run by default, and some with the slow tests; the others, whose calls pyright
 # has checked, before a release.
 QUICK = {"paper_discrepancy"}
-SLOW = {"drill", "simulate"}
+SLOW = {"simulate"}
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
