@@ -48,7 +48,7 @@ def modes_of(state: State) -> tuple[Any, ...] | None:
     return state.modes if isinstance(state, HybridState) else None
 
 
-def with_modes(state: State, modes: tuple[Any, ...]) -> State:
+def with_modes(state: State, modes: tuple[Any, ...] | None) -> State:
     """Return the state in these modes of the machine's own; as it is if there are none."""
     return HybridState(state, modes) if modes else state
 
