@@ -18,6 +18,10 @@ from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
 from .curve import Boundary
 from .special import Point
 
+# A unit tangent (scaled) of a curve has this component along its second parameter at least, if the
+# curve is begun with that kept: a choice.
+_STEEP = 1e-3
+
 _INSTEAD = (
     "Such a point is found value by value of the second parameter: `find_orbit` with another one, "
     "from this motion, and `continue_orbit` from there locates it again."
@@ -64,9 +68,11 @@ def boundary(
     problem, condition, x = _special_motion(point, parameter, ranges)
     scale = problem.scale([0.5 * (high - low) for low, high in ranges])
 
-    tangent = tangent_at(problem, x, scale)
-    tangent = tangent * np.copysign(1.0, tangent[-2])  # ahead the second parameter rises
-    start = advance(problem, x, tangent, scale, 0.0)
+    # Ahead the second parameter rises; where it hardly does, the tangent takes a program of its own.
+    start = advance(problem, x, np.eye(x.size)[-2], scale, 0.0)
+    if not bool(start.good) or start.tangent[-2] < _STEEP:
+        tangent = tangent_at(problem, x, scale)
+        start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), scale, 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "

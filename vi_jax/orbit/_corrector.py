@@ -125,16 +125,17 @@ def observe(problem: Shooting, x: np.ndarray) -> Observed:
 
 
 @compiled
-def _compiled_off(problem, x):
-    finer = dataclasses.replace(problem, steps=2 * problem.steps)
-    ends = (finer.lacks(x) - problem.lacks(x))[: problem.legs * problem.states]
-    return jnp.max(jnp.abs(ends.reshape(-1, problem.states) / problem.sizes[1:]))
+def _compiled_lacks(problem, x):
+    ends = problem.lacks(x)[: problem.legs * problem.states]
+    return ends.reshape(-1, problem.states) / problem.sizes[1:]
 
 
 def off_by(problem: Shooting, x: Unknowns) -> float:
     """How much twice the steps change the states where each flight ends, relative to their
     sizes."""
-    return float(_compiled_off(problem, jnp.asarray(x)))
+    finer = dataclasses.replace(problem, steps=2 * problem.steps)
+    one, other = (_compiled_lacks(steps, jnp.asarray(x)) for steps in (finer, problem))
+    return float(np.max(np.abs(np.asarray(one) - np.asarray(other))))
 
 
 @compiled

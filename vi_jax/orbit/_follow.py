@@ -17,7 +17,7 @@ from .._checks import count, given_number
 from .._messages import Interrupted, Tell, at_work, warn
 from ._corrector import Step, advance, off_by, way
 from ._locate import located
-from ._problem import finer, grown, sized_by_motion
+from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
 from .special import Point
 
@@ -43,11 +43,10 @@ _STEADY = 3
 # singular.
 _SHORT, _NOISE = 1e-4, 1e-3
 
-# Twice the steps of the flights change the states of a point by less than the first: above the
-# corrector's tolerance and below that to which special points are promised. Points of which no more
-# steps than are allowed can bring them below the second are warned of: of a motor whose crank
-# slowed to a fifth it was 0.07, with the steps of its first motion.
-_COARSE, _WRONG = 1e-10, 1e-8
+# Points whose states twice the steps change by more than this, where no more steps are allowed, are
+# warned of: of a motor whose crank slowed to a fifth it was 0.07, with the steps of its first
+# motion.
+_WRONG = 1e-8
 
 # A curve begins at the zero of a test that has this share of what it has a step further on.
 _BEGINS = 1e-7
@@ -277,7 +276,7 @@ class _Walk:
         if not sized_by_motion(table.problem):
             return False
         off = off_by(table.problem, new.x)
-        if off > max(_COARSE, 10 * self._vain):  # it is rounding what more steps do not change
+        if off > max(COARSE, 10 * self._vain):  # it is rounding what more steps do not change
             better = finer(table.problem, new.x)
             if better is not None:
                 table.problem = better

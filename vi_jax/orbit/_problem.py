@@ -135,6 +135,10 @@ _LISTED = 32
 # of `corrected`, the second a choice.
 _SETTLED, _MOST = 1e-11, 4096
 
+# Twice the steps of the flights change the states of a point of a curve by less than this: above
+# the corrector's tolerance and below that to which special points are promised.
+COARSE = 1e-10
+
 
 # Events so close (by the clock) are met at one instant, and a guard so far from zero there is not
 # met by the motion: choices.

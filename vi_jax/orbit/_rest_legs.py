@@ -25,8 +25,17 @@ from ..machine import (
     with_leaf,
     with_modes,
 )
+from ._corrector import off_by
 from ._flight import LANDS, LEAVES, Event
-from ._problem import fixed_step_method, logged_events, sized, steps_of
+from ._problem import (
+    COARSE,
+    finer,
+    fixed_step_method,
+    logged_events,
+    sized,
+    sized_by_motion,
+    steps_of,
+)
 from ._shooting import Shooting
 from .distinct import unit_of
 from .results import Orbit
@@ -94,10 +103,12 @@ def legs_of(
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
     problem = sized(problem, x)
-    if not problem.landings:
-        return problem, x
-    speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
-    return dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed)), x
+    if problem.landings:
+        speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
+        problem = dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed))
+    if sized_by_motion(problem) and off_by(problem, x) > COARSE:
+        problem = finer(problem, x) or problem
+    return problem, x
 
 
 def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
