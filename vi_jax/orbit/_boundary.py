@@ -68,7 +68,7 @@ def boundary(
     problem, condition, x = _special_motion(point, parameter, ranges)
     scale = problem.scale([0.5 * (high - low) for low, high in ranges])
 
-    # Ahead the second parameter rises; where it hardly does, the tangent takes a program of its own.
+    # Ahead the second parameter rises. Where it hardly does, the tangent takes its own program.
     start = advance(problem, x, np.eye(x.size)[-2], scale, 0.0)
     if not bool(start.good) or start.tangent[-2] < _STEEP:
         tangent = tangent_at(problem, x, scale)

@@ -21,6 +21,7 @@ from .._types import Scalar, State, Vector
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, with_leaf
 from ..machine import quantity_of as measured
+from ._chatter import Hops
 from ._corrector import Step, jacobian_at
 from ._observed import Observed
 from ._shooting import Shooting
@@ -109,8 +110,9 @@ class AbstractCondition(eqx.Module):
         return True
 
     @abc.abstractmethod
-    def missing(self, problem: Shooting, x: Vector, seen: Observed) -> Scalar:
-        """What the solution `x`, of which `seen` is observed, lacks to meet the condition."""
+    def missing(self, problem: Shooting, x: Vector, seen: Observed, chatters: Hops) -> Scalar:
+        """What the solution `x`, of which `seen` is observed and whose legs begin with `chatters`,
+        lacks to meet the condition."""
 
     def exchanged(self, problem: Shooting, x: Vector, missing: Vector) -> Vector:
         """The residual of the motion's own equations, some of them exchanged if need be."""
@@ -123,7 +125,7 @@ class Held(AbstractCondition):
     name: str = eqx.field(static=True)
     value: Scalar
 
-    def missing(self, problem, x, seen):
+    def missing(self, problem, x, seen, chatters):
         """Its difference from that value."""
         return quantity_of(problem, x, seen, self.name) - self.value
 
@@ -137,7 +139,7 @@ class HeldMultiplier(AbstractCondition):
     """The multiplier, with its sign; of a complex pair its modulus."""
     pair: bool = eqx.field(static=True)
 
-    def missing(self, problem, x, seen):
+    def missing(self, problem, x, seen, chatters):
         """The characteristic polynomial at the value held."""
         matrix, root = seen.monodromy, self.value
         if self.pair:
@@ -257,7 +259,7 @@ class Apart(AbstractCondition):
     row: Float[Array, " unknowns"]
     value: Scalar
 
-    def missing(self, problem, x, seen):
+    def missing(self, problem, x, seen, chatters):
         """Its difference from that value."""
         return self.row @ x - self.value
 
@@ -295,10 +297,10 @@ class Special(AbstractCondition):
         """Where branches cross, one of the equations is exchanged."""
         return missing if self.exchange is None else self.exchange.instead(problem, missing, x)
 
-    def missing(self, problem, x, seen):
+    def missing(self, problem, x, seen, chatters):
         """The determinant, V⁻ or the clearance."""
         if self.kind == REST:
-            return problem.rest_lost(x, self.impact)
+            return problem.rest_lost(x, self.impact, chatters)
         i = self.impact
         if i is None and self.kind in TOUCHING:
             return seen.nearest.room

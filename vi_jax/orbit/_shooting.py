@@ -321,13 +321,13 @@ class Shooting(eqx.Module):
 
     def residual(self, x: Vector) -> Vector:
         """The left sides of the motion's equations, then those of the conditions."""
-        missing = self.lacks(x)
+        missing, chatters = self._arrivals(x)
         if not self.conditions:
             return missing
         seen = self.observe(x) if any(c.observes for c in self.conditions) else None
         for condition in self.conditions:
             missing = condition.exchanged(self, x, missing)
-        more = [condition.missing(self, x, seen) for condition in self.conditions]
+        more = [condition.missing(self, x, seen, chatters) for condition in self.conditions]
         return jnp.concatenate([missing, jnp.stack(more)])
 
     def lacks(self, x: Vector) -> Vector:
@@ -335,6 +335,10 @@ class Shooting(eqx.Module):
         one begins, then the guards; zero for a periodic motion. Its Jacobian is taken forward
         (`jacobian_at`, `advance`), so that each leg is carried along with its
         derivatives."""
+        return self._arrivals(x)[0]
+
+    def _arrivals(self, x: Vector) -> tuple[Vector, Hops]:
+        """The same, and of each leg the end of the chatter with which it begins."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
@@ -342,15 +346,15 @@ class Shooting(eqx.Module):
             begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
             end, _, _ = self.flown(machine, leg, begin, s1)
             if not self.events:
-                return end, jnp.zeros((0,), x.dtype)
-            return end, self.guard(machine, leg, s0, u)[None]
+                return end, jnp.zeros((0,), x.dtype), begin
+            return end, self.guard(machine, leg, s0, u)[None], begin
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
-        arrived, away = jax.vmap(arrive)(legs, clock, ends, states)
+        arrived, away, begins = jax.vmap(arrive)(legs, clock, ends, states)
         after = jnp.roll(states, -1, axis=0)
         arrived = nearest_images(angles_in(machine, self.like), arrived, after)
-        return jnp.concatenate([(arrived - after).ravel(), away.ravel()])
+        return jnp.concatenate([(arrived - after).ravel(), away.ravel()]), begins
 
     def observe(self, x: Vector) -> Observed:
         """Multipliers, extremes and the distances to grazing of a solution `x`.
@@ -436,21 +440,20 @@ class Shooting(eqx.Module):
         s = clock[j] + (period if j < i else 0.0)
         return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
 
-    def rest_lost(self, x: Vector, landing: int | None) -> Scalar:
+    def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
         """χ of the chatter that begins with this event; without its number the least force on a
-        body within its rest, at a turn. Zero where a rest is lost."""
+        body within its rest, at a turn. Zero where a rest is lost.
+
+        **Arguments:** `chatters`, of each leg the end of the one with which it begins.
+        """
         machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
-
-        def chatter(i: int) -> Hops:
-            after = self.after(machine, i, clock[i], states[i]) if self.events else states[i]
-            return self.hopped(machine, i, clock[i], ends[i], after)
-
+        last = lambda i: jax.tree.map(lambda a: a[i], chatters)
         if landing is not None:
-            return self._escape(machine, landing, chatter(landing), clock, states, period)
+            return self._escape(machine, landing, last(landing), clock, states, period)
         for i, contact in enumerate(self.contacts):
             if any(contact):
-                begin = chatter(i)
+                begin = last(i)
                 places, path = self.flown(machine, i, begin, ends[i])[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
                 pull = pull_of(flight, places, path, h, closed=not self.events)
