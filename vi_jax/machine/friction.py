@@ -4,7 +4,7 @@ import abc
 import functools
 import inspect
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -127,9 +127,8 @@ class Friction(AbstractSwitch):
 
         **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
         """
-        modes = around.instead(mode)
-        flow = field_in(machine, s, state, modes)
-        found = held_flow(machine, flow, s, state, modes, around.contact)[1][around.own]
+        once: Any = _held_forces
+        found = once(machine, s, state, around.instead(mode), around.contact)[around.own]
         force, most, _ = self.held(machine, s, state, around.contact, found)
         return -force, most
 
@@ -146,6 +145,15 @@ class Friction(AbstractSwitch):
         pull, most = self._balance(machine, s, state, around, jnp.zeros_like(s))
         holds = sticks & (jnp.abs(pull) <= most) | ~self.touches(machine, around.contact)
         return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
+
+
+@eqx.filter_jit
+def _held_forces(
+    machine: Machine, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
+) -> dict[int, tuple[Any, Any, Any]]:
+    """What holds the bodies that friction may hold (see `held_flow`): asked for again and again in
+    a step, and so a program of its own, traced and differentiated once."""
+    return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)[1]
 
 
 class DryFriction(Friction):
