@@ -4,7 +4,7 @@ import abc
 import functools
 import inspect
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -149,7 +149,7 @@ class Friction(AbstractSwitch):
 
 @eqx.filter_jit
 def _held_forces(
-    machine: Machine, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> dict[int, tuple[Any, Any, Any]]:
     """What holds the bodies that friction may hold (see `held_flow`): asked for again and again in
     a step, and so a program of its own, traced and differentiated once."""
