@@ -269,7 +269,8 @@ def test_second_derivatives_where_a_body_may_rest():
         scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5, gap=gap, damping_ratio=0.05)
         return vi.find_orbit(scene, scene.start(Y=0.4476, V=1.9642), multipliers=False)
 
-    assert np.isnan(orbit(0.5).multipliers).all() and not bool(orbit(0.5).stable)
+    found = str(orbit(0.5))
+    assert "impact, without multipliers" in found and "multipliers:" not in found
     slope, step = jax.jit(jax.grad(lambda gap: orbit(gap).state.Y)), 1e-4
     wanted = (slope(0.5 + step) - slope(0.5 - step)) / (2 * step)
     np.testing.assert_allclose(jax.grad(slope)(0.5), wanted, rtol=1e-6)

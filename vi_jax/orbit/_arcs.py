@@ -159,8 +159,11 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
         )  # fmt: skip
 
     found = seen(arc, state)
-    still = jax.lax.stop_gradient((arc, state))
-    return found if second else found._replace(jacobians=jacobians_from(*still))
+    if second:
+        return found
+    numbers, rest = eqx.partition((arc, state), eqx.is_array)
+    still = eqx.combine(jax.lax.stop_gradient(numbers), rest)
+    return found._replace(jacobians=jacobians_from(*still))
 
 
 @eqx.filter_custom_jvp

@@ -10,6 +10,7 @@ import numpy as np
 from .._checks import given_number, short
 from .._messages import so_many
 from ..machine import angles_in, bare, cycles_in_words, in_rows, nearest_images, state_in_words
+from .floquet import STABILITY
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
 
@@ -40,7 +41,7 @@ def in_one_line(orbit: Orbit) -> str:
     """A motion in one line."""
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
-    stable = "stable" if bool(orbit.stable) else "unstable"
+    stable = STABILITY[orbit.stability].partition(":")[0]
     where, span = state_in_words(bare(orbit.state), 6, orbit.machine.units), span_in_words(orbit, 6)
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span}; {size}"

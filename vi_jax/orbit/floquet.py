@@ -15,7 +15,7 @@ class STABILITY(NamedEnumeration):
     period_doubling = "unstable: a real multiplier below -1 (past a period doubling)"
     neimark_sacker = "unstable: a complex pair outside the unit circle (past a Neimark–Sacker)"
     neutral = "neutral: neither stable nor unstable to rounding, a multiplier has modulus 1"
-    unknown = "unknown: no orbit was found, or it has no multipliers"
+    unknown = "without multipliers"
 
 
 # A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.

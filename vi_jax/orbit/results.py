@@ -271,8 +271,9 @@ class Orbit(Summarized):
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
-        values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
-        lines.append(f"  multipliers: {', '.join(first_few(values))}")
+        if self.stability != STABILITY.unknown:
+            values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
+            lines.append(f"  multipliers: {', '.join(first_few(values))}")
         if np.isfinite(float(self.clearance)):
             room = in_unit(f"{float(self.clearance):.4g}", units, "position")
             lines.append(f"  clearance: {room}")
