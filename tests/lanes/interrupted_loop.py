@@ -36,11 +36,13 @@ truth = np.asarray(last(STARTS))
 clock = time.perf_counter()
 np.asarray(last(STARTS))
 took = time.perf_counter() - clock
-heard, lost, wrong, errors, ended = [], [], [], [], threading.Event()
+heard, lost, wrong, errors = [], [], [], []
+begun, ended = threading.Event(), threading.Event()
 
 
 def strike():
     draw = random.Random(0)
+    begun.wait()  # Python's own start of this thread is no place for an interrupt
     for _ in range(INTERRUPTS):
         time.sleep(draw.uniform(0, 2.5 * took))
         before, clock = len(heard), time.perf_counter()
@@ -53,6 +55,7 @@ def strike():
 
 
 def work():
+    begun.set()
     while not ended.is_set():
         try:
             found = np.asarray(last(STARTS))
