@@ -262,8 +262,7 @@ def test_gradients_by_the_implicit_function_theorem():
 
 @pytest.mark.slow
 def test_second_derivatives_where_a_body_may_rest():
-    """Its motion meets only the right one of two stops: beside a difference of first ones. Without
-    multipliers, which would take third derivatives."""
+    """Beside differences of first ones; without multipliers, which would take third ones."""
 
     def orbit(gap):
         scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5, gap=gap, damping_ratio=0.05)
