@@ -151,8 +151,8 @@ class Friction(AbstractSwitch):
 def _held_forces(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> dict[int, tuple[Any, Any, Any]]:
-    """What holds the bodies that friction may hold (see `held_flow`): asked for again and again in
-    a step, and so a program of its own, traced and differentiated once."""
+    """The forces of `held_flow`, as a jitted function: a step calls it many times, and JAX traces
+    and differentiates it once."""
     return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)[1]
 
 

@@ -93,7 +93,7 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
 
 
 def with_leaves(tree: Any, values: Mapping[str, Any]) -> Any:
-    """The same machine with other numbers in place of those of these names."""
+    """Replace several numbers of a machine, given by name."""
     for name, value in values.items():
         tree = with_leaf(tree, name, value)
     return tree

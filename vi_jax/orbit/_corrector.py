@@ -134,7 +134,7 @@ def off_by(problem: Shooting, x: Unknowns) -> float:
     """How much twice the steps change the states where each flight ends, relative to their
     sizes."""
     finer = dataclasses.replace(problem, steps=2 * problem.steps)
-    one, other = (_compiled_lacks(steps, jnp.asarray(x)) for steps in (finer, problem))
+    one, other = (_compiled_lacks(each, jnp.asarray(x)) for each in (finer, problem))
     return float(np.max(np.abs(np.asarray(one) - np.asarray(other))))
 
 

@@ -277,7 +277,7 @@ class _Walk:
             return False
         off = off_by(table.problem, new.x)
         if off > max(COARSE, 10 * self._vain):  # it is rounding what more steps do not change
-            better = finer(table.problem, new.x)
+            better = finer(table.problem, new.x, off)
             if better is not None:
                 table.problem = better
                 return True

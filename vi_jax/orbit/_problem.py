@@ -290,10 +290,13 @@ def sized_by_motion(problem: Shooting) -> bool:
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
-def finer(problem: Shooting, x: Unknowns) -> Shooting | None:
+def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
     """The equations with as many steps as the flights of a solution ask for; `None` where more of
-    them change nothing, or more are not allowed."""
-    off, more = off_by(problem, x), None
+    them change nothing, or more are not allowed.
+
+    **Arguments:** the equations and a solution; what `off_by` gives for them.
+    """
+    more = None
     while 2 * problem.steps <= _MOST:
         problem = dataclasses.replace(problem, steps=2 * problem.steps)
         before, off = off, off_by(problem, x)

@@ -106,8 +106,9 @@ def legs_of(
     if problem.landings:
         speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
         problem = dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed))
-    if sized_by_motion(problem) and off_by(problem, x) > COARSE:
-        problem = finer(problem, x) or problem
+    off = off_by(problem, x) if sized_by_motion(problem) else 0.0
+    if off > COARSE:
+        problem = finer(problem, x, off) or problem
     return problem, x
 
 

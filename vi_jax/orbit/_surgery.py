@@ -22,7 +22,7 @@ from ._solution import sections_of
 def several(old: Shooting, n: int) -> Shooting:
     """The equations of a motion that is gone through n times."""
     events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
-    # Legs are as long as before, but the steps of a chatter are a share of those of the period.
+    # A leg needs as many steps as before. A chatter's are a share of those of the whole period.
     steps = old.steps if events and not old.landings else n * old.steps
     return dataclasses.replace(
         old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),

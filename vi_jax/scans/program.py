@@ -339,7 +339,7 @@ def check_leaf_name(
 
 
 def start_with(start: State, values: Mapping[str, Any]) -> State:
-    """The start with other numbers in place of those that these axes are of."""
+    """Replace numbers of a start, given by the names of their axes."""
     return with_leaves(start, {name.removeprefix(START): x for name, x in values.items()})
 
 
