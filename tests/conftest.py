@@ -33,6 +33,11 @@ def pytest_configure(config):
         config.checked = jaxtyping.install_import_hook(modules, "beartype.beartype")
 
 
+def pytest_collection_modifyitems(items):
+    """The longest file comes first, so that no worker is left with it in the end."""
+    items.sort(key=lambda item: item.path.name != "test_checks.py")
+
+
 # A shell lets what it runs in the background ignore Ctrl-C, which some tests press.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

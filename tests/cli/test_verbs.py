@@ -15,6 +15,8 @@ import xarray as xr
 from vi_jax import cli
 from vi_jax.cli import verbs
 
+from differences import quick
+
 READY = sorted((Path(__file__).parents[2] / "experiments").glob("*.toml"))
 
 OWN = """
@@ -193,23 +195,22 @@ def test_orbit_and_its_branch(run):
     assert "No orbit" in run("continue", failing, 1) and not os.path.exists("o.png")
 
 
-@pytest.mark.parametrize(
-    "head, period",
-    [
-        ('machine = "mine.py:Started"\n[start]\nY = 0.3\n', "1 cycle"),
-        ('machine = "mine:Body"\n[start]\nclass = "vi_jax:OscillatorState"\nY = 0\nV = 0\n',
-         "1 cycle"),
-        ('machine = "mine:Named"\n[start]\nx = 0.0\nu = 0\n', "1 cycle"),
-    ],
-)  # fmt: skip
-def test_machines_of_ones_own(run, here, monkeypatch, head, period):
+HEADS = [
+    'machine = "mine.py:Started"\n[start]\nY = 0.3\n',
+    'machine = "mine:Body"\n[start]\nclass = "vi_jax:OscillatorState"\nY = 0\nV = 0\n',
+    'machine = "mine:Named"\n[start]\nx = 0.0\nu = 0\n',
+]
+
+
+@pytest.mark.parametrize("head", quick(HEADS, HEADS[2]))
+def test_machines_of_ones_own(run, here, monkeypatch, head):
     """A start without arguments, and a machine without any; periods in the machine's words."""
     (here / "mine.py").write_text(OWN)
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     run("simulate", head + BODY)
     assert is_png("new/m.png") and len(rows("new/m.csv")) == 3
     out = run("scan", head + BODY)
-    assert f"period {period}: 4 (100.0 %)" in out and is_png("s.png")
+    assert "period 1 cycle: 4 (100.0 %)" in out and is_png("s.png")
     said = run("simulate", 'machine = "mine.py:Body"\n' + BODY, 2)
     assert said.count("\n") == 1 and "`start` is missing, and Body has no method `start`" in said
     said = run("simulate", 'machine = "mine.py:Body"\n[start]\nY = 1\n' + BODY, 2)

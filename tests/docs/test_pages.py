@@ -21,8 +21,6 @@ ROOT = Path(__file__).parents[2]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", *DOCS]
 LINKED = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "experiments").rglob("*.md"))]
-# The quickest pages; the others run with the slow tests.
-QUICK = {"README.md"}
 
 
 def name_of(page: Path) -> str:
@@ -37,9 +35,7 @@ def blocks(page: Path, language: str) -> list[str]:
 def cases(language: str):
     """Pages that have such blocks."""
     return [
-        pytest.param(
-            page, id=name_of(page), marks=[] if name_of(page) in QUICK else pytest.mark.slow
-        )
+        pytest.param(page, id=name_of(page), marks=pytest.mark.slow)
         for page in PAGES
         if blocks(page, language)
     ]

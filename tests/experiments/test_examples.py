@@ -11,10 +11,8 @@ from PIL import Image
 
 from differences import quick
 
-# The quickest of them run by default, and some with the slow tests; the others, whose calls pyright
-# has checked, before a release.
-QUICK = {"paper_discrepancy"}
-SLOW = {"simulate"}
+# These run with the slow tests; the others, whose calls pyright has checked, before a release.
+SLOW = {"paper_discrepancy", "simulate"}
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
@@ -40,7 +38,7 @@ def test_the_gallery_shows_it(example):
     assert f"(../experiments/figures/examples/{example.stem}.png)" in gallery
 
 
-@pytest.mark.parametrize("name", quick([path.stem for path in EXAMPLES], *QUICK, slow=SLOW))
+@pytest.mark.parametrize("name", quick([path.stem for path in EXAMPLES], slow=SLOW))
 def test_runs(name, tmp_path):
     (example,) = (path for path in EXAMPLES if path.stem == name)
     environment = {**os.environ, "PYTHONPATH": str(HERE.parents[1])}

@@ -10,7 +10,6 @@ from reproduction.report import headline_numbers as of_report
 from tools.pictures import save_picture
 from tools.study import headlines
 
-from differences import quick
 from headline_numbers import benchmarks, machines, orbits, paper
 from headline_numbers.closed_forms import Expected
 
@@ -42,14 +41,8 @@ def stale(kept: dict[str, float], computed: Expected) -> list[str]:
     ]
 
 
-# Their programs take longer to compile than the rest of this file.
-LONGER = {
-    "basins_map", "chains", "gradients", "motors", "peers", "posterior",
-    "regime_maps", "relief_valve", "reproduction", "robustness",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", quick(NAMES, *set(NAMES) - LONGER))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_headline_numbers(name):
     kept, function = kept_of(name), COMPUTED[name]
     computed = function(kept) if inspect.signature(function).parameters else function()

@@ -33,6 +33,7 @@ def faults():
     return {fault.number: fault for fault in check_faults()}
 
 
+@pytest.mark.slow
 def test_verdicts_are_those_kept(claims):
     kept = {claim["name"]: claim["verdict"] for claim in read(KEPT)["claims"]}
     assert len(kept) == 18 and len(claims) == 10
@@ -99,6 +100,7 @@ def test_motors_at_the_stated_speed(cases):
     assert 0 < speed["variation_by_torque"]["100"] < speed["variation_by_torque"]["2"] < 0.1
 
 
+@pytest.mark.slow
 def test_disc_and_lever(faults):
     assert faults[8].numbers["mass_of_the_disc"] == pytest.approx(75.0)
     assert faults[7].numbers["mass_of_such_a_lever"] == pytest.approx(12.5)

@@ -7,14 +7,7 @@ import pytest
 from validated.__main__ import ORDER, SCRIPTS, comparison_of, described, section
 from validated._comparison import Comparison, last_digit
 
-from differences import quick
 from gallery_page import rows, sections
-
-# The quickest of them; the others run with the slow tests.
-QUICK = {
-    "siconos_balls", "matlab_balls", "heyoka_ramp", "heyoka_sensitivity", "coco_stick_slip",
-    "siconos_friction", "siconos_chain",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
@@ -30,7 +23,8 @@ def test_the_page_has_every_script_once():
     assert sorted(ORDER) == [path.stem for path in SCRIPTS]
 
 
-@pytest.mark.parametrize("name", quick([path.stem for path in SCRIPTS], *QUICK))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [path.stem for path in SCRIPTS])
 def test_gives_what_the_page_prints(name):
     (script,) = (path for path in SCRIPTS if path.stem == name)
     comparison = comparison_of(script)

@@ -11,6 +11,7 @@ from free_oscillator import Free
 from rubbing import Rubbing
 from structures import machine_and_truth
 
+pytestmark = pytest.mark.slow
 SIGMA = 0.5
 REST = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 
@@ -67,7 +68,6 @@ def test_noise_by_the_time_between_impulses_keeps_the_temperature():
     assert error < 0.02 * 0.625 and abs(mean - 0.625) < 3 * error
 
 
-@pytest.mark.slow
 def test_measured_time_leaves_the_path_and_its_derivatives():
     def sections(sigma=SIGMA, **options):
         given = {"noise": shaken(16, sigma), "key": jax.random.key(5), "settle": 2, **options}
@@ -81,7 +81,6 @@ def test_measured_time_leaves_the_path_and_its_derivatives():
     assert jax.jacfwd(sections)(SIGMA)[-1] == pytest.approx(float(slope), rel=1e-6)
 
 
-@pytest.mark.slow
 def test_a_motor_is_shaken_alike_by_its_phase_and_in_time():
     """Its crank's speed and the body, at equal phases of the crank: the same path by both."""
     scene = vi.Parameters(torque=10.0, control=1.2, restitution=0.7, gap=0.05).scene()
@@ -109,7 +108,6 @@ class Plain(vi.machines.Structure):
         return jnp.asarray(1.0)
 
 
-@pytest.mark.slow
 def test_a_structure_in_its_natural_modes_is_shaken_as_without_them():
     machine, _, start = machine_and_truth(3, 3, "general")
     names = (

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+pytestmark = pytest.mark.slow
+
 # Units of time and of length; the first are those in which the numbers are given.
 UNITS = np.array(
     [(1, 1), *((10.0**t, 1) for t in (-9, -5, -2, 3, 6, 9)),

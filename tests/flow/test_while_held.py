@@ -203,6 +203,7 @@ def test_a_block_slips_whenever_it_is_pulled_hard_enough(method):
     assert np.abs(followed(Block, forces, method) - truth).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_block_on_a_spring_slips_and_sticks_in_turn():
     """Forty events in five cycles, with steps that its state alone would let grow to a fifth."""
     sizes = jnp.array([0.0, 0.55, 0.0, 0.0, 0.0])
@@ -240,6 +241,7 @@ class Hill(vi.AbstractMachine):
         return z[2], z[3], jnp.zeros_like(s), jnp.zeros_like(s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, vi.FixedStep()], ids=["a", "f"])
 def test_a_ball_hits_a_hill_that_is_narrower_than_a_step(method):
     start = tuple(map(jnp.array, (0.0, 0.5, 1.0, 0.0)))
@@ -280,6 +282,7 @@ def test_what_estimates_an_error_takes_steps_half_as_long(name):
     assert float(method.tighter().longest(*place)) <= 0.5 * float(method.longest(*place))
 
 
+@pytest.mark.slow
 def test_an_estimate_shows_pushes_that_fall_between_the_stages():
     """Each push that the run itself has missed, with the same tolerance or a hundredth of it."""
     places = jnp.linspace(3.0, 4.2, 25)

@@ -83,6 +83,7 @@ def pressed():
     gc.callbacks.remove(callback)
 
 
+@pytest.mark.slow
 def test_no_interrupt_within_the_garbage_collector_is_lost(pressed):
     """It ends a function before its program runs, where it tells what was done, and lanes."""
     hook = sys.unraisablehook

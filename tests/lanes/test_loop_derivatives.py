@@ -102,6 +102,7 @@ def _(primals, tangents):
     return drifted(*primals), (along[0] + tangents[0] * speed, along[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most_columns", [0, 9])
 def test_derivatives_of_a_branch_whose_value_has_less_to_do_with_others(monkeypatch, most_columns):
     """place + time * speed: forward, over a tape, and over columns, up to the third order."""

@@ -134,6 +134,7 @@ def test_an_unbalanced_motor_on_a_structure():
     assert int(run.impacts.sum()) == 35
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "crank"),
     [(SliderCrank, "cosine"), pytest.param(Buffered, "slider", marks=pytest.mark.slow)],
@@ -286,6 +287,7 @@ def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
     np.testing.assert_allclose(jnp.cumsum(run.impact_energy), lost[1:], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_of_three():
     """A row of three bodies by its matrix, and by the coordinates in which it is diagonal."""
 

@@ -67,6 +67,7 @@ def at(x, y):
     return Pushed(jnp.asarray(x), jnp.asarray(y))
 
 
+@pytest.mark.slow
 def test_it_slides_as_the_mean_that_stays_on_the_surface():
     def last(amplitude, x):
         run = vi.simulate(Relay(amplitude), at(x, 0.0), 1, event_log=8)

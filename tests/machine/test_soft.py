@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from differences import check_derivatives
+from differences import check_derivatives, quick
 from event_by_event import followed
 from thrown import thrown
 
@@ -101,14 +101,12 @@ def integrated(rate, x, contact, duration, max_step):
 
 
 @pytest.mark.parametrize(
-    ("law", "adhesive", "side"),
-    [
-        *((law, False, "left" if "prestress" in law else "right") for law in LAWS),
-        *(pytest.param(LAWS[i], True, "right", marks=pytest.mark.slow) for i in (1, 2, 4)),
-    ],
+    ("law", "adhesive"),
+    quick([*((x, False) for x in LAWS), *((LAWS[i], True) for i in (1, 2, 4))], (LAWS[6], False)),
     ids=str,
 )
-def test_a_law_beside_scipy(law, adhesive, side):
+def test_a_law_beside_scipy(law, adhesive):
+    side = "left" if "prestress" in law else "right"
     sign = 1 if side == "right" else -1
     stop = vi.SoftStop(0.5, 100.0, adhesive=adhesive, side=side, **law)
     speeds = np.array([0.2, 1.0, 5.0])

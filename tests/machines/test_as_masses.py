@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from differences import quick
-
 M, LANES, CYCLES = vi.machines, 24, 4
 
 
@@ -192,7 +190,8 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", quick(CASES, "free pair", "capsule", "rotor"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_a_machine_is_that_of_its_masses(name):
     ready, kind, *ranges = CASES[name]
     draw = np.random.default_rng(5).uniform

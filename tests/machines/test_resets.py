@@ -72,6 +72,7 @@ def test_a_kind_of_event_of_ones_own(walk):
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_at_equal_times_exponents_are_those_of_the_multipliers():
     start = tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343)))
     orbit = vi.find_orbit(ThreeStates(1.8), start, throw=True)

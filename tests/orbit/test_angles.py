@@ -49,6 +49,7 @@ def test_a_rotation_is_periodic(orbit):
     assert np.prod(orbit.multipliers) == pytest.approx(np.exp(-2 * np.pi * DAMPING), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_a_branch_passes_half_a_turn(orbit):
     """Its section passes ±π, where the angle begins again; its end is SciPy's."""
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.5, 6.0))
@@ -72,6 +73,7 @@ class Locked(vi.AbstractMachine):
         return {"phi": z.v, "v": self.torque - DAMPING * z.v + 0.2 * jnp.sin(z.phi - t)}
 
 
+@pytest.mark.slow
 def test_a_motor_that_is_locked_lies_on_a_closed_curve():
     """Its phase makes a whole turn along the curve, and each fold is listed once."""
     machine = Locked()
@@ -98,6 +100,7 @@ def test_a_section_at_half_a_turn_is_one_motion(orbit):
     assert len(basins.attractors) == 1
 
 
+@pytest.mark.slow
 def test_an_erosion_profile_passes_half_a_turn(orbit):
     zero = float(orbit.state.phi) - np.pi
     region = {"start.phi": (-3.0, 3.0), "start.v": (-2.0, 2.0)}

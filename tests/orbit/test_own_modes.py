@@ -55,6 +55,7 @@ def orbit(start):
     return vi.find_orbit(Flipped(), start, 2)
 
 
+@pytest.mark.slow
 def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orbit):
     once = vi.find_orbit(Flipped(), start)
     assert bool(once.result == vi.ORBIT_RESULTS.other_modes) and not bool(once.successful)

@@ -28,6 +28,7 @@ def branch(orbit):
     return vi.continue_orbit(orbit, parameter="frequency", bounds=(0.75, 0.85))
 
 
+@pytest.mark.slow
 def test_an_orbit_takes_the_power_that_it_loses(orbit):
     assert bool(orbit.successful)
     np.testing.assert_allclose(missing(orbit.averages, orbit), 0.0, atol=1e-8)

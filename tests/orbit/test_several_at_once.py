@@ -147,6 +147,7 @@ def test_curves_of_branch_points():
         vi.boundary(point, parameter="excess", bounds=((0.02, 0.25), (-0.1, 0.1)))
 
 
+@pytest.mark.slow
 def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
     """The motion that stays off the stop is the linear one, of the amplitude that grazes."""
     zeta, xi = 0.31, 0.25
@@ -185,6 +186,7 @@ class Turning(Kicked):
         return x + 0.3 * x * (self.a - (x - self.b) ** 2), 0.3 * y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [0.02, 0.005])
 def test_a_fold_and_a_branch_point_in_one_step(apart):
     """One branch point was named, at the place of the fold. A branch that begins at the fold has

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
+pytestmark = pytest.mark.slow
 SIZES = (1.0, 1e-6)
 
 
@@ -36,7 +37,6 @@ def test_all_orbits_are_told_apart():
     assert found[0] == found[1] and len(found[0]) == 4
 
 
-@pytest.mark.slow
 def test_what_follows_a_grazing_is_the_same():
     """Touches and impacts were told apart by lengths and speeds in the machine's units."""
     found = []

@@ -18,6 +18,8 @@ from PIL import Image
 from vi_jax.plot.colors import GREEN
 from vi_jax.plot.schematic import sketch
 
+from differences import quick
+
 M = vi.machines
 MACHINES = {
     "ideal": vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05),
@@ -68,7 +70,7 @@ def picture(figure):
     return np.asarray(canvas.buffer_rgba()).astype(int)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", quick(MACHINES, "motor", "soft stop", "pair"))
 def test_every_machine_is_drawn(name):
     scene = MACHINES[name]
     ax = vi.plot_sketch(scene, ax=Figure().subplots())

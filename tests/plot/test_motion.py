@@ -138,6 +138,7 @@ def test_errors_name_the_argument(scene, run):
         motion_path(samples)
 
 
+@pytest.mark.slow
 def test_impacts_of_a_machine_without_a_drive_lie_where_they_happen():
     """Its nominal cycle is not as long as the motion's, so that a place is a part of its time."""
     valve = vi.machines.ReliefValve()

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from vi_jax.orbit import _sliding, _words
 from vi_jax.plot.colors import MARKS, color_of
 
+pytestmark = pytest.mark.slow
 NAME = "drive.frequency_ratio"
 
 

@@ -65,6 +65,7 @@ def test_a_chaotic_transient_is_not_called_chaos():
         assert float(Y) == pytest.approx(steady, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_windows_of_periods_beside_a_grazing():
     """Beyond the grazing of a motion whose multiplier is 1/2 there are windows of longer and longer
     periods with one impact, with chaos between (Chin, Ott, Nusse and Grebogi, Phys. Rev. E 50,
@@ -123,6 +124,7 @@ class Small(vi.AbstractMachine):
         return vi.State(x=0.3 * self.length, v=0.0 * self.length)
 
 
+@pytest.mark.slow
 def test_motions_are_compared_by_their_own_size(monkeypatch):
     """In any unit of length two frequencies do not repeat, and two wells are two motions, told
     apart by few comparisons."""
