@@ -59,6 +59,7 @@ def assumptions(cases):
     return {claim.name: claim for claim in check_assumptions(cases[0])}
 
 
+@pytest.mark.slow
 def test_crank_phase_of_the_start(assumptions):
     claim = assumptions["the start's crank phase"]
     apart = claim.numbers["max_difference_cycles_3_4_by_phase_over_pi"]
@@ -69,6 +70,7 @@ def test_crank_phase_of_the_start(assumptions):
     assert claim.numbers["last_minima"] == pytest.approx([-3.2543] * len(apart), abs=1e-2)
 
 
+@pytest.mark.slow
 def test_exact_crank(assumptions):
     claim = assumptions["the cosine in the crank's place (Eq. 4)"]
     assert claim.verdict == "confirmed"

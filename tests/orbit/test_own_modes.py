@@ -8,6 +8,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
+pytestmark = pytest.mark.slow
+
 
 class Flipped(vi.AbstractMachine):
     """x'' = -(1 + 0.3 m) x - 0.04 x' + cos 2.2 s before a stop; each impact turns m over."""
@@ -55,7 +57,6 @@ def orbit(start):
     return vi.find_orbit(Flipped(), start, 2)
 
 
-@pytest.mark.slow
 def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orbit):
     once = vi.find_orbit(Flipped(), start)
     assert bool(once.result == vi.ORBIT_RESULTS.other_modes) and not bool(once.successful)
@@ -66,7 +67,6 @@ def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orb
     assert float(orbit.sections.Y.max()) == pytest.approx(-0.461410495, abs=1e-9)
 
 
-@pytest.mark.slow
 def test_all_orbits_finds_none_in_other_modes(start):
     region = {"start.Y": (-2.0, 0.1), "start.V": (-2.0, 2.0)}
     found = vi.all_orbits(Flipped(), 2, region=region, starts=8, start=start)
@@ -84,7 +84,6 @@ def test_exponents_and_runs_go_on_in_an_orbits_modes(orbit):
     np.testing.assert_allclose(exponents, wanted, atol=2e-4)
 
 
-@pytest.mark.slow
 def test_a_branch_and_a_table_keep_the_modes(orbit):
     branch = vi.continue_orbit(orbit, parameter="depth", bounds=(0.29, 0.31))
     assert branch.ends == ("bounds", "bounds")
