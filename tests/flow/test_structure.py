@@ -1,23 +1,32 @@
 """What a scene does not have is not in the compiled program, and numbers are not part of it."""
 
+from collections import Counter
+
 import jax
 import vi_jax as vi
 from vi_jax.lanes._program import LaneProgram
 
-from traced_size import primitives
+
+def equations(jaxpr):
+    """Those of a jaxpr and of all that it calls."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for parameter in equation.params.values():
+            parameter = getattr(parameter, "jaxprs", parameter)  # of a loop over lanes
+            for inner in parameter if isinstance(parameter, tuple | list) else (parameter,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from equations(inner)
+
+
+def primitives(jaxpr) -> Counter:
+    return Counter(equation.primitive.name for equation in equations(jaxpr))
 
 
 def carried(jaxpr) -> int:
     """Number of arrays that the lane's loop hands on."""
-    sizes = [0]
-    for equation in jaxpr.eqns:
-        for parameter in equation.params.values():
-            if isinstance(parameter, LaneProgram):
-                sizes.append(len(parameter.carry_avals))
-            inner = getattr(parameter, "jaxpr", parameter)
-            if hasattr(inner, "eqns"):
-                sizes.append(carried(inner))
-    return max(sizes)
+    parameters = [x for equation in equations(jaxpr) for x in equation.params.values()]
+    return max(len(x.carry_avals) for x in parameters if isinstance(x, LaneProgram))
 
 
 def program(scene, start, **options):
