@@ -289,11 +289,11 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     for i, stop in enumerate(stops_of(machine)):
         gap = concrete(stop.gap)
         Y = concrete(machine.coordinates[stop.coordinate].position(start))
-        slack = concrete(rounding(machine, stop.coordinate, start)[0])
-        if Y is None or gap is None or slack is None:
+        if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)
-        if depth > np.max(slack):
+        slack = concrete(rounding(machine, stop.coordinate, start)[0]) if depth > 0 else None
+        if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap})."
