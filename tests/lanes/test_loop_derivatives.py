@@ -32,6 +32,18 @@ def test_forward_derivatives():
             np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+def test_rules_that_cannot_be_used():
+    """An error in a rule is told, and a rule that is none for derivatives forward is refused."""
+    forward, backward = jax.custom_jvp(jnp.sin), jax.custom_vjp(jnp.sin)
+    forward.defjvp(lambda primals, tangents: int("mine"))
+    backward.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g * jnp.cos(x),))
+    with pytest.raises(ValueError, match="'mine'"):
+        jax.grad(lambda x: lanes.once(forward, x))(0.5)
+    assert float(lanes.once(backward, 0.5)) == pytest.approx(np.sin(0.5))
+    with pytest.raises(TypeError, match=r"define it by `jax\.custom_jvp`"):
+        jax.grad(lambda x: lanes.once(backward, x))(0.5)
+
+
 def test_directions_share_one_motion():
     """Six directions make one program whose primal part is there once."""
     rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, backend="xla")[1]["x"]))(

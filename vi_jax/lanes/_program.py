@@ -161,7 +161,7 @@ def dependent_parts(
 CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "remat2": "jaxpr", "custom_lin": "jaxpr",
+    "checkpoint": "jaxpr", "remat2": "jaxpr",
     "eval_jaxpr": "call_jaxpr",  # JAX 0.12's `closed_call`
 }  # fmt: skip
 

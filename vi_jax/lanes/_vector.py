@@ -34,7 +34,8 @@ class Unsupported(Exception):
 
 
 def check(jaxpr: Jaxpr) -> None:
-    """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form."""
+    """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form;
+    `TypeError` for a function that has no forward derivative."""
     needed = _needed(jaxpr)
     for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in needed for v in e.outvars)):
         dtype = getattr(var.aval, "dtype", None)
@@ -45,6 +46,11 @@ def check(jaxpr: Jaxpr) -> None:
     for eqn in needed:
         for body in _bodies(eqn):
             check(body)
+        if eqn.primitive.name == "custom_lin":
+            raise TypeError(
+                "Derivatives of lanes are carried along with them, and a function with a "
+                "`jax.custom_vjp` has none that can be: define it by `jax.custom_jvp`."
+            )
         if not (_bodies(eqn) or _has_rule(eqn.primitive.name)):
             raise Unsupported(f"the primitive `{eqn.primitive.name}`")
 
