@@ -7,9 +7,7 @@ import vi_jax as vi
 class Free(vi.AbstractMachine):
     """x'' + 0.2 x' + x = σ dW, of temperature σ²/0.4."""
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, -x.Y - 0.2 * x.V)

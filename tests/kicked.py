@@ -12,10 +12,7 @@ class Kicked(vi.AbstractMachine):
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
     contacts: tuple = eqx.field(default=(), kw_only=True)
-
-    @property
-    def cycle(self):
-        return 1.0
+    cycle = 1.0
 
     @property
     def events(self):

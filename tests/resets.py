@@ -97,10 +97,7 @@ class ThreeStates(vi.AbstractMachine):
     """x' = A x, and where x1 falls through 1 at the speed v: x2 -= b v, x3 -= 1.6 v."""
 
     b: jax.Array = eqx.field(converter=jnp.asarray)
-
-    @property
-    def cycle(self):
-        return 5.0
+    cycle = 5.0
 
     @property
     def events(self):
@@ -126,9 +123,7 @@ class Excited(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(1.0, self.restitution, ends_cycle=True),)
 
-    @property
-    def cycle(self):
-        return 6.0
+    cycle = 6.0
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, 0.2 * x.V - x.Y)

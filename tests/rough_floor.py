@@ -18,10 +18,7 @@ class Rough(vi.AbstractMachine):
     level: Any = 0.3
     second: Any = 0.0
     damping: Any = 0.0
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def pull(self, s, x):
         drive = jnp.cos(s + SINCE) + self.second * jnp.cos(2 * (s + SINCE) + 1)

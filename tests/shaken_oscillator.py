@@ -21,9 +21,7 @@ class Shaken(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(self.gap, self.restitution),)
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def pace(self, s, state):
         return 1 / self.frequency

@@ -65,10 +65,7 @@ class Table(vi.AbstractMachine):
 
     looked_up: bool
     contacts: tuple = (vi.RigidStop(1.5, 0.7),)
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, state):
         push = jnp.cos(s)

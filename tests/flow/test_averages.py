@@ -112,9 +112,7 @@ class Rubbed(NamedTuple):
 class Switching(vi.AbstractMachine):
     """A clock with a mode: ±1, by the sign of a sawtooth, which a reset begins anew."""
 
-    @property
-    def cycle(self):
-        return 3.0
+    cycle = 3.0
 
     @property
     def events(self):

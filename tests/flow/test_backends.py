@@ -28,10 +28,7 @@ class Ball(AbstractMachine):
     """Falls by 1 on a stop at 1, over and over; an impact ends a cycle, long before `cycle`."""
 
     restitution: Any
-
-    @property
-    def cycle(self):
-        return 6.0
+    cycle = 6.0
 
     @property
     def contacts(self):

@@ -42,9 +42,7 @@ class Shaken(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(1.5, self.law),)
 
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, state):
         push = sum(self.shaking * jnp.cos(n * s) / n for n in range(1, 1 + self.harmonics))

@@ -22,10 +22,7 @@ class BouncingBall(vi.AbstractMachine):
 
     gravity: jax.Array
     contacts: tuple[vi.RigidStop, ...]
-
-    @property
-    def cycle(self):
-        return 1.0
+    cycle = 1.0
 
     def field(self, s, state):
         return Ball(state.V, -self.gravity)

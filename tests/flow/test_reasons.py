@@ -22,9 +22,7 @@ class Bounce(vi.AbstractMachine):
     def contacts(self):
         return (self.kind(0.0, self.law),)
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, self.strength + 0 * state.V)
@@ -102,9 +100,7 @@ class Pushed(vi.AbstractMachine):
     def events(self):
         return vi.Switch(lambda machine, s, x: x.Y + x.V)
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, state, mode):
         return vi.OscillatorState(state.V, -2.0 * mode + 0.1 * jnp.cos(s))
@@ -120,9 +116,7 @@ def test_a_sliding_mode_has_its_own_reason():
 class Turned(vi.AbstractMachine):
     """A spring whose body is turned round as each cycle begins."""
 
-    @property
-    def cycle(self):
-        return 1.0
+    cycle = 1.0
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -state.Y)

@@ -172,10 +172,7 @@ class Body(vi.AbstractMachine):
     force: Any = eqx.field(converter=lambda x: jnp.asarray(x, float))
     contacts: tuple = ()
     drag: Any = eqx.field(default=0.0, converter=lambda x: jnp.asarray(x, float))
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, state):
         a, b, c = self.force

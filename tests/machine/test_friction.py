@@ -50,9 +50,7 @@ class Rubbing(vi.AbstractMachine):
     def contacts(self):
         return on_a_belt(self)
 
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, x):
         drive = self.amplitude * jnp.cos(s)

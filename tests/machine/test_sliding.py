@@ -20,10 +20,7 @@ class Oscillator(vi.AbstractMachine):
     """x'' = -x - sgn x'."""
 
     events = vi.Switch(speed, slides=True)
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, z, mode):
         return vi.OscillatorState(z.V, -z.Y - mode)
@@ -54,10 +51,7 @@ class Relay(vi.AbstractMachine):
 
     amplitude: Any = 0.5
     events = vi.Switch(place, slides=True)
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, z, mode):
         return Pushed(self.amplitude * jnp.sin(s) - mode, mode)

@@ -52,9 +52,7 @@ def test_a_machine_that_states_nothing_is_told_without_units():
         def contacts(self):
             return (vi.RigidStop(self.gap, 0.6),)
 
-        @property
-        def cycle(self):
-            return 2 * np.pi
+        cycle = 2 * np.pi
 
         @property
         def labels(self):

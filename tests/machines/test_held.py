@@ -87,9 +87,7 @@ class Put(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(0.5, 0.0),)
 
-    @property
-    def cycle(self):
-        return 2.0
+    cycle = 2.0
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, 1.0 + 0 * state.Y)

@@ -163,9 +163,7 @@ class Thrown(vi.AbstractMachine):
             ),
         )
 
-    @property
-    def cycle(self):
-        return 2.0
+    cycle = 2.0
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, 0 * x.V)

@@ -248,9 +248,7 @@ class Uneven(vi.AbstractMachine):
     def contacts(self):
         return vi.RigidStop(0.1, self.restitution), vi.RigidStop(1.9, 0.6, "left")
 
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, x):
         pull = 0.35 * jnp.sin(2 * s) - jnp.cos(s) - 0.16 * x.V - x.Y

@@ -204,10 +204,7 @@ class Pitchfork(vi.AbstractMachine):
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
-
-    @property
-    def cycle(self):
-        return 1.0
+    cycle = 1.0
 
     def field(self, s, x):
         grows = self.a - 0.1 * self.b**2 + (self.b - 0.5) * x[0] ** 2 - x[0] ** 4

@@ -23,10 +23,7 @@ class Coupled(vi.AbstractMachine):
 
     damping: jax.Array = eqx.field(default=0.3, converter=jnp.asarray)
     push: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, z):
         pull = z.y - z.x

@@ -18,9 +18,7 @@ class Soft(vi.AbstractMachine):
     def contacts(self):
         return self.stop
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi
+    cycle = 2 * jnp.pi
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, jnp.cos(s) - 0.5 * x.Y - 0.4 * x.V)

@@ -162,10 +162,7 @@ class Between(vi.AbstractMachine):
     pushed."""
 
     push: jax.Array | float = 1.0
-
-    @property
-    def cycle(self):
-        return 2 * np.pi
+    cycle = 2 * np.pi
 
     def field(self, s, z):
         calm = z.x**2
