@@ -183,7 +183,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         if not (ticks or others_of(machine)):
             return
         with jax.ensure_compile_time_eval():
-            found = jtu.tree_map(np.asarray, _values(machine, start, ticks))
+            zero, state = jtu.tree_map(jnp.asarray, (np.zeros(()), start))
+            found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
     except Exception:  # the error is raised in words where field and guards are traced
         return
     cycle, first, last, below = found
@@ -200,20 +201,22 @@ def check_values(machine: AbstractMachine, start: State) -> None:
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
-def _values(machine: AbstractMachine, start: State, ticks: bool) -> Any:
+def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
     """The cycle; the field where it begins and where it ends, if `s` `ticks`; which guards are
-    below zero in any state around the start."""
-    zero = jnp.zeros_like(machine.position(start))
+    below zero in any state around the start.
+
+    **Arguments:** `zero`, the number: what is computed from constants alone is compiled by itself.
+    """
+    zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     ends = (zero, cycle) if ticks else ()
     fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in ends] or [(), ()]
-    return cycle, *fields, _guards_below(machine, start, modes) if others_of(machine) else ()
+    return cycle, *fields, _guards_below(machine, zero, start, modes) if others_of(machine) else ()
 
 
-def _guards_below(machine: AbstractMachine, start: State, modes: Scalars) -> Array:
+def _guards_below(machine: AbstractMachine, zero: Scalar, start: State, modes: Scalars) -> Array:
     """Which guards of the machine's events are below zero in some state around the start."""
     first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
-    zero = jnp.zeros_like(machine.position(start))
     random = np.random.default_rng(0)
     far = np.resize(_FAR, _TRIED)
     s = zero + machine.cycle * np.append(0.0, random.uniform(size=_TRIED))
@@ -225,9 +228,9 @@ def _guards_below(machine: AbstractMachine, start: State, modes: Scalars) -> Arr
         return jnp.concatenate([x[None], x + jnp.asarray(moved, x.dtype) * (1 + jnp.abs(x))])
 
     def chosen(mode: Scalar) -> Array:
-        others = random.choice(len(_MODES) + 1, size=_TRIED)
-        values = jnp.append(jnp.asarray(_MODES, zero.dtype), mode)
-        return jnp.append(mode, values[others])
+        others = np.append(len(_MODES), random.choice(len(_MODES) + 1, size=_TRIED))
+        values = np.append(_MODES, 0.0)[others].astype(zero.dtype)
+        return jnp.where(others == len(_MODES), zero + mode, values)
 
     def guards(s: Scalar, state: State, modes: Scalars) -> Array:
         found = [guard_of(machine, i, s, state, modes) for i in range(first, last)]

@@ -15,7 +15,7 @@ from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .own import by_default, derived, is_own, says, stops_of, switches_of
-from .parts import coordinates_in, listed, other_events, stops_in, switches_in
+from .parts import MEMORY, contacts_in, coordinates_in, other_events, stops_in, switches_in
 from .shown import Shown
 from .soft import SoftStop
 from .stop import RigidStop, Wall
@@ -103,6 +103,9 @@ class AbstractMachine(Shown):
                 f"`{cls.__name__}` has only `{lost}`."
             )
         return super().__new__(cls, *args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: x for name, x in vars(self).items() if name != MEMORY}
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:
@@ -310,7 +313,7 @@ def names_coordinates(machine: AbstractMachine) -> bool:
     """Whether a machine defines coordinates, itself or by the names in its contacts."""
     if says(machine, "coordinates"):
         return True
-    walls = (x for x in listed(machine.contacts) if isinstance(x, Wall))
+    walls = (x for x in contacts_in(machine) if isinstance(x, Wall))
     return any(x.on is not None for x in walls)  # pyright: ignore[reportAttributeAccessIssue]
 
 

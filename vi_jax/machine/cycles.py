@@ -57,7 +57,7 @@ class Turn(Counter):
                 f"{type(machine).__name__}, about how long a turn takes, because its `start` does "
                 "not turn."
             )
-        return 2 * pi / jnp.abs(speed)
+        return 2 * pi / abs(speed)  # a plain number of a plain one: nothing to compile
 
     def speed(self, state: State) -> Any:
         """How fast the angle turns, where the state has that; `None` where it has not."""

@@ -5,7 +5,11 @@ one's own), each with the coordinate that it acts on. A step asks for the stops,
 for the other events, and for the coordinates that stops limit, by number.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
+
+from jax.extend.core import get_opaque_trace_state
 
 from .._types import Machine
 from .coordinates import Coordinate
@@ -24,17 +28,44 @@ def listed(parts: object) -> tuple[Any, ...]:
     return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
 
 
+def once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
+    """A function of a machine that is called once while JAX traces a function. A step asks for the
+    parts of a machine some hundred times, and each of a user's contacts takes a millisecond."""
+
+    @functools.wraps(found)
+    def kept(machine: Machine) -> Any:
+        trace, memory = get_opaque_trace_state(), vars(machine).setdefault(MEMORY, {})
+        known = memory.get(found)
+        if known is None or known[0] != trace:
+            known = memory[found] = trace, found(machine)
+        return known[1]
+
+    return kept
+
+
+# Where a machine keeps what `once_a_trace` found; it is no field, and no part of a copy.
+MEMORY = "_found_in_a_trace"
+
+
+@once_a_trace
+def contacts_in(machine: Machine) -> tuple[Any, ...]:
+    """The contacts that a machine lists."""
+    return listed(machine.contacts)
+
+
+@once_a_trace
 def stops_in(machine: Machine) -> tuple[RigidStop, ...]:
     """The rigid stops among a machine's contacts."""
-    contacts = listed(machine.contacts)
+    contacts = contacts_in(machine)
     places = _places(contacts)
     return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
 
 
+@once_a_trace
 def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     """The soft stops and frictions among a machine's contacts, which act by themselves, and the
     switches among its events."""
-    contacts, found, number = listed(machine.contacts), [], 0
+    contacts, found, number = contacts_in(machine), [], 0
     places = _places(contacts)
     for x in contacts:
         if isinstance(x, RigidStop):
@@ -46,6 +77,7 @@ def switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
 
 
+@once_a_trace
 def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
     """The events of a machine that are no switches, and the turn that ends its cycles."""
     found = []
@@ -58,7 +90,7 @@ def other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
 
 def coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
     """The coordinates on which a machine's contacts act, in the order of `_places`."""
-    contacts = listed(machine.contacts)
+    contacts = contacts_in(machine)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
     return tuple(machine._coordinate_on(on, masses.get(on)) for on in _places(contacts))
@@ -76,7 +108,7 @@ def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
 def number_on(machine: Machine, name: str) -> int | None:
     """The number of the coordinate that contacts name so, as one or by its position; `None` if no
     contact acts on it."""
-    for on, number in _places(listed(machine.contacts)).items():
+    for on, number in _places(contacts_in(machine)).items():
         if on == name or (isinstance(on, tuple) and on[0] == name):
             return number
     return None
