@@ -1,6 +1,7 @@
 """A driven pendulum that rotates: orbits, branches, regimes and basins up to whole turns."""
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -10,7 +11,7 @@ DAMPING, TORQUE = 0.3, 0.9
 
 
 class Pendulum(vi.AbstractMachine):
-    """Its angle is counted from `zero`."""
+    """Its angle is counted from `zero`; by name it is the second of its state."""
 
     amplitude: float = 1.6
     zero: float = 0.0
@@ -19,10 +20,10 @@ class Pendulum(vi.AbstractMachine):
 
     def field(self, t, z):
         drive = TORQUE + self.amplitude * jnp.cos(t)
-        return {"phi": z.v, "v": drive - jnp.sin(z.phi + self.zero) - DAMPING * z.v}
+        return {"phi": z.dphi, "dphi": drive - jnp.sin(z.phi + self.zero) - DAMPING * z.dphi}
 
     def start(self):
-        return vi.State(phi=0.1, v=1.0)
+        return vi.State(phi=0.1, dphi=1.0)
 
 
 def a_cycle_later(amplitude, phi, v):
@@ -43,7 +44,7 @@ def orbit():
 
 def test_a_rotation_is_periodic(orbit):
     """Three turns a cycle; the product of the multipliers is Liouville's."""
-    phi, v = float(orbit.state.phi), float(orbit.state.v)
+    phi, v = float(orbit.state.phi), float(orbit.state.dphi)
     later = a_cycle_later(1.6, phi, v)
     np.testing.assert_allclose(later, [phi + 6 * np.pi, v], atol=1e-8)
     assert np.prod(orbit.multipliers) == pytest.approx(np.exp(-2 * np.pi * DAMPING), abs=1e-8)
@@ -56,10 +57,14 @@ def test_a_branch_passes_half_a_turn(orbit):
     assert branch.ends == ("bounds", "bounds") and np.ptp(branch.sections["phi"]) > 6
     end = branch.orbit(-1)
     assert float(end.machine.amplitude) == pytest.approx(6.0)
-    later = a_cycle_later(6.0, float(end.state.phi), float(end.state.v))
+    later = a_cycle_later(6.0, float(end.state.phi), float(end.state.dphi))
     turns = (later[0] - float(end.state.phi)) / (2 * np.pi)
     assert turns == pytest.approx(round(turns), abs=1e-8) and round(turns) != 0
-    assert later[1] == pytest.approx(float(end.state.v), abs=1e-8)
+    assert later[1] == pytest.approx(float(end.state.dphi), abs=1e-8)
+    ax = vi.plot_branch(branch, y="section_phi", special=False)
+    drawn = [line.get_ydata() for line in ax.lines if len(line.get_ydata()) > 1]
+    assert max(np.abs(np.diff(y)).max() for y in drawn) < 1 < sum(map(len, drawn)) / 20
+    plt.close(ax.figure)
 
 
 class Locked(vi.AbstractMachine):
@@ -70,14 +75,14 @@ class Locked(vi.AbstractMachine):
     renewed = vi.wrap_angles("phi")
 
     def field(self, t, z):
-        return {"phi": z.v, "v": self.torque - DAMPING * z.v + 0.2 * jnp.sin(z.phi - t)}
+        return {"phi": z.dphi, "dphi": self.torque - DAMPING * z.dphi + 0.2 * jnp.sin(z.phi - t)}
 
 
 @pytest.mark.slow
 def test_a_motor_that_is_locked_lies_on_a_closed_curve():
     """Its phase makes a whole turn along the curve, and each fold is listed once."""
     machine = Locked()
-    start = vi.State(phi=np.pi - np.arcsin(0.25), v=1.0)
+    start = vi.State(phi=np.pi - np.arcsin(0.25), dphi=1.0)
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 20).last, throw=True)
     branch = vi.continue_orbit(orbit, parameter="torque", bounds=(0.0, 0.6), progress=False)
     assert branch.ends == ("closed", "closed")
@@ -93,9 +98,9 @@ def test_a_section_at_half_a_turn_is_one_motion(orbit):
     """Rounding puts it on either side, a whole turn apart."""
     machine = Pendulum(zero=float(orbit.state.phi) - np.pi)
     speeds = jnp.linspace(2.5, 3.5, 16)
-    data = vi.scan(machine, {"start.v": speeds}, measure="regime", progress=False)
+    data = vi.scan(machine, {"start.dphi": speeds}, measure="regime", progress=False)
     assert (data["period"].values == 1).all()
-    region = {"start.phi": (-3.0, 3.0), "start.v": (-2.0, 2.0)}
+    region = {"start.phi": (-3.0, 3.0), "start.dphi": (-2.0, 2.0)}
     basins = vi.basins(machine, region, resolution=6, progress=False)
     assert len(basins.attractors) == 1
 
@@ -103,8 +108,61 @@ def test_a_section_at_half_a_turn_is_one_motion(orbit):
 @pytest.mark.slow
 def test_an_erosion_profile_passes_half_a_turn(orbit):
     zero = float(orbit.state.phi) - np.pi
-    region = {"start.phi": (-3.0, 3.0), "start.v": (-2.0, 2.0)}
+    region = {"start.phi": (-3.0, 3.0), "start.dphi": (-2.0, 2.0)}
     profile = vi.integrity_profile(
         Pendulum(), "zero", [zero - 0.1, zero + 0.1], region, resolution=6, progress=False
     )
     assert profile.label.tolist() == [[0, 0]]
+
+
+@pytest.mark.slow
+def test_a_picture_of_an_angle_has_no_line_across(orbit):
+    """It is drawn within a turn, and in the middle of one a cycle ends."""
+    run = orbit.trajectory(cycles=3, samples=64)
+    phi = np.asarray(run.samples.state.phi)
+    figure, (left, right) = plt.subplots(1, 2)
+    vi.plot_history(run, machine=orbit.machine, ax=left)
+    vi.plot_phase_portrait(run, orbit.machine, coordinate="phi", ax=right)
+    for y in (left.lines[0].get_ydata(), right.lines[0].get_xdata()):
+        np.testing.assert_allclose(np.exp(1j * y[np.isfinite(y)]), np.exp(1j * phi), atol=1e-12)
+        assert np.isnan(y).sum() == 9 and np.nanmax(np.abs(np.diff(y))) < 1
+    plt.close(figure)
+
+
+REST = np.arcsin(0.3)
+
+
+class Hanging(Pendulum):
+    """It hangs still, or rotates for ever; in between it stands on its head."""
+
+    cycle = 2.0
+
+    def field(self, t, z):
+        return {"phi": z.dphi, "dphi": 0.3 - jnp.sin(z.phi + self.zero) - 0.1 * z.dphi}
+
+
+@pytest.mark.slow
+def test_an_edge_at_half_a_turn():
+    """The pendulum on its head, with multipliers in closed form, and how it falls from there,
+    wherever its angle is counted from."""
+    rates, ends = np.roots([1.0, 0.1, np.cos(np.pi - REST)]), []
+    for zero in (-REST, np.pi / 2):
+        machine, rest = Hanging(zero=zero), vi.State(phi=REST - zero, dphi=0.0)
+        edge = vi.edge_state(machine, rest, rest.replace(dphi=6.0), settle=200, progress=False)
+        assert edge.kind == "saddle" and len(edge.sections.phi) < 20
+        np.testing.assert_allclose(np.sort(edge.orbit.multipliers), np.sort(np.exp(2 * rates)))
+        found = vi.manifold(edge.orbit, which="unstable", length=1.0, progress=False)
+        assert max(float(np.nanmax(abs(jnp.diff(x.phi)))) for x in found.branches) < 0.1
+        ends.append(sorted((float(x.dphi[-1]), np.sin(x.phi[-1] + zero)) for x in found.branches))
+    np.testing.assert_allclose(*ends, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_ball_of_starts_reaches_around_half_a_turn():
+    """As far as where the angle is counted from another place."""
+    region = {"start.phi": (-np.pi, np.pi), "start.dphi": (-4.0, 4.0)}
+    options = {"resolution": 16, "settle": 300, "longest": 4, "progress": False}
+    found = [vi.basins(Hanging(zero=x), region, **options) for x in (REST, REST + np.pi)]
+    ((here,), (there,)) = (x.integrity() for x in found)
+    np.testing.assert_allclose((here.local, here.factor), (there.local, there.factor), atol=1e-9)
+    assert here.local > 1 and not here.local_at_edge and not there.local_at_edge

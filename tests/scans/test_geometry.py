@@ -41,14 +41,19 @@ def test_balls_in_a_half_plane_are_exact():
     assert np.isnan(ball_around(np.array([-1.2, 0.3]), ~own, stop).radius)
 
 
-def test_the_largest_ball_is_that_of_brute_force():
-    """On random labels, over all centres that are looked at, some cells without a start."""
+@pytest.mark.parametrize("turns", [False, True])
+def test_the_largest_ball_is_that_of_brute_force(turns):
+    """On random labels, over all centres that are looked at, some cells without a start; of an
+    angle that makes a whole turn, too, wherever that begins."""
     rng = np.random.default_rng(0)
     for _ in range(5):
         label = (rng.random((9, 12)) < 0.1).astype(int)
         there = rng.random(label.shape) < 0.9
         rows = [np.linspace(0.1, 1.7, 9), np.linspace(-2.0, 0.2, 12)]
-        cells = Cells(rows, np.array([0.7, 1.3]), rng.random((2, 2)) < 0.7)
+        ends = rng.random((2, 2)) < 0.7
+        if turns:
+            rows[0], ends[0] = 0.7 + 2 * np.pi * np.arange(9) / 9, False
+        cells = Cells(rows, np.array([0.7, 1.3]), ends, np.array([turns, False]))
         own, foreign = there & (label == 0), there & (label == 1)
         best = 0.0
         for i, j in np.argwhere(own):
@@ -57,6 +62,9 @@ def test_the_largest_ball_is_that_of_brute_force():
                 point = np.clip(point, *cells.edges.T)
                 best = max(best, ball_around(point, foreign, cells).radius)
         assert largest_ball(own, foreign, cells).radius == pytest.approx(best, rel=1e-9)
+        shifts = range(9 if turns else 0)
+        rolled = [(np.roll(x, n, axis=0) for x in (own, foreign)) for n in shifts]
+        assert all(largest_ball(*x, cells).radius == pytest.approx(best) for x in rolled)
 
 
 def test_entropy_of_half_planes_and_stripes():

@@ -144,27 +144,3 @@ def test_motions_are_compared_by_their_own_size(monkeypatch):
         assert len(compared) < 16
         compared.clear()
     assert len(shares[0]) == 2 and sum(shares[0]) == 32 and shares == shares[:1] * 4
-
-
-class Turning(vi.AbstractMachine):
-    """Its angle grows by a turn in each cycle, and is at half a turn on the section."""
-
-    cycle = 2 * np.pi
-    renewed = vi.wrap_angles("phi")
-
-    def field(self, s, x):
-        return vi.State(phi=x.dot, dot=1.0 - x.dot)
-
-    def position(self, x):
-        return x.phi
-
-    def velocity(self, x):
-        return x.dot
-
-    def start(self):
-        return vi.State(phi=np.pi, dot=1.0)
-
-
-def test_an_angle_is_one_in_any_order_of_the_state():
-    data = vi.scan(Turning(), {"start.dot": [1.0]}, measure="regime", settle=1, progress=False)
-    assert data.period.values.tolist() == [1]

@@ -27,6 +27,7 @@ from ..machine import (
     Reset,
     RigidStop,
     SoftStop,
+    angle_names,
     begin_modes,
     check_takes,
     clock_of,
@@ -315,7 +316,7 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop that names no velocity, or an angle of `wrap_angles`."""
-    wrapped = getattr(type(machine).renewed, "angles", frozenset())
+    wrapped = angle_names(machine)
     for stop in listed(machine.contacts):
         on = getattr(stop, "on", None)
         named = {on} if isinstance(on, str) else {*on} if isinstance(on, tuple) else set()

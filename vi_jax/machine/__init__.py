@@ -2,8 +2,10 @@
 
 from ..lanes import horner as horner
 from ..lanes import sincos as sincos
+from .angles import angle_names as angle_names
 from .angles import angles_in as angles_in
 from .angles import nearest_images as nearest_images
+from .angles import without_turns as without_turns
 from .angles import wrap_angles as wrap_angles
 from .base import AbstractMachine as AbstractMachine
 from .base import has_velocity as has_velocity

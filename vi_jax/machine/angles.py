@@ -42,12 +42,17 @@ def without_turns(angle: Any) -> Any:
     return angle - 2 * pi * stop_gradient(jnp.round(angle / (2 * pi)))
 
 
+def angle_names(machine: Machine) -> frozenset[str]:
+    """The names of the angles of `wrap_angles`."""
+    return getattr(type(machine).renewed, "angles", frozenset())
+
+
 def angles_in(machine: Machine, like: State) -> np.ndarray | None:
     """Which numbers of a state are angles of `wrap_angles`; `None` if none is.
 
     **Arguments:** `like`, one state, without modes.
     """
-    names = getattr(type(machine).renewed, "angles", ())
+    names = angle_names(machine)
     return np.array([name in names for name in components(like)]) if names else None
 
 

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 
 from .._checks import count, flag, given_number, instance_of
 from ..flow import Run
-from ..machine import AbstractMachine, logged_turn, phase_at, stops_of
+from ..machine import AbstractMachine, logged_turn, phase_at, stops_of, without_turns
 from ..orbit import Orbit
 from .colors import BLUE, RED
 from .motion import counts_by_angle, plot_history
-from .path import motion_path
+from .path import drawn_path, is_angle, motion_path
 from .schematic import pen_for, sketch
 
 # Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.
@@ -230,9 +230,11 @@ class _History:
         window = ends[0] - 1e-9, ends[1] + 1e-9
         plot_history(run, machine=machine, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
         self._factor = 2.0 if unit == "angle" else 1.0
-        path = motion_path(run, machine=machine, window=window)
+        path = drawn_path(run, machine=machine, window=window, coordinate=0)
         self._place, self._Y = self._factor * path.cycles, path.Y
-        self._frames = frames
+        self._frames, self._dots = frames, frames.positions[0]
+        if is_angle(run, machine, 0):
+            self._dots = without_turns(self._dots)
         (self._line,) = ax.plot([], [], color=BLUE, lw=1.6)
         (self._dot,) = ax.plot([], [], "o", color=RED, ms=6, zorder=5)
         ax.set_xlim(self._factor * ends[0], self._factor * ends[1])
@@ -240,7 +242,7 @@ class _History:
 
     def move(self, index: int) -> None:
         """Draw the course up to the frame of this index."""
-        place, Y = self._factor * self._frames.cycles[index], self._frames.positions[0, index]
+        place, Y = self._factor * self._frames.cycles[index], self._dots[index]
         passed = self._place <= place
         self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])
         self._dot.set_data([place], [Y])

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
-from ..machine import cycles_in_words, in_brackets, name_in, quantity_of, unit_of
+from ..machine import angle_names, cycles_in_words, in_brackets, name_in, quantity_of, unit_of
 from ..orbit import Boundary, Branch, branch_hits_in_words
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once, thick
@@ -17,6 +17,9 @@ from .motion import new_axes
 # Names of lines in a legend, and where dots lie: above lines and below the marks.
 _STABLE, _UNSTABLE = "stable", "unstable"
 _DOTS = 3
+
+# Of a segment along which an angle passes half a turn, where it begins again: no line is drawn.
+_NONE = 2
 
 
 def plot_branch(
@@ -52,13 +55,17 @@ def plot_branch(
     # Points where stability changes are points of the branch: there rounding decides.
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
+    names = [f"section_{name}" for name in angle_names(branch.problem.machine)]
+    turned = [np.abs(np.diff(z)) > np.pi for name, z in ((x, across), (y, up)) if name in names]
+    kinds = np.where(np.any(turned, axis=0), _NONE, stable)
     label = style.pop("label", None)
     look = {"color": color_of(branch.cycles, int(branch.impacts.max())), "lw": thick(1.6), **style}
     if label is not None:
         ax.plot([], [], label=label, **{"ls": "-", **look})
-    for start, end, solid in _stretches(stable):
+    for start, end, kind in _stretches(kinds):
         part = slice(start, end)
-        ax.plot(across[part], up[part], **{"ls": "-" if solid else "--", **look})
+        if kind != _NONE:
+            ax.plot(across[part], up[part], **{"ls": "-" if kind else "--", **look})
     if label is None and legend:
         period = cycles_in_words(branch.problem.machine, branch.cycles)
         motion = f"{period}, {branch_hits_in_words(branch)}"
@@ -108,10 +115,10 @@ def _legend(ax: Axes) -> None:
         ax.legend(handles, labels, fontsize="small", frameon=False)
 
 
-def _stretches(stable: np.ndarray) -> list[tuple[int, int, bool]]:
-    """First and last point (exclusive) and stability of each stretch of like segments."""
-    edges = [0, *(np.flatnonzero(np.diff(stable.astype(int))) + 1), len(stable)]
-    return [(int(a), int(b) + 1, bool(stable[a])) for a, b in itertools.pairwise(edges)]
+def _stretches(kinds: np.ndarray) -> list[tuple[int, int, int]]:
+    """First and last point (exclusive) and kind of each stretch of like segments."""
+    edges = [0, *(np.flatnonzero(np.diff(kinds.astype(int))) + 1), len(kinds)]
+    return [(int(a), int(b) + 1, int(kinds[a])) for a, b in itertools.pairwise(edges)]
 
 
 def plot_sweep(

@@ -20,7 +20,7 @@ from ..machine import (
     unit_of,
 )
 from .colors import BLUE, STOP, is_set, once, thick
-from .path import coordinate_of, motion_path
+from .path import coordinate_of, drawn_path
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -52,6 +52,7 @@ def plot_history(
     **style: Any,
 ) -> Axes:
     """Draw position over the drive's clock, with the stops of `machine` as lines (dashed if soft).
+    An angle of `wrap_angles` or `turn_of` is drawn within [-π, π].
 
     **Arguments:**
 
@@ -68,7 +69,7 @@ def plot_history(
 
     **Returns:** the axes.
     """
-    path = motion_path(motion, machine=machine, window=window, coordinate=coordinate)
+    path = drawn_path(motion, machine=machine, window=window, coordinate=coordinate)
     turning = counts_by_angle(machine)
     if unit is None:
         unit = "angle" if turning else "cycles"
@@ -159,13 +160,13 @@ def plot_phase_portrait(
 
     **Returns:** the axes.
     """
-    path = motion_path(motion, machine=machine, window=window, coordinate=coordinate)
+    path = drawn_path(motion, machine=machine, window=window, coordinate=coordinate)
     ax = new_axes(ax)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
         only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
         assert only is not None
-        samples = motion_path(only, machine=machine, window=window, coordinate=coordinate)
+        samples = drawn_path(only, machine=machine, window=window, coordinate=coordinate)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)

@@ -10,12 +10,16 @@ from .._checks import count, instance_of
 from ..flow import Run, Samples
 from ..machine import (
     AbstractMachine,
+    Turn,
+    angle_names,
     component,
+    counter_of,
     has_component,
     is_autonomous,
     logged_turn,
     number_on,
     stops_of,
+    without_turns,
 )
 from ..orbit import Orbit
 
@@ -97,6 +101,35 @@ def motion_path(
         keep = (path.cycles >= window[0]) & (path.cycles <= window[1])
         path = MotionPath(*(x[keep] for x in path))
     return path
+
+
+def drawn_path(
+    motion: Run | Samples, *, machine: AbstractMachine | None, **about: Any
+) -> MotionPath:
+    """The path that a picture draws: that of an angle lies within a turn, and its line is broken
+    where it passes half a turn.
+
+    **Arguments and raises:** as `motion_path`.
+    """
+    path = motion_path(motion, machine=machine, **about)
+    if machine is None or not is_angle(motion, machine, about["coordinate"]):
+        return path
+    Y = without_turns(path.Y)
+    at = np.flatnonzero(np.abs(np.diff(Y)) > np.pi) + 1
+    gap = MotionPath(path.cycles[at - 1], *np.full((2, at.size), np.nan))
+    pairs = zip(path._replace(Y=Y), gap, strict=True)
+    return MotionPath(*(np.insert(a, at, b) for a, b in pairs))
+
+
+def is_angle(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
+    """Whether a coordinate is one of the machine's angles, of `wrap_angles` or `turn_of`."""
+    samples = motion.samples if isinstance(motion, Run) else motion
+    assert samples is not None
+    Y = _coordinates(machine, coordinate_of(machine, coordinate))[0](samples.state)
+    counter = counter_of(machine)
+    names = {*angle_names(machine), *([counter.name] if isinstance(counter, Turn) else ())}
+    angles = (component(name, samples.state) for name in names)
+    return any(np.array_equal(Y, angle, equal_nan=True) for angle in angles)
 
 
 def coordinate_of(machine: AbstractMachine | None, coordinate: int | str) -> int | str:

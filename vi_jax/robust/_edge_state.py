@@ -10,7 +10,7 @@ from .._messages import Interrupted, Tell, at_work, silent
 from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, bare, in_rows
-from ..orbit import Orbit, adopted, distance
+from ..orbit import Orbit, adopted
 from ._settling import (
     ELSEWHERE,
     INADMISSIBLE,
@@ -154,7 +154,7 @@ def tracked(
         trail.append(sections)
         tell(1)
         inside, outside = pair
-        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs, settling.unit)
+        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs, settling)
         if met is not None:
             orbit = settling.orbit_near(*met, _NEAR * recurs)
             if orbit is not None and not bool(orbit.stable):
@@ -169,7 +169,8 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     parts = []
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)
-        far = np.flatnonzero(~(distance(both[1], both[0], settling.unit) <= _APART))  # or no number
+        both[1] = settling.near(both[1], both[0])
+        far = np.flatnonzero(~(settling.apart(both[1], both[0]) <= _APART))  # or no number
         end = far[0] if far.size else TRAIL
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -179,10 +180,12 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     return pair, np.concatenate(parts)
 
 
-def _met_again(trail: Rows, longest: int, recurs: float, unit: float) -> tuple[Row, int] | None:
+def _met_again(
+    trail: Rows, longest: int, recurs: float, settling: Settling
+) -> tuple[Row, int] | None:
     """A state near to which the motion comes back, the latest, and after how many cycles."""
     last = trail[-1]
-    back = np.flatnonzero(distance(trail[:-1], last, unit)[::-1][:longest] <= recurs)
+    back = np.flatnonzero(settling.apart(trail[:-1], last)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
 
 
@@ -192,7 +195,8 @@ def _described(settling: Settling, trail: list[Rows], orbit: Orbit | None) -> Ed
         outside = int(np.sum(np.abs(np.asarray(orbit.multipliers)) > 1))
         kind = "saddle" if outside == 1 else "unstable"
     else:
-        kind = "chaotic" if _chaotic(rows[len(rows) // 4 :]) else "irregular"
+        late = rows[len(rows) // 4 :]
+        kind = "chaotic" if _chaotic(settling.near(late, late[-1:])) else "irregular"
     sections = jax.vmap(settling.state)(jnp.asarray(rows))
     return EdgeState(orbit, kind, sections, settling.the_map.machine)
 

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
@@ -121,7 +120,7 @@ def manifold(
     parts, lengths = ([saddle.place[None]], [saddle.place[None]]), [0.0, 0.0]
 
     def grown() -> Manifold:
-        first, second = (jax.vmap(saddle.map.state)(jnp.concatenate(part)) for part in parts)
+        first, second = (jax.vmap(saddle.map.state)(saddle.curve(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
     def kept() -> Interrupted | None:
@@ -159,9 +158,17 @@ class _Saddle:
         turns = 2 if growth[0] < 0 else 1
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
+    def curve(self, parts: list[Rows]) -> Rows:
+        """Points of a curve, with rows of NaN where an angle passes half a turn."""
+        rows = np.concatenate(parts)
+        rows = self.map.near(rows, np.zeros_like(rows))
+        turned = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
+        return np.insert(rows, np.flatnonzero(turned.any(axis=1)) + 1, np.nan, axis=0)
+
     def side_of(self, rows: Rows, periods: int) -> tuple[Row, Rows]:
         """w·(Pⁿ(x) - xₛ), and Pⁿ(x) - xₛ."""
-        away = self.map.carried(rows, periods * self.period) - self.place
+        there = self.map.carried(rows, periods * self.period)
+        away = self.map.near(there, self.place) - self.place
         return away @ self.across, away
 
 
@@ -228,7 +235,8 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
     while grown < length and periods < 400:
         periods += 1
         rows, kept = _stretch(saddle, begin, periods, spacing)
-        steps = np.linalg.norm(np.diff(rows, axis=0), axis=1)
+        near = saddle.map.near(rows[1:], rows[:-1])
+        steps = np.linalg.norm(near - rows[:-1], axis=1)
         steps[~kept] = 0.0
         run = grown + np.concatenate([[0.0], np.cumsum(steps)])
         use = int(np.searchsorted(run, length)) + 1
@@ -252,7 +260,7 @@ def _stretch(
     parts = np.linspace(0, 1, 9)
     rows = images(parts)
     while True:
-        steps = np.diff(rows, axis=0)
+        steps = saddle.map.near(rows[1:], rows[:-1]) - rows[:-1]
         sizes = np.linalg.norm(steps, axis=1)
         wide = ~(sizes <= spacing)
         inner = np.sum(steps[1:] * steps[:-1], axis=1)

@@ -72,6 +72,7 @@ class Settling:
         self.settle, self.tolerance = settle, tolerance
         self.unit = float(unit_of(motion))
         """What counts as 1 in all comparisons of states."""
+        self.angles = angles_in(the_map.machine, like)
         self.begin = 0.0
         """How long after the section starts are, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
@@ -93,11 +94,17 @@ class Settling:
         """A state from its numbers."""
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
+    def near(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """States moved by whole turns of their angles to where they are nearest to others."""
+        return nearest_images(self.angles, here, there)
+
+    def apart(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """How far states lie from others, up to whole turns, see `orbit.distance`."""
+        return distance(self.near(here, there), there, self.unit)
+
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """How far section states lie from the motion's nearest one, see `orbit.distance`."""
-        angles = angles_in(self.the_map.machine, self.like)
-        near = nearest_images(angles, rows[:, None], self.motion)
-        return distance(near, self.motion, self.unit).min(axis=1)
+        """How far section states lie from the motion's nearest one."""
+        return self.apart(rows[:, None], self.motion).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
@@ -120,7 +127,7 @@ class Settling:
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
             # What repeats has settled: to go on would cost, and end an equilibrium in noise.
-            moves = (distance(there, here, self.unit) > _STAYS) | (begin > 0)
+            moves = (self.apart(there, here) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
             returned = goes_on.copy()
@@ -195,7 +202,7 @@ class Settling:
             return None
         rows = self.starting(0.0).trail(last, 2 * longest)[0]
         for period in range(1, longest + 1):
-            if distance(rows[:-period], rows[period:], self.unit).max() <= _SAME:
+            if self.apart(rows[:-period], rows[period:]).max() <= _SAME:
                 return rows[:period]
         return None
 
@@ -211,7 +218,7 @@ class Settling:
         if not bool(orbit.successful):
             return None
         sections = np.asarray(in_rows(orbit.sections))
-        return orbit if distance(row, sections, self.unit).min() <= near else None
+        return orbit if self.apart(row, sections).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """What judges starts so long after a section state of the motion, and the state then.
@@ -221,7 +228,7 @@ class Settling:
         machine, method = self.the_map.machine, self.the_map.method
         if _stands_still(machine, self.state(start)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
-        row = self.motion[distance(start, self.motion, self.unit).argmin()]
+        row = self.motion[self.apart(start, self.motion).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
         if autonomous:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..machine import in_rows
-from ..orbit import Orbit, cycle_map, distance
+from ..orbit import Orbit, cycle_map
 from ._rays import Kick, Kicks
 from ._settling import Row, Rows, Settling, images
 
@@ -59,7 +59,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
     longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
     trail = settling.trail(kick.rows(z)[None], longest * period)[0]
-    apart = distance(trail[1:, None], rows, settling.unit)
+    apart = settling.apart(trail[1:, None], rows)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None
@@ -69,7 +69,8 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
         numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
         there, jacobian = images(settling.the_map, settling.like, *numbers)
         slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
-        return (np.asarray(there) - rows[place]) @ normals[place], slope / kick.weights
+        away = settling.near(np.asarray(there), rows[place]) - rows[place]
+        return away @ normals[place], slope / kick.weights
 
     first, before, last = z, None, np.inf
     for more in range(_PERIODS):

@@ -27,6 +27,7 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    angle_names,
     angles_in,
     attributes,
     components,
@@ -126,7 +127,8 @@ class Basins(NamedTuple):
         anywhere.
 
         A ball ends at a cell whose start settles elsewhere, or nowhere, and at the edge of the
-        region. A stop does not limit a ball, since no start lies beyond it. Balls lie within the
+        region. A stop does not limit a ball, since no start lies beyond it, and the range of an
+        angle of `wrap_angles` has no edge if it is a whole turn. Balls lie within the
         region's components: if other components of a motion differ from those of the starts,
         sections count by their place in the region.
 
@@ -142,13 +144,15 @@ class Basins(NamedTuple):
         at_stop = self.data["label"].attrs.get("at_stop", ())
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
         centres = [np.asarray(self.data[name], float) for name in names]
-        cells = Cells(centres, scale, np.array(ends))
+        angles = [name.removeprefix(START) in angle_names(self.machine) for name in names]
+        cells = Cells(centres, scale, np.array(ends), np.array(angles))
+        cells = cells._replace(ends=cells.ends & ~cells.round[:, None])
         resolution = 0.5 * float(np.linalg.norm(cells.widths / scale))
         found = []
         for a in self.attractors:
             foreign = there & (label != a.label)
             points = np.stack([a.sections[name.removeprefix(START)] for name in names], axis=1)
-            balls = [ball_around(x, foreign, cells) for x in points]
+            balls = [ball_around(cells.inside(x), foreign, cells) for x in points]
             around = np.array([x.radius for x in balls])
             local, cut = np.nan, False
             if not np.isnan(around).all():

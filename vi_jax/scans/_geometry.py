@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..machine import without_turns
+
 # Tiles along each axis, of which one after the other is left out for the confidence interval, in
 # more dimensions and in one; and the distances looked at, at most this part of the grid. Choices.
 _TILES, _TILES_OF_A_ROW = 8, 64
@@ -218,6 +220,8 @@ class Cells(NamedTuple):
     """What counts as distance 1 along each axis."""
     ends: np.ndarray
     """Whether the low and the high edge of each axis end a ball; shape (axes, 2)."""
+    angles: np.ndarray = np.array(False)
+    """Which axes are angles, of which whole turns do not count."""
 
     @property
     def widths(self) -> np.ndarray:
@@ -229,6 +233,16 @@ class Cells(NamedTuple):
         """Low and high edge of each axis; shape (axes, 2)."""
         half = 0.5 * self.widths
         return np.array([(x[0] - h, x[-1] + h) for x, h in zip(self.centres, half, strict=True)])
+
+    @property
+    def round(self) -> np.ndarray:
+        """Which axes are angles of a whole turn, whose edges are one place."""
+        return self.angles & np.isclose(np.ptp(self.edges, axis=1), 2 * np.pi)
+
+    def inside(self, point: np.ndarray) -> np.ndarray:
+        """A point with its angles in the turn that begins at the low edge."""
+        low = self.edges[:, 0]
+        return np.where(self.angles, low + (point - low) % (2 * np.pi), point)
 
     def to_edge(self, point: np.ndarray) -> float:
         """How far a point is from the edges that end a ball."""
@@ -248,9 +262,10 @@ def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     if not ((point >= low) & (point <= high)).all():
         return Ball(np.nan, point, False)
     square = np.zeros(foreign.shape)
-    parts = zip(cells.centres, point, cells.widths, cells.scales, strict=True)
-    for axis, (row, x, width, scale) in enumerate(parts):
-        gap = np.maximum(np.abs(row - x) - width / 2, 0.0) / scale
+    parts = zip(cells.centres, point, cells.widths, cells.scales, cells.round, strict=True)
+    for axis, (row, x, width, scale, round_) in enumerate(parts):
+        away = without_turns(row - x) if round_ else row - x
+        gap = np.maximum(np.abs(away) - width / 2, 0.0) / scale
         square += (gap**2).reshape([-1 if i == axis else 1 for i in range(foreign.ndim)])
     nearest = float(np.sqrt(np.min(square[foreign], initial=np.inf)))
     edge = cells.to_edge(point)
@@ -266,6 +281,10 @@ def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     """
     from scipy.ndimage import distance_transform_edt  # slow to load
 
+    # Half a turn more on both sides of an angle, from where the cells go on.
+    more = np.where(cells.round, np.array(own.shape) // 2 + 1, 0)
+    own = np.pad(own, [(n, n) for n in more])
+    foreign = np.pad(foreign, [(n, n) for n in more], mode="wrap")
     # On a lattice of half the spacing the point of a box nearest to any node is itself a node.
     shape = tuple(2 * size + 1 for size in own.shape)
     free, near = np.ones(shape, bool), np.zeros(shape, bool)
@@ -281,5 +300,5 @@ def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     distance = distance_transform_edt(free, sampling=list(half / cells.scales))
     radius = np.where(near, np.asarray(distance, float), -1.0)
     place = np.array(np.unravel_index(int(np.argmax(radius)), shape))
-    largest, centre = float(radius.max()), low + place * half
+    largest, centre = float(radius.max()), low + (place - 2 * more) * half
     return Ball(largest, centre, cells.to_edge(centre) <= largest * (1 + 1e-9))

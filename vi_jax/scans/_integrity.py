@@ -13,6 +13,7 @@ from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import (
     AbstractMachine,
+    angle_names,
     attributes,
     check_leaf,
     nearest_images,
@@ -236,8 +237,7 @@ def _followed(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray
     Of the motions of a kind those nearest to each other are one, the nearest pair first.
     """
     names = [name.removeprefix(START) for name in axes]
-    turning = getattr(type(found[0].machine).renewed, "angles", ())
-    angles = np.array([name in turning for name in names])
+    angles = np.array([name in angle_names(found[0].machine) for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
     last: list[Attractor] = []
     rows: list[np.ndarray] = []
