@@ -45,6 +45,8 @@ class Side(NamedTuple):
     """The value at each stage."""
     slack: Scalar | float = 0.0
     """What counts as zero."""
+    asked: Flag | None = None
+    """Where it is a constant below zero if not, whether it is asked for."""
 
 
 class Crossing(NamedTuple):

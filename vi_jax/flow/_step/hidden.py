@@ -72,10 +72,16 @@ def crests(
     slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
-    given = zip(ends, values, slack, below, strict=True)
+
+    def at_a_glance(side: tuple) -> Flag:
+        x, inner, zero = side
+        return may_be_above(x[:2], x[2:], inner, shares, zero)
+
+    no = jnp.zeros((), bool)
     doubtful = jnp.stack([
-        ends_below & may_be_above(x[:2], x[2:], inner, shares, zero)
-        for x, inner, zero, ends_below in given
+        flag & at_a_glance(x) if side.asked is None
+        else jax.lax.cond(flag, at_a_glance, lambda _: no, x)
+        for side, *x, flag in zip(sides, ends, values, slack, below, strict=True)
     ])  # fmt: skip
 
     def one(flag: Flag, side: tuple) -> tuple[Flag, Scalar]:

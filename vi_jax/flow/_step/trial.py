@@ -138,7 +138,7 @@ def attempt(
             return motion.at(share * h)[0]
         return method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
 
-    seen = within(plan, lane, alone, ends, stages, at, h)
+    seen = within(plan, lane, alone, ends, stages, at, h, jnp.asarray(limit))
     of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
@@ -231,6 +231,6 @@ def _path(
                 )
                 for r, rate in ((begin, surge[0]), (end, surge[1]))
             )
-            slack = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(seen.forces[k]))
-            pull = Side(first, last, seen.forces[k], slack)
+            assert seen.slack is not None
+            pull = Side(first, last, seen.forces[k], seen.slack[k], rests | slow)
     return Path(begin, end, at_turn, leaves, surge, pull)

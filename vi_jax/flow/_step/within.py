@@ -43,12 +43,16 @@ class Within(NamedTuple):
     slow: dict[int, Flag]
     """By coordinate, whether it is so slow, and so close to a stop, that it may turn twice within
     the step and touch in between."""
+    error: Scalar | None = None
+    """The largest error of the forces, relative to the tolerance."""
+    slack: dict[int, Scalar] | None = None
+    """What rounding leaves of the forces."""
 
     def only(self, places: list[int]) -> "Within":
         """The values at some of the stages."""
         kept = self.forces, self.events
         forces, events = jtu.tree_map(lambda x: x[np.asarray(places)], kept)
-        return Within(forces, events, self.slow)
+        return self._replace(forces=forces, events=events)
 
 
 def looks_within(plan: Plan, state: State) -> bool:
@@ -72,16 +76,12 @@ def guards_error(
 ) -> Scalar | None:
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
     `None` without guards, or of a method that estimates none."""
-    events = events_of(plan.machine)
-    unit = plan.unit
-    # The integral of a force is a velocity.
-    guards = [(x, True, 1.0 if isinstance(unit, float) else 1 / unit) for x in seen.forces.values()]
+    events, errors = events_of(plan.machine), [seen.error]
     for number, sides in seen.events.items():
-        guards += [(x, events[number].holds_mode, unit) for x in sides]
-    errors = [
-        plan.method.guard_error(stages, x, h, longest, acts=acts, size=size)
-        for x, acts, size in guards
-    ]
+        acts = events[number].holds_mode
+        errors += [
+            plan.method.guard_error(stages, x, h, longest, acts=acts, size=plan.unit) for x in sides
+        ]
     known = [error for error in errors if error is not None]
     return functools.reduce(jnp.maximum, known) if known else None
 
@@ -97,13 +97,14 @@ def apart(stages: list[Stage]) -> list[Stage]:
 
 def within(
     plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], ends: list[tuple[Rates, Rates]],
-    stages: list[Stage], at: Callable[[Scalar], State], h: Scalar,
+    stages: list[Stage], at: Callable[[Scalar], State], h: Scalar, longest: Scalar,
 ) -> Within:  # fmt: skip
     """Return the guards at the stages of a step.
 
     **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
     `ends`, its rates where the step begins and ends; `at(share)`, the state at a share of the step,
-    asked for where the stages have none; `h`, the length of the step.
+    asked for where the stages have none; `h`, the length of the step; `longest`, that of the
+    longest one.
     """
     if not stages:
         return Within({}, {}, {})
@@ -144,11 +145,28 @@ def within(
         there = function if known else lambda s, share: function(s, at(share))
         return functools.partial(for_each, there)
 
-    forces = {k: jnp.full(len(stages), -1.0, lane.s.dtype) for k in limited}
-    if limited:
-        asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
-        forces = jax.lax.cond(asked, seen(pulls), lambda _: forces, places)
-    return Within(forces, seen(guards)(places) if looked_at else {}, slow)
+    events = seen(guards)(places) if looked_at else {}
+    if not limited:
+        return Within({}, events, slow)
+    # The integral of a force is a velocity.
+    size = 1.0 if isinstance(plan.unit, float) else 1 / plan.unit
+
+    def of_forces(places: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
+        forces, error, slack = seen(pulls)(places), jnp.zeros_like(h), {}
+        for k, x in forces.items():
+            own = plan.method.guard_error(stages, x, h, longest, acts=True, size=size)
+            error = error if own is None else jnp.maximum(error, own)
+            slack[k] = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(x))
+        return forces, error, slack
+
+    def of_none(_: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
+        nothing = jnp.full(len(stages), -1.0, lane.s.dtype)
+        zero = jnp.zeros_like(h)
+        return dict.fromkeys(limited, nothing), zero, dict.fromkeys(limited, zero)
+
+    asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
+    forces, error, slack = jax.lax.cond(asked, of_forces, of_none, places)
+    return Within(forces, events, slow, error, slack)
 
 
 def for_each(function: Callable[..., Any], given: tuple) -> Any:
