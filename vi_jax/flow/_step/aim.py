@@ -214,7 +214,8 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
         if path.pull is not None and path.leaves is not None:
             sides.append(path.pull)
             same = (path.pull.end.x <= 0) | path.leaves.landed
-            below.append(~path.leaves.left & same & path.pull.asked)
+            asked = same if path.pull.asked is None else same & path.pull.asked
+            below.append(~path.leaves.left & asked)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:

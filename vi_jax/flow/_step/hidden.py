@@ -1,6 +1,8 @@
 """What a step may have met twice, so that its ends do not show it: bounds by their tangents."""
 
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,8 +75,8 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
 
-    def at_a_glance(side: tuple) -> Flag:
-        x, inner, zero = side
+    def at_a_glance(given: Sequence[Any]) -> Flag:
+        x, inner, zero = given
         return may_be_above(x[:2], x[2:], inner, shares, zero)
 
     no = jnp.zeros((), bool)
