@@ -125,6 +125,7 @@ from .own import stops_of as stops_of
 from .own import switches_of as switches_of
 from .parameters import Parameters as Parameters
 from .parts import listed as listed
+from .parts import names_on as names_on
 from .parts import number_on as number_on
 from .reset import Reset as Reset
 from .scene import Oscillator as Oscillator

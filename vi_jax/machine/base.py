@@ -15,7 +15,15 @@ from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .own import by_default, derived, is_own, says, stops_of, switches_of
-from .parts import MEMORY, contacts_in, coordinates_in, other_events, stops_in, switches_in
+from .parts import (
+    MEMORY,
+    contacts_in,
+    coordinates_in,
+    names_on,
+    other_events,
+    stops_in,
+    switches_in,
+)
 from .shown import Shown
 from .soft import SoftStop
 from .stop import RigidStop, Wall
@@ -243,8 +251,9 @@ class AbstractMachine(Shown):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """The names of position and velocity in pictures, with units."""
-        return PLAIN
+        """The names of position and velocity in pictures, with units; by default those in the
+        state, if contacts name the first coordinate by them."""
+        return (not is_own(type(self).position) and names_on(self, 0)) or PLAIN
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -291,6 +300,10 @@ class AbstractMachine(Shown):
         methods = ("position", "velocity", "placed")
         own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
         return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
+
+    def _names_on(self, on: Any) -> tuple[str, str] | None:
+        """See `names_on`."""
+        return on if isinstance(on, tuple) else None
 
     @property
     def _first(self) -> Coordinate:

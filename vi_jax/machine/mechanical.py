@@ -184,6 +184,10 @@ class Mechanical(AbstractMachine):
             functools.partial(_pushed, self, on),
         )
 
+    def _names_on(self, on: Any) -> tuple[str, str] | None:
+        name = _named(self, on)
+        return None if name is None else (name, f"v.{name}")
+
 
 def _named(machine: Mechanical, on: Any) -> str | None:
     """The name of a coordinate, `None` of a gap."""

@@ -16,7 +16,7 @@ from .coordinates import Coordinate
 from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .friction import ContactFriction
-from .own import with_static
+from .own import says, with_static
 from .reset import Reset
 from .soft import SoftStop
 from .stop import RigidStop
@@ -112,6 +112,15 @@ def number_on(machine: Machine, name: str) -> int | None:
         if on == name or (isinstance(on, tuple) and on[0] == name):
             return number
     return None
+
+
+def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
+    """The names in the state of the position and the velocity of a coordinate, by its number;
+    `None` where contacts do not name it by them."""
+    if says(machine, "coordinates"):
+        return None
+    on = next((on for on, k in _places(contacts_in(machine)).items() if k == number), None)
+    return machine._names_on(on)
 
 
 def _at(stop: Any, places: dict[Any, int]) -> Any:

@@ -15,6 +15,7 @@ from ..machine import (
     cycles_in_words,
     in_brackets,
     name_in,
+    names_on,
     stops_of,
     switches_of,
     unit_of,
@@ -122,7 +123,8 @@ def _labels(
         )
         return place, rate
     if coordinate:  # the machine's words are those of the first
-        labels = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
+        plain = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
+        labels = names_on(machine, coordinate) or plain
     named = zip(PLAIN, labels, strict=True)
     position, velocity = (
         in_brackets(label, unit_of(machine.units, name)) if name_in(label) == label else label
