@@ -109,16 +109,23 @@ def test_two_bodies_and_a_wall():
 
 def test_pictures_show_a_coordinate_by_its_name():
     """With its own stops and impacts, or none; a component that no contact limits, too."""
-    machine = Pair()
+
+    class Measured(Pair):
+        units = {"left": "mm", "right": "mm"}
+        contacts = property(lambda self: Pair.contacts.fget(self)[::-1])  # the wall is the first
+
+    machine = Measured()
     run = vi.simulate(machine, machine.at(left=-0.5, right=0.3), 4, samples=8, impact_log=8)
     figure, axes = plt.subplots(1, 3)
     swing = run.samples.state.left.max()
     for name, lines, highest, ax in (("right", 2, 1.0, axes[0]), ("left", 1, swing, axes[1])):
         vi.plot_history(run, machine=machine, coordinate=name, ax=ax)
-        assert len(ax.lines) == lines and ax.get_ylabel() == name
+        assert len(ax.lines) == lines and ax.get_ylabel() == f"{name} (mm)"
         assert ax.lines[0].get_ydata().max() == pytest.approx(float(highest))
     vi.plot_phase_portrait(run, machine, coordinate="left", ax=axes[2])
-    assert axes[2].get_ylabel() == "v.left"
+    assert axes[2].get_ylabel() == "v.left"  # in no unit of a length
+    assert "  last cycle: right in [" in str(run) and "] mm\n" in str(run)
+    assert run.to_xarray()["y_max"].attrs["units"] == "mm"
     with pytest.raises(ValueError, match="`coordinate` must be a number or a component"):
         vi.plot_history(run, machine=machine, coordinate="up")
     plt.close(figure)

@@ -149,5 +149,6 @@ from .units import name_in as name_in
 from .units import quantity_of as quantity_of
 from .units import stated as stated
 from .units import unit_of as unit_of
+from .units import units_of as units_of
 from .units import with_unit as with_unit
 from .units import with_units as with_units

@@ -18,15 +18,26 @@ PLAIN = "position", "velocity"
 
 def unit_of(units: Mapping[str, str], name: str) -> str:
     """The unit of a quantity, of a number by its last word too; "" where none is stated."""
-    for key in (name, name.split(".")[-1].split("[")[0], ""):
+    last = name.split(".")[-1].split("[")[0]
+    for key in (name, "" if name.startswith("v.") else last, ""):  # `v.x` has another one than `x`
         if key in units:
             return units[key]
     return ""
 
 
+def units_of(machine: Machine) -> dict[str, str]:
+    """The units that a machine states. Those of position and velocity are by default those of the
+    numbers in the state that they are."""
+    units = dict(machine.units)
+    for quantity, name in zip(PLAIN, machine.labels, strict=True):
+        if name in units:
+            units.setdefault(quantity, units[name])
+    return units
+
+
 def stated(machine: Machine) -> Stated:
     """The units of a machine."""
-    return tuple(machine.units.items())
+    return tuple(units_of(machine).items())
 
 
 def attributes(unit: str) -> dict[str, str]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from .._programs import compiled
 from .._types import Scalar, State, Vector
 from ..flow import average_names, quantities_on, quantity_names
-from ..machine import components, frequency_ratio, in_unit, with_leaf
+from ..machine import components, frequency_ratio, in_unit, units_of, with_leaf
 from ..machine import quantity_of as measured
 from ._chatter import Hops
 from ._corrector import Step, jacobian_at
@@ -200,7 +200,7 @@ def held_in_words(problem: Shooting) -> str:
     """What is held, and where; host-side."""
     held = (c for c in problem.conditions if isinstance(c, Held | HeldMultiplier))
     named = ((c.name if isinstance(c, Held) else "multiplier", float(c.value)) for c in held)
-    units = problem.machine.units
+    units = units_of(problem.machine)
     return ", ".join(
         f"{name} = {in_unit(f'{value:.9g}', units, measured(name) or name)}"
         for name, value in named

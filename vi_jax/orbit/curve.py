@@ -21,6 +21,7 @@ from ..machine import (
     frequency_ratio,
     in_unit,
     phase_at,
+    units_of,
     with_units,
 )
 from ._conditions import Special, held_in_words
@@ -306,7 +307,7 @@ class Curve(InWords, abc.ABC):
             data[name] = ("point", *axes), np.stack([row[name] for row in rows])
         named = {name: name for name in (*shapes, own)} | {"parameter": own}
         table = xr.Dataset(data, attrs={"parameter": own})
-        return with_units(table, self.problem.machine.units, named)
+        return with_units(table, units_of(self.problem.machine), named)
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
@@ -361,7 +362,7 @@ class Curve(InWords, abc.ABC):
         own |= {f"special_{name}": name for name in self.names}
         own |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
         own |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
-        return tidy(with_units(found, self.problem.machine.units, own), along)
+        return tidy(with_units(found, units_of(self.problem.machine), own), along)
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -391,7 +392,7 @@ class Branch(Curve):
         """What was freed and what is held instead, if anything is."""
         if not self.free:
             return []
-        units = self.problem.machine.units
+        units = units_of(self.problem.machine)
         ranges = (
             f"{name} in {in_unit(f'[{values.min():.6g}, {values.max():.6g}]', units, name)}"
             for name, values in self.free.items()
@@ -402,7 +403,7 @@ class Branch(Curve):
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
         period = cycles_in_words(machine, self.cycles)
-        span = in_unit(f"[{low:.6g}, {high:.6g}]", machine.units, self.name)
+        span = in_unit(f"[{low:.6g}, {high:.6g}]", units_of(machine), self.name)
         lines = [
             f"Branch of {so_many(len(self.parameter), 'motion')} of period {period} with "
             f"{branch_hits_in_words(self)}, {self.name} in {span}, "

@@ -9,7 +9,15 @@ import numpy as np
 
 from .._checks import given_number, short
 from .._messages import so_many
-from ..machine import angles_in, bare, cycles_in_words, in_rows, nearest_images, state_in_words
+from ..machine import (
+    angles_in,
+    bare,
+    cycles_in_words,
+    in_rows,
+    nearest_images,
+    state_in_words,
+    units_of,
+)
 from .floquet import STABILITY
 from .results import InWords, Orbit, hits_in_words, span_in_words, trimmed
 
@@ -42,7 +50,10 @@ def in_one_line(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
     stable = STABILITY[orbit.stability].partition(":")[0]
-    where, span = state_in_words(bare(orbit.state), 6, orbit.machine.units), span_in_words(orbit, 6)
+    where, span = (
+        state_in_words(bare(orbit.state), 6, units_of(orbit.machine)),
+        span_in_words(orbit, 6),
+    )
     size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     return f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span}; {size}"
 

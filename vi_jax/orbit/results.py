@@ -38,6 +38,7 @@ from ..machine import (
     state_in_words,
     stops_of,
     summary_table,
+    units_of,
     with_units,
 )
 from .floquet import STABILITY, stability_of
@@ -238,7 +239,7 @@ class Orbit(Summarized):
         }
         data = xr.Dataset(variables | present(words, batch))
         own = {name: name for name in self.averages}
-        return tidy(with_units(data, self.machine.units, own), along)
+        return tidy(with_units(data, units_of(self.machine), own), along)
 
     def summary(self) -> str:
         """The motion, its impacts and its multipliers."""
@@ -251,7 +252,7 @@ class Orbit(Summarized):
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_nearly(self)}"
-        count, cycles, units = int(self.impacts), int(self.cycles), self.machine.units
+        count, cycles, units = int(self.impacts), int(self.cycles), units_of(self.machine)
         period = cycles_in_words(self.machine, cycles)
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
@@ -324,7 +325,7 @@ def hits_in_words(orbit: Orbit) -> str:
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """The interval of the first coordinate, by the name that pictures give it."""
     low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span = in_unit(f"[{low}, {high}]", orbit.machine.units, "position")
+    span = in_unit(f"[{low}, {high}]", units_of(orbit.machine), "position")
     return f"{name_in(orbit.machine.labels[0])} in {span}"
 
 

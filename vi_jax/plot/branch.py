@@ -8,7 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
-from ..machine import angle_names, cycles_in_words, in_brackets, name_in, quantity_of, unit_of
+from ..machine import (
+    angle_names,
+    cycles_in_words,
+    in_brackets,
+    name_in,
+    quantity_of,
+    unit_of,
+    units_of,
+)
 from ..orbit import Boundary, Branch, branch_hits_in_words
 from ..scans import Sweep
 from .colors import DASHES, MARKS, color_of, mark_style, once, thick
@@ -80,8 +88,8 @@ def plot_branch(
         _legend(ax)
     machine = branch.problem.machine
     along = x if x in branch.free else branch.name
-    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(along, machine.units))
-    ax.set_ylabel(extreme_name(y, machine.labels, machine.units, branch.averages))
+    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(along, units_of(machine)))
+    ax.set_ylabel(extreme_name(y, machine.labels, units_of(machine), branch.averages))
     return ax
 
 
@@ -175,7 +183,7 @@ def plot_boundary(
         ax.plot(*point.parameters, **mark)
     if legend:
         _legend(ax)
-    units = curve.problem.machine.units
+    units = units_of(curve.problem.machine)
     ax.set_xlabel(axis_name(curve.names[0], units))
     ax.set_ylabel(axis_name(curve.names[1], units))
     return ax

@@ -19,6 +19,7 @@ from ..machine import (
     stops_of,
     switches_of,
     unit_of,
+    units_of,
 )
 from .colors import BLUE, STOP, is_set, once, thick
 from .path import coordinate_of, drawn_path
@@ -118,7 +119,7 @@ def _labels(
     labels = machine.labels
     if isinstance(coordinate, str):
         place, rate = (
-            in_brackets(name, unit_of(machine.units, name))
+            in_brackets(name, unit_of(units_of(machine), name))
             for name in (coordinate, f"v.{coordinate}")
         )
         return place, rate
@@ -127,7 +128,7 @@ def _labels(
         labels = names_on(machine, coordinate) or plain
     named = zip(PLAIN, labels, strict=True)
     position, velocity = (
-        in_brackets(label, unit_of(machine.units, name)) if name_in(label) == label else label
+        in_brackets(label, unit_of(units_of(machine), name)) if name_in(label) == label else label
         for name, label in named
     )
     return position, velocity

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag
 from .._messages import so_many
-from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of
+from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins
 from . import colors as look
 from .branch import axis_name
@@ -197,7 +197,7 @@ def _start_name(machine: AbstractMachine, name: str) -> str:
     """The label of an axis of starts: the machine's words, with units, for what is a position or a
     velocity; else the name, with its unit if the machine states one."""
     name = name.removeprefix("start.")
-    by_its_name = in_brackets(f"{name} at the start", unit_of(machine.units, name))
+    by_its_name = in_brackets(f"{name} at the start", unit_of(units_of(machine), name))
     try:
         start = machine.start()
     except ValueError:  # a machine that has no start of its own

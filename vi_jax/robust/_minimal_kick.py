@@ -11,7 +11,7 @@ from .._checks import count, flag, given_number, interval
 from .._messages import Interrupted, at_work
 from .._types import State
 from ..flow import MethodLike
-from ..machine import AbstractMachine, Summarized, components, state_in_words
+from ..machine import AbstractMachine, Summarized, components, state_in_words, units_of
 from ..orbit import Orbit
 from ._edge_state import EdgeState, tracked
 from ._rays import NARROWER, Exits, Kick, Row, first_exits, narrowed, nearer, nearest_first
@@ -78,7 +78,7 @@ class MinimalKick(Summarized):
 
     def summary(self) -> str:
         """The kick and where it leads, in words."""
-        units = self.machine.units
+        units = units_of(self.machine)
         parts = state_in_words({name: np.asarray(x) for name, x in self.kick.items()}, 9, units)
         how = "exact" if self.exact else "by simulations only"
         sure = "confirmed" if self.confirmed else "NOT confirmed"

@@ -12,7 +12,7 @@ from .._checks import count, given_number
 from .._messages import in_parts, so_many, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
-from ..machine import AbstractMachine, components, cycles_in_words, with_units
+from ..machine import AbstractMachine, components, cycles_in_words, units_of, with_units
 from ..orbit import (
     ORBIT_RESULTS,
     AbstractRootFinder,
@@ -118,7 +118,7 @@ class AllOrbits(InWords):
                      "detectable", "still"):  # fmt: skip
             values = [getattr(searched, name) for searched in self.searched]
             data[f"search_{name}"] = "search", np.array(values)
-        return tidy(with_units(xr.Dataset(data), self.machine.units, {}), along)
+        return tidy(with_units(xr.Dataset(data), units_of(self.machine), {}), along)
 
     def __str__(self) -> str:
         count, stable = len(self.orbits), int(self.stable.sum())

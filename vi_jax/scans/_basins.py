@@ -37,6 +37,7 @@ from ..machine import (
     state_in_words,
     summary_table,
     unit_of,
+    units_of,
     with_leaves,
 )
 from ..orbit import distance
@@ -226,7 +227,7 @@ class Basins(NamedTuple):
             rows = np.full((len(self.attractors), longest), np.nan)
             for row, a in zip(rows, self.attractors, strict=True):
                 row[: a.period] = a.sections[name]
-            about = attributes(unit_of(self.machine.units, name))
+            about = attributes(unit_of(units_of(self.machine), name))
             variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
         return tidy(self.data.assign(variables), along)
 
@@ -234,7 +235,7 @@ class Basins(NamedTuple):
         lines = [f"Basins of {so_many(len(self.attractors), 'periodic motion')}"]
         for a in self.attractors:
             first = {name: x[0] for name, x in a.sections.items()}
-            where = state_in_words(first, 6, self.machine.units)
+            where = state_in_words(first, 6, units_of(self.machine))
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "
                 f"{so_many(round(a.impacts), 'impact')}, {where}: "

@@ -19,7 +19,7 @@ import numpy as np
 
 from .._messages import installed_version
 from ..flow import REASON_NAMES
-from ..machine import AbstractMachine, attributes, leaf, leaf_names, outcomes_of, unit_of
+from ..machine import AbstractMachine, attributes, leaf, leaf_names, outcomes_of, unit_of, units_of
 from ._lane_noise import NOISE, START, part_of
 from .grid import LANE, Blocks
 from .program import ScanProgram
@@ -217,7 +217,7 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
         about = dict(known.get(name.removeprefix("d_") if by else name, {}))
         dims = tuple(about.pop("dims", ()))
         if "unit_of" in about:
-            about |= attributes(unit_of(machine.units, about.pop("unit_of")))
+            about |= attributes(unit_of(units_of(machine), about.pop("unit_of")))
         if by:
             dims = ("by", *dims)
             about = {
@@ -243,4 +243,4 @@ def unit_on_axis(program: ScanProgram, blocks: Blocks, name: str) -> str:
         return ""
     if program.build is not None and not name.startswith(START):
         return ""
-    return unit_of(program.at(blocks, 0)[0].units, name)
+    return unit_of(units_of(program.at(blocks, 0)[0]), name)

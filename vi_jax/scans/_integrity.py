@@ -19,6 +19,7 @@ from ..machine import (
     nearest_images,
     summary_table,
     unit_of,
+    units_of,
     with_leaf,
 )
 from ._basins import (
@@ -103,7 +104,7 @@ class IntegrityProfile(NamedTuple):
         **Raises:** `ValueError` if there is no such dimension.
         """
         both = "motion", self.parameter
-        unit = unit_of(self.basins[0].machine.units, self.parameter)
+        unit = unit_of(units_of(self.basins[0].machine), self.parameter)
         variables: dict[str, Any] = {
             name: (both, getattr(self, name)) for name in ("label", *_NUMBERS)
         }

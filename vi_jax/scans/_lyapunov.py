@@ -45,6 +45,7 @@ from ..machine import (
     renews,
     stated,
     unit_of,
+    units_of,
     with_modes,
     with_unit,
     with_units,
@@ -301,7 +302,7 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
         state=with_modes(ravel_pytree(bare(start))[1](x), modes),
         result=result,
         averages=means(sums, jnp.sum(duration)),
-        unit=unit_of(machine.units, "rate"),
+        unit=unit_of(units_of(machine), "rate"),
         units=stated(machine),
     )
 
