@@ -111,7 +111,7 @@ def test_pictures_show_a_coordinate_by_its_name():
     """With its own stops and impacts, or none; a component that no contact limits, too."""
 
     class Measured(Pair):
-        units = {"left": "mm", "right": "mm"}
+        units = property(lambda self: {"left": "mm", "right": "mm"})
         contacts = property(lambda self: Pair.contacts.fget(self)[::-1])  # the wall is the first
 
     machine = Measured()
