@@ -1,7 +1,8 @@
 """The chatter with which a body comes to rest on a stop, and where its rest is lost.
 
-The hops of a chatter are followed one by one, until one is so slow that the body may be put on its
-stop without rebound: the error of the state is of third order in that speed.
+The hops of a chatter are followed one by one, until one is so slow, compared with the fastest, that
+the body may be put on its stop without rebound: the error of the state is of third order in that
+speed.
 
 The body rests as long as its chatter ends before the stop lets go of it. Near that limit the hops
 are a map with a saddle: of τ, the time left until the release, and ξ = u/(β τ²), with the speed u
@@ -30,13 +31,21 @@ _HOPS, _CORRECTIONS = 400, 7
 # be its square, and what the derivatives are off by is of the order of the last one.
 _CLOSE = 1e-9
 
-# A landing is found if what is missing is less than this share of the hop's height.
-_LANDED = 1e-6
+# A landing is found if what is missing is less than this share of the hop's height, which is more
+# than so many roundings of the stop's place then: choices.
+_LANDED, _ROUNDINGS = 1e-6, 10
 
+# A hop is the last one if its rebound is slower than this share of the fastest one: its error of
+# third order is rounding then, and its landing is still known to a millionth of its duration.
+_SLOW = 1e-4
 
 # A chatter that takes less than this share of the time until the release ends before it: at the
 # limit it is 0.6, for each restitution. A choice.
 _OVER = 0.1
+
+# A motion that escapes has this share of (ξ/ξ of the manifold τ²)^(5/6) at least: at the limit it
+# is more than 0.4, with a restitution above 0.4. A choice.
+_ESCAPES = 0.1
 
 
 class Hops(NamedTuple):
@@ -49,14 +58,11 @@ class Hops(NamedTuple):
     """Whether there is no next impact, or it comes too late."""
 
 
-def hopped(
-    free: Flight, number: int, begin: Hops, *, slow: Scalar, until: Scalar, steps: int
-) -> Hops:
-    """The last impact of a chatter whose rebound is faster than `slow`, or the first one of which
-    it is not.
+def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: int) -> Hops:
+    """The first impact of a chatter whose rebound is slow, or the last one before a clock.
 
     **Arguments:** the flight with the body free; the number of its stop; `begin`, the first impact;
-    `slow`, a speed by the clock; a clock beyond which no impact is wanted; the steps of a hop.
+    a clock beyond which no impact is wanted; the steps of a hop.
     """
     stop = stops_of(free.machine)[number]
     averages = tuple(name for name in begin.passed if name != TIME)
@@ -64,13 +70,15 @@ def hopped(
     def rates(s: Scalar, u: Vector) -> Rates:
         return _rates(free, stop, s, u)
 
-    def going(carry: tuple[Hops, int]) -> Flag:
-        hops, count = carry
+    def going(carry: tuple[Hops, Scalar, int]) -> Flag:
+        hops, fastest, count = carry
         here = rates(hops.s, hops.u)
-        return ~hops.over & ((-here.v > slow) | (here.a < 0)) & (count < _HOPS)
+        least = _ROUNDINGS * jnp.finfo(here.v.dtype).eps / _LANDED * jnp.abs(stop.place * here.a)
+        fast = (-here.v > _SLOW * fastest) & (here.v**2 > least)
+        return ~hops.over & (fast | (here.a < 0)) & (count < _HOPS)
 
-    def hop(carry: tuple[Hops, int]) -> tuple[Hops, int]:
-        hops, count = carry
+    def hop(carry: tuple[Hops, Scalar, int]) -> tuple[Hops, Scalar, int]:
+        hops, fastest, count = carry
         first = _duration(free, stop, hops.s, hops.u)
 
         def off(carry):
@@ -94,9 +102,11 @@ def hopped(
         rebound, _ = stop.after(free.machine, s, free.unravel(u), *free.modes)
         new = Hops(s, ravel_pytree(rebound)[0], passed, ~lands)
         old = hops._replace(over=~lands)
-        return jax.tree.map(lambda a, b: jnp.where(lands, a, b), new, old), count + 1
+        new = jax.tree.map(lambda a, b: jnp.where(lands, a, b), new, old)
+        return new, jnp.maximum(fastest, -rates(new.s, new.u).v), count + 1
 
-    return jax.lax.while_loop(going, hop, (begin, 0))[0]
+    first = jnp.maximum(-rates(begin.s, begin.u).v, 0.0)
+    return jax.lax.while_loop(going, hop, (begin, first, 0))[0]
 
 
 def _rates(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Rates:
@@ -132,8 +142,12 @@ def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
 
 def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scalar:
     """How far the last impact of a chatter is above the stable manifold of the hops: negative where
-    the body comes to rest. That is ln(ξ/ξ of the manifold), which grows from hop to hop as τ^-q
-    with q close to 5/3, and is taken times τ^(5/3): so it depends little on the number of hops.
+    the body comes to rest.
+
+    That is ((ξ/ξ of the manifold)^(5/6) - 1) τ^(5/3). Close to the manifold ln(ξ/ξ of the manifold)
+    grows from hop to hop as τ^-q with q close to 5/3, so that this depends little on the number of
+    hops. Far from it this is not zero where the last impact comes with the release (τ = 0, while
+    ξ τ² is not 0).
 
     **Arguments:** the flight in which the body rests; the number of its stop; the last impact;
     clock and state of the release.
@@ -172,14 +186,15 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     before = after / jnp.where(share > 0, share, 1.0)
     share, slope = jax.jvp(stop.share, (before,), (jnp.ones_like(after),))
     k, k1 = share - slope * before, slope * jnp.abs(unit)
-    xi = speed / (beta * left**2)
     limit = _manifold(k, left, mu / beta, nu / beta, c, p, beta * k1)
-    safe = jnp.where((share > 0) & (xi > 0), xi, 1.0)
-    above = jnp.log(safe / limit) * (left**2) ** (5 / 6)
+    height = speed / (beta * limit)
+    safe = jnp.where((share > 0) & (height > 0), height, 1.0) ** (5 / 6)
+    above = safe - jnp.sign(left) * (left**2) ** (5 / 6)
     # Far from the limit, as where the stop lets go of it with a force that hardly changes, the
     # manifold is not known.
     over = remaining(free, number, hops) < _OVER * left
     above = jnp.where(over, -jnp.abs(above), above)
+    above = jnp.where(hops.over, jnp.maximum(above, _ESCAPES * safe), above)
     return jnp.where(share > 0, above, -jnp.inf)
 
 

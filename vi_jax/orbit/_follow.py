@@ -31,6 +31,11 @@ SHORTER = "shorter"
 # The tangents of two points close to each other on one curve have at least this product.
 SAME_CURVE = 0.9
 
+# A step of a curve whose tangent turns by less than 26° (as the walk asks) lies within half that of
+# its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations,
+# or another part of this one. Steps no longer than the second are rounding.
+_ASIDE, _TINY = 0.9, 1e-6
+
 # A walk whose steps have to be shorter than this share of the longest stalls. The shortest that the
 # branches of the tests need is 2e-3 of it.
 _SHORTEST = 1e-6
@@ -99,7 +104,10 @@ class Table(abc.ABC):
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """The point at this length along the tangent."""
-        return advance(self.problem, x, tangent, self.scale, length)
+        new = advance(self.problem, x, tangent, self.scale, length)
+        gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
+        aside = gone > _TINY and not abs(length) >= _ASIDE * gone
+        return new._replace(good=np.asarray(False)) if aside else new
 
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """The point between two at which a test is zero."""
@@ -331,10 +339,10 @@ def bounds_of(table: Table) -> list[Event]:
     """The rows of a table that end a curve at the bounds of its parameters."""
 
     def row(i: int, bound: float, sense: float) -> Event:
-        return Event(
-            lambda step: sense * (float(step.x[i]) - bound) / float(table.scale[i]),
-            lambda at: Ending(at, BOUNDS),
-        )
+        def left(step: Step) -> float:
+            return sense * (float(step.x[i]) - bound) / float(table.scale[i])
+
+        return Event(left, lambda at: Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER))
 
     places = enumerate(table.bounds, -len(table.bounds))
     return [row(i, *at) for i, (low, high) in places for at in ((low, 1.0), (high, -1.0))]

@@ -92,11 +92,6 @@ _ALMOST = 10.0
 # rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
 _LONG = 4.0
 
-# A step of a curve whose tangent turns by less than 26° (as the walk asks) lies within half that of
-# its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations.
-# Steps no longer than the second are rounding.
-_ASIDE, _TINY = 0.9, 1e-6
-
 # A flight between two rests is over at once if it is this brief (a cycle is 2π).
 _BRIEF = 1e-3
 
@@ -148,9 +143,6 @@ class MotionTable(Table):
     def advance(self, x, tangent, length) -> Step:
         """The point at this length along the tangent."""
         new = super().advance(x, tangent, length)
-        gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
-        if gone > _TINY and not abs(length) >= _ASIDE * gone:
-            return new._replace(good=np.asarray(False))
         if not self.problem.autonomous or not bool(new.good):
             return new
         if self.size is None:

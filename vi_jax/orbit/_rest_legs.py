@@ -40,10 +40,6 @@ from ._shooting import Shooting
 from .distinct import unit_of
 from .results import Orbit
 
-# A hop is the last one if its rebound is slower than this share of the motion's speed: its error of
-# third order is rounding then, and its landing is still known to a millionth of its duration.
-_SLOW = 1e-4
-
 # Events of a cycle that are looked at, and of a period that are followed: choices.
 _LOGGED, _MOST = 512, 24
 
@@ -103,9 +99,6 @@ def legs_of(
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
     problem = sized(problem, x)
-    if problem.landings:
-        speed = max(float(orbit.y_max - orbit.y_min), abs(float(orbit.y_min))) / problem.radian
-        problem = dataclasses.replace(problem, slow=jnp.asarray(_SLOW * speed))
     off = off_by(problem, x) if sized_by_motion(problem) else 0.0
     if off > COARSE:
         problem = finer(problem, x, off) or problem

@@ -83,8 +83,6 @@ class Shooting(eqx.Module):
     sizes: Array | None = None
     """How large the clock and each number of the state are along the motion, (1 + states,): the
     scales by which differences between motions are judged; 1 if not given."""
-    slow: Array | None = None
-    """The hop of a chatter with a slower rebound (by the clock) is its last one."""
     held: tuple[float, ...] = eqx.field(static=True, default=())
     """Of each coordinate that rests all the time its contact (see `Flight.contact`), of others 0;
     empty if nothing rests."""
@@ -313,10 +311,10 @@ class Shooting(eqx.Module):
         """
         hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
-            assert self.slow is not None
-            free, begin = self.departing(machine, leg), hops._replace(over=~lands)
+            free, begin = self.departing(machine, leg), hops._replace(over=~lands | hops.over)
             steps = max(2, ceil(_HOP * self.steps / self.cycles))
-            hops = hopped(free, number, begin, slow=self.slow, until=until, steps=steps)
+            last = hopped(free, number, begin, until=until, steps=steps)
+            hops = last._replace(over=jnp.where(lands, last.over, hops.over))
         return hops
 
     def residual(self, x: Vector) -> Vector:
@@ -438,6 +436,8 @@ class Shooting(eqx.Module):
         landing, later = self.events[i], (*range(i + 1, self.legs), *range(i))
         j = next(j for j in later if self.events[j] == landing._replace(use=LEAVES))
         s = clock[j] + (period if j < i else 0.0)
+        if j != (i + 1) % self.legs:  # another event comes before the chatter is over
+            last = last._replace(over=jnp.zeros_like(last.over))
         return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
 
     def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
