@@ -63,7 +63,7 @@ def start_of(machine):
 def test_a_rest_that_is_divided():
     """Two bodies. The place, the curve and the multipliers are those of a shooting code with exact
     hops; on both sides of the curve simulations count the rests."""
-    way = {"parameter": "omega", "method": vi.FixedStep(steps_per_cycle=50)}
+    way = {"parameter": "omega", "method": vi.FixedStep(steps_per_cycle=24)}
     bounds, orbit = (0.346, 0.3505), settled(Coupled())
     branch = vi.continue_orbit(orbit, bounds=bounds, step=0.3, max_step=0.3, **way)
     assert branch.ends == ("rest", "bounds") and (branch.rests == 1).all()

@@ -1,6 +1,5 @@
 """What a machine does beside a grazing, where the local map forecasts it."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._programs import compiled
-from ..flow import AbstractMethod, FixedStep, simulate
+from ..flow import simulate
 from ..machine import in_rows, stops_of, with_leaf
 from ._forecast import (
     LOOKED,
@@ -71,7 +70,7 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
     found = _lanes(
-        problem, _method(problem), problem.parameters[0], jnp.asarray(value + offsets),
+        problem, problem.method, problem.parameters[0], jnp.asarray(value + offsets),
         jnp.asarray(smooth), problem.cycles * LOOKED, settling(local) * problem.cycles,
     )  # fmt: skip
     rows, impacts, good = (np.asarray(a) for a in found)
@@ -96,15 +95,6 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
     counted = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
     whole = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
     return Simulated(period, counted, last, far, whole)
-
-
-def _method(problem: Shooting) -> AbstractMethod:
-    """As exact as the flights of the branch, whose number of steps may be larger than the
-    method's: its error has to be small beside the depth of a touch."""
-    if not isinstance(problem.method, FixedStep):
-        return problem.method
-    steps = max(problem.method.steps_per_cycle, problem.steps // problem.cycles)
-    return dataclasses.replace(problem.method, steps_per_cycle=steps)
 
 
 def alike(forecast: Settled, machine: Simulated) -> np.ndarray:

@@ -342,7 +342,10 @@ def bounds_of(table: Table) -> list[Event]:
         def left(step: Step) -> float:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
-        return Event(left, lambda at: Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER))
+        def ending(at: Step) -> Ending:
+            return Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER)
+
+        return Event(left, ending)
 
     places = enumerate(table.bounds, -len(table.bounds))
     return [row(i, *at) for i, (low, high) in places for at in ((low, 1.0), (high, -1.0))]

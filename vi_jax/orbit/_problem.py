@@ -222,6 +222,7 @@ def problem_of(
         blank, way = doubled, again  # the finer one: along the branch flights may ask for more
         if apart < _SETTLED:
             break
+        blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=way.modes)
     states = way.states[:-1] if found else way.states
     x = problem.pack(places, states, [leaf(machine, parameter)], period)
@@ -291,14 +292,15 @@ def sized_by_motion(problem: Shooting) -> bool:
 
 
 def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
-    """The equations with as many steps as the flights of a solution ask for; `None` where more of
-    them change nothing, or more are not allowed.
+    """The equations with as many steps as the flights of a solution ask for, and a method by which
+    simulations of it are as exact; `None` where more change nothing, or more are not allowed.
 
     **Arguments:** the equations and a solution; what `off_by` gives for them.
     """
     more = None
     while 2 * problem.steps <= _MOST:
-        problem = dataclasses.replace(problem, steps=2 * problem.steps)
+        method, steps = problem.method.tighter(), 2 * problem.steps
+        problem = dataclasses.replace(problem, method=method, steps=steps)
         before, off = off, off_by(problem, x)
         if not off < 0.5 * before:  # rounding
             break
