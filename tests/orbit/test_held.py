@@ -1,12 +1,14 @@
 """Branches on which numbers of the motion are held and others of the machine are free."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
-from vi_jax.orbit import _conditions
+from vi_jax.orbit import Orbits, _conditions
 from vi_jax.orbit._observed import Observed
 from vi_jax.orbit.floquet import compound
 
@@ -118,6 +120,22 @@ def test_special_points_where_numbers_are_held(struck):
 def test_says_what_is_wrong(linear, arguments, message):
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(linear, parameter=ZETA, bounds=(0.5, 1.5), **arguments)
+
+
+def test_an_orbit_without_multipliers_is_refused_by_what_needs_them(linear):
+    without = dataclasses.replace(linear, multipliers=jnp.nan * linear.multipliers)
+    given = {"free": {XI: (0.001, 0.5)}, "fixed": {"multiplier": 0.5}}
+    for call in (
+        lambda: vi.continue_orbit(without, parameter=ZETA, bounds=(0.5, 1.5), **given),
+        lambda: vi.plot_multipliers(without),
+        lambda: vi.manifold(without),
+        lambda: vi.minimal_kick(without.machine, without),
+    ):
+        with pytest.raises(ValueError, match="must have multipliers, but they are not a num"):
+            call()
+    assert "nan" not in str(Orbits([without])) and "without multipliers" in str(Orbits([without]))
+    both = jax.tree.map(lambda *x: jnp.stack(x), without, without)
+    assert "2 orbits found, without multipliers" in str(both)
 
 
 @pytest.mark.slow

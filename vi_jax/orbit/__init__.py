@@ -29,6 +29,7 @@ from .grazing import grazing as grazing
 from .results import ORBIT_RESULTS as ORBIT_RESULTS
 from .results import InWords as InWords
 from .results import Orbit as Orbit
+from .results import check_multipliers as check_multipliers
 from .results import complex_in_words as complex_in_words
 from .results import trimmed as trimmed
 from .root_finders import AbstractRootFinder as AbstractRootFinder

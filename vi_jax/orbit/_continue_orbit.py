@@ -20,7 +20,7 @@ from ._rest_legs import legs_of
 from ._shooting import Shooting
 from .curve import Branch
 from .floquet import NEUTRAL
-from .results import ORBIT_RESULTS, Orbit, lies_on_a_stop
+from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -91,6 +91,7 @@ def continue_orbit(
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)
     _check_orbit(orbit)
+    _check_held(orbit, free, fixed)
     check_leaf(orbit.machine, parameter)
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
@@ -134,6 +135,25 @@ def _check_orbit(orbit: Orbit) -> None:
         )
 
 
+def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
+    """**Raises:** `TypeError` or `ValueError` unless these free and hold as many numbers, which the
+    orbit has."""
+    for argument, given in (("free", free), ("fixed", fixed)):
+        if not isinstance(given, Mapping):
+            example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
+            raise TypeError(
+                f"Argument `{argument}` must map names, as {example}, but got {given!r}."
+            )
+    assert isinstance(free, Mapping) and isinstance(fixed, Mapping)
+    if len(free) != len(fixed):
+        raise ValueError(
+            f"Argument `fixed` must hold as many numbers as `free` frees, {len(free)}, but holds "
+            f"{len(fixed)}."
+        )
+    if "multiplier" in fixed:
+        check_multipliers("orbit", orbit)
+
+
 def _freed(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
@@ -144,19 +164,8 @@ def _freed(
     **Arguments:** the equations and the unknowns that the orbit gives; `free`, `fixed` and `bounds`
     as in `continue_orbit`; the orbit's `multipliers`.
 
-    **Raises:** `ValueError` or `TypeError` for what cannot be freed or held.
+    **Raises:** `ValueError` for what cannot be freed or held.
     """
-    for argument, given in (("free", free), ("fixed", fixed)):
-        if not isinstance(given, Mapping):
-            example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
-            raise TypeError(
-                f"Argument `{argument}` must map names, as {example}, but got {given!r}."
-            )
-    if len(free) != len(fixed):
-        raise ValueError(
-            f"Argument `fixed` must hold as many numbers as `free` frees, {len(free)}, but holds "
-            f"{len(fixed)}."
-        )
     if not free:
         return problem, x, [bounds]
     machine, values, ranges = problem.machine, [], []

@@ -50,12 +50,11 @@ def in_one_line(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
     stable = STABILITY[orbit.stability].partition(":")[0]
-    where, span = (
-        state_in_words(bare(orbit.state), 6, units_of(orbit.machine)),
-        span_in_words(orbit, 6),
-    )
-    size = f"greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
-    return f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span}; {size}"
+    where = state_in_words(bare(orbit.state), 6, units_of(orbit.machine))
+    size = f"; greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
+    size = "" if orbit.stability == STABILITY.unknown else size
+    found = f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span_in_words(orbit, 6)}"
+    return found + size
 
 
 def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, np.ndarray]:

@@ -146,7 +146,8 @@ class Orbit(Summarized):
 
     @property
     def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle, by more than rounding."""
+        """Whether all multipliers lie inside the unit circle, by more than rounding; false also
+        where they are not known (see `stability`)."""
         return self.stability == STABILITY.stable
 
     @property
@@ -244,11 +245,12 @@ class Orbit(Summarized):
     def summary(self) -> str:
         """The motion, its impacts and its multipliers."""
         if self.residual.ndim:
-            found, stable = int(jnp.sum(self.successful)), int(jnp.sum(self.stable))
-            return (
-                f"{self.residual.size} searches {self.residual.shape}: {found} orbits found, "
-                f"{stable} of them stable"
-            )
+            found = self.successful
+            counted = f"{int(jnp.sum(self.stable))} of them stable"
+            if jnp.any(found & (self.stability == STABILITY.unknown)):
+                counted = STABILITY[STABILITY.unknown]
+            searches = f"{self.residual.size} searches {self.residual.shape}"
+            return f"{searches}: {int(jnp.sum(found))} orbits found, {counted}"
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_nearly(self)}"
@@ -284,6 +286,18 @@ class Orbit(Summarized):
         )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
+
+
+def check_multipliers(name: str, orbit: Orbit) -> None:
+    """**Raises:** `ValueError` if a motion was found without its multipliers.
+
+    **Arguments:** the name of the argument; an orbit, or a batch of them.
+    """
+    if bool(jnp.any(orbit.successful & jnp.isnan(orbit.multipliers).any(axis=-1))):
+        raise ValueError(
+            f"Argument `{name}` must have multipliers, but they are not a number: find it without "
+            "`multipliers=False`."
+        )
 
 
 class InWords:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._checks import instance_of, tuple_of
-from ..orbit import Orbit
+from ..orbit import Orbit, check_multipliers
 from .colors import BLUE
 from .motion import new_axes
 
@@ -22,11 +22,12 @@ def plot_multipliers(
 
     **Returns:** the axes.
 
-    **Raises:** `TypeError` for an argument without multipliers.
+    **Raises:** `TypeError` or `ValueError` for an argument without multipliers.
     """
     listed = [orbits] if isinstance(orbits, Orbit) else tuple_of("orbits", orbits, Orbit)
     for orbit in listed:
         instance_of("orbits", orbit, Orbit, "an `Orbit`, from `find_orbit`, or a list of them")
+        check_multipliers("orbits", orbit)
     ax = new_axes(ax)
     angle = np.linspace(0, 2 * np.pi, 256)
     ax.plot(np.cos(angle), np.sin(angle), color="0.5", lw=1)

@@ -29,7 +29,16 @@ from ..machine import (
     modes_of,
     nearest_images,
 )
-from ..orbit import CycleMap, Orbit, adopted, cycle_map, distance, find_orbit, unit_of
+from ..orbit import (
+    CycleMap,
+    Orbit,
+    adopted,
+    check_multipliers,
+    cycle_map,
+    distance,
+    find_orbit,
+    unit_of,
+)
 
 Row = Float[np.ndarray, " _"]
 """The numbers of a state, or of a kick."""
@@ -261,8 +270,7 @@ def one_orbit(name: str, orbit: object) -> Orbit:
             f"Argument `{name}` must be one orbit that was found, but is a batch, a failed search "
             "or something else. See `Orbit.result`."
         )
-    if not np.isfinite(orbit.multipliers).all():
-        raise ValueError(f"Argument `{name}` must have multipliers, but they are not a number.")
+    check_multipliers(name, orbit)
     return orbit
 
 
