@@ -1,7 +1,7 @@
 """Branches of motions that rest on a stop for a part of their period."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from in_decimals import rests_again
+from two_coupled import Two
 
 ZETA, GAP = "drive.frequency_ratio", 0.3
 
@@ -109,10 +110,9 @@ def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping,
     scene = scene_at(bounds[0] + 0.01, k, gap, damping)
     orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
     branch = vi.continue_orbit(orbit, parameter=ZETA, bounds=bounds)
-    assert branch.ends == ("bounds", "rest")
     (point,) = branch.special
-    assert point.kind == "rest"
-    assert "lost" in point.detail
+    assert branch.ends == ("bounds", "rest")
+    assert point.kind == "rest" and "lost" in point.detail
     assert rests_again(point.parameter - 1e-9, k, gap, damping)
     assert not rests_again(point.parameter + 1e-9, k, gap, damping)
 
@@ -140,15 +140,11 @@ def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
 @pytest.mark.slow
 def test_a_motor_remembers_its_speed_through_a_rest():
     """Rest forgets two of three numbers; the third's multiplier beside differences of the map."""
-    scene = vi.Parameters(torque=10.0, control=0.55, restitution=0.3, gap=0.006).scene(
-        drive="motor"
-    )
-    scene = scene.at_section(np.pi)
+    motor = vi.Parameters(torque=10.0, control=0.55, restitution=0.3, gap=0.006)
+    scene = motor.scene(drive="motor").at_section(np.pi)
     orbit = vi.find_orbit(scene, settled(scene, 100), impact_log=32, throw=True)
-    gap = float(scene.stops[0].gap)
-    branch = vi.continue_orbit(
-        orbit, parameter="stops.0.gap", bounds=(0.95 * gap, gap), max_step=0.3
-    )
+    bounds = tuple(np.array([0.95, 1.0]) * float(scene.stops[0].gap))
+    branch = vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=bounds, max_step=0.3)
     there = branch.orbit(0)
     # Both are crank angles, not clocks since the section.
     turns = (branch.impact_phase[0, 0] - float(there.impact_phase[0])) / (2 * np.pi)
@@ -284,9 +280,8 @@ def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
     settled = vi.simulate(Uneven(), start, 1, settle=40).last
     orbit = vi.find_orbit(Uneven(), settled, impact_log=64, throw=True)
     wanted = [brentq(released, *bracket, xtol=1e-13) for bracket in ((0.37, 0.385), (0.55, 0.6))]
-    branch = vi.continue_orbit(  # a step of 0.5 leads over both
-        orbit, parameter="frequency", bounds=(0.2, 0.6), step=0.5, max_step=0.5
-    )
+    over_both = {"step": 0.5, "max_step": 0.5}
+    branch = vi.continue_orbit(orbit, parameter="frequency", bounds=(0.2, 0.6), **over_both)
     assert branch.ends == ("grazing", "grazing")
     np.testing.assert_allclose([p.parameter for p in branch.special], wanted, atol=1e-10)
     soft = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.0, 0.45))
@@ -304,15 +299,12 @@ def listing(orbit, count):
 def test_a_motion_at_rest_on_its_section():
     """Is followed, however many of its impacts are listed: chatter, one that sticks, and rest all
     the time."""
-    for gap, restitution in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
-        scene = vi.Scene.ideal(
-            frequency_ratio=0.5, restitution=restitution, gap=gap, damping_ratio=0.05
-        )
+    for gap, k in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
+        scene = vi.Scene.ideal(frequency_ratio=0.5, restitution=k, gap=gap, damping_ratio=0.05)
         orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
         assert (int(orbit.impacts) > 1) == (gap > 0)
-        branch = vi.continue_orbit(
-            listing(orbit, 1), parameter=ZETA, bounds=(0.4, 0.6), max_step=0.3
-        )
+        listed, bounds = listing(orbit, 1), (0.4, 0.6)
+        branch = vi.continue_orbit(listed, parameter=ZETA, bounds=bounds, max_step=0.3)
         assert branch.ends == ("bounds", "bounds") and not branch.special
         np.testing.assert_allclose(branch.multipliers, 0.0, atol=1e-12)
         for i in (0, -1):  # at the last one it has been let go of again
@@ -326,13 +318,6 @@ def test_a_motion_at_rest_on_its_section():
     moving = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2, throw=True)
     with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
         vi.continue_orbit(listing(moving, 0), parameter=ZETA, bounds=(0.5, 1.9))
-
-
-class Pair4(NamedTuple):
-    x: Any
-    u: Any
-    z: Any
-    v: Any
 
 
 class Busy(vi.AbstractMachine):
@@ -370,7 +355,7 @@ class Busy(vi.AbstractMachine):
     def field(self, s, q, side, braked):
         pull = 2.0 * (q.x - q.z) + jnp.where(side < 0, 0.5 * (q.x - self.gap + 0.1), 0.0)
         push = jnp.cos(self.omega * s + 2.6) - q.x - 0.1 * q.u - 0.1 * braked
-        return Pair4(q.u, push - pull, q.v, 2.0 * (q.x - q.z) - 0.1 * q.v - 0.5 * q.z)
+        return Two(q.u, push - pull, q.v, 2.0 * (q.x - q.z) - 0.1 * q.v - 0.5 * q.z)
 
 
 @pytest.mark.slow
@@ -381,14 +366,13 @@ def test_a_rest_beside_friction_a_switch_and_a_reset():
     def after(omega, start, settle=0):
         return vi.simulate(Busy(omega=omega), start, 1, settle=settle, event_log=64)
 
-    start = Pair4(*map(jnp.asarray, (-0.5, 0.0, 0.0, 0.0)))
+    start = Two(*map(jnp.asarray, (-0.5, 0.0, 0.0, 0.0)))
     run = after(jnp.asarray(0.35), start, 80)
     kinds = run.event_log.kind
     assert all((kinds == kind).any(axis=1).all() for kind in range(len(vi.EVENTS)))
     orbit = vi.find_orbit(Busy(), run.last, impact_log=64, throw=True)
-    branch = vi.continue_orbit(
-        orbit, parameter="omega", bounds=(0.348, 0.352), step=0.5, max_step=0.5
-    )
+    way = {"parameter": "omega", "step": 0.5, "max_step": 0.5}
+    branch = vi.continue_orbit(orbit, bounds=(0.348, 0.352), **way)
     assert branch.ends == ("bounds", "bounds") and (branch.rests == 1).all()
     for i in (0, -1):
         there = branch.orbit(i)

@@ -129,7 +129,6 @@ def test_an_orbit_without_multipliers_is_refused_by_what_needs_them(linear):
         lambda: vi.continue_orbit(without, parameter=ZETA, bounds=(0.5, 1.5), **given),
         lambda: vi.plot_multipliers(without),
         lambda: vi.manifold(without),
-        lambda: vi.minimal_kick(without.machine, without),
     ):
         with pytest.raises(ValueError, match="must have multipliers, but they are not a num"):
             call()

@@ -27,37 +27,28 @@ def test_a_lost_rest_of_one_body():
     beyond = point.switch()
     assert beyond.rests == 0 and beyond.impacts > 5
     assert float(beyond.machine.drive.frequency_ratio) > point.parameter
-    curves = [
-        vi.boundary(point, parameter=name, bounds=((0.3, 1.2), between), max_step=0.3)
-        for name, between in (("stops.0.restitution", (0.3, 0.7)), ("stops.0.gap", (-0.2, 0.1)))
-    ]
-    assert all(curve.ends == ("bounds", "bounds") for curve in curves)
-    ends = [curves[0].parameters[0, 0], curves[0].parameters[-1, 0]]
-    np.testing.assert_allclose(ends, [0.952471322875, 0.44400204982114795], atol=1e-11)
-    ends = [curves[1].parameters[0, 0], curves[1].parameters[-1, 0]]
-    np.testing.assert_allclose(ends, [0.78727209495956652, 0.60897630686131181], atol=5e-11)
-    for curve, name in zip(curves, ("restitution", "gap"), strict=True):
+    for name, between, ends, off in (
+        ("restitution", (0.3, 0.7), [0.952471322875, 0.44400204982114795], 1e-11),
+        ("gap", (-0.2, 0.1), [0.78727209495956652, 0.60897630686131181], 5e-11),
+    ):
+        within = {"parameter": f"stops.0.{name}", "bounds": ((0.3, 1.2), between)}
+        curve = vi.boundary(point, **within, max_step=0.3)
+        assert curve.ends == ("bounds", "bounds")
+        np.testing.assert_allclose(curve.parameters[[0, -1], 0], ends, atol=off)
         zeta, other = curve.parameters[-3]
         numbers = {"restitution": 0.5, "gap": 0.0, "damping_ratio": 0.05, name: other}
-        assert rest_beside(
-            lambda zeta, numbers=numbers: vi.Scene.ideal(frequency_ratio=zeta, **numbers), zeta
-        ) == [1, 0]
+        machine_at = lambda zeta, numbers=numbers: vi.Scene.ideal(frequency_ratio=zeta, **numbers)
+        assert rest_beside(machine_at, zeta) == [1, 0]
 
 
 def rest_beside(machine_at, value, by=1e-6):
     """The rests in a cycle of settled simulations on both sides of a value."""
-    rests = []
-    for there in (value - by, value + by):
-        machine = machine_at(there)
-        run = vi.simulate(machine, start_of(machine), 1, settle=100)
-        rests.append(int(run.rests[0]))
-    return rests
 
+    def rests(machine):
+        start = machine.start(Y=-0.7) if isinstance(machine, vi.Scene) else machine.start()
+        return int(vi.simulate(machine, start, 1, settle=100).rests[0])
 
-def start_of(machine):
-    if isinstance(machine, vi.Scene):
-        return machine.start(Y=float(machine.stops[0].gap) - 0.5)
-    return machine.start()
+    return [rests(machine_at(value + x)) for x in (-by, by)]
 
 
 def test_a_rest_that_is_divided():
