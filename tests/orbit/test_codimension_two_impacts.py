@@ -99,7 +99,7 @@ class Two(vi.Mechanical):
 
     q = ("x", "y")
     mass = (1.0, 0.5)
-    amplitude: float = 0.01
+    amplitude: float = 0.5
     frequency: float = 1.05
 
     @property
