@@ -1,12 +1,12 @@
 """A sampled run as a path to draw, with its impacts inserted between the samples."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from .._checks import count, instance_of
+from .._programs import compiled
 from ..flow import Run, Samples
 from ..machine import (
     AbstractMachine,
@@ -24,20 +24,19 @@ from ..machine import (
 from ..orbit import Orbit
 
 
-def _coordinates(machine: AbstractMachine | None, k: int | str) -> tuple[Callable[[Any], Any], ...]:
+def _course(machine: AbstractMachine | None, k: int | str, states: Any) -> tuple[Any, Any]:
     """Position and velocity of states by coordinate number k, or the component of that name;
     without a machine their components `Y` and `V`."""
     if isinstance(k, str):
         rate = f"v.{k}"  # of a `Mechanical`
-        return (lambda state: component(k, state)), (
-            lambda state: component(rate if has_component(rate, state) else k, state)
-        )
-    if machine is not None:
-        body = machine.coordinates[k]
-        if k == 0:
-            return jax.vmap(machine.position), jax.vmap(machine.velocity)
-        return jax.vmap(body.position), jax.vmap(body.velocity)
-    return (lambda state: state.Y), (lambda state: state.V)
+        return component(k, states), component(rate if has_component(rate, states) else k, states)
+    return (states.Y, states.V) if machine is None else _by_number(machine, k, states)
+
+
+@compiled
+def _by_number(machine: AbstractMachine, k: int, states: Any) -> tuple[Any, Any]:
+    body = machine if k == 0 else machine.coordinates[k]
+    return jax.vmap(body.position)(states), jax.vmap(body.velocity)(states)
 
 
 class MotionPath(NamedTuple):
@@ -83,10 +82,8 @@ def motion_path(
             f"Argument `motion` must be one motion, but is a batch of shape {cycles.shape[:-1]}."
         )
     try:
-        path = MotionPath(
-            cycles,
-            *(np.asarray(x(samples.state), float) for x in _coordinates(machine, coordinate)),
-        )
+        course = _course(machine, coordinate, samples.state)
+        path = MotionPath(cycles, *(np.asarray(x, float) for x in course))
     except AttributeError:
         raise ValueError(
             "Argument `machine` must be given for states without `Y` and `V`: it defines the "
@@ -125,7 +122,7 @@ def is_angle(motion: Run | Samples, machine: AbstractMachine, coordinate: int | 
     """Whether a coordinate is one of the machine's angles, of `wrap_angles` or `turn_of`."""
     samples = motion.samples if isinstance(motion, Run) else motion
     assert samples is not None
-    Y = _coordinates(machine, coordinate_of(machine, coordinate))[0](samples.state)
+    Y = _course(machine, coordinate_of(machine, coordinate), samples.state)[0]
     counter = counter_of(machine)
     names = {*angle_names(machine), *([counter.name] if isinstance(counter, Turn) else ())}
     angles = (component(name, samples.state) for name in names)
@@ -149,8 +146,8 @@ def _with_impacts(
 ) -> MotionPath:
     log = run.impact_log
     assert log is not None
-    stop = np.asarray(log.stop)
-    own = [i for i, x in enumerate(stops_of(machine)) if x.coordinate == coordinate]
+    stop, stops = np.asarray(log.stop), stops_of(machine)
+    own = [i for i, x in enumerate(stops) if x.coordinate == coordinate]
     logged = np.isin(stop, own)
     cycle, _ = np.nonzero(logged)
     stop = stop[logged]
@@ -161,7 +158,7 @@ def _with_impacts(
         length = np.asarray(run.duration)
     at = cycle + np.asarray(log.phase)[logged] / length[cycle]
     speed = np.asarray(log.speed)[logged]
-    hit = [stops_of(machine)[i] for i in stop]
+    hit = [stops[i] for i in stop]
     before = np.array([s.sign for s in hit]) * speed
     after = [float(s.rebound(v)) for s, v in zip(hit, before, strict=True)]
     extra = MotionPath(
