@@ -83,6 +83,24 @@ def test_a_port_that_is_taken(monkeypatch, capsys):
     assert f"port {port}" in capsys.readouterr().err
 
 
+def test_answers_do_not_wait_for_acknowledgements(monkeypatch):
+    pytest.importorskip("marimo")
+    uvicorn = pytest.importorskip("uvicorn")
+    at_once = []
+
+    def run(server, sockets):
+        option = sockets[0].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        at_once.append(option != 0)  # what it accepts inherits it
+
+    monkeypatch.setattr(uvicorn.Server, "run", run)
+    monkeypatch.setattr(Subject, "compile", lambda self, tell: None)
+    monkeypatch.setattr(serve, "SERVED", [])
+    monkeypatch.setattr(os, "_exit", lambda code: None)
+    machine = "it", Subject(vi.machines.Duffing())
+    serve.serve("127.0.0.1", 0, machine, browser=False, tell=lambda line: None)
+    assert at_once == [True]
+
+
 @pytest.fixture(scope="module")
 def address():
     """The page, served by the command."""
