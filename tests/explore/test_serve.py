@@ -37,13 +37,7 @@ def test_a_port_that_is_none(capsys):
     assert "port must be 0-65535" in capsys.readouterr().err
 
 
-OWN = """
-import vi_jax as vi
-
-
-def make():
-    return vi.machines.Duffing()
-"""
+OWN = "import vi_jax as vi\n\nmake = vi.machines.Duffing\n"
 
 
 @pytest.mark.parametrize(
@@ -85,20 +79,14 @@ def test_a_port_that_is_taken(monkeypatch, capsys):
 
 def test_answers_do_not_wait_for_acknowledgements(monkeypatch):
     pytest.importorskip("marimo")
-    uvicorn = pytest.importorskip("uvicorn")
-    at_once = []
-
-    def run(server, sockets):
-        option = sockets[0].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-        at_once.append(option != 0)  # what it accepts inherits it
-
-    monkeypatch.setattr(uvicorn.Server, "run", run)
+    option, found = (socket.IPPROTO_TCP, socket.TCP_NODELAY), []
+    run = lambda server, sockets: found.append(sockets[0].getsockopt(*option))
+    monkeypatch.setattr("uvicorn.Server.run", run)  # connections inherit the option
     monkeypatch.setattr(Subject, "compile", lambda self, tell: None)
     monkeypatch.setattr(serve, "SERVED", [])
     monkeypatch.setattr(os, "_exit", lambda code: None)
-    machine = "it", Subject(vi.machines.Duffing())
-    serve.serve("127.0.0.1", 0, machine, browser=False, tell=lambda line: None)
-    assert at_once == [True]
+    serve.serve("127.0.0.1", 0, ("it", Subject(vi.machines.Duffing())), browser=False, tell=str)
+    assert found and found[0]
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +213,7 @@ def after(page, act) -> str:
 
 
 @pytest.mark.slow
-def test_a_slider_redraws_and_a_click_in_the_diagram_moves_it(page):
+def test_sliders_a_click_in_the_diagram_and_another_machine(page):
     assert page.inner_text("#regime").startswith("period 4π with 1 impact")
     slider = page.get_by_role("slider").nth(1)
     assert slider.get_attribute("aria-valuenow") == "0.9"
@@ -239,10 +227,7 @@ def test_a_slider_redraws_and_a_click_in_the_diagram_moves_it(page):
     assert "period 2π" in after(page, lambda: canvas.click(position=middle))
     slider = page.get_by_role("slider").first
     assert float(slider.get_attribute("aria-valuenow")) == pytest.approx(0.1, abs=0.001)
-
-
-@pytest.mark.slow
-def test_another_machine(page):
+    page.get_by_role("tab", name="Motion").click()
     menu = page.get_by_label("machine")
     assert "multipliers" in after(page, lambda: menu.select_option("Duffing"))
     assert "period 1 cycle" in page.inner_text("#regime")

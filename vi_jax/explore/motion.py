@@ -122,8 +122,8 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
             period = int(REGIMES.chaotic)
     log, ratio = run.impact_log, run.frequency_ratio
     assert log is not None and run.y_min is not None and run.y_max is not None
-    averages = {name: x.mean() for name, x in run.averages.items()}
-    numbers = {name: x[-1] for name, x in run.quantities.items()} | averages
+    numbers = {name: x[-1] for name, x in run.quantities.items()}
+    numbers |= {name: x.mean() for name, x in run.averages.items()}
     met = np.asarray(log.stop) >= 0
     return Motion(
         machine=scene,

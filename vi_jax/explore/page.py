@@ -65,33 +65,55 @@ def _(menu, mo, picked, shown):
             for name, c in shown.controls.items()
         }
     )  # fmt: skip
-    return (sliders,)
+    listed = [*sliders.elements.values()]  # so that a move does not render the sidebar again
+    return listed, sliders
 
 
 @app.cell
-def _(across, menu, mo, moving, sliders, tab, upwards, which):
+def _(across, listed, menu, mo, moving, tab, upwards, which):
     _parts = {"Motion": [which], "Diagram": [across, upwards, which], "Animation": [moving]}
-    _all = [*_parts[tab.value], *sliders.elements.values()]
-    mo.sidebar([mo.md(f"### {menu.value}"), *_all], width="340px")
+    mo.sidebar([mo.md(f"### {menu.value}"), *_parts[tab.value], *listed], width="340px")
     return
 
 
 @app.cell
 def _(html, mo, shown, sliders, time):
-    since = time.perf_counter()
-    _fault, motion = shown.fault(sliders.value), None
-    if _fault is None:
-        try:
-            motion = shown.seen(sliders.value)
-        except ValueError as error:
-            _fault = str(error)
-    mo.stop(_fault is not None, mo.Html(f'<p id="fault">{html.escape(str(_fault))}</p>'))
-    return motion, since
+    _since, _fault, motion = time.perf_counter(), "", None
+    try:
+        motion = shown.seen(sliders.value)
+    except ValueError as error:
+        _fault = str(error)
+    mo.stop(motion is None, mo.Html(f'<p id="fault">{html.escape(_fault)}</p>'))
+    computed = time.perf_counter() - _since
+    return computed, motion
+
+
+@app.cell
+def _(b64encode, computed, gif_of, html, mo, motion, moving, picture, shown, tab, time, which):
+    _since = time.perf_counter() - computed
+    if tab.value == "Animation":
+        mo.stop(not moving.value, mo.md("*Set the sliders, then let it move: it takes seconds.*"))
+        _name, _kind, _drawn = "moving", "gif", gif_of(motion)
+    else:
+        _name, _kind, _drawn = "motion", "svg+xml", picture.draw(motion, which.value)
+    _words = {"": motion.fault or motion.stability, **shown.words(motion)}
+    _told = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
+    _took = 1000 * (time.perf_counter() - _since)
+    mo.Html(
+        f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{_told}</p>'
+        f'<img id="{_name}" style="max-width: 100%" alt="{html.escape(motion.regime)}" '
+        f'src="data:image/{_kind};base64,{b64encode(_drawn).decode()}">'
+        f'<p id="took" style="opacity: 0.6"><small>redrawn in {_took:.0f} ms</small></p>'
+    )
+    return
 
 
 @app.cell
 def _(across, draw_diagram, html, mo, motion, shown, sliders, tab, upwards):
     mo.stop(tab.value != "Diagram" or motion is None or across.value is None)
+    if not shown.before:
+        with mo.status.spinner(title="compiling the diagram"):
+            shown.diagram(sliders.value, across.value)
     _found = shown.diagram(sliders.value, across.value)
     _axes = draw_diagram(_found, sliders.value[across.value], upwards.value)
     place = mo.ui.matplotlib(_axes, debounce=True)
@@ -111,36 +133,6 @@ def _(across, menu, pick, place, shown, sliders):
         _steps = round((_middle - _control.low) / _control.step)
         _there = min(max(_control.low + _steps * _control.step, _control.low), _control.high)
         pick((menu.value, {**sliders.value, across.value: _there}))
-    return
-
-
-@app.cell
-def _(b64encode, html, mo, motion, picture, shown, since, tab, time, which):
-    mo.stop(tab.value == "Animation" or motion is None)
-    assert motion is not None
-    _png = picture.draw(motion, which.value)
-    _words = {"": motion.fault or motion.stability, **shown.words(motion)}
-    _told = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
-    _took = 1000 * (time.perf_counter() - since)
-    mo.Html(
-        f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{_told}</p>'
-        f'<img id="motion" style="max-width: 100%" alt="{html.escape(motion.regime)}" '
-        f'src="data:image/png;base64,{b64encode(_png).decode()}">'
-        f'<p id="took" style="opacity: 0.6"><small>redrawn in {_took:.0f} ms</small></p>'
-    )
-    return
-
-
-@app.cell
-def _(b64encode, gif_of, mo, motion, moving, tab):
-    mo.stop(tab.value != "Animation" or motion is None)
-    assert motion is not None
-    mo.stop(not moving.value, mo.md("*Set the sliders, then let it move: some seconds of work.*"))
-    _gif = b64encode(gif_of(motion)).decode()
-    mo.Html(
-        f'<img id="moving" style="max-width: 100%" alt="{motion.regime}" '
-        f'src="data:image/gif;base64,{_gif}">'
-    )
     return
 
 

@@ -1,18 +1,14 @@
-"""The page's pictures: figures made once, whose lines are given new numbers at each redraw.
+"""The page's pictures. That of a motion is SVG, written in milliseconds and sharp at any size."""
 
-Frames and labels take most of the time of drawing one; they are kept until the limits change.
-"""
-
+import html
 import tempfile
-from io import BytesIO
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from PIL import Image
+from matplotlib.ticker import MaxNLocator
 
 from ..machine import logged_turn, name_in, stops_of
 from ..plot import BLUE, GREEN, RED, animate
@@ -22,15 +18,84 @@ from .subject import SHOWN, Diagram
 MAPS = ("section map", "impact map", "drive's speed")
 """What the third picture of a motion shows."""
 
-# Dots per inch, and the look of lines behind: choices.
-_DPI, _FAINT = 90, {"color": "0.88", "lw": 0.8, "zorder": 0}
+_STYLE = f"""
+text {{ font: 13px "DejaVu Sans", sans-serif }} rect {{ fill: none }} .frame {{ stroke: black }}
+path {{ fill: none; stroke-linecap: round; stroke-linejoin: round }} .behind {{ stroke: #e0e0e0 }}
+.circle {{ stroke: gray }} .motion {{ stroke: {BLUE}; stroke-width: 1.5 }}
+.stop {{ stroke: {GREEN}; stroke-width: 2.4 }} .section {{ stroke: {RED}; stroke-width: 4.2 }}
+.multiplier {{ stroke: {BLUE}; stroke-width: 8 }}
+"""
 
-# Of the motion's extent, the least that a map of its sections shows, so that sections that move a
-# little need no new frame: a choice.
-_WIDE = 0.3
+# Limits are kept while what is drawn is so far within them and fills so much of them. The least
+# extent of what is drawn, as a share of its size, and of sections as one of their motion's: choices.
+_EDGE, _FILLED, _LEAST, _WIDE = 0.02, 0.5, 0.001, 0.1
 
-# Limits are kept while what is drawn is within them and fills so much of them.
-_FILLED = 0.5
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+class _Panel:
+    """One of the pictures in a picture: its frame, its limits, and what is drawn within them."""
+
+    def __init__(self, left: int, top: int, width: int, height: int):
+        self.corner, self.size = (left, top), (width, height)
+        self.limits = [(0.0, 1.0), (0.0, 1.0)]
+        self._drawn: list[str] = []
+
+    def fit(self, axis: int, values: np.ndarray, *, least: float = 0.0) -> None:
+        """Set limits around what is finite, a little wider; keep them where they still suit."""
+        values = values[np.abs(values) < 1e300]
+        if not values.size:
+            return
+        low, high, (left, right) = float(values.min()), float(values.max()), self.limits[axis]
+        width, middle = max(high - low, least, _LEAST * max(-low, high), 1e-12), (low + high) / 2
+        edge, filled = _EDGE * (right - left), _FILLED * (right - left)
+        if low < left + edge or high > right - edge or width < filled:
+            self.limits[axis] = middle - 0.6 * width, middle + 0.6 * width
+
+    def draw(self, style: str, x: np.ndarray, y: np.ndarray, *, dots: bool = False) -> None:
+        """Draw a line, with a gap at what is not finite, or dots."""
+        points = np.stack([self._pixels(0, x), self._pixels(1, y)], axis=-1)
+        good = np.isfinite(points[:, 0] + points[:, 1])
+        begins = good & ~np.append(False, good[:-1])
+        text = "".join(
+            f"M{x:.1f} {y:.1f}h.01" if dots else f"{'M' if first else 'L'}{x:.1f} {y:.1f}"
+            for (x, y), first in zip(points[good].tolist(), begins[good].tolist(), strict=True)
+        )
+        self._drawn.append(f'<path class="{style}" d="{text}"/>')
+
+    def _pixels(self, axis: int, values: np.ndarray) -> np.ndarray:
+        low, high = self.limits[axis]
+        share = (values - low) / (high - low)
+        return self.size[axis] * (1 - share if axis else share)
+
+    def framed(self, labels: Sequence[str], note: str = "") -> str:
+        """Return what was drawn, in its frame, and begin anew."""
+        (left, top), (width, height), middle = self.corner, self.size, 'text-anchor="middle"'
+        drawn, self._drawn = "".join(self._drawn), []
+        (across, x_label), (upwards, y_label) = (self._ticks(k, labels[k]) for k in (0, 1))
+        ticks = [f'<path class="frame" d="M{x:.1f} {height}v4"/><text x="{x:.1f}" '
+                 f'y="{height + 18}" {middle}>{word}</text>' for x, word in across]  # fmt: skip
+        ticks += [f'<path class="frame" d="M0 {y:.1f}h-4"/><text x="-7" y="{y + 4.5:.1f}" '
+                  f'text-anchor="end">{word}</text>' for y, word in upwards]  # fmt: skip
+        return (
+            f'<g transform="translate({left} {top})"><svg width="{width}" height="{height}">{drawn}'
+            f'</svg>{"".join(ticks)}<text y="-8">{y_label}</text>'
+            f'<text x="{width / 2}" y="{height + 36}" {middle}>{x_label}</text>'
+            f'<text x="{width / 2}" y="{height / 2}" {middle} fill="gray">{note}</text>'
+            f'<rect class="frame" width="{width}" height="{height}"/></g>'
+        )
+
+    def _ticks(self, axis: int, label: str) -> tuple[list[tuple[float, str]], str]:
+        """Places and words of the ticks, and the label with the power of ten taken out of them."""
+        low, high = self.limits[axis]
+        most = min(8, self.size[axis] // (48, 32)[axis])
+        places = np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(low, high))
+        places, size = places[(low <= places) & (places <= high)], max(abs(low), abs(high))
+        power = 0 if 0.1 <= size < 1e5 else 3 * int(np.floor(np.log10(size) / 3))
+        digits = max(5, int(np.log10(size / (high - low))) + 4)
+        words = [f"{x:.{digits}g}".replace("-", "−") for x in places / 10.0**power]
+        label = html.escape(label) + (f" × 10{str(power).translate(_RAISED)}" if power else "")
+        return list(zip(self._pixels(axis, places), words, strict=True)), label
 
 
 class MotionPicture:
@@ -38,127 +103,74 @@ class MotionPicture:
 
     def __init__(self, labels: tuple[str, str]):
         """**Arguments:** what the machine calls its position and its velocity."""
-        self._names = tuple(map(name_in, labels))
-        self.figure = Figure(figsize=(11.2, 6.6), dpi=_DPI)
-        self._canvas = FigureCanvasAgg(self.figure)
-        grid = self.figure.add_gridspec(
-            2, 3, left=0.065, right=0.985, bottom=0.08, top=0.98, wspace=0.26, hspace=0.26
-        )
-        self._course = self.figure.add_subplot(grid[0, :])
-        self._portrait, self._map, self._circle = (
-            self.figure.add_subplot(grid[1, i]) for i in range(3)
-        )
-        self._course.set(xlabel="cycles", ylabel=labels[0], xlim=(0, WINDOW))
-        self._portrait.set(xlabel=labels[0], ylabel=labels[1])
-        self._lines = self._made_lines()
-        look = {"ha": "center", "color": "0.4", "animated": True}
-        self._notes = [
-            ax.text(0.5, 0.45, "", transform=ax.transAxes, **look)
-            for ax in (self._map, self._circle)
-        ]
-        self._drawn, self._frame = None, None
-
-    def _made_lines(self) -> dict[str, Line2D]:
-        lines = {}
-        for name, ax in (("course", self._course), ("portrait", self._portrait)):
-            line = ax.axhline if name == "course" else ax.axvline
-            lines[f"{name} stop"] = line(0, color=GREEN, lw=1.8)
-            (lines[name],) = ax.plot([], [], color=BLUE, lw=1.2)
-        for name, ax in (("sections", self._portrait), ("map", self._map)):
-            (lines[name],) = ax.plot([], [], "o", color=RED, ms=3.2, mew=0)
-        angle = np.linspace(0, 2 * np.pi, 129)
-        self._circle.plot(np.cos(angle), np.sin(angle), color="0.5", lw=1)
-        self._circle.axhline(0, **_FAINT)
-        self._circle.axvline(0, **_FAINT)
-        (lines["multipliers"],) = self._circle.plot([], [], "o", color=BLUE, ms=6)
-        self._circle.set(xlim=(-1.6, 1.6), ylim=(-1.2, 1.2), xlabel="Re μ", ylabel="Im μ")
-        self._circle.set_aspect("equal")
-        for line in lines.values():
-            line.set_animated(True)  # left out where the frames are drawn
-        return lines
+        self._labels = labels
+        self._course = _Panel(66, 28, 930, 200)
+        lower = (_Panel(left, 312, 248, 200) for left in (66, 407, 748))
+        self._portrait, self._map, self._circle = lower
+        self._course.limits[0] = (0.0, WINDOW)
+        self._circle.limits = [(-1.488, 1.488), (-1.2, 1.2)]  # a circle is round
 
     def draw(self, motion: Motion, which: str = MAPS[0]) -> bytes:
-        """Return the picture of a motion, as PNG; the map is `which` out of `MAPS`."""
-        self._set_motion(motion)
-        self._set_map(motion, which)
-        mu = motion.multipliers
-        self._lines["multipliers"].set_data(np.real(mu), np.imag(mu))
-        self._notes[1].set_text("" if mu.size else "no period")
-        axes = (self._course, self._portrait, self._map)
-        frame = [(ax.get_xlabel(), *ax.get_xlim(), *ax.get_ylim()) for ax in axes]
-        if frame != self._drawn:
-            self._canvas.draw()
-            self._frame = self._canvas.copy_from_bbox(self.figure.bbox)
-            self._drawn = frame
-        self._canvas.restore_region(self._frame)
-        for artist in (*self._lines.values(), *self._notes):
-            self.figure.draw_artist(artist)
-        picture = Image.fromarray(np.asarray(self._canvas.buffer_rgba())).convert("RGB")
-        out = BytesIO()
-        picture.save(out, "png", compress_level=1)
-        return out.getvalue()
+        """Return the picture of a motion, as SVG; the map is `which` out of `MAPS`."""
+        panels = (*self._motion(motion), self._mapped(motion, which), self._multipliers(motion))
+        return (
+            '<svg xmlns="http://www.w3.org/2000/svg" width="1008" height="560" '
+            f'viewBox="0 0 1008 560"><style>{_STYLE}</style>'
+            f'<rect width="1008" height="560" style="fill: white"/>{"".join(panels)}</svg>'
+        ).encode()
 
-    def _set_motion(self, motion: Motion) -> None:
-        lines, path = self._lines, motion.path
-        stops = [stop for stop in stops_of(motion.machine) if stop.coordinate == 0]
-        places = [float(stop.place) for stop in stops] or [np.nan]
-        lines["course"].set_data(path.cycles, path.Y)
-        lines["portrait"].set_data(path.Y, path.V)
-        at, across = np.repeat(places, 3), np.tile([0.0, 1.0, np.nan], len(places))
-        lines["course stop"].set_data(across, at)  # a line for each stop
-        lines["portrait stop"].set_data(at, across)
-        lines["sections"].set_data(*motion.places)
-        _fit(self._course, y=np.append(path.Y, places))
-        _fit(self._portrait, x=np.append(path.Y, places), y=path.V)
+    def _motion(self, motion: Motion) -> tuple[str, str]:
+        course, portrait, path = self._course, self._portrait, motion.path
+        places = [float(x.place) for x in stops_of(motion.machine) if x.coordinate == 0]
+        course.fit(1, np.append(path.Y, places))
+        portrait.fit(0, np.append(path.Y, places))
+        portrait.fit(1, path.V)
+        for place in places:
+            course.draw("stop", np.array(course.limits[0]), np.repeat(place, 2))
+            portrait.draw("stop", np.repeat(place, 2), np.array(portrait.limits[1]))
+        course.draw("motion", path.cycles, path.Y)
+        portrait.draw("motion", path.Y, path.V)
+        portrait.draw("section", *motion.places, dots=True)
+        return course.framed(("cycles", self._labels[0])), portrait.framed(self._labels)
 
-    def _set_map(self, motion: Motion, which: str) -> None:
-        (Y, V), note = motion.places, ""
+    def _mapped(self, motion: Motion, which: str) -> str:
+        panel, note = self._map, ""
         if which == MAPS[0]:
-            x, y, names = Y, V, [f"{name} on the section" for name in self._names]
-            for values, drawn, way in ((Y, motion.path.Y, "x"), (V, motion.path.V, "y")):
-                span = np.ptp(drawn[np.isfinite(drawn)]) if np.isfinite(drawn).any() else 0.0
-                _fit(self._map, **{way: values}, least=max(_WIDE * float(span), 1e-12))
+            x, y = motion.places
+            names = [f"{name_in(label)} on the section" for label in self._labels]
+            for axis, (low, high) in enumerate(self._portrait.limits):
+                panel.fit(axis, motion.places[axis], least=_WIDE * (high - low))
         elif which == MAPS[1]:
             x, y = motion.impact_phase, motion.impact_speed
             names, note = ["phase of the impact", "speed before it"], "" if x.size else "no impact"
-            self._map.set_xlim(0, float(logged_turn(motion.machine)))
-            _fit(self._map, y=np.append(y, 0.0))
+            panel.limits[0] = (0.0, float(logged_turn(motion.machine)))
+            panel.fit(1, np.append(y, 0.0))
         else:
             y = motion.frequency_ratio
             x, names = np.arange(1.0, y.size + 1), ["cycle", "ζ of the cycle"]
             note = "" if np.isfinite(y).any() else "no drive"
-            self._map.set_xlim(0, y.size + 1)
-            _fit(self._map, y=y, least=0.1)
-        self._lines["map"].set_data(x, y)
-        self._map.set(xlabel=names[0], ylabel=names[1])
-        self._notes[0].set_text(note)
+            panel.limits[0] = (0.0, y.size + 1.0)
+            panel.fit(1, y, least=0.02)
+        panel.draw("section", x, y, dots=True)
+        return panel.framed(names, note)
+
+    def _multipliers(self, motion: Motion) -> str:
+        panel, angle, mu = self._circle, np.linspace(0, 2 * np.pi, 129), motion.multipliers
+        for x, y in ([0, 0], [-9, 9]), ([-9, 9], [0, 0]):
+            panel.draw("behind", np.array(x), np.array(y))
+        panel.draw("circle", np.cos(angle), np.sin(angle))
+        panel.draw("multiplier", np.real(mu), np.imag(mu), dots=True)
+        return panel.framed(("Re μ", "Im μ"), "" if mu.size else "no period")
 
 
 def draw_diagram(found: Diagram, chosen: float, shown: str) -> Axes:
     """A bifurcation diagram, with the chosen value marked; `shown`, out of `SHOWN`."""
-    figure = Figure(figsize=(11.2, 3.6), dpi=_DPI)
+    figure = Figure(figsize=(11.2, 3.6), dpi=90)
     ax, rows = figure.add_axes((0.065, 0.14, 0.92, 0.84)), getattr(found, SHOWN[shown])
     ax.plot(found.values, rows, "o", color="0.15", ms=1.3, mew=0)
     ax.axvline(chosen, color=RED, lw=1)
     ax.set(xlabel=found.label, ylabel=shown, xlim=found.values[[0, -1]])
     return ax
-
-
-def _fit(
-    ax: Axes, *, x: np.ndarray | None = None, y: np.ndarray | None = None, least: float = 0.01
-) -> None:
-    """Limits around what is finite, a little wider; kept where they still suit."""
-    for values, getter, setter in ((x, ax.get_xlim, ax.set_xlim), (y, ax.get_ylim, ax.set_ylim)):
-        if values is None:
-            continue
-        values = values[np.isfinite(values)]
-        if not values.size:
-            continue
-        low, high, (left, right) = float(values.min()), float(values.max()), getter()
-        width = max(high - low, least)
-        if left <= low and high <= right and width >= _FILLED * (right - left):
-            continue
-        setter(low - 0.1 * width, high + 0.1 * width)
 
 
 def gif_of(motion: Motion) -> bytes:

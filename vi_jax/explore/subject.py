@@ -2,6 +2,7 @@
 
 import inspect
 import time
+import timeit
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -42,8 +43,8 @@ SHOWN = {
 """What a diagram can show upwards, with the array of a `Diagram`."""
 
 # Steps of a slider; sliders at most that are made by themselves; seconds within which a redrawing
-# computes, which with drawing is below 0.2; cycles before what is drawn at most. Choices.
-_STEPS, _MOST, _PATIENCE, _LONGEST = 400, 40, 0.08, 1000
+# computes, which with marimo's work is below 0.2; cycles before what is drawn at most. Choices.
+_STEPS, _MOST, _PATIENCE, _LONGEST = 400, 40, 0.1, 1000
 
 # Cycles before that are tried, to learn how long one takes; the fewest; and rounding of a slider.
 _TRIED, _FEWEST, _ROUNDING = 40, 20, 1e-9
@@ -105,23 +106,21 @@ class Subject:
             low, step = _grid(low, high, value)
             self.controls[name] = Control(_label(machine, name, numbers), low, high, step, value)
         self.controls[SETTLE] = Control(SETTLE, 0.0, _LONGEST, 1.0, 0.0)
-        self.before = _FEWEST
-        """Cycles before what a diagram shows."""
+        self.before = 0
+        """Cycles before what a diagram shows; as many as fit, once one was made."""
         self._kept: tuple[Any, Any] = None, None
-
-    def fault(self, values: Mapping[str, Any]) -> str | None:
-        """What is wrong with values that did not come from the sliders, or `None`."""
-        for name, (label, low, high, _, _) in self.controls.items():
-            x = values.get(name)
-            if not (isinstance(x, int | float) and low - _ROUNDING <= x <= high + _ROUNDING):
-                return f"The {label} must be a number from {low:g} to {high:g}, but is {x!r}."
-        return None
 
     def at(self, values: Mapping[str, Any]) -> tuple[AbstractMachine, Any]:
         """Machine and start at these values of the sliders.
 
-        **Raises:** `ValueError` for numbers that the machine refuses.
+        **Raises:** `ValueError` for values that no slider has, or that the machine refuses.
         """
+        for name, (label, low, high, _, _) in self.controls.items():
+            x = values.get(name)
+            if not (isinstance(x, int | float) and low - _ROUNDING <= x <= high + _ROUNDING):
+                raise ValueError(
+                    f"The {label} must be a number from {low:g} to {high:g}, but is {x!r}."
+                )
         moved = [name for name in self.names if values[name] != self.controls[name].value]
         machine = with_leaves(self.machine, {name: float(values[name]) for name in moved})
         check_again(machine)
@@ -134,20 +133,11 @@ class Subject:
 
     def compile(self, tell: Callable[[str], None]) -> None:
         """Compile what the sliders need, and fit the cycles before to how long they take here."""
-        name = type(self.machine).__name__
-        tell(f"compiling the {name}")
+        tell(f"compiling the {type(self.machine).__name__}")
         start = self.at(self.beginning())[1]
         prepare(self.machine, start)
         fits = _fitting(lambda cycles: look(self.machine, start, cycles))
         self.controls[SETTLE] = Control(SETTLE, 0.0, float(fits), 1.0, float(min(300, fits)))
-        if self.names:
-            tell(f"compiling the diagram of the {name}")
-
-            def timed(cycles: int) -> None:
-                self.before, self._kept = cycles, (None, None)
-                self.diagram(self.beginning(), self.names[0])
-
-            self.before = _fitting(timed)
 
     def beginning(self) -> dict[str, float]:
         """The first value of each slider, by name."""
@@ -155,19 +145,21 @@ class Subject:
 
     def diagram(self, values: Mapping[str, Any], parameter: str) -> Diagram:
         """What motions from the start settle on over one of the machine's numbers; kept while the
-        others do not change."""
+        others do not change. The first one is compiled."""
         key = [(name, x) for name, x in values.items() if name not in (parameter, SETTLE)]
         if self._kept[0] != (parameter, key):
             machine, start = self.at(values)
             control = self.controls[parameter]
             across = np.linspace(control.low, control.high, ACROSS)
-            rows = np.tile([float(values[name]) for name in self.names], (ACROSS, 1))
-            rows[:, self.names.index(parameter)] = across
-            found = _settled(
-                machine, self.names, jnp.asarray(rows), start, jnp.asarray(float(self.before))
-            )
-            made = Diagram(control.label, across, *map(np.asarray, found))
-            self._kept = (parameter, key), made
+            row = jnp.array([float(values[name]) for name in self.names])
+            rows = jnp.tile(row, (ACROSS, 1)).at[:, self.names.index(parameter)].set(across)
+
+            def found(cycles: int) -> Any:
+                settle = jnp.asarray(float(cycles))
+                return jax.device_get(_settled(machine, self.names, rows, start, settle))
+
+            self.before = self.before or _fitting(found)
+            self._kept = (parameter, key), Diagram(control.label, across, *found(self.before))
         return self._kept[1]
 
     def words(self, motion: Motion) -> dict[str, str]:
@@ -249,14 +241,14 @@ def _grid(low: float, high: float, value: float) -> tuple[float, float]:
 
 def _fitting(do: Callable[[int], Any]) -> int:
     """How many cycles before are done in the time that a redrawing may take."""
-    took = []
-    for cycles in (0, _TRIED):
-        do(cycles)
-        since = time.perf_counter()
-        do(cycles)
-        took.append(time.perf_counter() - since)
-    each = max((took[1] - took[0]) / _TRIED, 1e-9)
-    return int(np.clip((_PATIENCE - took[0]) / each, _FEWEST, _LONGEST)) // 10 * 10
+    # Seconds of the processor, since other programs delay it.
+    twice: Any = {"timer": time.process_time, "number": 1, "repeat": 2}
+    seconds = lambda cycles: min(timeit.repeat(lambda: do(cycles), **twice))
+    do(0)  # compiles
+    if (none := seconds(0)) > _PATIENCE:
+        return _FEWEST
+    each = max((seconds(_TRIED) - none) / _TRIED, 1e-9)
+    return int(np.clip((_PATIENCE - none) / each, _FEWEST, _LONGEST)) // 10 * 10
 
 
 @compiled
