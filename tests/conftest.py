@@ -63,3 +63,13 @@ def _room_for_programs():
     yield
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()
+
+
+@pytest.fixture
+def compilations():
+    """A list of the programs that are compiled meanwhile."""
+    found = []
+    note = lambda event, *_, **__: found.append(event) if "backend_compile" in event else None
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(note)

@@ -111,7 +111,6 @@ class Two(vi.Mechanical):
         return (vi.RigidStop(1.0, 0.8, on="x"),)
 
     def force(self, t, q, v):
-        """Of springs and dampers, and the drive."""
         pull = 0.3 * (q.y - q.x) + 0.05 * (v.y - v.x)
         drive = self.amplitude * jnp.cos(self.frequency * t)
         return {"x": pull - q.x - 0.1 * v.x + drive, "y": -pull}

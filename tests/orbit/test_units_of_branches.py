@@ -20,11 +20,9 @@ class Struck(vi.AbstractMachine):
 
     @property
     def cycle(self):
-        """2π/w, in the unit of time."""
         return 2 * np.pi * self.time / self.frequency
 
     def field(self, s, state):
-        """The rates of position and velocity."""
         x = state.x / self.length
         pull = self.force * jnp.cos(self.frequency * s / self.time) - x - self.cubic * x**3
         v = state.v
@@ -32,11 +30,9 @@ class Struck(vi.AbstractMachine):
 
     @property
     def contacts(self):
-        """A stop on one side."""
         return (vi.RigidStop(self.gap * self.length, restitution=0.7, on=("x", "v")),)
 
     def start(self):
-        """At rest."""
         return vi.State(x=0.0, v=0.0)
 
 
@@ -45,7 +41,6 @@ class Rubbed(Struck):
 
     @property
     def contacts(self):
-        """Friction of a third of the force's amplitude."""
         return (vi.DryFriction(on=("x", "v"), level=self.length / self.time**2 / 3),)
 
 
@@ -60,13 +55,11 @@ class Swinging(vi.AbstractMachine):
     cycle = vi.rising("v", usual=lambda machine: 6.3 * machine.time)
 
     def field(self, s, state):
-        """The rates of position and velocity."""
         x, v = state.x / self.length, state.v
         pull = -x * self.length / self.time**2 + (self.growth - x * x) * v / self.time
         return {"x": v, "v": pull}
 
     def start(self):
-        """Away from rest."""
         return vi.State(x=-1.0 * self.length, v=0.0)
 
 
