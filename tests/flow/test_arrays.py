@@ -214,34 +214,25 @@ class Row(vi.AbstractMachine):
 
     @property
     def contacts(self):
-        return (vi.RigidStop(0.5, 0.8),)
+        return vi.RigidStop(0.5, 0.8, on=("x[-1]", "v[-1]"))
 
     @property
     def cycle(self):
         return 2 * jnp.pi / 0.4
 
-    def position(self, state):
-        return state[0][-1]
-
-    def velocity(self, state):
-        return state[1][-1]
-
-    def placed(self, state, Y, V):
-        return state[0].at[-1].set(Y), state[1].at[-1].set(V)
-
     def field(self, s, state):
-        x, v = state
+        x, v = state.x, state.v
         y = x + 0.1 * v
         push = self.force * jnp.cos(0.4 * s)
         if self.written == "matrix":
             K = jnp.diag(self.springs + jnp.append(self.springs[1:], 0.0))
             K = K - jnp.diag(self.springs[1:], 1) - jnp.diag(self.springs[1:], -1)
-            return v, (-K @ y).at[0].add(push)
+            return {"x": v, "v": (-K @ y).at[0].add(push)}
         pull = self.springs * jnp.diff(y, prepend=0.0)
-        return v, (jnp.append(pull[1:], 0.0) - pull).at[0].add(push)
+        return {"x": v, "v": (jnp.append(pull[1:], 0.0) - pull).at[0].add(push)}
 
     def start(self):
-        return (jnp.zeros(self.springs.shape),) * 2
+        return vi.State(x=jnp.zeros(self.springs.shape), v=jnp.zeros(self.springs.shape))
 
 
 SPRINGS = jnp.linspace(1.0, 2.0, MASSES)
@@ -268,7 +259,7 @@ def test_derivatives_by_arrays_beside_differences():
     def loss(springs):
         machine = Row(springs)
         run = vi.simulate(machine, machine.start(), 3, method=METHOD)
-        return jnp.sum(run.last[0] * jnp.arange(MASSES)) + run.y_min[-1]
+        return jnp.sum(run.last.x * jnp.arange(MASSES)) + run.y_min[-1]
 
     gradient, way = jax.grad(loss)(SPRINGS), jnp.cos(jnp.arange(MASSES))
     _, along = jax.jvp(loss, (SPRINGS,), (way,))
@@ -281,10 +272,10 @@ def test_derivatives_by_arrays_beside_differences():
 def test_a_thousand_numbers():
     """A wave that has not come to the end: the last mass rests, energy is what was put in."""
     machine = Row(jnp.ones(500), force=0.0)
-    x = jnp.zeros(500)
-    start = x, x.at[0].set(1.0)
-    run = vi.simulate(machine, start, 1, method=vi.FixedStep(steps_per_cycle=60))
-    q, v = (np.asarray(x) for x in run.last)
+    still, method = machine.start(), vi.FixedStep(steps_per_cycle=60)
+    start = still.replace(v=still.v.at[0].set(1.0))
+    run = vi.simulate(machine, start, 1, method=method)
+    q, v = np.asarray(run.last.x), np.asarray(run.last.v)
     assert bool(run.successful) and abs(q[-1]) < 1e-12 and np.abs(v).max() > 0.05
-    rest = vi.simulate(machine, (x, x), 1, method=vi.FixedStep(steps_per_cycle=60))
+    rest = vi.simulate(machine, still, 1, method=method)
     np.testing.assert_array_equal(flat(rest.last), 0.0)

@@ -145,40 +145,19 @@ def test_drives():
         dataclasses.replace(ideal, drive=Bare()).start()
 
 
-class Rows(eqx.Module):
-    x: Any
-    v: Any
-
-
 class Springs(vi.AbstractMachine):
     k: Any = eqx.field(default_factory=lambda: jnp.array([1.0, 2.0]))
     gap: Any = 9.0
     restitution: Any = 0.5
     cycle: Any = 3.0
+    on: Any = eqx.field(static=True, default=("x[0]", "v[0]"))
 
     @property
     def contacts(self):
-        return (vi.RigidStop(self.gap, self.restitution),)
-
-    def position(self, state):
-        return state.x[0]
-
-    def velocity(self, state):
-        return state.v[0]
-
-    def placed(self, state, Y, V):
-        return Rows(state.x.at[0].set(Y), state.v.at[0].set(V))
+        return vi.RigidStop(self.gap, self.restitution, on=self.on)
 
     def field(self, s, state):
-        return Rows(state.v, -self.k * state.x)
-
-
-class Unplaced(Springs):
-    def position(self, state):
-        return state.x
-
-    def velocity(self, state):
-        return state.v
+        return dict(x=state.v, v=-self.k * state.x)
 
 
 class Squares(Springs):
@@ -186,7 +165,7 @@ class Squares(Springs):
         return {"square": state.x**2}
 
 
-ROWS = Rows(jnp.zeros(2), jnp.ones(2))
+ROWS = vi.State(x=jnp.zeros(2), v=jnp.ones(2))
 
 
 @pytest.mark.parametrize(
@@ -196,7 +175,8 @@ ROWS = Rows(jnp.zeros(2), jnp.ones(2))
         (Springs(gap=jnp.array([9.0])), r"must have one number as `gap`, but has shape \(1,\)"),
         (Springs(restitution=jnp.ones(2)), r"one number as `restitution`, but has shape \(2,\)"),
         (Springs(cycle=jnp.ones(1)), r"`cycle` of a Springs must be one number, but has shape"),
-        (Unplaced(), r"shape \(2,\). A machine whose state holds arrays must define"),
+        (Springs(on=("x[2]", "v[2]")), r"no component 'x\[2\]'; 'x' has the shape \(2,\)"),
+        (Springs(on=("x", "v")), r"shape \(2,\). A contact names numbers of arrays, .on="),
         (Squares(), "`quantities` of a Squares must be numbers, but 'square' is an array"),
     ],
 )

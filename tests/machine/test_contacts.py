@@ -221,12 +221,12 @@ def test_an_event_in_both_directions():
 
     class Counted(Toppling):
         events = vi.Reset(
-            lambda m, t, z: z.x, lambda m, t, z: {"count": z.count + 1}, direction="both"
+            lambda m, t, z: z.x, lambda m, t, z: {"n[1]": z.n[1] + 1}, direction="both"
         )
         cycle = 2 * jnp.pi
 
         def field(self, t, z):
-            return {"x": z.u, "u": -z.x, "count": 0.0}
+            return {"x": z.u, "u": -z.x, "n": jnp.zeros(2)}
 
-    run = vi.simulate(Counted(), vi.State(x=1.0, u=0.0, count=0.0), 5)
-    assert float(run.last.count) == 10.0
+    run = vi.simulate(Counted(), vi.State(x=1.0, u=0.0, n=jnp.zeros(2)), 5)
+    assert run.last.n.tolist() == [0, 10]

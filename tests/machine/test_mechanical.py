@@ -300,16 +300,20 @@ def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
 
 @pytest.mark.slow
 def test_a_mass_matrix_of_three():
-    """A row of three bodies by its matrix, and by the coordinates in which it is diagonal."""
+    """A row of three bodies by its matrix, and by the coordinates in which it is diagonal, two of
+    them in an array."""
 
     class Row(vi.Mechanical):
-        q = ("x", "y", "z")
-        mass = (1.0, 2.0, 3.0)
+        q = ("s", "x[2]")
+        mass = (1.0, np.array([2.0, 3.0]))
         cycle = 2 * jnp.pi
-        contacts = (vi.RigidStop(0.1, 0.5, on="z"), vi.DryFriction(0.2, on=lambda q: q.y - q.x))
+        contacts = (
+            vi.RigidStop(0.1, 0.5, on="x[1]"),
+            vi.DryFriction(0.2, on=lambda q: q.x[0] - q.s),
+        )
 
         def force(self, t, q, v):
-            return dict(x=jnp.cos(t) - q.x, y=-q.y, z=0.5 * jnp.sin(t) - q.z)
+            return dict(s=jnp.cos(t) - q.s, x=0.5 * jnp.sin(t) * jnp.arange(2) - q.x)
 
     class Relative(vi.Mechanical):
         """The same by x, y - x, z - y."""
@@ -328,14 +332,41 @@ def test_a_mass_matrix_of_three():
             return dict(x=x + y + z, r=y + z, s=z)
 
     row, other = Row(), Relative()
-    one = vi.simulate(row, row.at(y=0.3, z=-0.2), 6, method=CLOSE)
+    one = vi.simulate(row, row.at(x=jnp.array([0.3, -0.2])), 6, method=CLOSE)
     two = vi.simulate(other, other.at(r=0.3, s=-0.5), 6, method=CLOSE)
     z = two.sections
     assert int(one.impacts.sum()) == int(two.impacts.sum()) > 5
-    np.testing.assert_allclose(one.sections.x, z.x, atol=1e-9)
-    np.testing.assert_allclose(one.sections.y, z.x + z.r, atol=1e-9)
-    np.testing.assert_allclose(one.sections.z, z.x + z.r + z.s, atol=1e-9)
+    np.testing.assert_allclose(one.sections.s, z.x, atol=1e-9)
+    np.testing.assert_allclose(one.sections.x.T, (z.x + z.r, z.x + z.r + z.s), atol=1e-9)
     np.testing.assert_allclose(one.impact_energy, two.impact_energy, atol=1e-9)
+
+
+def test_masses_of_an_array_that_depend_on_it():
+    """A spring of masses m(x) in an array and by names."""
+
+    class Names(vi.Mechanical):
+        q = ("x", "y")
+        cycle = 1.0
+
+        def mass(self, q):
+            return 2.0 + jnp.sin(q.x) * q.y, 3.0 + q.x**2
+
+        def force(self, t, q, v):
+            return dict(x=1.0, y=v.x - q.y)
+
+    class Array(Names):
+        q = ("a[2]",)
+
+        def mass(self, q):
+            return jnp.stack(super().mass(vi.State(x=q.a[0], y=q.a[1])))
+
+        def force(self, t, q, v):
+            return dict(a=jnp.stack([1.0, v.a[0] - q.a[1]]))
+
+    x, v = np.array([0.4, -0.7]), np.array([1.3, 0.6])
+    one = Names().field(0.0, Names().at(x=x[0], y=x[1], v={"x": v[0], "y": v[1]}))
+    other = Array().field(0.0, Array().at(a=x, v={"a": v}))
+    np.testing.assert_allclose(other.v.a, [one.v.x, one.v.y], rtol=1e-14)
 
 
 def test_wrong_masses_and_names_are_told():
@@ -344,6 +375,9 @@ def test_wrong_masses_and_names_are_told():
 
     with pytest.raises(ValueError, match="`mass` of a Wrong must be one for each of its 2"):
         vi.simulate(Wrong(), Wrong().at(), 1)
+    Wrong.q, Wrong.mass = ("left[2]", "right"), ((1.0, 0.0), (0.0, 1.0))
+    with pytest.raises(ValueError, match="must be a number or an array for each of its coord"):
+        Wrong().field(0.0, Wrong().at())
     with pytest.raises(ValueError, match="'up' is not one of the coordinates left, right"):
         Pair().at(up=1.0)
 

@@ -1,7 +1,5 @@
 """Events that come together, that do not happen, and what rests or sticks as a force jumps."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,25 +93,18 @@ def test_nor_does_it_end_a_cycle():
     assert float(run.duration[0]) == pytest.approx(4 * jnp.pi - 1, abs=1e-9)
 
 
-class Held(State):
-    force: Any
-
-
 class Pressed(Glider):
     """A body on the left stop, whose force is part of its state."""
 
-    contacts: tuple = (vi.RigidStop(0.0, 0.0, "left"),)
-    events: tuple = (vi.Reset(lambda m, s, x: s - 2.0, lambda m, s, x: Held(x.Y, x.V, -x.force)),)
-
-    def placed(self, state, Y, V):
-        return Held(Y, V, state.force)
+    contacts: tuple = (vi.RigidStop(0.0, 0.0, "left", on=("Y", "V")),)
+    events: tuple = (vi.Reset(lambda m, s, x: s - 2.0, lambda m, s, x: {"force": -x.force}),)
 
     def field(self, s, state):
-        return Held(state.V, state.force, 0 * state.force)
+        return {"Y": state.V, "V": state.force, "force": 0.0}
 
 
 def test_a_body_is_let_go_of_as_its_force_jumps():
-    run = vi.simulate(Pressed(), Held(*(jnp.asarray(x) for x in (0.0, 0.0, -1.0))), 1, event_log=4)
+    run = vi.simulate(Pressed(), vi.State(Y=0.0, V=0.0, force=-1.0), 1, event_log=4)
     assert float(run.last.Y) == pytest.approx(0.5 * 2**2, abs=1e-12)
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["reset", "release"]
 

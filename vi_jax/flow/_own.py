@@ -27,7 +27,6 @@ from ..machine import (
     Reset,
     RigidStop,
     SoftStop,
-    angle_names,
     begin_modes,
     check_takes,
     clock_of,
@@ -35,6 +34,7 @@ from ..machine import (
     events_of,
     field_in,
     guard_of,
+    is_angle,
     is_autonomous,
     like,
     listed,
@@ -316,13 +316,13 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop that names no velocity, or an angle of `wrap_angles`."""
-    wrapped = angle_names(machine)
     for stop in listed(machine.contacts):
         on = getattr(stop, "on", None)
-        named = {on} if isinstance(on, str) else {*on} if isinstance(on, tuple) else set()
-        if isinstance(stop, RigidStop) and wrapped & named:
+        named = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
+        wrapped = [x for x in named if is_angle(machine, x)]
+        if isinstance(stop, RigidStop) and wrapped:
             raise ValueError(
-                f"A stop is at one value of {min(wrapped & named)!r}, which `wrap_angles` changes "
+                f"A stop is at one value of {wrapped[0]!r}, which `wrap_angles` changes "
                 "by whole turns: leave the angle out there, with a stop at each end of its range."
             )
         if isinstance(machine, Mechanical):

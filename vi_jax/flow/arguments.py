@@ -273,9 +273,9 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
-            f"and velocity are numbers, but there they have shape {shape}. A machine whose state "
-            "holds arrays must define `position` and `velocity`, or `coordinates`, which pick "
-            "these numbers."
+            f"and velocity are numbers, but there they have shape {shape}. A contact names numbers "
+            'of arrays, `on=("x[0]", "v[0]")`, or `position` and `velocity` of the machine pick '
+            "them."
         )
     for path, leaf in jtu.tree_leaves_with_path(start):
         numbers = concrete(leaf)

@@ -2,8 +2,8 @@
 
 from ..lanes import horner as horner
 from ..lanes import sincos as sincos
-from .angles import angle_names as angle_names
 from .angles import angles_in as angles_in
+from .angles import is_angle as is_angle
 from .angles import nearest_images as nearest_images
 from .angles import without_turns as without_turns
 from .angles import wrap_angles as wrap_angles

@@ -11,7 +11,7 @@ from jax.lax import stop_gradient
 
 from .._types import Machine, State
 from .coordinates import component, with_component
-from .numbers import components
+from .numbers import components, split_place
 
 
 def wrap_angles(*names: str) -> Callable[[Any, State], State]:
@@ -42,8 +42,12 @@ def without_turns(angle: Any) -> Any:
     return angle - 2 * pi * stop_gradient(jnp.round(angle / (2 * pi)))
 
 
-def angle_names(machine: Machine) -> frozenset[str]:
-    """The names of the angles of `wrap_angles`."""
+def is_angle(machine: Machine, name: str) -> bool:
+    """Whether a number of the state is an angle of `wrap_angles`, by its name or its array's."""
+    return not {name, split_place(name)[0]}.isdisjoint(_angles(machine))
+
+
+def _angles(machine: Machine) -> frozenset[str]:
     return getattr(type(machine).renewed, "angles", frozenset())
 
 
@@ -52,8 +56,9 @@ def angles_in(machine: Machine, like: State) -> np.ndarray | None:
 
     **Arguments:** `like`, one state, without modes.
     """
-    names = angle_names(machine)
-    return np.array([name in names for name in components(like)]) if names else None
+    if not _angles(machine):
+        return None
+    return np.array([is_angle(machine, name) for name in components(like)])
 
 
 def nearest_images(angles: np.ndarray | None, here: Any, there: Any) -> Any:

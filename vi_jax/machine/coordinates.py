@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from .._types import Scalar, State
 from .numbers import split_place
@@ -47,7 +48,12 @@ def component(name: str, state: State) -> Any:
     """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
     base, place = split_place(name)
     found = functools.reduce(getattr, base.split("."), state)
-    return found[place] if place else found  # a leaf itself, so that a stop can set it exactly
+    if not place:
+        return found  # a leaf itself, so that a stop can set it exactly
+    shape = jnp.shape(found)
+    if len(place) != len(shape) or any(not -n <= i < n for i, n in zip(place, shape, strict=True)):
+        raise LookupError(f"The state has no component {name!r}; {base!r} has the shape {shape}.")
+    return found[place]
 
 
 def has_component(name: str, state: State) -> bool:

@@ -14,12 +14,14 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine
-from .coordinates import Coordinate
+from .coordinates import Coordinate, component
+from .numbers import split_place
 from .state import State as Named
 from .state import like
 
@@ -39,7 +41,7 @@ class Mechanical(AbstractMachine):
 
     | definition | meaning |
     |---|---|
-    | `q` | the names of its coordinates |
+    | `q` | the names of its coordinates; `"x[40]"` is an array of 40, `x` |
     | `mass` | the mass of each, or a mass matrix: numbers, or a method `mass(q)` |
     | `force(t, q, v)` | the applied force on each, by name |
     | `prescribed(t)` | the places of coordinates whose motion is given, by name: moving walls |
@@ -49,6 +51,9 @@ class Mechanical(AbstractMachine):
     The momentum of an impact, the mass that it acts on (`Run.impact_energy`) and inertial terms
     follow from the masses. `mass` and `force` have entries only for coordinates whose motion is not
     given.
+
+    An array of coordinates has arrays of forces and masses, and contacts such as `on="x[39]"`. Then
+    the masses cannot be a matrix.
     """
 
     q: ClassVar[tuple[str, ...]]
@@ -70,8 +75,11 @@ class Mechanical(AbstractMachine):
         wrong = [x for x in (*places, *(v or {})) if x not in names]
         if wrong:
             raise ValueError(f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}.")
-        zeros = dict.fromkeys(self.q_names, 0.0)
+        zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
         at, rate = zeros | places, zeros | dict(v or {})
+        for name, zero in zeros.items():
+            if self.q_shapes[name]:  # one number is that of each
+                at[name], rate[name] = zero + at[name], zero + rate[name]
         if len(names) < len(zeros):
             given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
             at, rate = at | given[0], rate | given[1]
@@ -84,12 +92,17 @@ class Mechanical(AbstractMachine):
     @property
     def q_names(self) -> tuple[str, ...]:
         """The names of the coordinates."""
+        return tuple(self.q_shapes)
+
+    @property
+    def q_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of the coordinates, by name: `()` of one number."""
         if not hasattr(self, "q"):
             raise TypeError(
                 f'A {type(self).__name__} must have `q`: write `q = ("x", "y")` in the class, the '
                 "names of its coordinates."
             )
-        return (self.q,) if isinstance(self.q, str) else tuple(self.q)
+        return dict(map(split_place, (self.q,) if isinstance(self.q, str) else self.q))
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -149,9 +162,8 @@ class Mechanical(AbstractMachine):
                 f"A {type(self).__name__} must have `mass`: one for each of its coordinates, in "
                 "the class or by a method `mass(self, q)`."
             )
-        return matrix_of(
-            given(q) if callable(given) else given, self.free_names, type(self).__name__
-        )
+        shapes = {name: self.q_shapes[name] for name in self.free_names}
+        return matrix_of(given(q) if callable(given) else given, shapes, type(self).__name__)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """h, what the applied forces are diminished by; 0 where the masses are constant."""
@@ -160,6 +172,8 @@ class Mechanical(AbstractMachine):
         h: list[Any] = [0.0] * n
         if not callable(getattr(self, "mass", None)):
             return h
+        if any(self.q_shapes.values()):
+            return self._inertial_of_arrays(q, v)
         turns = moving(self.masses, q)
         for name in self.q_names:
             if not any(name in where for where in turns.values()):
@@ -174,6 +188,21 @@ class Mechanical(AbstractMachine):
                 k = names.index(name)
                 h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
         return h
+
+    def _inertial_of_arrays(self, q: Named, v: Named) -> list[Any]:
+        """The same of masses that are one for each coordinate, some of which are arrays."""
+
+        def momenta(q: Named) -> list[Any]:
+            M = self.masses(q)
+            return [M[i][i] * getattr(v, name) for i, name in enumerate(self.free_names)]
+
+        def twice_energy(q: Named) -> Any:
+            both = zip(momenta(q), self.free_names, strict=True)
+            return sum(jnp.sum(p * getattr(v, name)) for p, name in both)
+
+        _, moves = jax.jvp(momenta, (q,), (v,))
+        pulls = jax.grad(twice_energy)(q)
+        return [x - 0.5 * getattr(pulls, k) for x, k in zip(moves, self.free_names, strict=True)]
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         return Coordinate(
@@ -194,9 +223,11 @@ def _named(machine: Mechanical, on: Any) -> str | None:
     name = machine.q_names[0] if on is None else on
     if not isinstance(name, str):
         return None
-    if name not in machine.q_names:
+    base, place = split_place(name)
+    if len(machine.q_shapes.get(base, (0,))) != len(place):
+        names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine.q_shapes.items()]
         raise ValueError(
-            f"Argument `on` of a contact must be one of the coordinates {machine.q_names}, or a "
+            f"Argument `on` of a contact must be one of the coordinates {tuple(names)}, or a "
             f"function of them, but got {on!r}."
         )
     return name
@@ -204,13 +235,13 @@ def _named(machine: Mechanical, on: Any) -> str | None:
 
 def _place(machine: Mechanical, on: Any, state: State) -> Any:
     name = _named(machine, on)
-    return on(machine.places(state)) if name is None else getattr(state, name)
+    return on(machine.places(state)) if name is None else component(name, state)
 
 
 def _speed(machine: Mechanical, on: Any, state: State) -> Any:
     name = _named(machine, on)
     if name is not None:
-        return getattr(state.v, name)
+        return component(name, state.v)
     return jax.jvp(on, (machine.places(state),), (machine.places(state.v),))[1]
 
 
@@ -218,13 +249,18 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
     """J, the slopes of a gap; plain numbers where they are constant ones."""
     name, names = _named(machine, on), machine.q_names
     if name is not None:
-        return [float(x == name) for x in names]
+        base, place = split_place(name)
+        one = jnp.zeros_like(getattr(q, base)).at[place].set(1.0) if place else 1.0
+        return [one if x == base else 0.0 for x in names]
     by = moving(on, q).get((), frozenset())
     return [_slope(on, q, name) if name in by else 0.0 for name in names]
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
     """The derivative of a function of the coordinates with respect to one of them."""
+    here = getattr(q, name)
+    if jnp.ndim(here):
+        return jax.grad(lambda x: function(q.replace(**{name: x})))(here)
     one = {x: jnp.full_like(y, float(x == name)) for x, y in vars(q).items()}
     return jax.jvp(function, (q,), (Named(**one),))[1]
 
@@ -236,7 +272,8 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
     slopes = dict(zip(machine.q_names, _slopes(machine, on, q), strict=True))
     slopes = [slopes[name] for name in names]
     push = solved(machine.masses(q), slopes)
-    gain = sum(x * y for x, y in zip(slopes, push, strict=True) if not _is_zero(x))
+    gain = sum(jnp.sum(x * y) if jnp.ndim(x) else x * y
+               for x, y in zip(slopes, push, strict=True) if not _is_zero(x))  # fmt: skip
     if _is_zero(gain):
         raise ValueError(
             f"A contact of a {type(machine).__name__} is `on` no coordinate that it could move. "
@@ -253,7 +290,7 @@ def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
 def _pushed(machine: Mechanical, on: Any, state: State) -> Named:
     q, name = machine.places(state), _named(machine, on)
     push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
-    if name is not None:
+    if name in push:
         push[name] = 1.0
     v = {x: jnp.full_like(y, push[x]) for x, y in vars(state.v).items()}
     return Named(**{x: jnp.zeros_like(y) for x, y in vars(q).items()}, v=Named(**v))
@@ -263,13 +300,18 @@ def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named
     """A gap's place and velocity changed by as little as can be, in the measure of the masses; a
     coordinate by its name alone is put where it is to be."""
     name, q = _named(machine, on), machine.places(state)
-    q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else q.replace(**{name: Y})
+    q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
     push, _ = _push(machine, on, q)
     gained = V - _speed(machine, on, Named(**vars(q), v=state.v))
     v = _moved(state.v, push, gained)
     if name is not None:
-        v = v.replace(**{name: V})
+        v = _with(v, name, V)
     return Named(**vars(q), v=v)
+
+
+def _with(x: Named, name: str, value: Any) -> Named:
+    base, place = split_place(name)
+    return x.replace(**{base: getattr(x, base).at[place].set(value) if place else value})
 
 
 def _moved(x: Named, push: list[Any], amount: Any) -> Named:
@@ -282,30 +324,37 @@ def _is_zero(x: Any) -> bool:
     return isinstance(x, int | float) and x == 0
 
 
-def matrix_of(given: Any, names: Sequence[str], whose: str) -> Matrix:
+def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> Matrix:
     """Masses as a matrix, from one for each coordinate, by name or in their order, or rows of
-    them. **Raises:** `ValueError` for another number of them."""
-    n = len(names)
+    them. **Raises:** `ValueError` for another number of them, or a matrix for arrays."""
+    n = len(shapes)
     if isinstance(given, Mapping):
-        given = [given[x] for x in names]
+        given = [given[x] for x in shapes]
     elif isinstance(given, Named):
-        given = [getattr(given, x) for x in names]
-    rows = [given] if n == 1 and _is_number(given) else list(given)
+        given = [getattr(given, x) for x in shapes]
+    rows = [given] if n == 1 and _is_mass(given, *shapes.values()) else list(given)
     if len(rows) != n:
         raise ValueError(
             f"`mass` of a {whose} must be one for each of its {n} coordinates, or {n} rows, but "
             f"has {len(rows)}."
         )
-    if all(map(_is_number, rows)):
-        known = [x for x in map(concrete, rows) if x is not None]
-        if any(x <= 0 for x in known):
-            raise ValueError(f"`mass` of a {whose} must be positive, but has {min(known):g}.")
+    if all(map(_is_mass, rows, shapes.values())):
+        least = min((np.min(x) for x in map(concrete, rows) if x is not None), default=1.0)
+        if least <= 0:
+            raise ValueError(f"`mass` of a {whose} must be positive, but has {least:g}.")
         return [[rows[i] if i == j else 0.0 for j in range(n)] for i in range(n)]
+    if any(shapes.values()):
+        raise ValueError(
+            f"`mass` of a {whose} must be a number or an array for each of its coordinates, since "
+            "some are arrays. Write a machine with a matrix of them as an `AbstractMachine`, or a "
+            "linear one as a `vi.machines.Structure`."
+        )
     return [[row[j] for j in range(n)] for row in rows]
 
 
-def _is_number(x: Any) -> bool:
-    return not isinstance(x, list | tuple) and jnp.ndim(x) == 0
+def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
+    """Whether this is the mass of one coordinate, or those of an array of this shape."""
+    return not isinstance(x, list | tuple) and jnp.shape(x) in ((), shape)
 
 
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .numbers import split_place
 from .shown import in_words, known, number_in_words, table
 
 
@@ -118,6 +119,7 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
     else:
         raise TypeError(f"{whose} returned names, but its state has none: {type(state).__name__}.")
     names = list(parts)
+    given = _in_arrays(parts, given)
     missing = [x for x in names if x not in given] if all_of_them else []
     extra = [x for x in given if x not in names]
     if missing or extra:
@@ -129,6 +131,16 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
     if isinstance(state, Mapping):
         return type(state)({**parts, **new})  # pyright: ignore
     return eqx.tree_at(lambda z: [getattr(z, x) for x in new], state, list(new.values()))
+
+
+def _in_arrays(parts: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Components of which some are given by one of their numbers, as `"x[3]"`."""
+    found: dict[str, Any] = {}
+    for name, value in given.items():
+        base, place = (name, ()) if name in parts else split_place(name)
+        old = found.get(base, parts.get(base)) if place else None
+        found[name if old is None else base] = value if old is None else old.at[place].set(value)
+    return found
 
 
 def _component(old: Any, new: Any, whose: str) -> Any:

@@ -18,7 +18,7 @@ from ..machine import AbstractMachine, logged_turn, phase_at, stops_of, without_
 from ..orbit import Orbit
 from .colors import BLUE, RED
 from .motion import counts_by_angle, plot_history
-from .path import drawn_path, is_angle, motion_path
+from .path import drawn_path, motion_path, turns
 from .schematic import pen_for, sketch
 
 # Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.
@@ -233,7 +233,7 @@ class _History:
         path = drawn_path(run, machine=machine, window=window, coordinate=0)
         self._place, self._Y = self._factor * path.cycles, path.Y
         self._frames, self._dots = frames, frames.positions[0]
-        if is_angle(run, machine, 0):
+        if turns(run, machine, 0):
             self._dots = without_turns(self._dots)
         (self._line,) = ax.plot([], [], color=BLUE, lw=1.6)
         (self._dot,) = ax.plot([], [], "o", color=RED, ms=6, zorder=5)

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 
 from .._checks import instance_of, one_of
 from ..machine import (
-    angle_names,
     cycles_in_words,
     in_brackets,
+    is_angle,
     name_in,
     quantity_of,
     unit_of,
@@ -63,9 +63,8 @@ def plot_branch(
     # Points where stability changes are points of the branch: there rounding decides.
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
-    names = [f"section_{name}" for name in angle_names(branch.problem.machine)]
-    turned = [np.abs(np.diff(z)) > np.pi for name, z in ((x, across), (y, up)) if name in names]
-    kinds = np.where(np.any(turned, axis=0), _NONE, stable)
+    angles = [z for name, z in ((x, across), (y, up)) if _is_angle(branch, name)]
+    kinds = np.where(np.any([np.abs(np.diff(z)) > np.pi for z in angles], axis=0), _NONE, stable)
     label = style.pop("label", None)
     look = {"color": color_of(branch.cycles, int(branch.impacts.max())), "lw": thick(1.6), **style}
     if label is not None:
@@ -91,6 +90,11 @@ def plot_branch(
     ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(along, units_of(machine)))
     ax.set_ylabel(extreme_name(y, machine.labels, units_of(machine), branch.averages))
     return ax
+
+
+def _is_angle(branch: Branch, name: str) -> bool:
+    on_section = name.startswith("section_")
+    return on_section and is_angle(branch.problem.machine, name.removeprefix("section_"))
 
 
 def _moving(found: Branch | Sweep) -> str:

@@ -11,10 +11,12 @@ from ..flow import Run, Samples
 from ..machine import (
     AbstractMachine,
     Turn,
-    angle_names,
+    bare,
     component,
+    components,
     counter_of,
     has_component,
+    is_angle,
     is_autonomous,
     logged_turn,
     number_on,
@@ -29,7 +31,9 @@ def _course(machine: AbstractMachine | None, k: int | str, states: Any) -> tuple
     without a machine their components `Y` and `V`."""
     if isinstance(k, str):
         rate = f"v.{k}"  # of a `Mechanical`
-        return component(k, states), component(rate if has_component(rate, states) else k, states)
+        return jax.vmap(
+            lambda z: (component(k, z), component(rate if has_component(rate, z) else k, z))
+        )(states)
     return (states.Y, states.V) if machine is None else _by_number(machine, k, states)
 
 
@@ -84,7 +88,7 @@ def motion_path(
     try:
         course = _course(machine, coordinate, samples.state)
         path = MotionPath(cycles, *(np.asarray(x, float) for x in course))
-    except AttributeError:
+    except (AttributeError, LookupError):
         raise ValueError(
             "Argument `machine` must be given for states without `Y` and `V`: it defines the "
             "position."
@@ -109,7 +113,7 @@ def drawn_path(
     **Arguments and raises:** as `motion_path`.
     """
     path = motion_path(motion, machine=machine, **about)
-    if machine is None or not is_angle(motion, machine, about["coordinate"]):
+    if machine is None or not turns(motion, machine, about["coordinate"]):
         return path
     Y = without_turns(path.Y)
     at = np.flatnonzero(np.abs(np.diff(Y)) > np.pi) + 1
@@ -118,14 +122,15 @@ def drawn_path(
     return MotionPath(*(np.insert(a, at, b) for a, b in pairs))
 
 
-def is_angle(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
+def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
     """Whether a coordinate is one of the machine's angles, of `wrap_angles` or `turn_of`."""
     samples = motion.samples if isinstance(motion, Run) else motion
     assert samples is not None
     Y = _course(machine, coordinate_of(machine, coordinate), samples.state)[0]
     counter = counter_of(machine)
-    names = {*angle_names(machine), *([counter.name] if isinstance(counter, Turn) else ())}
-    angles = (component(name, samples.state) for name in names)
+    turn = counter.name if isinstance(counter, Turn) else None
+    named = components(bare(samples.state), lead=1).items()
+    angles = (x for name, x in named if name == turn or is_angle(machine, name))
     return any(np.array_equal(Y, angle, equal_nan=True) for angle in angles)
 
 

@@ -27,12 +27,12 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
-    angle_names,
     angles_in,
     attributes,
     components,
     cycles_in_words,
     in_rows,
+    is_angle,
     nearest_images,
     state_in_words,
     summary_table,
@@ -145,7 +145,7 @@ class Basins(NamedTuple):
         at_stop = self.data["label"].attrs.get("at_stop", ())
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
         centres = [np.asarray(self.data[name], float) for name in names]
-        angles = [name.removeprefix(START) in angle_names(self.machine) for name in names]
+        angles = [is_angle(self.machine, name.removeprefix(START)) for name in names]
         cells = Cells(centres, scale, np.array(ends), np.array(angles))
         cells = cells._replace(ends=cells.ends & ~cells.round[:, None])
         resolution = 0.5 * float(np.linalg.norm(cells.widths / scale))

@@ -13,9 +13,9 @@ from .._types import State, xr
 from ..flow import MethodLike, chosen, machine_of, tidy
 from ..machine import (
     AbstractMachine,
-    angle_names,
     attributes,
     check_leaf,
+    is_angle,
     nearest_images,
     summary_table,
     unit_of,
@@ -238,7 +238,7 @@ def _followed(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray
     Of the motions of a kind those nearest to each other are one, the nearest pair first.
     """
     names = [name.removeprefix(START) for name in axes]
-    angles = np.array([name in angle_names(found[0].machine) for name in names])
+    angles = np.array([is_angle(found[0].machine, name) for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
     last: list[Attractor] = []
     rows: list[np.ndarray] = []
