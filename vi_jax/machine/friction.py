@@ -127,9 +127,9 @@ class Friction(AbstractSwitch):
 
         **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
         """
-        once: Any = _held_forces
-        found = once(machine, s, state, around.instead(mode), around.contact)[around.own]
-        force, most, _ = self.held(machine, s, state, around.contact, found)
+        once: Any = _held
+        _, found = once(machine, s, state, around.instead(mode), around.contact)
+        force, most, _ = self.held(machine, s, state, around.contact, found[around.own])
         return -force, most
 
     def _from_rest(
@@ -148,12 +148,12 @@ class Friction(AbstractSwitch):
 
 
 @eqx.filter_jit
-def _held_forces(
+def _held(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
-) -> dict[int, tuple[Any, Any, Any]]:
-    """The forces of `held_flow`, as a jitted function: a step calls it many times, and JAX traces
-    and differentiates it once."""
-    return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)[1]
+) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
+    """`held_flow` as a jitted function: a step calls it many times, and JAX traces and
+    differentiates it once."""
+    return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)
 
 
 class DryFriction(Friction):
@@ -420,8 +420,8 @@ def _consistent(
 ) -> Flag:  # fmt: skip
     """Whether no force contradicts these modes: what sticks is held, what begins to slip is
     accelerated that way."""
-    flow = field_in(machine, s, state, modes)
-    total, forces = held_flow(machine, flow, s, state, modes, contact)
+    once: Any = _held
+    total, forces = once(machine, s, state, modes, contact)
     good = jnp.ones((), bool)
     for i, slip in zip(places, slips, strict=True):
         friction, mode = switches_of(machine)[i], modes[i]
