@@ -66,7 +66,6 @@ def test_an_editors_mark_is_no_fault(here):
         (DUFFING, "missing table [simulate], which holds the arguments"),
         (DUFFING + "simulate = 3", "missing table [simulate], which holds the arguments"),
         (DUFFING + "[simulate]\ncycle = 1", "unknown key `cycle` in [simulate]; near names: cycle"),
-        (DUFFING + "[simulate]\nsettle = 1", "missing key `cycles` in [simulate]"),
         (DUFFING + "start = {Z = 1}" + ONE, "unknown key `Z` in [start]; known: Y, V"),
         (DUFFING + "start = {Y = 3}" + ONE, "[simulate]: Argument `start` must not lie beyond"),
         (DUFFING + "method = 'standrd'" + ONE, "[simulate]: Argument `method`"),

@@ -44,8 +44,8 @@ _FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 @warning_once
 def simulate(
     machine: AbstractMachine,
-    start: State,
-    cycles: int | Int[Array, ""],
+    start: State = None,
+    cycles: int | Int[Array, ""] = 1,
     *,
     settle: Any = 0,
     method: MethodLike = None,
@@ -74,8 +74,9 @@ def simulate(
 
     - `machine`: a `Scene`, or an `AbstractMachine` of your own.
     - `start`: the state on the first section, from `machine.start(...)`; or `last` of another run,
-      to continue it with its discrete modes (see `HybridState`).
-    - `cycles`: number of drive cycles to record, at least 1; static.
+      to continue it with its discrete modes (see `HybridState`). By default the machine's own,
+      `machine.start()`.
+    - `cycles`: number of drive cycles to record, 1 by default; static.
     - `settle`: drive cycles simulated before them, which are not recorded; a new value does not
       compile again.
     - `method`: `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, `ExactFlight()`, or the name of a

@@ -60,6 +60,7 @@ def planned(
     **Raises:** as `simulate`.
     """
     machine = machine_of(machine)
+    start = machine.start() if start is None else start
     check_parts(machine)
     cycles = count("cycles", cycles, least=1)
     options = options.checked(machine)
