@@ -155,7 +155,12 @@ def test_names_that_are_wrong_are_named(field, message):
 def test_contacts_that_are_wrong_are_told(contacts, message):
     machine = type("Wrong", (Oscillator,), {"contacts": contacts})()
     with pytest.raises((TypeError, ValueError), match=message):
-        vi.simulate(machine, machine.start(), 1)
+        vi.simulate(machine)
+
+
+def test_a_plain_number_of_a_subclass_is_its_default():
+    wider = type("Wider", (Oscillator,), {"gap": 3.0})
+    assert jax.tree.leaves((wider(), wider(gap=2.0))) == [0.9, 3.0, 0.7, 0.9, 2.0, 0.7]
 
 
 def test_a_state_is_a_pytree_of_names():

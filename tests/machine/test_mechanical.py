@@ -363,9 +363,8 @@ def test_masses_of_an_array_that_depend_on_it():
         def force(self, t, q, v):
             return dict(a=jnp.stack([1.0, v.a[0] - q.a[1]]))
 
-    x, v = np.array([0.4, -0.7]), np.array([1.3, 0.6])
-    one = Names().field(0.0, Names().at(x=x[0], y=x[1], v={"x": v[0], "y": v[1]}))
-    other = Array().field(0.0, Array().at(a=x, v={"a": v}))
+    one = Names().field(0.0, Names().at(x=0.4, y=-0.7, v={"x": 1.3, "y": 0.6}))
+    other = Array().field(0.0, Array().at(a=np.array([0.4, -0.7]), v={"a": np.array([1.3, 0.6])}))
     np.testing.assert_allclose(other.v.a, [one.v.x, one.v.y], rtol=1e-14)
 
 

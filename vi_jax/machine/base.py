@@ -14,7 +14,7 @@ from .._types import Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
-from .own import by_default, derived, is_own, says, stops_of, switches_of
+from .own import by_default, derived, is_own, says, stops_of, switches_of, with_own_defaults
 from .parts import (
     MEMORY,
     contacts_in,
@@ -97,6 +97,10 @@ class AbstractMachine(Shown):
     `machine.observed_every(interval)` is the same machine observed at equal intervals. Ready
     machines, each written in this way, are in `vi_jax.machines`.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        with_own_defaults(cls)
 
     def __new__(cls, *args: Any, **kwargs: Any):
         missing = {*cls.__abstractmethods__, *getattr(cls, "__abstractvars__", ())}

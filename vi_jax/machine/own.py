@@ -1,6 +1,8 @@
 """What a machine or one of its parts says itself, and what is said in its place."""
 
 import copy
+import dataclasses
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -25,6 +27,19 @@ def changed(part: object, base: type, names: Iterable[str]) -> str | None:
     `base`; `None` if it shares all."""
     kind = type(part)
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x, None)), None)
+
+
+def with_own_defaults(kind: type) -> None:
+    """Take a plain value of a class as the default of the field that its parent has by this name.
+    A dataclass would silently keep the parent's, since the class gives it no type."""
+    fields = getattr(kind, "__dataclass_fields__", {})
+    plain = [x for x, value in vars(kind).items() if x in fields and not hasattr(value, "__get__")]
+    types = inspect.get_annotations(kind) if plain else {}
+    for name in set(plain).difference(types):
+        field = copy.copy(fields[name])
+        field.default, field.default_factory = vars(kind)[name], dataclasses.MISSING
+        setattr(kind, name, field)
+        kind.__annotations__ = types = {**types, name: field.type}
 
 
 class derived:
