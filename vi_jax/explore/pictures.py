@@ -27,7 +27,7 @@ path {{ fill: none; stroke-linecap: round; stroke-linejoin: round }} .behind {{ 
 """
 
 # Limits are kept while what is drawn is so far within them and fills so much of them. The least
-# extent of what is drawn, as a share of its size, and of sections as one of their motion's: choices.
+# extent of what is drawn, as a share of its size, of sections as one of their motion's. Choices.
 _EDGE, _FILLED, _LEAST, _WIDE = 0.02, 0.5, 0.001, 0.1
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
