@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..flow import NamedEnumeration
+from ..lanes import pin
 
 
 class STABILITY(NamedEnumeration):
@@ -39,7 +40,9 @@ def eigenvalues(
     half: Float[Array, "..."], determinant: Float[Array, "..."]
 ) -> Complex[Array, "... 2"]:
     """Eigenvalues of 2x2 matrices from half their trace and their determinant."""
-    square = (half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
+    # Pinned: computed again with other rounding, it would be zero for one of those who ask, and not
+    # for another (seen with JAX 0.12: 1 ± 0.7 for 1 and 1).
+    square = pin(half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
     double = square == 0  # where the derivative of the root is infinite
     root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
     return jnp.stack([half + root, half - root], axis=-1)
