@@ -9,7 +9,10 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from jax.extend.core import get_opaque_trace_state
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # JAX 0.9
+    from jax.core import get_opaque_trace_state  # pyright: ignore
 
 from .._types import Machine
 from .coordinates import Coordinate
