@@ -306,7 +306,7 @@ class AbstractMachine(Shown):
         return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
-        """See `names_on`."""
+        """The names of position and velocity in the `on` of a contact; `None` where it has none."""
         return on if isinstance(on, tuple) else None
 
     @property

@@ -22,7 +22,8 @@ from ._solution import sections_of
 def several(old: Shooting, n: int) -> Shooting:
     """The equations of a motion that is gone through n times."""
     events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
-    # A leg needs as many steps as before. A chatter's are a share of those of the whole period.
+    # With events `steps` counts those of one leg, which stays as long; but each hop of a chatter
+    # takes a part of `steps / cycles`, so that there they grow with the cycles.
     steps = old.steps if events and not old.landings else n * old.steps
     return dataclasses.replace(
         old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),

@@ -222,12 +222,12 @@ class Basins(NamedTuple):
         for name in ("period", "impacts", "starts", "fraction", "error"):
             values = [getattr(a, name) for a in self.attractors]
             variables[f"motion_{name}"] = "motion", np.asarray(values)
-        longest = max((a.period for a in self.attractors), default=0)
+        longest, units = max((a.period for a in self.attractors), default=0), units_of(self.machine)
         for name in self.attractors[0].sections if self.attractors else ():
             rows = np.full((len(self.attractors), longest), np.nan)
             for row, a in zip(rows, self.attractors, strict=True):
                 row[: a.period] = a.sections[name]
-            about = attributes(unit_of(units_of(self.machine), name))
+            about = attributes(unit_of(units, name))
             variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
         return tidy(self.data.assign(variables), along)
 

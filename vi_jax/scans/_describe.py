@@ -211,13 +211,13 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
         }
     for measure in program.measures:
         known |= measure.described(start)
-    found = {}
+    found, units = {}, units_of(machine)
     for name, shape in shapes.items():
         by = name.startswith("d_") and name not in known and bool(program.derivatives)
         about = dict(known.get(name.removeprefix("d_") if by else name, {}))
         dims = tuple(about.pop("dims", ()))
         if "unit_of" in about:
-            about |= attributes(unit_of(units_of(machine), about.pop("unit_of")))
+            about |= attributes(unit_of(units, about.pop("unit_of")))
         if by:
             dims = ("by", *dims)
             about = {

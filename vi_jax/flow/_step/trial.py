@@ -138,8 +138,9 @@ def attempt(
             return motion.at(share * h)[0]
         return method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
 
-    seen = within(plan, lane, alone, ends, stages, at, h, jnp.asarray(limit))
-    of_guards = guards_error(plan, seen, stages, h, jnp.asarray(limit))
+    longest = jnp.asarray(limit)
+    seen = within(plan, lane, alone, ends, stages, at, h, longest)
+    of_guards = guards_error(plan, seen, stages, h, longest)
     error = error if of_guards is None else jnp.maximum(error, of_guards)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = is_alive(machine, new)
