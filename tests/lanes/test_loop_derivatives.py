@@ -33,7 +33,7 @@ def test_forward_derivatives():
 
 
 def test_rules_that_cannot_be_used():
-    """A rule's own error is passed on; a `custom_vjp`, which has no forward derivative, is refused."""
+    """A rule's own error is passed on; a `custom_vjp`, which has none forward, is refused."""
     forward, backward = jax.custom_jvp(jnp.sin), jax.custom_vjp(jnp.sin)
     forward.defjvp(lambda primals, tangents: int("mine"))
     backward.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g * jnp.cos(x),))
