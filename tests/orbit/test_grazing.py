@@ -9,8 +9,8 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from vi_jax.orbit._forecast import settled
 from vi_jax.orbit._local_map import graze_at
+from vi_jax.orbit.grazing import settled
 
 from grazings import grazing_of
 

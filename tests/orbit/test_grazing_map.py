@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from vi_jax.orbit._forecast import _next_to_each_other, scenario_of, settled, windows
 from vi_jax.orbit._local_map import LocalMap
+from vi_jax.orbit.grazing import _next_to_each_other, scenario_of, settled, windows
 
 
 def root_map(share):

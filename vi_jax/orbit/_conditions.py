@@ -23,8 +23,7 @@ from ..machine import components, frequency_ratio, in_unit, units_of, with_leaf
 from ..machine import quantity_of as measured
 from ._chatter import Hops
 from ._corrector import Step, jacobian_at
-from ._observed import Observed
-from ._shooting import Shooting
+from ._shooting import Observed, Shooting
 from ._sliding import SLIDING, holding
 from ._words import DOUBLING, REST, TORUS, TOUCHING
 from .floquet import compound

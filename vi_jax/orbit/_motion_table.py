@@ -29,20 +29,24 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ._closing import Closing
 from ._conditions import alone, overtaken, rates_at
-from ._corrector import Step, advance, halves_apart, way
+from ._corrector import BESIDE, Step, advance, crossing, way
 from ._flight import LANDS, LEAVES
 from ._flight import Event as MotionEvent
 from ._follow import Ending, Event, Table, bounds_of
 from ._hopf import hopf_between, size_of
-from ._locate import BESIDE, crossing
-from ._observed import ROUNDING
-from ._shooting import Shooting
+from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING, change_at, refined
 from ._solution import orbit_of
-from ._surgery import origin, without_events
-from ._symmetry import ALIKE, ROUNDED, may_be_symmetric, may_repeat
+from ._surgery import (
+    ALIKE,
+    ROUNDED,
+    halves_apart,
+    may_be_symmetric,
+    may_repeat,
+    origin,
+    without_events,
+)
 from ._words import (
     ANEW,
     CROSSING,
@@ -136,7 +140,6 @@ class MotionTable(Table):
         super().__init__(problem, scale, bounds)
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
-        self.closing = Closing(self)
         self.size, self.duration = None, None
         self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 

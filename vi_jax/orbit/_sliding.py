@@ -29,9 +29,8 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from ._corrector import Step, observe, state_at
+from ._corrector import Step, observe, state_at, zero_near
 from ._flight import Event, Flight
-from ._locate import zero_near
 from ._shooting import Leg, Shooting
 from ._surgery import without_events
 

@@ -26,17 +26,22 @@ import numpy as np
 
 from .._messages import so_many
 from .._programs import compiled
-from ._closing import Closing
 from ._conditions import Special, is_defective, minors
-from ._corrector import Step, advance, halves_apart, jacobian_at, way
+from ._corrector import (
+    BESIDE,
+    MOST,
+    Step,
+    advance,
+    crossing,
+    jacobian_at,
+    located,
+    way,
+)
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
-from ._locate import BESIDE, MOST, crossing, located
 from ._motion_table import pulled, room
-from ._observed import ROUNDING
-from ._shooting import Shooting
-from ._surgery import repeated, several
-from ._symmetry import ALIKE, ROUNDED, may_be_symmetric
+from ._shooting import ROUNDING, Shooting
+from ._surgery import ALIKE, ROUNDED, halves_apart, may_be_symmetric, repeated, several
 from ._words import (
     AT_CODIMENSION_TWO,
     CROSSING,
@@ -91,7 +96,6 @@ class SpecialTable(Table):
         self.symmetric = condition.kind != SYMMETRY and may_be_symmetric(
             problem, [problem.machine, *problem.corners(bounds)]
         )
-        self.closing = Closing(self)
 
     def stalled(self, steps: list[Step]) -> Ending:
         """How a curve ends that the corrector follows no further: perhaps where the motion becomes

@@ -1,22 +1,87 @@
-"""The equations of a motion without some of its events, or over another number of its cycles.
+"""The equations of a motion without some of its events, or over another number of its cycles; and
+motions whose second half is as the first, or its image under the symmetry of their machine.
 
 A branch may spring from a motion of half the period of its own (`origin`).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ._corrector import Step, advance, halves_apart, observe, state_at, tangent_at
-from ._locate import zero_near
-from ._observed import ROUNDING
-from ._shooting import Shooting
+from .._programs import compiled
+from ..machine import AbstractMachine, stops_of
+from ._corrector import Step, advance, observe, state_at, tangent_at, zero_near
+from ._flight import Event
+from ._shooting import ROUNDING, Shooting
 from ._solution import sections_of
+
+# Halves of a period that differ by less than this are alike, or images of each other; and by less
+# than this but for rounding: choices.
+ALIKE, ROUNDED = 1e-3, 1e-7
+
+
+def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> bool:
+    """Whether a motion with these events can be its own image, on each of these machines.
+
+    A machine that is driven is its own image after half a drive cycle, so that only periods of an
+    odd number of cycles can be.
+    """
+    events, half = problem.events, len(problem.events) // 2
+    if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
+        return False
+    if any(machine.mirrored(problem.like) is None for machine in machines):
+        return False
+    pairs = zip(events[:half], events[half:], strict=True)
+    return all(_are_images(problem.machine, one, other) for one, other in pairs)
+
+
+def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
+    stops = stops_of(machine)
+    if one.use != other.use:
+        return False
+    if max(one.number, other.number) < len(stops):  # stops come first among the events
+        left, right = stops[one.number], stops[other.number]
+        return left.coordinate == right.coordinate and left.sign == -right.sign
+    return one.of(machine).holds_mode and other.of(machine).holds_mode
+
+
+def may_repeat(problem: Shooting) -> bool:
+    """Whether the second half of a period with these events can be as the first."""
+    events, half = problem.events, len(problem.events) // 2
+    later = tuple(event.later(-(problem.cycles // 2)) for event in events[half:])
+    return problem.cycles % 2 == 0 and events[:half] == later
+
+
+@compiled
+def _halves(
+    problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
+) -> Float[Array, " differences"]:
+    """How the second half of a period differs from the first, or from its image; smooth along a
+    branch, as the events of both halves are compared."""
+    half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
+
+    def image(u):
+        if not mirrored:
+            return u
+        return ravel_pytree(problem.machine.mirrored(problem.unravel(u)))[0]
+
+    clock, states = problem.parts(x)
+    if not half:
+        return ravel_pytree(problem.state_at(x, 0, turn))[0] - image(states[0])
+    late = clock[half:] - clock[:half] - turn
+    return jnp.concatenate([late, (states[half:] - jax.vmap(image)(states[:half])).ravel()])
+
+
+def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
+    """How the second half of the period differs from the first one, or from its image under the
+    symmetry of the machine, in the sizes of the unknowns."""
+    apart = _halves(problem, jnp.asarray(step.x), mirrored)
+    return np.asarray(apart) / problem.half_scale()
 
 
 def several(old: Shooting, n: int) -> Shooting:

@@ -15,10 +15,9 @@ from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
 from ._conditions import AbstractCondition, Apart, Special
-from ._corrector import Step, advance, jacobian_at, state_at, tangent_at
+from ._corrector import Step, advance, jacobian_at, located, state_at, tangent_at
 from ._flight import Event
 from ._local_map import graze_at
-from ._locate import located
 from ._motion_table import tests_of
 from ._problem import events_in
 from ._shooting import Shooting

@@ -25,10 +25,8 @@ from ..machine import (
     with_units,
 )
 from ._conditions import Special, held_in_words
-from ._corrector import Step
-from ._locate import located
-from ._observed import Observed
-from ._shooting import Shooting
+from ._corrector import Step, located
+from ._shooting import Observed, Shooting
 from ._solution import Counted, counted_of, energies_of, orbit_at, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS

@@ -1,7 +1,7 @@
-"""Root finders, `Newton` and `Gradient`: how a zero of a residual is searched for, step by step.
+"""Root finders, `Newton` and `Gradient`, and how equations with a neutral direction are solved.
 
 They know nothing of orbits. What they are run on, and how the root moves with the numbers of the
-machine, is in `_root.py`.
+machine, is in `find.py`.
 """
 
 import abc
@@ -14,11 +14,40 @@ import jax.numpy as jnp
 import lineax as lx
 import optax
 import optimistix as optx
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
-from ._neutral import rounding
+
+Matrix = Float[Array, "n n"]
+
+# Where the greatest singular value is larger than this, a motion is so unstable that its rounding
+# hides what is neutral: a choice.
+_STEEP = 1e3
+
+
+def rounding(dtype: object) -> float:
+    """The share of the greatest singular value below which one is zero to rounding: 2e-12 in double
+    and 6e-6 in single precision."""
+    return float(jnp.finfo(dtype).eps) ** 0.75
+
+
+def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None) -> Array:
+    """What solves `matrix @ step = missing`, where many do, the smallest one. What no step reaches
+    is left over: `missing - matrix @ step`.
+
+    **Arguments:** the equations; the share of the greatest singular value below which one is zero,
+    by default that of rounding.
+    """
+    left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
+    least = rounding(matrix.dtype) if least is None else least
+    lost = sizes <= least * jnp.minimum(sizes[0], _STEEP)
+    size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
+    # An image for each direction that has none, so that the matrix can be inverted.
+    filled = (left * (lost.astype(matrix.dtype) * size)) @ right
+    return jnp.linalg.solve(matrix + filled, missing)
+
 
 # A motion smaller than the first part of the guess, or than the second, is at rest in the origin.
 # Choices.

@@ -10,8 +10,7 @@ import numpy as np
 from .._checks import given_number, one_of
 from ._conditions import alone
 from ._corrector import Step
-from ._observed import ROUNDING
-from ._shooting import Shooting
+from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING
 from ._solution import orbit_of
 from ._words import (

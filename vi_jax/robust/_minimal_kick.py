@@ -1,22 +1,355 @@
-"""`minimal_kick`: the smallest change of the state after which a machine settles elsewhere."""
+"""`minimal_kick`: the smallest change of the state after which a machine settles elsewhere.
+
+Rays of kicks are simulated until they leave the basin (`first_exits`). Its boundary near the
+shortest kick is the stable manifold of a saddle xₛ: the states x whose image Pⁿ(x) has no part
+along the saddle's unstable direction (`shortest`). With w the left eigenvector of the saddle's
+monodromy matrix for its multiplier outside the unit circle, that is
+
+    g(z) = w·(Pⁿ(x(z)) - xₛ) = 0,
+
+up to the square of Pⁿ(x) - xₛ, which shrinks as n grows. Least |z|² under it has Lagrange's
+equations z = λ∇g, g = 0, which Newton's method solves; ∇g is exact, through the impacts, and its
+own derivatives are differences of ∇g between lanes beside each other.
+"""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from .._checks import count, flag, given_number, interval
 from .._messages import Interrupted, at_work
 from .._types import State
 from ..flow import MethodLike
-from ..machine import AbstractMachine, Summarized, components, state_in_words, units_of
-from ..orbit import Orbit
+from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
+from ..orbit import Orbit, cycle_map
 from ._edge_state import EdgeState, tracked
-from ._rays import NARROWER, Exits, Kick, Row, first_exits, narrowed, nearer, nearest_first
-from ._settling import ELSEWHERE, RETURNS, Settling, settling_on
-from ._shortest import shortest
+from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
+
+Kicks = Float[np.ndarray, "..."]
+"""Kicks, the components last."""
+
+# Points of a ray that are judged at once between two others: a choice, three bits a round.
+_BETWEEN = 7
+
+# Rounds by which the exits of the rays are narrowed before they are compared, and at most those of
+# a closer look. Choices.
+_COARSE, _FINE = 7, 17
+
+# Points on a ray as the rays grow, doubled until one leaves, at most so many times.
+_DOUBLINGS = 12
+
+# Directions looked at around the best, per dimension; a round narrows them to a third. Choices.
+AROUND, NARROWER = 12, 3.0
+
+
+class Kick(eqx.Module):
+    """The kicks that are looked for: which numbers of the state, how they are weighed, how far.
+
+    A kick is a vector in units of the weights: component i of the state changes by zᵢ/wᵢ, and |z|
+    is the kick's norm.
+    """
+
+    start: Row
+    """The state that is kicked."""
+    places: tuple[int, ...] = eqx.field(static=True)
+    """Of the components, among all numbers of the state."""
+    weights: Row
+    low: Row
+    """The least that each component may become, -∞ if any."""
+    high: Row
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.places)
+
+    def rows(self, z: Kicks) -> Any:
+        """The states that kicks lead to."""
+        rows = np.broadcast_to(self.start, (*z.shape[:-1], self.start.size)).copy()
+        rows[..., self.places] += z / self.weights
+        return rows
+
+    def allowed(self, z: Kicks) -> Bool[np.ndarray, "..."]:
+        """Whether they stay within the bounds."""
+        there = self.rows(z)[..., self.places]
+        return np.asarray(((there >= self.low) & (there <= self.high)).all(axis=-1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Exits:
+    """Where rays leave the basin."""
+
+    directions: Kicks
+    """Units, (rays, components)."""
+    inside: Float[np.ndarray, " rays"]
+    """The last radius on each that comes back, before the first that does not."""
+    outside: Float[np.ndarray, " rays"]
+    """The first that does not; infinite where a ray ends before (a stop, a bound)."""
+
+
+def spread(count: int, size: int, seed: int) -> Kicks:
+    """Directions all around: both ways along a line, evenly around a circle, at random in more
+    dimensions."""
+    if size == 1:
+        return np.array([[1.0], [-1.0]])
+    if size == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    z = np.random.default_rng(seed).normal(size=(count, size))
+    return z / np.linalg.norm(z, axis=1, keepdims=True)
+
+
+def exits(
+    settling: Settling, kick: Kick, directions: Kicks, inside: Any, outside: Any, points: int
+) -> Exits:
+    """Of so many points between two radii of each ray, the first that does not come back.
+
+    **Arguments:** `inside` and `outside`, the radii of each ray, of which the latter is judged too.
+    """
+    parts = np.arange(1, points + 1) / points
+    inside = np.broadcast_to(inside, len(directions)).astype(float)
+    outside = np.broadcast_to(outside, len(directions)).astype(float)
+    radii = inside[:, None] + parts * (outside - inside)[:, None]
+    z = radii[..., None] * directions[:, None]
+    # What lies beyond a bound is not judged: the ray ends at the last point within.
+    within = np.logical_and.accumulate(kick.allowed(z), axis=1).sum(axis=1)
+    rows = kick.rows(z)
+    rows[~kick.allowed(z)] = kick.start
+    place, leaves = settling.first_change(rows)
+    leaves &= place < within
+    ends = np.concatenate([inside[:, None], radii], axis=1)
+    rays = np.arange(len(directions))
+    last = ends[rays, np.minimum(np.where(leaves, place, 0), points)]
+    first = np.where(leaves, ends[rays, np.minimum(place + 1, points)], np.inf)
+    return Exits(directions, last, first)
+
+
+def narrowed(settling: Settling, kick: Kick, found: Exits, rounds: int) -> Exits:
+    """Exits to some bits more: the first change in each bracket, again and again."""
+    good = np.isfinite(found.outside)
+    inside, outside = found.inside[good], found.outside[good]
+    directions = found.directions[good]
+    for _ in range(rounds):
+        if not good.any() or np.all(outside - inside <= 4e-16 * outside):
+            break
+        new = exits(settling, kick, directions, inside, outside, _BETWEEN + 1)
+        # The outer end of a bracket was judged before; a bracket without a change is kept.
+        same = ~np.isfinite(new.outside)
+        inside = np.where(same, inside, new.inside)
+        outside = np.where(same, outside, new.outside)
+    return Exits(directions, inside, outside)
+
+
+def first_exits(
+    settling: Settling, kick: Kick, directions: int, points: int, largest: float | None, seed: int
+) -> Exits:
+    """Where rays all around leave the basin, each to some bits.
+
+    The rays grow until one leaves, then points are set as densely again on what is not longer than
+    the shortest way out, until that is not shortened any more.
+
+    **Arguments:** numbers of rays and of points on each; the largest norm of a kick, `None` for as
+    large as it takes to leave.
+    """
+    rays = spread(directions, kick.size, seed)
+    reach = largest
+    if reach is None:
+        sizes = settling.unit + np.abs(kick.start[list(kick.places)])
+        reach = float(np.max(kick.weights * sizes)) / 4
+    found = exits(settling, kick, rays, 0.0, reach, points)
+    for _ in range(_DOUBLINGS if largest is None else 0):
+        if np.isfinite(found.outside).any():
+            break
+        reach *= 2
+        found = exits(settling, kick, rays, 0.0, reach, points)
+    while np.isfinite(found.outside).any():
+        least = found.outside.min()
+        closer = exits(settling, kick, rays, 0.0, least, points)
+        nearer = closer.outside < found.outside
+        found = Exits(
+            rays,
+            np.where(nearer, closer.inside, found.inside),
+            np.where(nearer, closer.outside, found.outside),
+        )
+        if found.outside.min() > 0.5 * least:
+            break
+    return narrowed(settling, kick, found, _COARSE)
+
+
+def nearest_first(found: Exits, most: int) -> list[int]:
+    """The rays that leave sooner than their neighbours, the soonest first, at most so many: two
+    neighbours around a circle, a choice of three per dimension in more."""
+    units, size = found.directions, found.directions.shape[1]
+    neighbours = 3 * size if size > 2 else 2 * (size - 1)
+    near = np.argsort(-(units @ units.T), axis=1, kind="stable")[:, 1 : neighbours + 1]
+    least = found.outside <= np.min(found.outside[near], axis=1, initial=np.inf)
+    order = np.argsort(found.outside, kind="stable")
+    return [int(i) for i in order if least[i]][:most]
+
+
+def nearer(
+    settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, rounds: int, seed: int
+) -> tuple[Row, float, float]:
+    """A direction near another one that leaves sooner, by looking ever more closely around the
+    best: for a boundary without a derivative.
+
+    **Returns:** the direction, the last radius that comes back and the first that does not.
+    """
+    rng = np.random.default_rng(seed)
+    best: tuple[Row, float, float] = unit, 0.0, radius
+    for _ in range(rounds):
+        around = _around(best[0], angle, rng)
+        coarse = exits(settling, kick, around, 0.0, best[2] * (1 + angle**2), 2 * AROUND)
+        # A direction so far off is worse by the square of the angle, or better.
+        bits = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
+        found = narrowed(settling, kick, coarse, max(1, bits))
+        if len(found.outside):
+            i = int(np.argmin(found.outside))
+            if found.outside[i] <= best[2]:
+                best = found.directions[i], float(found.inside[i]), float(found.outside[i])
+        angle /= NARROWER
+    return best
+
+
+def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
+    """Directions within an angle of another one, and itself."""
+    if unit.size == 1:
+        return unit[None]
+    across = np.linalg.svd(unit[None])[2][1:]
+    if unit.size == 2:
+        steps = np.linspace(-angle, angle, 2 * AROUND + 1)[:, None]
+    else:
+        steps = rng.normal(size=(AROUND * unit.size, unit.size - 1)) * angle / 2
+        steps = np.concatenate([np.zeros((1, unit.size - 1)), steps])
+    z = np.asarray(unit) + np.asarray(steps) @ across
+    return z / np.linalg.norm(z, axis=1, keepdims=True)
+
+
+# Where the motion on the edge is as near to the saddle as this, Newton's method begins; it goes on
+# with one period more until a kick moves by less than that, relative to its norm. Choices.
+_BEGINS, _STANDS = 0.05, 1e-11
+
+# Below this, relative to the norm, a change that is no smaller than the one before is the method's
+# own error (adaptive steps of 1e-11 leave some 1e-9 in a gradient), and the kick stands. A choice.
+_NOISE = 1e-7
+
+# Periods more that are tried, and Newton steps for each: choices.
+_PERIODS, _STEPS = 12, 12
+
+# Of the differences of gradients, relative to the norm of the kick; and the longest step, likewise.
+_DIFFERENCE, _STEP = 1e-5, 0.2
+
+# A kick that turns by more than this, relative to its norm, has left the place where it was begun.
+_STRAYS = 0.5
+
+
+Edge = Callable[[Kicks], tuple[Row, Kicks]]
+"""g and its gradient at some kicks."""
+
+
+def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
+    """The kick of least norm onto the stable manifold of a saddle, near a kick onto it that is
+    known to rounding; `None` where Newton's method finds none, as beside a grazing.
+
+    **Returns:** the kick and what it lacks: its distance from the manifold to first order and how
+    far it is from standing at a right angle on it, both relative to its norm; the larger.
+    """
+    rows, normals = _frame(settling, saddle)
+    if not np.isfinite(normals).all():
+        return None
+    period = len(rows)
+    # A motion that begins within rounding of the manifold stays near it for so many periods.
+    growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
+    longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
+    trail = settling.trail(kick.rows(z)[None], longest * period)[0]
+    apart = settling.apart(trail[1:, None], rows)
+    near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
+    if not near.size:
+        return None
+    place = int(apart[near[0]].argmin())
+
+    def edge(z: Kicks, cycles: int) -> tuple[Row, Kicks]:
+        numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
+        there, jacobian = images(settling.the_map, settling.like, *numbers)
+        slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
+        away = settling.near(np.asarray(there), rows[place]) - rows[place]
+        return away @ normals[place], slope / kick.weights
+
+    first, before, last = z, None, np.inf
+    for more in range(_PERIODS):
+        found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + more * period), z)
+        if found is None or np.linalg.norm(found[0] - first) > _STRAYS * np.linalg.norm(first):
+            return before
+        moved, z = float(np.linalg.norm(found[0] - z) / np.linalg.norm(z)), found[0]
+        if more and _stands(moved, last):
+            return found
+        before, last = found if more else None, moved
+    return before
+
+
+def _stands(change: float, last: float) -> bool:
+    """Whether a change, relative to the norm, is nothing, or nothing but the method's error."""
+    return change <= _STANDS or last / 2 <= change <= _NOISE
+
+
+def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
+    """Section states of a saddle, and at each the left eigenvector that its unstable direction has
+    there, of unit length."""
+    period = int(saddle.cycles)
+    rows = np.asarray(in_rows(saddle.sections))[:period]
+    the_map = settling.the_map
+    whole = cycle_map(the_map.machine, period, method=the_map.method)
+    normals = []
+    for row in rows:
+        state = settling.state(row)
+        jacobian = np.asarray(whole.jacobian(state))
+        if not np.isfinite(jacobian).all():
+            return rows, np.full_like(rows, np.nan)
+        values, vectors = np.linalg.eig(jacobian.T)
+        normal = np.real(vectors[:, np.argmax(np.abs(values))])
+        normals.append(normal / np.linalg.norm(normal))
+    return rows, np.array(normals)
+
+
+def _newton(edge: Edge, z: Row) -> tuple[Row, float] | None:
+    """A solution of Lagrange's equations near a kick, or `None`."""
+    size, multiplier, last = z.size, None, np.inf
+    for _ in range(_STEPS):
+        step = _DIFFERENCE * np.linalg.norm(z)
+        aside = step * np.eye(size)
+        values, slopes = edge(np.concatenate([z[None], z + aside, z - aside]))
+        if not np.isfinite(slopes).all() or not np.any(slopes[0]):
+            return None
+        # In units in which the gradient has length one.
+        unit = np.linalg.norm(slopes[0])
+        value, slope = values[0] / unit, slopes[0] / unit
+        hessian = (slopes[1 : size + 1] - slopes[size + 1 :]) / (2 * step * unit)
+        if multiplier is None:
+            multiplier = float(z @ slope)
+        lacks = np.concatenate([z - multiplier * slope, [value]])
+        matrix = np.zeros((size + 1, size + 1))
+        matrix[:size, :size] = np.eye(size) - multiplier * 0.5 * (hessian + hessian.T)
+        matrix[:size, size], matrix[size, :size] = -slope, slope
+        try:
+            change = np.linalg.solve(matrix, -lacks)
+        except np.linalg.LinAlgError:
+            return None
+        length, norm = float(np.linalg.norm(change[:size])), float(np.linalg.norm(z))
+        change *= min(1.0, _STEP * norm / length) if length else 1.0
+        z = z + change[:size]
+        multiplier = None if length > _STEP * norm else multiplier + float(change[size])
+        if _stands(length / norm, last):
+            return z, float(np.max(np.abs(lacks)) / norm)
+        last = length / norm
+    return None
+
 
 # Of the kick, relative to it: by how much more and less simulation confirms it.
 _ASIDE = 1e-6
