@@ -9,7 +9,7 @@ import equinox as eqx
 
 from .._checks import REAL, Range, optional_real, real, require_ranges
 from .._types import Scalar, State
-from ..machine import AbstractMachine, Coordinate, RigidStop
+from ..machine import AbstractMachine, Coordinate, RigidStop, stops_of
 
 
 def number_field(name: str, default: float | None, allowed: Range = REAL, unit: str = "") -> Any:
@@ -73,3 +73,17 @@ class ForcedMachine(PhaseMachine):
     def pace(self, s: Scalar, state: State) -> Scalar:
         """dt/ds = 1/ω, the time that a unit of phase takes."""
         return 1 / self.frequency
+
+
+def supported(machine: Any, pen: Any, place: float) -> float:
+    """Draw a body between stops, on a spring and a damper from a post; return the post's place."""
+    size = pen.size
+    post, back = -pen.reach - 2.6 * size, place - size / 2
+    pen.floor(post, pen.reach + 1.4 * size, -0.5 * size)
+    pen.wall(post, -1, low=-0.5 * size, high=0.8 * size, color="0.5")
+    pen.spring((post, 0.23 * size), (back, 0.23 * size))
+    pen.damper((post, -0.24 * size), (back, -0.24 * size))
+    pen.body(place, width=size)
+    for stop in stops_of(machine):
+        pen.stop(stop, slot=0.43 * size)  # spring and damper pass through one on the left
+    return post

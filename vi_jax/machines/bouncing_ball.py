@@ -1,5 +1,6 @@
 """A ball that bounces on a shaken table."""
 
+from math import cos
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -8,7 +9,6 @@ from .._checks import NOT_NEGATIVE, SHARE, number
 from .._types import Number, Scalar
 from ..machine import RigidStop, Shown
 from ._base import PhaseMachine, number_field
-from ._drawn import draw_ball
 
 
 class BallState(Shown):
@@ -40,7 +40,6 @@ class BouncingBall(PhaseMachine):
         **BallState.units, "rate": "ω", "time": "1/ω", "energy": "m g²/ω²", "power": "m g²/ω",
     }  # fmt: skip
     labels: ClassVar = ("height (g/ω²)", "speed from the table (g/ω)")  # pyright: ignore
-    sketch = draw_ball
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -54,3 +53,13 @@ class BouncingBall(PhaseMachine):
     def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> BallState:
         """A ball above the table at ωt = 0, where the table is lowest."""
         return BallState(number("height", height), number("speed", speed))
+
+    def sketch(self, pen: Any, state: BallState, phase: float) -> None:
+        """A ball above its table."""
+        radius, table = 0.3 * pen.size, -float(self.acceleration) * cos(phase)
+        wide = 2.4 * pen.size
+        pen.body(0.0, table - 0.15 * pen.size, width=wide, height=0.3 * pen.size, color=pen.green)
+        pen.ball(0.0, table + radius + float(state.height), radius)
+        pen.arrow((-0.7 * wide, 0.35 * pen.size), (-0.7 * wide, -0.35 * pen.size))
+        pen.label(-0.7 * wide, 0.6 * pen.size, "$g$")
+        pen.label(0.62 * wide, table, "$-\\Gamma\\,\\cos\\,\\omega t$", ha="left", color=pen.green)

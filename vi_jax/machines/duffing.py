@@ -1,5 +1,6 @@
 """A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
 
+from math import cos
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -8,8 +9,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
 from .._types import Number, Scalar
 from ..machine import OscillatorState, RigidStop
-from ._base import ForcedMachine, number_field, stops_at
-from ._drawn import draw_duffing
+from ._base import ForcedMachine, number_field, stops_at, supported
 
 
 class Duffing(ForcedMachine):
@@ -33,7 +33,6 @@ class Duffing(ForcedMachine):
     two_sided: bool = eqx.field(kw_only=True, static=True, default=True)
     labels: ClassVar = ("x", "dx/dt")  # pyright: ignore
     units: ClassVar = {"": "1"}  # pyright: ignore
-    sketch = draw_duffing
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -54,3 +53,13 @@ class Duffing(ForcedMachine):
     def mirrored(self, state: OscillatorState) -> OscillatorState | None:
         """x → -x half a cycle later, if there are two stops."""
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
+
+    def sketch(self, pen: Any, state: OscillatorState, phase: float) -> None:
+        """A body on its spring, between stops, with the force on it."""
+        place, size = float(state.Y), pen.size
+        post = supported(self, pen, place)
+        pull = 0.9 * size * cos(phase)
+        if abs(pull) > 0.1 * size:
+            pen.arrow((place, 0.75 * size), (place + pull, 0.75 * size))
+        pen.label(place, 1.0 * size, "$A\\,\\cos\\,\\omega t$")
+        pen.label((post + place) / 2, 0.75 * size, "$\\alpha x + \\beta x^3$")

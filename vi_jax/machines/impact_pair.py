@@ -1,6 +1,7 @@
 """A ball in a shaken box: impact pair, impact damper, vibro-impact harvester."""
 
 from collections.abc import Mapping
+from math import sin
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -9,7 +10,6 @@ from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, Shown
 from ._base import PhaseMachine, number_field, relative_to, stops_at
-from ._drawn import draw_pair
 
 
 class PairState(Shown):
@@ -64,7 +64,6 @@ class ImpactPair(PhaseMachine):
     frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
     force: Any = number_field("force", 0.5, REAL, "M a ω²")
     labels: ClassVar = ("place in the box (a)", "speed in the box (a ω)")  # pyright: ignore
-    sketch = draw_pair
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -113,3 +112,26 @@ class ImpactPair(PhaseMachine):
     def mirrored(self, state: State) -> Any:
         """Left and right exchanged, half a cycle later."""
         return type(state)(*(-x for x in vars(state).values()))
+
+    def sketch(self, pen: Any, state: Any, phase: float) -> None:
+        """A box with a ball in it."""
+        free = self.mass_ratio is not None
+        box = float(state.box) if free else sin(phase)
+        radius, wall, half = 0.4 * pen.size, 0.25 * pen.size, float(self.half_gap)
+        edge, top = half + radius + wall, 1.6 * radius
+        for side in (-1, 1):
+            face = box + side * (edge - wall / 2)
+            pen.body(face, width=wall, height=2 * top, color=pen.green)
+        pen.body(box, -top - wall / 2, width=2 * edge, height=wall, color=pen.green)
+        pen.ball(box + float(state.place), radius - top, radius)
+        pen.floor(-2.2 * half - 2.0, 2.2 * half + 2.0, -top - wall)
+        if free:
+            post = -edge - pen.reach - 1.6
+            pen.spring((post, 0.0), (box - edge, 0.0))
+            pen.wall(post, -1, low=-top, high=top, color="0.5")
+            pen.arrow((box + edge, 0.0), (box + edge + 0.6 * pen.size, 0.0))
+            pen.label(box + edge, 0.45 * pen.size, "$F\\,\\sin\\,\\omega t$", ha="left")
+        else:
+            words, right = "$a\\,\\sin\\,\\omega t$", box + edge + 0.2 * pen.size
+            pen.label(right, 0.0, words, ha="left", color=pen.green)
+        pen.label(box, top + 0.2 * pen.size, "$e$")

@@ -1,16 +1,53 @@
 """A structure of many degrees of freedom with rigid stops, given by its matrices or its modes."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, number, require, require_ranges
+from .._checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    concrete,
+    number,
+    optional_real,
+    real,
+    require,
+    require_ranges,
+    tuple_of,
+)
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field
-from ._matrices import check_contacts, check_matrices, check_vector, matrix, numbered, vector
+
+# A matrix differs from its transpose by no more than this share of its largest number: rounding of
+# one that was assembled. A choice.
+_ALIKE = 1e-12
+
+
+def _numbered(contacts: object) -> tuple[RigidStop, ...]:
+    """Contacts with the numbers of their coordinates; those of one `at` share the first one's."""
+    rows, found = [], []
+    for stop in tuple_of("contacts", contacts, RigidStop):
+        if not isinstance(stop, RigidStop):
+            raise TypeError(f"Argument `contacts` must hold `RigidStop`s, but holds {stop!r}.")
+        if stop.at is not None:
+            same = [k for k, row in enumerate(rows) if _same(row, stop.at)]
+            if same:
+                stop = dataclasses.replace(stop, at=None, coordinate=same[0])
+            else:
+                stop = dataclasses.replace(stop, coordinate=len(rows))
+                rows.append(stop.at)
+        found.append(stop)
+    return tuple(found)
+
+
+def _same(a: object, b: object) -> bool:
+    one, other = concrete(a), concrete(b)
+    return a is b or (one is not None and other is not None and np.array_equal(one, other))
 
 
 class Structure(LinearMachine):
@@ -42,26 +79,28 @@ class Structure(LinearMachine):
     **Raises:** `ValueError` for other numbers and shapes.
     """
 
-    mass: jax.Array = eqx.field(kw_only=True, converter=matrix("mass"))
-    stiffness: jax.Array = eqx.field(kw_only=True, converter=matrix("stiffness"))
-    damping: jax.Array = eqx.field(kw_only=True, default=None, converter=vector("damping"))  # pyright: ignore
-    contacts: tuple[RigidStop, ...] = eqx.field(kw_only=True, default=(), converter=numbered)
-    force: jax.Array | None = eqx.field(kw_only=True, default=None, converter=vector("force"))
+    mass: jax.Array = eqx.field(kw_only=True, converter=real("mass"))
+    stiffness: jax.Array = eqx.field(kw_only=True, converter=real("stiffness"))
+    damping: jax.Array = eqx.field(kw_only=True, default=None, converter=optional_real("damping"))  # pyright: ignore
+    contacts: tuple[RigidStop, ...] = eqx.field(kw_only=True, default=(), converter=_numbered)
+    force: jax.Array | None = eqx.field(
+        kw_only=True, default=None, converter=optional_real("force")
+    )
     sine_force: jax.Array | None = eqx.field(
-        kw_only=True, default=None, converter=vector("sine_force")
+        kw_only=True, default=None, converter=optional_real("sine_force")
     )
     static_force: jax.Array | None = eqx.field(
-        kw_only=True, default=None, converter=vector("static_force")
+        kw_only=True, default=None, converter=optional_real("static_force")
     )
     amplitude: Any = number_field("amplitude", 1.0)
     frequency: Any = number_field("frequency", 1.0, POSITIVE)
 
     def __check_init__(self):
         loss = jnp.zeros(self.mass.shape[-1:]) if self.damping is None else self.damping
-        n = check_matrices(self.mass, loss, self.stiffness)
+        n = _check_matrices(self.mass, loss, self.stiffness)
         for name in ("force", "sine_force", "static_force"):
-            check_vector(name, getattr(self, name), n)
-        check_contacts(self.contacts, n)
+            _check_vector(name, getattr(self, name), n)
+        _check_contacts(self.contacts, n)
         require_ranges(self)
 
     @classmethod
@@ -114,7 +153,7 @@ class Structure(LinearMachine):
                 stop
                 if getattr(stop, "at", None) is None
                 else eqx.tree_at(lambda x: x.at, stop, _onto("at", stop.at, shapes))
-                for stop in numbered(contacts)
+                for stop in _numbered(contacts)
             )
         return cls(
             mass=jnp.ones_like(omega), damping=2 * xi * omega, stiffness=omega**2,
@@ -141,3 +180,87 @@ def _onto(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
             f"point of `shapes`, but has {f.shape}."
         )
     return f @ shapes
+
+
+def _check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
+    """The number of degrees of freedom. **Raises:** `ValueError` for matrices of other shapes, that
+    are not symmetric or hold what is no number, and for a mass that is not positive definite."""
+    shape = mass.shape
+    if len(shape) not in (1, 2) or shape[0] != shape[-1] or not shape[0]:
+        raise ValueError(
+            "Argument `mass` must be a square matrix, or the diagonal of one, of one degree of "
+            f"freedom at least, but has the shape {shape}."
+        )
+    n = shape[0]
+    for name, value in (("mass", mass), ("damping", damping), ("stiffness", stiffness)):
+        if value.shape not in ((n,), (n, n)):
+            raise ValueError(
+                f"Argument `{name}` must have the shape ({n}, {n}), or ({n},) for a diagonal "
+                f"matrix, like `mass`, but has {value.shape}."
+            )
+        _check_numbers(name, value)
+    _check_positive(mass)
+    return n
+
+
+def _check_numbers(name: str, value: object) -> None:
+    """**Raises:** `ValueError` for a matrix that is known and not finite, or not symmetric."""
+    known = concrete(value)
+    if known is None:
+        return
+    if not np.isfinite(known).all():
+        raise ValueError(
+            f"Argument `{name}` must be finite, but holds {known[~np.isfinite(known)][0]}."
+        )
+    if known.ndim < 2:
+        return
+    apart = np.abs(known - known.T)
+    if apart.max() > _ALIKE * np.abs(known).max():
+        i, j = np.unravel_index(apart.argmax(), apart.shape)
+        raise ValueError(
+            f"Argument `{name}` must be symmetric, but its numbers [{i}, {j}] and [{j}, {i}] are "
+            f"{known[i, j]:.9g} and {known[j, i]:.9g}."
+        )
+
+
+def _check_positive(mass: object) -> None:
+    """**Raises:** `ValueError` for masses that are known and not positive definite."""
+    known = concrete(mass)
+    if known is None:
+        return
+    values = known if known.ndim == 1 else np.linalg.eigvalsh(known)
+    if not values.min() > known.shape[0] * np.finfo(values.dtype).eps * np.abs(values).max():
+        raise ValueError(
+            "Argument `mass` must be positive definite, but its smallest eigenvalue is "
+            f"{values.min():.3g}, its largest {values.max():.3g}."
+        )
+
+
+def _check_vector(name: str, value: Any, n: int) -> None:
+    """**Raises:** `ValueError` for a vector of another length, or that is not finite."""
+    if value is None:
+        return
+    if value.shape != (n,):
+        raise ValueError(
+            f"Argument `{name}` must have the shape ({n},), one number for each degree of freedom, "
+            f"but has {value.shape}."
+        )
+    _check_numbers(name, value)
+
+
+def _check_contacts(contacts: tuple[RigidStop, ...], n: int) -> None:
+    """**Raises:** `ValueError` for a contact without a row of n numbers, or of zeros alone."""
+    rows = 0
+    for i, stop in enumerate(contacts):
+        if stop.at is None:
+            if stop.coordinate >= rows:
+                raise ValueError(
+                    f"Stop {i} in argument `contacts` must name the sum of displacements that it "
+                    f"limits: `RigidStop(..., at=c)` with {n} numbers."
+                )
+            continue
+        rows += 1
+        _check_vector(f"contacts[{i}].at", stop.at, n)
+        known = concrete(stop.at)
+        if known is not None and not known.any():
+            raise ValueError(f"Argument `contacts[{i}].at` must not be zero throughout.")

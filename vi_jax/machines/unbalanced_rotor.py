@@ -1,7 +1,7 @@
 """A motor with an unbalanced rotor on an elastic support: the Sommerfeld effect."""
 
 import dataclasses
-from math import pi
+from math import cos, pi, sin
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range, number, require
 from .._types import Number, Scalar, State
 from ..machine import Coordinate, RigidStop, ShaftMachine, Shown
-from ._base import PhaseMachine, number_field, stops_at
-from ._drawn import draw_rotor
+from ._base import PhaseMachine, number_field, stops_at, supported
 
 
 class RotorState(Shown):
@@ -91,7 +90,6 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         "energy": "m² r² ω²/M", "power": "m² r² ω³/M",
     }  # fmt: skip
     labels: ClassVar = ("Y (m r/M)", "dY/dτ (m r ω/M)")  # pyright: ignore
-    sketch = draw_rotor
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -192,6 +190,19 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     def alive(self, state: State) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""
         return jnp.isfinite(state.P) if self.is_paced(state) else None
+
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
+        """A body on its spring, with the unbalanced rotor in it."""
+        place, size = float(state.Y), pen.size
+        radius = 0.34 * size
+        post = supported(self, pen, place)
+        pen.disc(place, 0.0, radius)
+        heavy = place + radius * cos(phase), radius * sin(phase)
+        pen.line((place, 0.0), heavy)
+        pen.ball(*heavy, 0.1 * size, color=pen.red)
+        pen.label(place + 0.15 * size, 0.68 * size, "$m,\\ r$", color=pen.red)
+        pen.label(place + 0.68 * size, 0.0, "$M$", color=pen.blue)
+        pen.label((post + place) / 2, 0.7 * size, "$k,\\ c$")
 
 
 def _pace(W: Scalar) -> Scalar:

@@ -1,17 +1,22 @@
 """The woodpecker toy: a bird on a spring that pecks its way down a pole, jamming and slipping."""
 
+import dataclasses
+from collections.abc import Sequence
+from functools import reduce
 from math import pi
+from operator import add
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete, number
 from .._types import Number, Scalar, State
 from ..machine import ContactFriction, Coordinate, RigidStop, Shown, counter_of, rising
 from ._base import ReadyMachine, number_field
-from ._levers import by_levers, dot, response
-from ._woodpecker_drawn import draw_woodpecker
+
+WOOD, SLEEVE, BIRD, BEAK = "#c9a36b", "#6f6f6f", "#4c5b66", "#e0b83f"
 
 
 class WoodpeckerState(Shown):
@@ -204,6 +209,107 @@ class Woodpecker(ReadyMachine):
         numbers = {name: number(name, value) for name, value in given.items()}
         return WoodpeckerState(**numbers, drop=jnp.zeros_like(numbers["height"]))
 
-    def sketch(self, pen: object, state: WoodpeckerState, phase: float) -> None:
+    def sketch(self, pen: Any, state: WoodpeckerState, phase: float) -> None:
         """Pole, sleeve, spring and bird, as large as they are."""
-        draw_woodpecker(self, pen, state)
+        inside, half = float(self.sleeve_radius), float(self.sleeve_height)
+        pole, arm = float(self.pole_radius), float(self.bird_arm)
+        beak = float(self.bird_arm - self.beak_arm), float(self.beak_height)
+        middle, tilt = np.array([0.0, float(state.height)]), float(state.sleeve_angle)
+        hang = middle + _turned((float(self.sleeve_arm), 0.0), tilt)
+
+        def filled(about: Any, points: Any, angle: float, color: str) -> None:
+            shape = about + _turned(points, angle)
+            pen.ax.fill(*shape.T, facecolor=color, edgecolor="0.15", lw=1.2, joinstyle="round")
+
+        # The pole is as long as the motion, with rings a centimetre apart that show the way down.
+        low, high = -pen.reach - beak[1] - arm, beak[1] + arm + half
+        filled(0.0, [(-pole, low), (pole, low), (pole, high), (-pole, high)], 0.0, WOOD)
+        for ring in np.arange(np.ceil(low / 0.01), high / 0.01) * 0.01:
+            pen.line((-pole, ring), (pole, ring), lw=0.7, color="#7a5c2e")
+        for side in (-1, 1):  # the two walls of the sleeve, cut open
+            x = side * inside * np.array([1.0, 1.0, 1.28, 1.28])
+            filled(middle, np.stack([x, half * np.array([-1, 1, 1, -1])], -1), tilt, SLEEVE)
+        pen.spring(tuple(middle + _turned((1.28 * inside, 0.0), tilt)), tuple(hang))
+        # The tip of its beak and its centre of mass are the machine's.
+        lean, centre = float(state.bird_angle), np.array([arm, 0.0])
+        head = np.array([0.5 * (beak[0] + arm), beak[1]])
+        long = float(np.hypot(*(head - centre)))
+        along = float(np.arctan2(*(head - centre)[::-1]))
+        thick = np.array([0.0, 0.1 * long])
+        filled(hang, [beak, head + thick, head - thick], lean, BEAK)
+        filled(hang, centre + _turned(_oval(0.8 * long, 0.33 * long), along), lean, BIRD)
+        filled(hang, head + _oval(0.23 * long, 0.23 * long), lean, BIRD)
+        pen.line(tuple(hang), tuple(hang + _turned(centre, lean)), lw=3.0)
+        left, up, right = -2.6 * inside, float(middle[1]), float(hang[0]) + 1.6 * arm
+        pen.label(left, up, "sleeve, $\\varphi_M$", ha="right")
+        pen.label(left, up + 1.2 * beak[1], "pole, $\\mu$", ha="right")
+        pen.label(right, float(hang[1]), "bird, $\\varphi_S$", ha="left")
+        pen.label(1.3 * inside, up - 1.7 * arm, "spring, $c$", ha="left")
+
+
+def _turned(points: Any, angle: float) -> np.ndarray:
+    """Points turned counterclockwise about the origin."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.asarray(points, float) @ np.array([[cosine, sine], [-sine, cosine]])
+
+
+def _oval(long: float, wide: float) -> np.ndarray:
+    turn = np.linspace(0, 2 * np.pi, 60)
+    return np.stack([long * np.cos(turn), wide * np.sin(turn)], -1)
+
+
+Row = tuple[Any, Any, Any]
+"""By how much y, φM and φS each enter: a number, or `None` where one does not."""
+
+Inertia = tuple[Sequence[Any], Sequence[Any], Any]
+"""The diagonal D of a matrix of masses D + m a aᵀ; D⁻¹a; and 1/m + aᵀD⁻¹a."""
+
+
+def dot(row: Sequence[Any], values: Sequence[Any]) -> Any:
+    """The sum of these values times the numbers of a row, where 1 and -1 are no work."""
+    terms = [
+        (x if a > 0 else -x) if isinstance(a, int) else a * x
+        for a, x in zip(row, values, strict=True)
+        if a is not None
+    ]
+    return reduce(add, terms)
+
+
+def response(row: Row, inertia: Inertia) -> list[Any]:
+    """The accelerations of y, φM and φS by a force of one along a row: the inverse of Sherman and
+    Morrison, D⁻¹ - D⁻¹a aᵀD⁻¹/(1/m + aᵀD⁻¹a), times that row."""
+    own, by, total = inertia
+    common = dot(row, by) / total
+    return [
+        -x * common if a is None else a / m - x * common
+        for a, m, x in zip(row, own, by, strict=True)
+    ]
+
+
+def by_levers(row: Row, inertia: Inertia) -> Coordinate:
+    """The sum of y, φM and φS times the numbers of a row. One of an angle alone is set, to the last
+    bit; one with y is placed by the height."""
+    gained = response(row, inertia)
+    mobility = dot(row, gained)
+
+    def position(x: Any) -> Scalar:
+        return dot(row, (x.height, x.sleeve_angle, x.bird_angle))
+
+    def velocity(x: Any) -> Scalar:
+        return dot(row, (x.speed, x.sleeve_rate, x.bird_rate))
+
+    def placed(x: Any, Y: Scalar, V: Scalar) -> Any:
+        impulse = (V - velocity(x)) / mobility
+        if row[0] is not None:
+            place = {"height": x.height + Y - position(x)}
+        elif row[1] is not None:
+            place = {"sleeve_angle": Y / row[1]}
+        else:
+            place = {"bird_angle": Y / row[2]}
+        rates = {
+            name: getattr(x, name) + impulse * a
+            for name, a in zip(("speed", "sleeve_rate", "bird_rate"), gained, strict=True)
+        }
+        return dataclasses.replace(x, **place, **rates)
+
+    return Coordinate(position, velocity, placed, 1 / mobility)
