@@ -113,12 +113,30 @@ def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
 
 
 # %%
+class _Blocks(vi.Mechanical):
+    """A block on a shaken floor with friction, and another that rubs on a wall and strikes it."""
+
+    q = ("x", "y", "z")
+    mass = (1.0, 1.0, 0.5)
+    cycle = 2 * np.pi
+    contacts = (
+        vi.RigidStop(0.0, 0.4, "left", on="y", friction=0.3, along="x"),
+        vi.RigidStop(0.5, 0.8, on=lambda q: q.z - q.x),
+        vi.DryFriction(0.1, on="z"),
+    )
+
+    def force(self, t, q, v):
+        pull = 0.4 * jnp.sin(t) - q.x
+        return dict(x=pull, y=-1 + 1.5 * jnp.cos(t), z=0.5 * jnp.cos(t) - q.z)
+
+
 def _verbs() -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield calls of verbs, each with what it is called."""
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
     ready: dict[str, Any] = {"Scene": scene, "Scene with motor": vi.Parameters().scene()}
     kinds = ("ImpactPair", "Capsule", "ReliefValve", "Duffing", "BouncingBall")
     ready |= {kind: getattr(vi.machines, kind)() for kind in kinds}
+    ready["Mechanical, two blocks with friction"] = _Blocks()
     for name, machine in ready.items():
         many = jax.tree.map(lambda x: x + jnp.linspace(0, 0.01, 64), machine.start())
         run = jax.vmap(lambda start, machine=machine: vi.simulate(machine, start, 5).last)
