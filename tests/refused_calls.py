@@ -188,7 +188,7 @@ def work(*arguments, **options):
 
 if __name__ == "__main__":
     for module, name in (
-        ("scans._computed", "run_blocks"),
+        ("scans._scan", "run_blocks"),
         ("scans._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),

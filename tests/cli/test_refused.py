@@ -106,7 +106,7 @@ def test_what_cannot_be_done_is_said_before_any_work(run, here, monkeypatch, ver
         raise AssertionError("work began")
 
     for module, name in (
-        ("scans._computed", "run_blocks"),
+        ("scans._scan", "run_blocks"),
         ("scans._sweep", "_sweep"),
         ("orbit.find", "_find"),
         ("flow._simulate", "_simulate"),

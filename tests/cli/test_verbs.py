@@ -112,7 +112,7 @@ def test_interrupted_scans_tell_how_to_go_on(run, capsys, monkeypatch):
     def interrupt(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "run_blocks", interrupt)
+    monkeypatch.setattr(importlib.import_module("vi_jax.scans._scan"), "run_blocks", interrupt)
     text = "[scan]\naxes.start.Y = [0.0, 1.0]\n"
     Path("file.toml").write_text("machine = 'vi_jax.machines:Duffing'\n" + text)
     assert cli.main(["scan", "file.toml"]) == 130

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow._contact.sequence import _coupled
+from vi_jax.flow._step.impact import _coupled
 
 CLOSE = vi.Adaptive(rtol=1e-11)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.methods._implicit import inverse_of
+from vi_jax.flow.methods.runge_kutta import inverse_of
 
 from differences import check_derivatives
 from truth import integrated

@@ -9,7 +9,7 @@ import pytest
 import vi_jax as vi
 from vi_jax.flow.events import rising_root, slope
 from vi_jax.flow.methods import AbstractMethod
-from vi_jax.flow.methods import _series as power_series
+from vi_jax.flow.methods.taylor import Along, expand
 
 from differences import quick
 
@@ -33,7 +33,7 @@ def test_a_rule_gives_the_derivatives(name):
     """Coefficients n! c_n are the solution's derivatives, found by repeated forward mode."""
     field, order = RULES[name], 6
     t0, x0 = jnp.asarray(0.3), jnp.asarray(0.7)
-    _, (found,) = power_series.expand(field, t0, x0, order)
+    _, (found,) = expand(field, t0, x0, order)
     rate, factor = field, 1.0
     np.testing.assert_allclose(found[0], x0)
     for n in range(1, order + 1):
@@ -195,12 +195,10 @@ def test_what_rounding_moves_when_a_body_is_let_go_is_no_turn():
         facing = tuple(-x for x in slope(path.over(jnp.asarray(0.1))))
         return 0.1 * float(rising_root(facing, iterations=8))
 
-    assert turn(power_series.Along(series)) < 1e-15
-    assert abs(turn(power_series.Along(series).without_flutter(jnp.asarray(4e-14))) - 0.05) < 1e-9
+    assert turn(Along(series)) < 1e-15
+    assert abs(turn(Along(series).without_flutter(jnp.asarray(4e-14))) - 0.05) < 1e-9
     moving = [*series[:2], jnp.asarray(-1e-3), *series[3:]]
-    assert turn(power_series.Along(moving).without_flutter(jnp.asarray(4e-14))) == turn(
-        power_series.Along(moving)
-    )
+    assert turn(Along(moving).without_flutter(jnp.asarray(4e-14))) == turn(Along(moving))
 
 
 @pytest.mark.parametrize(

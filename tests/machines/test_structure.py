@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.methods._linear import clear, modal_flight
+from vi_jax.flow.methods.exact import clear, modal_flight
 
 from linear_truth import Chatters
 from structures import KINDS, machine_and_truth

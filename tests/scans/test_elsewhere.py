@@ -80,7 +80,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path, whole):
 @pytest.mark.slow
 def test_a_cluster_without_workers_is_waited_for(monkeypatch):
     distributed = pytest.importorskip("dask.distributed")
-    computed, said = importlib.import_module("vi_jax.scans._computed"), []
+    computed, said = importlib.import_module("vi_jax.scans._scan"), []
     monkeypatch.setattr(computed, "_PATIENCE", 0.2)
     monkeypatch.setattr(computed, "warn", lambda words: said.append(words) or cluster.scale(1))
     scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 300)}
@@ -110,7 +110,7 @@ def test_a_block_that_a_cluster_forgets_is_given_to_it_again(monkeypatch):
     scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 2000)}
     options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
     wanted = vi.scan(scene, axes, **options)
-    monkeypatch.setattr(importlib.import_module("vi_jax.scans._computed"), "_PATIENCE", 0.1)
+    monkeypatch.setattr(importlib.import_module("vi_jax.scans._scan"), "_PATIENCE", 0.1)
     with _Forgetful(1) as client:
         found = vi.scan(scene, axes, **options, cluster=client)
     assert client.given > 8  # nine, but where a machine stalls for longer than blocks take

@@ -9,8 +9,7 @@ import equinox as eqx
 import jax
 import pytest
 import vi_jax as vi
-from vi_jax.scans._describe import identity
-from vi_jax.scans.store import UNVERIFIABLE
+from vi_jax.scans.store import UNVERIFIABLE, identity
 
 # What a user may have written: a global number, a helper, a closure, a default, a class.
 SOURCE = """
@@ -117,7 +116,7 @@ def test_another_process_gives_the_same(tmp_path):
     (tmp_path / "study.py").write_text(SOURCE + LIST)
     script = tmp_path / "tell.py"
     script.write_text(
-        "from study import THINGS\nfrom vi_jax.scans._describe import identity\n"
+        "from study import THINGS\nfrom vi_jax.scans.store import identity\n"
         "print([identity(thing) for thing in THINGS.values()])\n"
     )
     described = [

@@ -89,7 +89,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
-    struck(monkeypatch, "scans._basins.sorted_out", after=0)
+    struck(monkeypatch, "scans._basins._sorted_out", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
     error = interrupted_by(
@@ -163,7 +163,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
     options = {"parameter": "amplitude", "bounds": ((0.05, 0.5), (0.5, 2.0))}
     curve = interrupted_by(vi.Interrupted, lambda: vi.boundary(point, **options)).partial
     assert curve.ends == ("interrupted", "interrupted") and len(curve.parameters) > 1
-    struck(monkeypatch, "scans._integrity.sorted_out", after=1)
+    struck(monkeypatch, "scans._basins._sorted_out", after=1)
     asked = "gap", [1.0, 1.1], {"start.Y": (-0.5, 0.5), "start.V": (-0.5, 0.5)}
     options = {"resolution": 2, "settle": 5, "longest": 4}
     error = interrupted_by(

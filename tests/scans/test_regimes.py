@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax.scans import _basins
-from vi_jax.scans.regime import least_period
+from vi_jax.scans.measures import least_period
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 

@@ -14,7 +14,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 
 
 def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
-    work = importlib.import_module("vi_jax.scans._computed")
+    work = importlib.import_module("vi_jax.scans._scan")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
     options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
     whole = vi.scan(SCENE, axes, **options)
@@ -75,7 +75,7 @@ def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
 
 def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
     """Also a block that ends on another thread after the interrupt."""
-    work = importlib.import_module("vi_jax.scans._computed")
+    work = importlib.import_module("vi_jax.scans._scan")
     begun, compute = threading.Barrier(2), work.compute
 
     def interrupted(*arguments, dry=False):

@@ -65,7 +65,7 @@ def test_what_is_damaged_is_told_and_computed_again(
         shutil.rmtree(broken) if broken.is_dir() else broken.unlink()
     else:
         damage(broken)
-    work = importlib.import_module("vi_jax.scans._computed")
+    work = importlib.import_module("vi_jax.scans._scan")
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
     with pytest.warns(UserWarning, match=f"lost or damaged, and are computed again: {words}[.]"):
@@ -102,7 +102,7 @@ def test_a_block_is_no_larger_than_the_grid():
 
 
 def test_two_writers_are_refused(whole, tmp_path, monkeypatch):
-    computed = importlib.import_module("vi_jax.scans._computed")
+    computed = importlib.import_module("vi_jax.scans._scan")
     compute = computed.compute
 
     def twice(*arguments):
@@ -143,7 +143,7 @@ def test_failed_lanes_are_no_damage(tmp_path):
 
 def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, monkeypatch):
     """First and last lane are alike: only their code tells them apart."""
-    module = importlib.import_module("vi_jax.scans._computed")
+    module = importlib.import_module("vi_jax.scans._scan")
     monkeypatch.setattr(module, "run_blocks", lambda *arguments: None)
 
     def run(name, change=0.0, hidden=None):  # functions that close over what differs

@@ -25,11 +25,9 @@ from ..machine import (
     switches_of,
     with_modes,
 )
-from .integrals import TIME, Integrals
-from .labelled import EventKind
 from .methods import AbstractMethod
-from .results import code
-from .smooth import rounding, unit_of
+from .results import EventKind, code
+from .smooth import TIME, Integrals, rounding, unit_of
 
 # What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
 FREE = 0.0

@@ -29,14 +29,38 @@ from ..machine import (
     stated,
 )
 from ._lane import Plan, Record
-from .arguments import planned
-from .integrals import TIME, means
+from ._own import has_quantities
+from .arguments import RunOptions, planned
 from .loop import Ends, run_lane
 from .methods import MethodLike
-from .named import has_quantities
 from .noise import with_noise
-from .options import RunOptions
 from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reason_of
+from .smooth import TIME, means
+
+_CPU_OPTIONS = {
+    # Small kernels lose more by being split over threads than they gain.
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+    # The widest there are; XLA itself prefers half of that.
+    "xla_cpu_prefer_vector_width": 512,
+}
+
+
+def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:
+    """Compile as `jax.jit`, with compiler options for batches of simulations on a CPU.
+
+    On other backends it is plain `jax.jit`. Measured on 1,024 motor lanes on one core it saves a
+    tenth to a third of the time. For outermost use only: JAX refuses compiler options inside of
+    another `jit`.
+
+    **Arguments:** `function` and any options of `jax.jit`.
+    """
+    return jax.jit(function, **{**compiling(), **options})
+
+
+def compiling() -> dict[str, Any]:
+    """Options for `jax.jit`, by backend."""
+    return {"compiler_options": _CPU_OPTIONS} if jax.default_backend() == "cpu" else {}
+
 
 _FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 

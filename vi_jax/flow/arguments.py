@@ -1,5 +1,7 @@
 """What `simulate` was asked, checked and put in the form in which the loop needs it."""
 
+import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -13,9 +15,12 @@ from .. import lanes
 from .._checks import (
     concrete,
     count,
+    count_or_traced,
     fits_records,
+    flag,
     instance_of,
     narrow,
+    one_of,
     require_ranges,
     require_real,
     require_session,
@@ -42,12 +47,77 @@ from ..machine import (
     stops_of,
 )
 from ._lane import Plan
-from ._own import check_parts
+from ._own import average_names, check_parts, quantity_names
 from ._own import check_values as check_values
-from .methods import AbstractMethod
-from .named import average_names, quantity_names
-from .options import RunOptions, largest_count
+from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding
+
+_NUMBERS = ["settle", "method", "begin", "until", "stop"]
+_FIXED = [
+    "clock", "samples", "impact_log", "event_log", "record", "rests", "max_impacts", "max_steps",
+]  # fmt: skip
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=_NUMBERS, meta_fields=_FIXED)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class RunOptions:
+    """The options of a run, each as `simulate` describes it, with the same default.
+
+    A pytree: `settle` and the numbers of `method` may be traced, so that others are not another
+    program; all else is a part of the program.
+    """
+
+    settle: Any = 0
+    method: MethodLike = None
+    clock: str | None = None
+    samples: int = 0
+    impact_log: int = 0
+    event_log: int = 0
+    record: str = "motion"
+    rests: bool | None = None
+    max_impacts: int = 1000
+    max_steps: int | None = None
+    begin: Any = None
+    """Clock of the start, where that is not on the section."""
+    until: Any = None
+    """The clock at which the one cycle of the run ends; the machine's own by default. Neither is
+    for a machine whose cycles an event ends."""
+    stop: Any = None
+    """Ends a lane early, at a record point: `stop(machine, state, record, first)`, a flag, or
+    `None` where it cannot tell; `first`, whether recording begins there. A pytree."""
+
+    def checked(self, machine: AbstractMachine | None) -> "RunOptions":
+        """The same options once each is known to be one, with the method that they choose.
+
+        **Arguments:** the machine; `None` if it is not known yet.
+
+        **Raises:** `TypeError` or `ValueError` that names the option.
+        """
+        most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
+        return dataclasses.replace(
+            self,
+            **{name: count(name, getattr(self, name)) for name in counts},
+            method=chosen(machine, self.method),
+            settle=count_or_traced("settle", self.settle),
+            rests=None if self.rests is None else flag("rests", self.rests),
+            max_steps=None if most is None else count("max_steps", most, least=1),
+            record=one_of("record", self.record, ("motion", "sections")),
+        )
+
+    def check_limits(self, dtype: object) -> None:
+        """**Raises:** `ValueError` for a limit beyond which numbers of this type do not count."""
+        for name in ("max_impacts", "max_steps"):
+            value = getattr(self, name)
+            if value is not None and value > largest_count(dtype):
+                raise ValueError(
+                    f"Argument `{name}` must be at most {largest_count(dtype)}, up to which "
+                    f"numbers of type {dtype} count, but got {value}."
+                )
+
+
+def largest_count(dtype: object) -> int:
+    """The number up to which floating-point numbers of this type, in which the loop counts, do."""
+    return round(2 / float(jnp.finfo(dtype).eps))
 
 
 def planned(

@@ -1,15 +1,19 @@
 """Why a simulation ended, and what it returns."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import difflib
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from .._checks import one_of
 from .._messages import so_many
 from .._types import Scalar, State, xr
 from ..machine import (
@@ -18,14 +22,232 @@ from ..machine import (
     Stated,
     Summarized,
     bare,
+    by_name,
     in_unit,
     name_in,
     state_in_words,
     with_modes,
+    with_units,
 )
-from .enumeration import NamedEnumeration, in_names, member_of, names_of
-from .labelled import EVENTS as EVENTS
-from .labelled import run_dataset
+
+# Of a batch no more than so many are listed one by one: a choice, what fits a line.
+_NAMED = 8
+
+if TYPE_CHECKING:
+    from equinox import Enumeration as NamedEnumeration
+
+    _Member: Any = None
+else:
+
+    class _Member(eqx.Module):
+        """A member of an enumeration, or one for each lane of a batch."""
+
+        number: Any
+        kind: type = eqx.field(static=True)
+
+        def __eq__(self, other):
+            if not isinstance(other, self.kind):
+                raise ValueError(f"A {self.kind.__name__} has no order with {other!r}.")
+            return jnp.equal(self.number, other.number)
+
+        def __ne__(self, other):
+            return ~(self == other)
+
+        def __repr__(self) -> str:
+            name, number = self.kind.__name__, self.number
+            if isinstance(number, Tracer):
+                return f"{name}<traced>"
+            if not isinstance(number, jnp.ndarray | np.ndarray):
+                return f"{name}<unknown>"
+            found = names_of(self.kind)[number]
+            if not found.ndim:
+                return f"{name}.{found}"
+            if found.size <= _NAMED:
+                return f"{name}{found.tolist()}".replace("'", "")
+            kinds, counts = np.unique(found, return_counts=True)
+            parts = (f"{count:,} {kind}" for kind, count in zip(kinds, counts, strict=True))
+            return f"{name}[{', '.join(parts)}; shape {found.shape}]"
+
+    class _Kind(type):
+        def __new__(mcs, name, bases, namespace):
+            texts = {k: x for k, x in namespace.items() if isinstance(x, str) and k[0] != "_"}
+            cls = super().__new__(mcs, name, bases, namespace)
+            cls._texts = texts
+            for number, word in enumerate(texts):
+                setattr(cls, word, _Member(np.asarray(number, np.int32), cls))
+            return cls
+
+        def __instancecheck__(cls, value):
+            return isinstance(value, _Member) and value.kind is cls
+
+        def __getitem__(cls, item):
+            return list(cls._texts.values())[int(item.number)]
+
+        def __getattr__(cls, name: str) -> Any:
+            if name.startswith("_"):
+                raise AttributeError(name)
+            near = difflib.get_close_matches(name, cls._texts, n=3, cutoff=0.5)
+            words = f"{'near names' if near else 'its members'}: {', '.join(near or cls._texts)}"
+            raise AttributeError(f"`{cls.__name__}` has no member {name!r}; {words}.")
+
+    class NamedEnumeration(metaclass=_Kind):
+        """Names with a text each, as class attributes. Members are pytrees, which may be traced and
+        batched, and `RESULTS[item]` is the text of one."""
+
+        @classmethod
+        def where(cls, condition, a, b):
+            """`jnp.where` of two members."""
+            return _Member(jnp.where(condition, a.number, b.number), cls)
+
+
+def names_of(kind: Any) -> np.ndarray:
+    """The names of the members of an enumeration, in their order."""
+    return np.asarray(list(kind._texts))
+
+
+def in_names(member: Any) -> np.ndarray:
+    """The names of members, one for each lane."""
+    return np.asarray(names_of(member.kind)[np.asarray(member.number)])
+
+
+def number_of(member: Any) -> Int[Array, "..."]:
+    """The place of a member in its enumeration; a number for each lane."""
+    return jnp.asarray(member.number)
+
+
+def member_of(kind: Any, number: Any) -> Any:
+    """The member of an enumeration at this place; one for each lane."""
+    return _Member(jnp.asarray(number, jnp.int32), kind)
+
+
+class EventKind(enum.IntEnum):
+    """What may happen to a motion, as `EventLog` lists it."""
+
+    impact = 0
+    """A body hits a rigid stop."""
+    rest = 1
+    """A body comes to rest on a stop."""
+    release = 2
+    """A body leaves the stop on which it rested."""
+    mode = 3
+    """A switch changes its mode."""
+    reset = 4
+    """One of the machine's `events`."""
+
+
+EVENTS = tuple(kind.name for kind in EventKind)
+"""The names of what may happen to a motion, as `EventLog` lists it: an impact on a stop; a body
+that comes to rest on one; a body that leaves the stop on which it rested; a switch that changes its
+mode; one of the machine's `events`."""
+
+Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
+
+
+def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
+    """Names of the batch axes. **Raises:** `ValueError` if others are given than there are."""
+    if dims is None:
+        return ("lane",) if number == 1 else tuple(f"lane_{i}" for i in range(number))
+    if isinstance(dims, str) or len(dims) != number:
+        raise ValueError(
+            f"Argument `dims` must name the {number} batch axes of this result, but got {dims!r}."
+        )
+    return tuple(dims)
+
+
+def states(prefix: str, state: State, dims: tuple[str, ...]) -> Variables:
+    """The components of a state, each a variable; an array among them has axes of its own."""
+    found = {}
+    for name, x in by_name(state).items():
+        name, x = name or "state", np.asarray(x)
+        inner = tuple(f"{name}_{i}" for i in range(x.ndim - len(dims)))
+        found[f"{prefix}_{name}"] = (*dims, *inner), x
+    return found
+
+
+def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
+    """The entries that are not `None`."""
+    return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
+
+
+def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
+    """Of a data set what lies along one of its dimensions, so that it makes a table with one
+    row for each of its places; all of it by default.
+
+    **Raises:** `ValueError` if there is no such dimension.
+    """
+    if along is None:
+        return data
+    columns = {}
+    for name, x in data.data_vars.items():
+        columns |= _columns(str(name), x)
+    last = {name: str(x.dims[-1]) for name, x in columns.items() if x.dims}
+    one_of("along", along, tuple(dict.fromkeys(last.values())))
+    return data.assign(columns)[[name for name, dim in last.items() if dim == along]]
+
+
+def _columns(name: str, x: Any) -> dict[str, Any]:
+    """A variable, or those of the single numbers of an array of the state (see `states`)."""
+    inner = [dim for dim in map(str, x.dims) if name.endswith("_" + dim.rpartition("_")[0])]
+    if not inner:
+        return {name: x}
+    shape = [x.sizes[dim] for dim in inner]
+    return {
+        name + str(list(place)): x.isel(dict(zip(inner, place, strict=True)))
+        for place in np.ndindex(*shape)
+    }
+
+
+# What tells, along these dimensions, which places of a log are used.
+_LISTED = {"impact": "log_stop", "event": "event_number"}
+
+
+def _met(log: Any, number: str) -> Any:
+    """The entries of a log, one after the other, without unused places: those where the variable
+    `number` is negative."""
+    rows = log.stack(row=log[number].dims).reset_index("row")
+    return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
+
+
+def run_dataset(
+    run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None
+) -> "xr.Dataset":
+    """A run as a data set (see `Run.to_xarray`)."""
+    batch = batch_names(dims, run.steps.ndim)
+    cycle, section = (*batch, "cycle"), (*batch, "section")
+    names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
+             "duration", "frequency_ratio")  # fmt: skip
+    variables = states("section", run.sections, section)
+    variables |= present({name: getattr(run, name) for name in names} | run.averages, cycle)
+    variables |= states("section", run.quantities, section)
+    variables |= states("section", {f"mode_{i}": x for i, x in enumerate(run.modes)}, section)
+    count = run.impacts.shape[-1]
+    coordinates: dict[str, Any] = {
+        "cycle": np.arange(1, count + 1), "section": np.arange(count + 1),
+    }  # fmt: skip
+    if run.samples is not None:
+        sample = (*batch, "sample")
+        variables |= states("sample", run.samples.state, sample)
+        variables |= states("sample", run.samples.quantities, sample)
+        variables["sample_time"] = sample, np.asarray(run.samples.time)
+        place = np.asarray(run.samples.cycles)
+        coordinates["sample"] = place.reshape(-1, place.shape[-1])[0]
+    if run.impact_log is not None:
+        log = (*cycle, "impact")
+        kept = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
+        variables |= present(kept, log)
+    if run.event_log is not None:
+        names = ("phase", "number", "value")
+        kept = {f"event_{name}": getattr(run.event_log, name) for name in names}
+        kept["event_kind"] = np.asarray([*EVENTS, ""])[np.asarray(run.event_log.kind)]
+        variables |= present(kept, (*cycle, "event"))
+    if run.errors is not None:
+        variables |= states("error_section", run.errors.sections, section)
+        kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
+        variables |= present(kept, cycle)
+    variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
+    own = {name: name for name in run.averages}
+    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units), own), along)
+    return _met(data, _LISTED[along]) if along in _LISTED else data
 
 
 class RESULTS(NamedEnumeration):
@@ -92,7 +314,7 @@ def code(name: str) -> float:
 _OUTCOMES = 64
 
 
-def with_outcome(number: int) -> float:
+def code_of_outcome(number: int) -> float:
     """The reason of a lane that an event ended, as a number, with the number of its outcome."""
     return code("ended") + number / _OUTCOMES
 

@@ -17,9 +17,8 @@ from .._checks import count, one_of, require
 from .._messages import warning_once
 from .._types import Scalar, State
 from ..machine import AbstractMachine, adopt
-from ._simulate import simulate
+from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
-from .fusion import jit
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")

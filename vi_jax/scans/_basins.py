@@ -1,4 +1,4 @@
-"""`basins`: which start goes to which motion, the motions found on the way."""
+"""`basins`: which start goes to which motion; `integrity_profile`: how basins erode."""
 
 import difflib
 import inspect
@@ -29,6 +29,7 @@ from ..machine import (
     AbstractMachine,
     angles_in,
     attributes,
+    check_leaf,
     components,
     cycles_in_words,
     in_rows,
@@ -38,10 +39,10 @@ from ..machine import (
     summary_table,
     unit_of,
     units_of,
+    with_leaf,
     with_leaves,
 )
 from ..orbit import distance
-from ._computed import ScanInterrupted
 from ._geometry import (
     BasinEntropy,
     Cells,
@@ -51,12 +52,10 @@ from ._geometry import (
     largest_ball,
     uncertainty_of,
 )
-from ._lane_noise import START
-from ._scan import LanesFailed, scan
-from .grid import axes_of
-from .measures import Regime, Sections
+from ._scan import LanesFailed, ScanInterrupted, scan
+from .grid import START, axes_of
+from .measures import CODES, REGIMES, Regime, Sections, flags, size_of
 from .program import check_leaf_name, start_with
-from .regime import CODES, REGIMES, flags, size_of
 
 _BEYOND = REASON_NAMES.index("bad_start")
 
@@ -141,7 +140,7 @@ class Basins(NamedTuple):
         **Raises:** `ValueError` if the starts lie on no grid, or for scales of other components.
         """
         label, there, names = self._grid()
-        scale = scales_along(names, scales)
+        scale = _scales_along(names, scales)
         at_stop = self.data["label"].attrs.get("at_stop", ())
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
         centres = [np.asarray(self.data[name], float) for name in names]
@@ -250,7 +249,7 @@ class Basins(NamedTuple):
         return summary_table(str(self))
 
 
-def scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np.ndarray:
+def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np.ndarray:
     """What counts as distance 1 along these axes. **Raises:** as `Basins.integrity`."""
     given = {} if scales is None else dict(scales)
     for name, scale in given.items():
@@ -318,21 +317,21 @@ def basins(
     section state of each start that was simulated.
     """
     machine = machine_of(machine)
-    check_options(basins, options, ())
+    _check_options(basins, options, ())
     given_number("apart", apart, low=0.0, open_low=True)
     begin = machine.start() if start is None else start
     axes = starts_in(region, machine, begin, resolution, samples, count("seed", seed))
     method = chosen(machine, method)
-    data = followed(
+    data = _scanned(
         machine, axes, longest, tolerance, start=start, settle=settle, method=method,
         paired=samples is not None, progress=progress, **options,
     )  # fmt: skip
     kept = partial(ScanInterrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
-        return sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)
+        return _sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)
 
 
-def sorted_out(
+def _sorted_out(
     data: "xr.Dataset",
     machine: AbstractMachine,
     begin: object,
@@ -343,7 +342,7 @@ def sorted_out(
 ) -> Basins:
     """The basins in what a scan of starts found.
 
-    **Arguments:** what `followed` found; the machine; a start, of which the region's
+    **Arguments:** what `_scanned` found; the machine; a start, of which the region's
     parts are replaced; `apart`, `longest` and `method` as for `basins`.
     """
     names = list(components(begin))
@@ -408,7 +407,7 @@ def _can_be(machine: AbstractMachine, begin: object, values: Mapping[str, float]
     return True
 
 
-def check_options(
+def _check_options(
     verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
 ) -> None:
     """**Raises:** `TypeError` for an option that is none of `scan`'s, or one that a verb which
@@ -427,14 +426,14 @@ def check_options(
             raise TypeError(f"`{who}` has no argument `{name}`; {hint}.")
 
 
-def followed(
+def _scanned(
     machine: AbstractMachine,
     axes: Mapping[str, Any],
     longest: int,
     tolerance: float | None,
     **options: Any,
 ) -> "xr.Dataset":
-    """What a scan finds of starts, for `sorted_out`; those that fail are no news."""
+    """What a scan finds of starts, for `_sorted_out`; those that fail are no news."""
     measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
@@ -527,3 +526,239 @@ def _labelled(
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
     return label, [motions[i] for i in order]
+
+
+# From one value to the next a section of one motion moves by less than this part of the region.
+# A choice.
+_MOVES = 0.25
+
+# What is said of each motion at each value, and where there is none.
+_NUMBERS = {
+    "share": 0.0, "error": 0.0, "local": np.nan, "factor": np.nan,
+    "local_at_edge": False, "factor_at_edge": False,
+}  # fmt: skip
+
+
+class IntegrityProfile(NamedTuple):
+    """Basins over one number of a machine: the share and the integrity of each motion, also called
+    an erosion profile. Thompson's Dover cliff is where they fall off.
+
+    Motions at two neighbouring values count as the same if they have the same period and number of
+    impacts, and their sections differ by less than a quarter of the region.
+    """
+
+    parameter: str
+    values: np.ndarray
+    """The values, rising; shape (values,)."""
+    period: np.ndarray
+    """Period of each motion in drive cycles; shape (motions,), the one of most starts first."""
+    impacts: np.ndarray
+    """Impacts in a period; shape (motions,)."""
+    label: np.ndarray
+    """Number of the motion among the `attractors` at each value, -1 where no start settles on it;
+    shape (motions, values), as of all below."""
+    share: np.ndarray
+    """Part of the starts that settle on it, 0 where none does."""
+    error: np.ndarray
+    """Standard error of `share`, as in `Attractor`."""
+    local: np.ndarray
+    """Local integrity measure, as in `Integrity`; NaN where no start settles on the motion, or its
+    sections lie outside of the region."""
+    factor: np.ndarray
+    """Integrity factor; NaN where no start settles on the motion."""
+    local_at_edge: np.ndarray
+    """Whether the edge of the region limits the ball, so that a larger region might give a larger
+    one."""
+    factor_at_edge: np.ndarray
+    """Whether the edge of the region limits the ball of `factor`."""
+    resolution: float
+    """The uncertainty of the radii; NaN if there is no motion."""
+    basins: list[Basins]
+    """The basins at each value."""
+
+    @property
+    def irregular(self) -> dict[str, np.ndarray]:
+        """Parts of the starts that end on no periodic motion, by the names of `REGIMES`; each of
+        shape (values,)."""
+        return {name: np.array([x.irregular[name] for x in self.basins])
+                for name in self.basins[0].irregular}  # fmt: skip
+
+    def name_of(self, motion: int) -> str:
+        """A motion in words: its period and its impacts."""
+        period = self.basins[0].period_of(int(self.period[motion]))
+        return f"{period}, {so_many(round(float(self.impacts[motion])), 'impact')}"
+
+    def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
+        """This profile as an `xarray.Dataset` over `motion` and the parameter.
+
+        **Arguments:** `along`, to keep only what lies along one of these.
+
+        **Raises:** `ValueError` if there is no such dimension.
+        """
+        both = "motion", self.parameter
+        unit = unit_of(units_of(self.basins[0].machine), self.parameter)
+        variables: dict[str, Any] = {
+            name: (both, getattr(self, name)) for name in ("label", *_NUMBERS)
+        }
+        variables |= {name: (self.parameter, x) for name, x in self.irregular.items()}
+        variables |= {"period": ("motion", self.period), "impacts": ("motion", self.impacts)}
+        coords = {self.parameter: (self.parameter, self.values, attributes(unit))}
+        return tidy(xr.Dataset(variables, coords), along)
+
+    def __str__(self) -> str:
+        low, high = self.values[[0, -1]]
+        lines = [
+            f"Integrity over {self.parameter}, {self.values.size} values from {low:.6g} to "
+            f"{high:.6g}: {so_many(len(self.period), 'motion')}"
+        ]
+        for i in range(min(len(self.period), 8)):
+            here = self.values[self.share[i] > 0]
+            best = int(np.argmax(self.share[i]))
+            text = (
+                f"  {i}: {self.name_of(i)}, {here[0]:.6g} to {here[-1]:.6g}: at most "
+                f"{100 * self.share[i, best]:.1f} % at {self.values[best]:.6g}"
+            )
+            if not np.isnan(self.local[i]).all():
+                best = int(np.nanargmax(self.local[i]))
+                text += f", local integrity {self.local[i, best]:.4g} at {self.values[best]:.6g}"
+            lines.append(text)
+        if len(self.period) > 8:
+            lines.append(f"  {len(self.period) - 8} further motions")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return summary_table(str(self))
+
+
+@warning_once
+def integrity_profile(
+    machine: AbstractMachine,
+    parameter: str,
+    values: object,
+    region: Mapping[str, tuple[float, float]],
+    *,
+    resolution: int | tuple[int, ...] = 64,
+    scales: Mapping[str, float] | None = None,
+    settle: int = 400,
+    longest: int = 64,
+    tolerance: float | None = None,
+    apart: float = 1e-3,
+    method: MethodLike = None,
+    start: State = None,
+    progress: bool = True,
+    **options: Any,
+) -> IntegrityProfile:
+    """Compute basins, their shares and their integrity over one parameter (an erosion profile).
+
+    All values are one scan, by one compiled program.
+
+    **Arguments:**
+
+    - `machine`, `parameter`: the machine and the name of the number that is changed, such as
+      `"drive.frequency_ratio"`.
+    - `values`: its values; they are taken in rising order.
+    - `region`, `resolution`: as for `basins`; the same starts at each value.
+    - `scales`: as for `Basins.integrity`.
+    - `settle`, `longest`, `tolerance`, `apart`, `method`, `start`, `progress`, and further options:
+      as for `basins` (`start`: by default the machine's own at each value).
+
+    **Returns:** an `IntegrityProfile`.
+
+    **Raises:** as `basins`; `ValueError` for values that are no rising row of numbers, or scales
+    of what is not in the region.
+    """
+    machine = machine_of(machine)
+    check_leaf(machine, parameter)
+    _check_options(integrity_profile, options, ("samples", "seed"))
+    given_number("apart", apart, low=0.0, open_low=True)
+    row = np.unique(axes_of({parameter: values}, "values")[parameter])
+    begin = machine.start() if start is None else start
+    axes = starts_in(region, machine, begin, resolution, None, 0)
+    for x in axes.values():
+        count("resolution", x.size, least=2)
+    _scales_along([*axes], scales)
+    method = chosen(machine, method)
+    data = _scanned(
+        machine, {parameter: row, **axes}, longest, tolerance, start=start, settle=settle,
+        method=method, progress=progress, **options,
+    )  # fmt: skip
+    found, integrity = [], []
+    kept = partial(ScanInterrupted, data, options.get("store"))
+    with at_work("basins", kept, progress=progress, unit="value", total=row.size) as tell:
+        for i, value in enumerate(row):
+            here = with_leaf(machine, parameter, value)
+            begin = here.start() if start is None else start
+            part = data.isel({parameter: i}).load()
+            one = _sorted_out(part, here, begin, apart=apart, longest=longest, method=method)
+            found.append(one)
+            integrity.append(one.integrity(scales=scales))
+            tell(1)
+    return _profile(parameter, row, axes, found, integrity)
+
+
+def _profile(
+    parameter: str,
+    values: np.ndarray,
+    axes: Mapping[str, np.ndarray],
+    found: list[Basins],
+    integrity: list[list[Integrity]],
+) -> IntegrityProfile:
+    """The basins at each value sorted by motion."""
+    label = _matched(found, axes)
+    shape = label.shape
+    numbers = {name: np.full(shape, absent) for name, absent in _NUMBERS.items()}
+    period, impacts, resolution = np.zeros(shape[0], int), np.zeros(shape[0]), math.nan
+    for motion, i in np.argwhere(label >= 0):
+        a, reach = found[i].attractors[label[motion, i]], integrity[i][label[motion, i]]
+        period[motion], impacts[motion], resolution = a.period, a.impacts, reach.resolution
+        numbers["share"][motion, i], numbers["error"][motion, i] = a.fraction, a.error
+        for name in ("local", "factor", "local_at_edge", "factor_at_edge"):
+            numbers[name][motion, i] = getattr(reach, name)
+    order = np.argsort(-numbers["share"].sum(axis=1), kind="stable")
+    numbers = {name: x[order] for name, x in numbers.items()}
+    return IntegrityProfile(
+        parameter, values, period[order], impacts[order], label[order], **numbers,
+        resolution=resolution, basins=found,
+    )  # fmt: skip
+
+
+def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Which attractor at each value is which motion, -1 for none: (motions, values).
+
+    Of the motions of a kind those nearest to each other are one, the nearest pair first.
+    """
+    names = [name.removeprefix(START) for name in axes]
+    angles = np.array([is_angle(found[0].machine, name) for name in names])
+    widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
+    last: list[Attractor] = []
+    rows: list[np.ndarray] = []
+    for i, one in enumerate(found):
+        pairs = sorted(
+            (_distance(a, b, names, angles, widths), motion, b.label)
+            for motion, a in enumerate(last)
+            for b in one.attractors
+            if a.period == b.period and round(a.impacts) == round(b.impacts)
+        )
+        free = {b.label for b in one.attractors}
+        for away, motion, label in pairs:
+            if label in free and rows[motion][i] < 0 and away < _MOVES:
+                rows[motion][i] = label
+                last[motion] = one.attractors[label]
+                free.remove(label)
+        for label in sorted(free):
+            last.append(one.attractors[label])
+            rows.append(np.full(len(found), -1))
+            rows[-1][i] = label
+    return np.array(rows, int).reshape(len(rows), len(found))
+
+
+def _distance(
+    a: Attractor, b: Attractor, names: list[str], angles: np.ndarray, widths: np.ndarray
+) -> float:
+    """How far sections of two motions of one period are apart, as a part of the region's widths,
+    by the best shift in phase."""
+    x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
+    shifted = (np.roll(y, shift, axis=0) for shift in range(len(y)))
+    return float(min((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted))

@@ -1,23 +1,399 @@
 """`scan`: axes over parameters and starts give a labelled data set."""
 
+import contextlib
 import dataclasses
 import functools
+import itertools
+import json
+import math
+import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array
 
-from .._checks import count, flag, instance_of
-from .._messages import at_work, warning_once
+from .. import lanes
+from .._checks import count, fits_memory, fits_records, flag, instance_of
+from .._messages import Interrupted, at_work, warn, warning_once
+from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
-from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, preset
+from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, compiling, preset
 from ..machine import AbstractMachine
-from ._computed import ScanInterrupted, Workplace, computed, in_blocks, workplace
-from ._lane_noise import lane_numbers
-from .grid import Blocks, axes_of
-from .program import ScanProgram, make_program
+from ..machine import attributes as units_of
+from .grid import Blocks, axes_of, lane_numbers
+from .program import ScanProgram, check_corners, make_program
+from .store import (
+    MemoryStore,
+    Where,
+    ZarrStore,
+    attributes_of,
+    check_writable,
+    description_of,
+    unit_on_axis,
+    variables_of,
+)
+
+# Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.
+_MOST, _ON_ACCELERATOR = 4096, 65536
+
+# A block has so many lanes on each device, or so many doubled again and again: few sizes, for few
+# programs. A choice.
+_LEAST = 256
+
+# Blocks that a cluster has at a time: a choice, more than it has cores.
+_ON_CLUSTER = 4096
+
+# Seconds without a new block after which a cluster is asked for its workers. A choice.
+_PATIENCE = 10.0
+
+# Dask's blocks are given to it again after so many times the longest wait for one so far (that for
+# the first one is not known, and taken to be as many times the patience). A choice.
+_LONG = 6
+
+
+class ScanInterrupted(Interrupted):
+    """Raised when a scan is interrupted; `data` holds the finished part."""
+
+    def __init__(self, data: "xr.Dataset", store: str | Path | None):
+        kept = "what was computed is in `.data`"
+        if store is not None:
+            kept = f"what was computed is in {store}, and the same call continues from there"
+        super().__init__("scan", data, kept)
+        self.data = data
+
+
+class Workplace(NamedTuple):
+    """Where blocks are computed: by threads on local devices, or by a cluster."""
+
+    workers: int
+    devices: int
+    cluster: Any
+
+
+def workplace(workers: int | None, devices: int | None, cluster: object) -> Workplace:
+    """As many threads and devices as are asked for, or as there are.
+
+    **Raises:** `TypeError` or `ValueError` for what are no such numbers, more devices than there
+    are, or a cluster that is none.
+    """
+    if not (cluster is None or isinstance(cluster, Executor) or hasattr(cluster, "get_executor")):
+        raise TypeError(
+            "Argument `cluster` must be a `dask.distributed.Client` or a "
+            f"`concurrent.futures.Executor`, but got {cluster!r}."
+        )
+    workers = lanes.cores() if workers is None else count("workers", workers, least=1)
+    there = len(jax.local_devices())
+    devices = there if devices is None else count("devices", devices, least=1)
+    if devices > there:
+        raise ValueError(
+            f"Argument `devices` must be at most {there}, the local devices, but got {devices}."
+        )
+    return Workplace(workers, devices, cluster)
+
+
+def computed(
+    program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False
+) -> "xr.Dataset":
+    """What a program finds on a grid, checked before any work.
+
+    **Arguments:** `blocks`, the grid; `place`, where it is computed; `store`, a path to keep it at,
+    `None` for the memory; `progress`, whether a bar is shown.
+
+    **Raises:** as `scan`.
+    """
+    program = check_corners(program, blocks)
+    variables = variables_of(program, blocks)
+    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
+    total = blocks.total
+    fits_memory("axes", total * per_lane if store is None else total + 500 * len(blocks))
+    description = description_of(program, blocks)
+    kept = MemoryStore(blocks, variables)
+    if store is not None:
+        check_writable(store)
+        kept = ZarrStore(store, description, blocks, variables)
+
+    def collected() -> "xr.Dataset":
+        data = kept.data()
+        for name in blocks.axes:
+            data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
+        data.attrs = attributes_of(description, program.at(blocks, 0)[0])
+        return data
+
+    with contextlib.closing(kept):
+        todo = kept.open_blocks()
+        _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
+        done = total - sum(map(size_of, todo))
+        with at_work(
+            "scan", lambda: ScanInterrupted(collected(), store),
+            progress=progress, unit="lane", total=total, done=done,
+        ) as tell:  # fmt: skip
+
+            def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
+                kept.write(where, numbers)
+                tell(size_of(where))
+
+            try:
+                run_blocks(program, blocks, todo, place, write)
+            except ClusterLost as lost:
+                raise ConnectionError(_how_to_go_on(kept)) from lost
+        return collected()
+
+
+def size_of(where: Where) -> int:
+    """Number of lanes in a block."""
+    return math.prod(part.stop - part.start for part in where)
+
+
+def in_blocks(
+    program: ScanProgram,
+    grid: Mapping[str, np.ndarray],
+    place: Workplace,
+    paired: bool,
+    store: str | Path | None = None,
+    lanes: int | None = None,
+    numbers: np.ndarray | None = None,
+) -> Blocks:
+    """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
+
+    **Arguments:** `grid`, values by axis; `place`, where it is computed; `paired`, whether the axes
+    have one length and are gone along together; `store`, a path or `None`; `lanes`, `None` to
+    choose; `numbers` of the lanes, by which noise tells them apart, by default their places.
+
+    **Raises:** `ValueError` if a block would not fit into the memory.
+    """
+    total = Blocks(grid, 1, paired=paired).total
+    if store is not None and lanes is None:
+        lanes = _lanes_in(Path(store))
+    at_fault = "cycles" if lanes is None else "lanes"
+    if lanes is None:
+        lanes = _block_size(total, place)
+    else:  # a multiple of what it must be, but no larger than the grid
+        step = _LEAST * place.devices
+        lanes = math.ceil(min(count("lanes", lanes, least=1), total) / step) * step
+    points = program.cycles * max(1, program.options.samples) + 1
+    fits_records(at_fault, lanes * points, 12)
+    if program.lane_noise is not None and numbers is None:
+        numbers = lane_numbers(total)
+    return Blocks(grid, lanes, paired=paired, numbers=numbers)
+
+
+def _lanes_in(path: Path) -> int | None:
+    """The block size of a store that is there already."""
+    try:
+        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        return int(attributes["scan"]["lanes"])
+    except (OSError, KeyError, ValueError, TypeError):
+        return None
+
+
+def _block_size(total: int, place: Workplace) -> int:
+    """Lanes in a block of a grid of `total` lanes where the user names no number.
+
+    Few sizes, because each is a program of its own; small enough to occupy every core.
+    """
+    if jax.default_backend() != "cpu":
+        most, share = _ON_ACCELERATOR * place.devices, total
+    else:
+        most, share = _MOST * place.devices, math.ceil(total / place.workers)
+    size = _LEAST * place.devices
+    while size < min(share, most):
+        size *= 2
+    return size
+
+
+class ClusterLost(Exception):
+    """A cluster, or an executor, does not answer."""
+
+
+def run_blocks(
+    program: ScanProgram,
+    blocks: Blocks,
+    todo: list[Where],
+    place: Workplace,
+    write: Callable[[Where, dict[str, np.ndarray]], None],
+) -> None:
+    """Compute the blocks `todo` in an executor, and write each when it is done.
+
+    Local threads have one core and one block each; on an accelerator, or over several devices,
+    there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
+    cluster seems to have forgotten are given to it once more (a worker that is killed can leave
+    Dask waiting for ever: https://github.com/dask/distributed/issues/3196).
+
+    **Raises:** `ClusterLost`; what a block raises.
+    """
+    # With NumPy's arrays it can be sent with every task: data that are shared would die with their
+    # worker.
+    parcel = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
+    with contextlib.ExitStack() as stack:
+        if place.cluster is not None:
+            pool, at_once = _executor_of(place.cluster), _ON_CLUSTER
+            devices, one_core = 1, False
+        else:
+            at_once = place.workers
+            if place.devices > 1 or jax.default_backend() != "cpu":
+                at_once = 1
+            elif todo and at_once > 1:
+                # Compiled here, once and not in several threads at a time.
+                compute(program, blocks.values(todo[0]), blocks.lanes, dry=True)
+            pool = stack.enter_context(ThreadPoolExecutor(at_once))
+            devices, one_core = place.devices, True
+        task = functools.partial(
+            _task, parcel, lanes_of_block=blocks.lanes, devices=devices, x64=_x64(),
+            one_core=one_core,
+        )  # fmt: skip
+        waiting, running = iter(todo), dict[Future, Where]()
+
+        def begin(where: Where) -> None:
+            try:
+                running[pool.submit(task, blocks.values(where))] = where
+            except RuntimeError as error:
+                raise ClusterLost from error
+
+        def finish(future: Future) -> None:
+            where = running.get(future)
+            if where is None:  # given away twice, and done by the other one
+                return
+            try:
+                write(where, future.result())
+            except (CancelledError, BrokenExecutor) as error:
+                raise ClusterLost from error
+            del running[future]
+            for other in [x for x in running if twice and running[x] == where]:
+                other.cancel()
+                del running[other]
+
+        since, longest, twice = time.monotonic(), 0.0, False
+        try:
+            while True:
+                for where in itertools.islice(waiting, at_once - len(running)):
+                    begin(where)
+                if not running:
+                    return
+                done, _ = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                waited = time.monotonic() - since
+                if done:
+                    since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
+                elif _has_workers(place.cluster) and hasattr(place.cluster, "get_executor"):
+                    if not twice and waited > _LONG * (longest or _LONG * _PATIENCE):
+                        twice = True
+                        for where in list(running.values()):
+                            begin(where)
+                for future in done:
+                    finish(future)
+        finally:
+            wait([future for future in running if not future.cancel()])
+            for future in list(running):
+                if not future.cancelled() and future.exception() is None:
+                    finish(future)
+
+
+def _executor_of(cluster: Any) -> Executor:
+    if isinstance(cluster, Executor):
+        return cluster
+    if cluster.status != "running":
+        raise ClusterLost
+    return cluster.get_executor(pure=False, retries=3)
+
+
+def _has_workers(cluster: Any) -> bool:
+    """Whether a cluster has workers, with a warning where it has none."""
+    if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
+        warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
+        return False
+    return True
+
+
+def _task(
+    parcel: ScanProgram,
+    values: dict[str, np.ndarray],
+    lanes_of_block: int,
+    devices: int,
+    x64: bool,
+    one_core: bool,
+) -> dict[str, np.ndarray]:
+    threads = lanes.threads(1) if one_core else contextlib.nullcontext()
+    with jax.enable_x64(x64), threads:  # a thread has its own
+        program = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parcel)
+        return compute(program, values, lanes_of_block, devices)
+
+
+def _x64() -> bool:
+    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _how_to_go_on(kept: MemoryStore) -> str:
+    """What is left of a scan whose cluster is lost."""
+    how = "Nothing was stored. Pass a `store`, from which the same call can continue."
+    if isinstance(kept, ZarrStore):
+        number = len(kept.blocks)
+        done = number - len(kept.open_blocks())
+        how = (
+            f"{done:,} of {number:,} blocks are computed and stored in {kept.path}. The same "
+            "call continues from there, with a new client or without `cluster`."
+        )
+    return f"The cluster was lost, or its scheduler. {how}"
+
+
+@functools.cache
+def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
+    """A program of a block of lanes, compiled for so many devices."""
+    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
+    whole, split = PartitionSpec(), PartitionSpec("lanes")
+
+    def here(program, values, wanted):
+        return program(values, wanted)
+
+    def over_devices(program, values, wanted):
+        numbers, rest = eqx.partition(program, eqx.is_array)
+        return jax.shard_map(
+            lambda numbers, *lanes: here(eqx.combine(numbers, rest), *lanes),
+            mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False,
+        )(numbers, values, wanted)  # fmt: skip
+
+    return CompiledFunction(here if devices == 1 else over_devices, PLAIN, **compiling())
+
+
+def compute(
+    program: ScanProgram,
+    values: dict[str, np.ndarray],
+    lanes: int,
+    devices: int = 1,
+    *,
+    dry: bool = False,
+) -> dict[str, np.ndarray]:
+    """The numbers of a block of lanes, by name, as the program finds them.
+
+    A block is filled up to `lanes`, so that all blocks are one program. With several devices the
+    lanes are dealt to them in turn, since neighbours take alike long. `dry` only compiles: none of
+    the lanes is run.
+
+    **Arguments:** the program; the axes' values of each lane; the size of a full block; over how
+    many local devices it is spread; whether to compile only.
+    """
+    size = next(iter(values.values())).size
+    deal = np.arange(lanes).reshape(-1, devices).T.ravel()
+    place = np.minimum(deal, size - 1)
+    filled = {name: jnp.asarray(x[place]) for name, x in values.items()}
+    out = _compiled(devices)(program, filled, jnp.asarray((deal < size) & (not dry)))
+    back = np.argsort(deal)[:size]
+    return {name: np.asarray(x)[back] for name, x in out.items()}
 
 
 class LanesFailed(UserWarning):

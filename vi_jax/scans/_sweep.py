@@ -51,10 +51,8 @@ from ..machine import (
     with_unit,
     with_units,
 )
-from ._lane_noise import LaneNoise, lane_noise_of
-from .grid import LANE
-from .measures import Regime, Usual
-from .regime import CODES, REGIMES, flags
+from .grid import LANE, LaneNoise, lane_noise_of
+from .measures import CODES, REGIMES, Regime, Usual, flags
 
 # A jump is so many times the change at the values beside it, and this part of 1 + |number|:
 # choices.

@@ -1,13 +1,21 @@
-"""The grid of a scan, and the blocks in which it is computed and stored."""
+"""The grid of a scan, the blocks in which it is computed and stored, and the noise of its lanes, a
+path of its own for each by its number in the grid."""
 
+import dataclasses
 import math
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, UInt32
 
 from .._checks import row_of_numbers
+from ..flow import WhiteNoise, lane_key, words_of
+from ..machine import is_own
+from .measures import AbstractMeasure
 
 # The number of a lane among its values, where it has one: no name of an axis.
 LANE = "lane number"
@@ -97,3 +105,110 @@ class Blocks:
         rows = [x[part] for x, part in zip(self.axes.values(), where, strict=True)]
         grid = np.meshgrid(*rows, indexing="ij")
         return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)} | beside
+
+
+# What the name of an axis begins with, of a number of the start and of one of the noise; one of the
+# machine has no prefix.
+MACHINE, START, NOISE = "", "start.", "noise."
+
+# Lanes are told apart by 32 bits.
+_MOST = 2**32
+
+
+def part_of(name: str) -> str | None:
+    """What an axis or a derivative is of: `MACHINE`, `START` or `NOISE`; `None` for `LANE`."""
+    if name == LANE:
+        return None
+    return next((prefix for prefix in (START, NOISE) if name.startswith(prefix)), MACHINE)
+
+
+def lane_numbers(total: int) -> np.ndarray:
+    """The numbers of so many lanes. **Raises:** `ValueError` if they are too many to have some."""
+    if total > _MOST:
+        raise ValueError(
+            f"Argument `axes` must have at most {_MOST:,} lanes where there is noise, but has "
+            f"{total:,}."
+        )
+    return np.arange(total, dtype=np.uint32)
+
+
+class LaneNoise(eqx.Module):
+    """The noise of a scan."""
+
+    noise: WhiteNoise
+    key: UInt32[Array, "2"]
+    """The words of its key, of which each lane's is made."""
+
+    def noise_of(
+        self, values: Mapping[str, Any], names: tuple[str, ...] = (), nudge: Array | None = None
+    ) -> WhiteNoise:
+        """The noise of the lane with these values on the axes.
+
+        **Arguments:** the values; the numbers by which is differentiated, and what is added to each
+        of them.
+        """
+        amplitudes = dict(self.noise.amplitudes)
+        for name, value in values.items():
+            if part_of(name) == NOISE and (own := name.removeprefix(NOISE)) in amplitudes:
+                amplitudes[own] = value
+        for name, change in zip(names, () if nudge is None else nudge, strict=nudge is not None):
+            if part_of(name) == NOISE:
+                own = name.removeprefix(NOISE)
+                amplitudes[own] = amplitudes[own] + change
+        amplitudes |= dict(self.noise.functions)
+        return dataclasses.replace(self.noise, amplitudes=amplitudes)
+
+    def lane(
+        self, values: Mapping[str, Any], names: tuple[str, ...] = (), nudge: Array | None = None
+    ) -> tuple[WhiteNoise, Array]:
+        """Noise and key of a lane, whose number is among its values; arguments as `noise_of`."""
+        number = jnp.asarray(values[LANE], jnp.uint32)
+        return self.noise_of(values, names, nudge), lane_key(self.key, number)
+
+    def described(self) -> dict[str, Any]:
+        """What makes two noises the same, as JSON can hold it."""
+        sizes = {name: np.asarray(x).tolist() for name, x in self.noise.amplitudes.items()}
+        words = [f"{int(word):08x}" for word in np.asarray(self.key)]
+        return {"amplitudes": sizes, "impulses": self.noise.impulses, "key": " ".join(words)}
+
+
+def lane_noise_of(
+    noise: object,
+    key: object,
+    axes: Iterable[str],
+    derivatives: Iterable[str],
+    measures: Iterable[AbstractMeasure],
+) -> LaneNoise | None:
+    """The noise of a scan, `None` for none.
+
+    **Arguments:** `noise` and `key` as for `scan`; the names of the axes, and of the numbers by
+    which is differentiated; what is measured.
+
+    **Raises:** `TypeError` or `ValueError` for what does not fit together.
+    """
+    given = {"axes": axes, "derivatives": derivatives}
+    names = [
+        (which, name) for which, row in given.items() for name in row if part_of(name) == NOISE
+    ]
+    if noise is None:
+        if key is not None or names:
+            what = "`key`" if key is not None else f"`{names[0][0]}`, which names {names[0][1]!r},"
+            raise ValueError(f"Argument {what} needs noise: give `noise`, a `WhiteNoise`.")
+        return None
+    if not isinstance(noise, WhiteNoise):
+        raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
+    for which, name in names:
+        offered = [NOISE + x for x in (*noise.amplitudes, *(["path"] if which == "axes" else []))]
+        if name not in offered:
+            raise ValueError(
+                f"Argument `{which}` must name a number of the noise ({', '.join(offered)}), but "
+                f"got {name!r}."
+            )
+    for measure in measures:
+        if is_own(type(measure).refine):
+            raise ValueError(
+                f"Argument `measure` must not contain {type(measure).__name__} with noise: a "
+                "motion under noise has no period, and the cycles that the measure adds have no "
+                'noise. Use others, such as `measure="extremes"`.'
+            )
+    return LaneNoise(noise, words_of(key))

@@ -45,8 +45,7 @@ from ..machine import (
     with_leaf,
     with_leaves,
 )
-from ._lane_noise import MACHINE, NOISE, START, LaneNoise, lane_noise_of, part_of
-from .grid import Blocks
+from .grid import MACHINE, NOISE, START, Blocks, LaneNoise, lane_noise_of, part_of
 from .measures import MEASURES, AbstractMeasure, Average, Numbers
 from .statistics import Escape
 

@@ -19,16 +19,30 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar
 from ...lanes import pin_flag
-from ...machine import SoftStop, rewound, section_in, stops_of, struck_modes, switches_of
-from .._lane import FREE, Lane, Plan, Record, select, to_event
-from ..integrals import TIME, carried
+from ...machine import (
+    SoftStop,
+    is_alive,
+    others_of,
+    rewound,
+    section_in,
+    stops_of,
+    struck_modes,
+    switches_of,
+)
+from .._lane import FREE, Lane, Plan, Record, select, to_event, total
 from ..noise import with_impulse
-from ..smooth import holding
+from ..results import code
+from ..smooth import TIME, carried, holding
 from .aim import aim_ahead, aim_at
-from .arrive import arrive
-from .faults import faults
-from .happen import after_jump, contacts_after_jump, release_pulled
+from .arrive import after_jump, arrive, contacts_after_jump, release_pulled
 from .trial import Trial, attempt
+
+# A lane that has aimed this often without landing is lost; after so many impacts in one interval
+# it was chattering. Both are choices: a smooth flow needs two or three aims.
+_LOST, _MANY = 64.0, 16.0
+
+# Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
+_STUCK = 65536.0
 
 # Of a cycle, a step that is long enough to tell by it whether anything moves. A choice.
 _LONG = 1e-3
@@ -70,9 +84,9 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
     fault = new.fault
-    for condition, code in faults(plan, lane, trial, taken, rejected, new):
+    for condition, reason in _faults(plan, lane, trial, taken, rejected, new):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
-        fault = jnp.where(stops_here, code, fault)
+        fault = jnp.where(stops_here, reason, fault)
     return new._replace(fault=fault), completed, there.record
 
 
@@ -180,3 +194,53 @@ def _may_change_modes(plan: Plan) -> bool:
     """Whether a jump of velocities may put a switch into another mode: all but adhesive soft stops,
     which know a body's place alone."""
     return any(not (isinstance(x, SoftStop) and x.adhesive) for x in switches_of(plan.machine))
+
+
+def _faults(
+    plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag, new: Lane
+) -> list[tuple[Flag, Scalar | float]]:
+    """What ends a lane, the first that holds being the reason.
+
+    **Arguments:** `taken` and `rejected`, whether the trial was; `new`, the lane after it.
+
+    **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
+    """
+    impacts, broken = new.record.impacts, code("not_finite")
+    many = impacts > _MANY
+    if is_alive(plan.machine, trial.state) is not None:
+        # A clock that breaks down makes the steps shrink to nothing.
+        broken = code("stalled")
+    ends = [
+        (impacts > plan.max_impacts, code("chatter")),
+        (((new.aims >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
+        (new.aims >= _LOST, _lost(plan, lane, new.target)),
+        (new.steps >= plan.max_steps, code("max_steps")),
+        (new.spent >= _STUCK, code("max_steps")),
+    ]
+    if plan.method.may_be_unstable(plan.machine, lane.s, lane.state):
+        ends = [(taken & (trial.error > 1), code("unstable")), *ends]
+    if not plan.method.adaptive:
+        return [(rejected, broken), *ends]
+    eps = float(jnp.finfo(new.length.dtype).eps)
+    gone = rejected & (new.length < 4 * eps * jnp.maximum(plan.unit, plan.machine.cycle))
+    numeric = jnp.isfinite(total(trial.state, new.length))
+    tiny = code("underflow") if broken == code("not_finite") else broken
+    return [(gone & ~numeric, broken), (gone, tiny), *ends]
+
+
+def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
+    """The reason of a lane that has aimed too often, by what it aimed at."""
+    machine, reason = plan.machine, code("unresolved")
+    if plan.motion or stops_of(machine):
+        reason = jnp.where(target < FREE, code("turn_unresolved"), reason)
+    first = len(stops_of(machine))
+    if switches_of(machine):
+        others = target >= to_event(first)
+        reason = jnp.where(others, code("switch_unresolved"), reason)
+    if others_of(machine):
+        others = target >= to_event(first + len(switches_of(machine)))
+        reason = jnp.where(others, code("reset_unresolved"), reason)
+    if not plan.ticks(lane.state):
+        ends = target == plan.to_section
+        reason = jnp.where(ends, code("section_unresolved"), reason)
+    return reason

@@ -11,6 +11,6 @@ from .exact import ExactFlight as ExactFlight
 from .runge_kutta import Adaptive as Adaptive
 from .runge_kutta import FixedStep as FixedStep
 from .runge_kutta import ImplicitSteps as ImplicitSteps
+from .runge_kutta import Unrolled as Unrolled
 from .taylor import Taylor as Taylor
-from .unrolled import Unrolled as Unrolled
 from .verner import Verner9 as Verner9

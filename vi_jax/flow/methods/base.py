@@ -12,9 +12,7 @@ from jaxtyping import Array
 
 from ..._types import Scalar, State
 from ...machine import AbstractMachine
-from ..integrals import Integrals
-from ..smooth import SmoothMachine
-from ._series import Along
+from ..smooth import Integrals, SmoothMachine
 
 # Where guards are evaluated within a step of a method without stages, as shares of it.
 QUARTERS = (0.25, 0.5, 0.75)
@@ -28,8 +26,8 @@ class Foreseen(Protocol):
         """State, and what is integrated beside it, a length h away."""
         ...
 
-    def of(self, function: Callable[[State], Any]) -> Along:
-        """A scalar function of the state along it, as a power series."""
+    def of(self, function: Callable[[State], Any]) -> Any:
+        """A scalar function of the state along it, as a power series (`Along` of `taylor.py`)."""
         ...
 
     def reach(self, limit: Scalar) -> Scalar:

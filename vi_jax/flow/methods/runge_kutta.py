@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax
@@ -11,15 +12,239 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
 
 from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
-from ..integrals import TIME, Integrals, rate_of_integrals
-from ..smooth import SmoothMachine, unit_of
+from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals, unit_of
 from .base import AbstractMethod, Stage, fading_is_known
-from .unrolled import Unrolled
 from .verner import Verner9
+
+Vector = Float[Array, " n"]
+
+# Newton's steps after which a stage is given up, so that the step is tried again shorter: a choice.
+_MOST = 12
+
+
+def implicit_stages(
+    tableau: Any,
+    field: Callable[[Scalar, Vector], Vector],
+    s0: Any,
+    h: Any,
+    y0: Vector,
+    tolerance: Scalar | float,
+) -> tuple[list[Vector], Scalar]:
+    """The slopes of all stages, and what the last steps of Newton's method still changed.
+
+    All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
+    Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to 1 + |y|; where that
+    fails what is left is infinite. Derivatives are those of the solution, by the implicit function
+    theorem.
+
+    **Arguments:** `tableau`, diffrax's Butcher tableau; `field`, dy/ds; `s0`, `h` and `y0`, where
+    the step begins, its length and the state, flattened.
+    """
+    gamma = float(tableau.a_diagonal[-1])
+    still = stop_gradient((s0, y0))
+    jacobian = jax.jacfwd(field, argnums=1)(*still)
+    inverse = inverse_of(jnp.eye(y0.size, dtype=y0.dtype) - stop_gradient(h) * gamma * jacobian)
+    stages, left = [field(s0, y0)], jnp.zeros_like(h)
+    for row, predictor, c in zip(tableau.a_lower, tableau.a_predictor, tableau.c, strict=True):
+        base = y0 + h * weighted(row, stages)
+        s = s0 + float(c) * h
+
+        def lacks(k: Vector, s: Scalar = s, base: Vector = base) -> Vector:
+            return k - field(s, base + h * gamma * k)
+
+        def solve(lacks: Callable[[Vector], Vector], k: Vector) -> tuple[Vector, Scalar]:
+            def goes_on(carry):
+                _, size, i = carry
+                return (size > tolerance) & (i < _MOST)
+
+            def newton(carry):
+                k, _, i = carry
+                change = dot(inverse, lacks(k))
+                return k - change, change_of(h * gamma * change, y0), i + 1
+
+            start = (k, jnp.full_like(h, jnp.inf), jnp.zeros_like(h))
+            k, size, _ = jax.lax.while_loop(goes_on, newton, start)
+            return k, jnp.where(size <= tolerance, size, jnp.inf)
+
+        guess = stop_gradient(weighted(predictor, stages))
+        k, size = jax.lax.custom_root(lacks, guess, solve, _tangent, has_aux=True)
+        stages.append(k)
+        left = jnp.maximum(left, stop_gradient(size))
+    return stages, left
+
+
+def change_of(change: Vector, y: Vector) -> Scalar:
+    """The largest component of a change, relative to 1 + |y|; infinite if there is a NaN."""
+    size = jnp.max(jnp.abs(change) / (1 + jnp.abs(y)))
+    return jnp.where(jnp.isfinite(size), size, jnp.inf)
+
+
+def weighted(weights: np.ndarray, stages: list, base: object = None) -> Any:
+    """base + Σ weight·stage, leaf by leaf, without the zero weights."""
+    used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
+
+    def leaf(*leaves: jax.Array) -> jax.Array:
+        return functools.reduce(jnp.add, [w * x for (w, _), x in zip(used, leaves, strict=True)])
+
+    change = jtu.tree_map(leaf, *(stage for _, stage in used))
+    return change if base is None else jtu.tree_map(jnp.add, base, change)
+
+
+def dot(matrix: Float[Array, "n n"], vector: Vector) -> Vector:
+    """The product of a small matrix and a vector, written out number by number."""
+    return jnp.sum(matrix * vector, axis=1)
+
+
+def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a small matrix, by elimination written out with row pivots."""
+    n = matrix.shape[0]
+    rows = [jnp.concatenate([matrix[i], jnp.eye(n, dtype=matrix.dtype)[i]]) for i in range(n)]
+    for i in range(n):
+        for j in range(i + 1, n):  # the greatest pivot comes up
+            swap = jnp.abs(rows[j][i]) > jnp.abs(rows[i][i])
+            rows[i], rows[j] = jnp.where(swap, rows[j], rows[i]), jnp.where(swap, rows[i], rows[j])
+        rows[i] = rows[i] / rows[i][i]
+        for j in range(n):
+            if j != i:
+                rows[j] = rows[j] - rows[j][i] * rows[i]
+    return jnp.stack([row[n:] for row in rows])
+
+
+def _tangent(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
+    """The solution of a linear equation, the function given and the right side: how `custom_root`
+    carries derivatives over."""
+    unit = jnp.eye(right.size, dtype=right.dtype)
+    columns = jnp.stack([linear(unit[i]) for i in range(right.size)], axis=1)
+    return dot(inverse_of(columns), right)
+
+
+class Unrolled(diffrax.AbstractSolver):
+    """Any explicit or diagonally implicit diffrax Runge–Kutta solver, its stages written out.
+
+    diffrax keeps the stages in a buffer filled by an inner loop, which XLA cannot fuse. This solver
+    has the same tableau, error estimate and interpolant, and can be used anywhere a diffrax solver
+    can. The stages of an implicit one are solved by Newton's method with one matrix for all of a
+    step; its own `root_finder` is not used.
+
+    **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
+    `tolerance`, to which stages are solved, relative to 1 + |y| (by default
+    1e-12).
+
+    **Raises:** `TypeError` if `solver` is not one.
+    """
+
+    solver: Any  # not yet known to be a solver when it is checked below
+    tolerance: Any = eqx.field(kw_only=True, default=None)
+    term_structure: ClassVar[Any] = diffrax.AbstractTerm
+
+    def __check_init__(self):
+        if not isinstance(self.solver, diffrax.AbstractERK | diffrax.AbstractESDIRK):
+            raise TypeError(
+                "Argument `solver` must be an explicit or diagonally implicit diffrax Runge–Kutta "
+                f"solver, but got {self.solver!r}."
+            )
+
+    @property
+    def implicit(self) -> bool:
+        """Whether its stages are equations to be solved."""
+        return isinstance(self.solver, diffrax.AbstractESDIRK)
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        """The interpolant of the wrapped solver."""
+        return self.solver.interpolation_cls
+
+    def order(self, terms):
+        """Order of the wrapped solver."""
+        return self.solver.order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """No hidden state: the first stage is evaluated anew in each step."""
+        return None
+
+    def func(self, terms, t0, y0, args):
+        """The vector field at a point."""
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step over [t0, t1]."""
+        y1, error, slopes, _ = self.step_with_stages(terms, t0, t1, y0, args)
+        control = terms.contr(t0, t1)
+        stages = [terms.prod(slope, control) for slope in slopes]
+        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
+        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
+
+    def step_with_stages(self, terms, t0, t1, y0, args):
+        """Return the end of a step over [t0, t1], its error, the slope of each stage, and share
+        of the step, t, y and weight in the error of each."""
+        tableau = _tableau(self.solver)
+        control = terms.contr(t0, t1)
+        if self.implicit:
+            return self._implicit(terms, t0, t1, y0, args, control)
+        # The length comes last: once for each sum of slopes, where it is part of the addition.
+        slopes, y1 = [terms.vf(t0, y0, args)], None
+        places = [(0.0, t0, y0)]
+
+        def reached(weights):
+            return jtu.tree_map(jnp.add, y0, terms.prod(weighted(weights, slopes), control))
+
+        for a, c in zip(tableau.a_lower, tableau.c, strict=True):
+            y1 = reached(a)
+            t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
+            places.append((float(c), t, y1))
+            slopes.append(terms.vf(t, y1, args))
+        if not tableau.ssal or y1 is None:
+            y1 = reached(tableau.b_sol)
+        error = terms.prod(weighted(tableau.b_error, slopes), control)
+        return y1, error, slopes, _with_weights(tableau, places)
+
+    def error(self, slopes: list[Any], control: Any) -> Any:
+        """The error of a step from the slopes of its stages and its length."""
+        change = weighted(_tableau(self.solver).b_error, slopes)
+        return jtu.tree_map(lambda x: control * x, change)
+
+    def _implicit(self, terms, t0, t1, y0, args, control):
+        """The step of an implicit solver; its error is infinite where a stage was not solved.
+
+        **Arguments:** as `step`; `control`, the length of the step.
+        """
+        tableau = _tableau(self.solver)
+        flat, unravel = ravel_pytree(y0)
+        tolerance = 1e-12 if self.tolerance is None else self.tolerance
+
+        def field(t, y):
+            return ravel_pytree(terms.vf(t, unravel(y), args))[0]
+
+        slopes, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
+        stages = [unravel(control * k) for k in slopes]
+        error = jtu.tree_map(lambda e: jnp.abs(e) + left, weighted(tableau.b_error, stages))
+        y1 = weighted(tableau.b_sol, stages, y0)
+        assert tableau.a_diagonal is not None
+        diagonal, places = tableau.a_diagonal[-1], [(0.0, t0, y0)]
+        for n, (a, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True), start=2):
+            there = weighted(np.append(a, diagonal), stages[:n], y0)
+            places.append((float(c), t0 + float(c) * (t1 - t0), there))
+        return y1, error, [unravel(k) for k in slopes], _with_weights(tableau, places)
+
+
+def _with_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
+    """The stages with their weights in the error."""
+    return [(*x, float(b)) for x, b in zip(places, tableau.b_error, strict=True)]
+
+
+def _tableau(solver: Any) -> diffrax.ButcherTableau:
+    tableau = solver.tableau
+    if not isinstance(tableau, diffrax.ButcherTableau):
+        raise TypeError(f"Argument `solver` must have one Butcher tableau, but got {solver!r}.")
+    return tableau
+
 
 # A fixed step is unstable if its error is larger than this share of the state, before it or after
 # it. Of x' = -a x that of each of diffrax's explicit solvers is, from the limit of stability on: at

@@ -12,24 +12,14 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import (
-    added,
-    forces,
-    held_by,
-    holds_anywhere,
-    push_of,
-    rubs,
-    shares,
-    struck_modes,
-)
-from .._flow_to_event import FlowToEvent
+from ...machine import added, forces, held_by, holds_anywhere, push_of, rubs, shares, struck_modes
 from .._lane import Lane, Plan, any_of, in_place, select
-from .._step.trial import Situation
+from ..drift import FlowToEvent
 from ..events import force_rate, rates
-from ..labelled import EventKind
+from ..results import EventKind
 from ..smooth import SmoothMachine, holding, in_modes
 from .impact import Blow
-from .rest import allowed
+from .trial import Situation, allowed
 
 # A contact whose bodies leave each other with less than this share of the speed with which they
 # came stays closed while it is looked at what presses on it: a choice, far above rounding.

@@ -1,1 +1,0 @@
-"""What happens on stops: impacts, coming to rest, release."""
