@@ -12,8 +12,7 @@ from .._types import Flag, Machine, Number, Scalar, State
 from .cycles import Turn, counter_of
 from .linear import LinearMachine, Prepared
 from .own import clock_of, stops_of, switches_of
-from .scene import Scene
-from .shaft import ShaftMachine
+from .scene import Scene, ShaftMachine
 
 
 def in_clock(machine: Machine, clock: str) -> Machine:

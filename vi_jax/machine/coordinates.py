@@ -1,14 +1,18 @@
-"""Coordinates that contacts act on, and numbers of a state by their names."""
+"""Coordinates that contacts act on, numbers of a state by their names, and angles that grow: whole
+turns are taken off at the end of a cycle, and left out where states are compared."""
 
 import functools
 from collections.abc import Callable
+from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.lax import stop_gradient
 
-from .._types import Scalar, State
-from .numbers import split_place
+from .._types import Machine, Scalar, State
+from .numbers import components, split_place
 
 
 class Coordinate(NamedTuple):
@@ -77,3 +81,61 @@ def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) ->
     if position == velocity:
         return with_component(velocity, state, V)
     return with_component(velocity, with_component(position, state, Y), V)
+
+
+def wrap_angles(*names: str) -> Callable[[Any, State], State]:
+    """Return a method `renewed` for a machine with angles that grow by whole turns:
+    `renewed = vi.wrap_angles("phi")`.
+
+    At the end of each cycle an angle is set back into [-π, π], so that a rotation is a periodic
+    motion. Orbits and branches close up to whole turns, and may pass ±π; basins and kicks compare
+    angles in the same way.
+
+    **Arguments:** `names`, of the angles in the state (radians).
+    """
+
+    def renewed(machine: Any, state: State) -> State:
+        for name in names:
+            angle = component(name, state)
+            state = with_component(name, state, without_turns(angle))
+        return state
+
+    renewed.angles = frozenset(names)  # pyright: ignore[reportFunctionMemberAccess]
+    return renewed
+
+
+def without_turns(angle: Any) -> Any:
+    """An angle, or a difference of angles, in [-π, π]."""
+    if isinstance(angle, np.ndarray):
+        return angle - 2 * pi * np.round(angle / (2 * pi))
+    return angle - 2 * pi * stop_gradient(jnp.round(angle / (2 * pi)))
+
+
+def is_angle(machine: Machine, name: str) -> bool:
+    """Whether a number of the state is an angle of `wrap_angles`, by its name or its array's."""
+    return not {name, split_place(name)[0]}.isdisjoint(_angles(machine))
+
+
+def _angles(machine: Machine) -> frozenset[str]:
+    return getattr(type(machine).renewed, "angles", frozenset())
+
+
+def angles_in(machine: Machine, like: State) -> np.ndarray | None:
+    """Which numbers of a state are angles of `wrap_angles`; `None` if none is.
+
+    **Arguments:** `like`, one state, without modes.
+    """
+    if not _angles(machine):
+        return None
+    return np.array([is_angle(machine, name) for name in components(like)])
+
+
+def nearest_images(angles: np.ndarray | None, here: Any, there: Any) -> Any:
+    """States moved by whole turns of their angles to where they are nearest to other states.
+
+    **Arguments:** `angles`, of `angles_in`; states as rows of numbers, the last axis.
+    """
+    if angles is None:
+        return here
+    moved = there + without_turns(here - there)
+    return (np if isinstance(moved, np.ndarray) else jnp).where(angles, moved, here)

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from math import pi
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from .._types import Scalar, State
 from .coordinates import component, has_component, with_component
 from .event import AbstractEvent
 from .own import with_static
-from .reset import Reset
+from .user_events import Reset
 
 
 class Counter:
@@ -86,15 +86,8 @@ class Turn(Counter):
 class _TurnOver(Reset):
     """The end of a turn. Its guard is an angle, which falls by a whole turn there."""
 
-    @property
-    def from_below(self) -> bool:
-        """False: the guard is far below zero behind the event."""
-        return False
-
-    @property
-    def looked_at_within(self) -> bool:
-        """False: a shaft does not turn to and fro within a step."""
-        return False
+    from_below: ClassVar = False
+    looked_at_within: ClassVar = False  # a shaft does not turn to and fro within a step
 
 
 class Passing(Counter):

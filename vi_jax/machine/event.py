@@ -49,40 +49,22 @@ class AbstractEvent(Shown):
     ends: str = eqx.field(static=True, kw_only=True, default="")
     """The name of the outcome with which the motion ends there; "" if it continues; static."""
 
-    @property
-    def holds_mode(self) -> bool:
-        """Whether the event holds one of the machine's modes; then it has `begin` and `struck`."""
-        return False
-
-    @property
-    def is_dry(self) -> bool:
-        """Whether it is friction that may hold a body anywhere."""
-        return False
-
-    @property
-    def sees_around(self) -> bool:
-        """Whether `guard`, `after` and `struck` of an event that holds a mode get a keyword
-        argument `around` as well, an `Around`."""
-        return False
-
-    @property
-    def may_slide(self) -> bool:
-        """Whether the field may point at the guard's surface from both sides. A motion would have
-        to slide along it, but the event has no mode for that: such a lane ends as
-        `RESULTS.sliding`."""
-        return False
-
-    @property
-    def from_below(self) -> bool:
-        """Whether the event happens only once its guard has been below zero since the last jump.
-        That is not required if its guard is another function after the event."""
-        return True
-
-    @property
-    def looked_at_within(self) -> bool:
-        """Whether the guard may be positive for a part of a step only and must be evaluated within
-        each step; static. It need not be if the length of steps depends on it already."""
-        return True
+    holds_mode: ClassVar[bool] = False
+    """Whether the event holds one of the machine's modes; then it has `begin` and `struck`."""
+    is_dry: ClassVar[bool] = False
+    """Whether it is friction that may hold a body anywhere."""
+    sees_around: ClassVar[bool] = False
+    """Whether `guard`, `after` and `struck` of an event that holds a mode get a keyword argument
+    `around` as well, an `Around`."""
+    may_slide: ClassVar[bool] = False
+    """Whether the field may point at the guard's surface from both sides. A motion would have to
+    slide along it, but the event has no mode for that: such a lane ends as `RESULTS.sliding`."""
+    from_below: ClassVar[bool] = True
+    """Whether the event happens only once its guard has been below zero since the last jump. That
+    is not required if its guard is another function after the event."""
+    looked_at_within: ClassVar[bool] = True
+    """Whether the guard may be positive for a part of a step only and must be evaluated within each
+    step. It need not be if the length of steps depends on it already."""
 
     @abc.abstractmethod
     def guard(self, *args: Any, **kwargs: Any) -> Scalar:
@@ -144,25 +126,17 @@ class AbstractSwitch(AbstractEvent):
     """Whether it adds its own force to the machine's field, which then does not receive its mode:
     true for everything that is listed in `contacts`; static."""
 
-    @property
-    def holds_mode(self) -> bool:
-        """True, since each switch has a mode."""
-        return True
-
-    @property
-    def from_below(self) -> bool:
-        """False: behind the event the guard is that of another mode."""
-        return False
-
-    @property
-    def analytic(self) -> bool:
-        """Whether the force of a mode has a power series up to the event that ends it."""
-        return True
-
-    @property
-    def may_slide(self) -> bool:
-        """True: the mode is another on either side of the surface."""
-        return True
+    holds_mode: ClassVar[bool] = True
+    from_below: ClassVar[bool] = False  # behind the event the guard is that of another mode
+    may_slide: ClassVar[bool] = True  # the mode is another on either side of the surface
+    analytic: ClassVar[bool] = True
+    """Whether the force of a mode has a power series up to the event that ends it."""
+    rubs_on: ClassVar[int | None] = None
+    """The number of the stop on which this is friction, also in its impacts (see
+    `ContactFriction`)."""
+    blends: ClassVar[bool] = False
+    """Whether in mode 0 the field is the mean of those of modes -1 and +1 that stays on the surface
+    where they meet (see `Switch`)."""
 
     @abc.abstractmethod
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
@@ -171,18 +145,6 @@ class AbstractSwitch(AbstractEvent):
     def jump(self, machine, s, state, mode):
         """The state as it is: a switch changes a mode, not the state."""
         return state
-
-    @property
-    def rubs_on(self) -> int | None:
-        """The number of the stop on which this is friction, also in its impacts (see
-        `ContactFriction`)."""
-        return None
-
-    @property
-    def blends(self) -> bool:
-        """Whether in mode 0 the field is the mean of those of modes -1 and +1 that stays on the
-        surface where they meet (see `Switch`)."""
-        return False
 
     def push_in(
         self, machine: Machine, s: Scalar, state: State, mode: Scalar

@@ -26,9 +26,8 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .contacts import added, forces, gained, held_flow, push_of, shares, way_of
+from .contacts import added, field_in, forces, gained, held_flow, push_of, shares, way_of
 from .event import AbstractSwitch, Around
-from .field import field_in
 from .own import coordinate_on, stops_of, switches_of
 from .state import with_components
 
@@ -44,15 +43,8 @@ class Friction(AbstractSwitch):
     roundings: ClassVar[int]
     """So many roundings of the state count as no slip."""
 
-    @property
-    def sees_around(self) -> bool:
-        """True: the force that holds a body depends on all that holds others."""
-        return True
-
-    @property
-    def may_slide(self) -> bool:
-        """Never along its own surface: where both sides point at it, the body sticks."""
-        return False
+    sees_around: ClassVar = True  # the force that holds a body depends on all that holds others
+    may_slide: ClassVar = False  # where both sides point at its surface, the body sticks
 
     @abc.abstractmethod
     def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
@@ -198,6 +190,7 @@ class DryFriction(Friction):
         "level": NOT_NEGATIVE, "mass": POSITIVE, "static_ratio": Range(1.0, float("inf")),
     }  # fmt: skip
 
+    is_dry: ClassVar = True
     roundings: ClassVar = 4
 
     def __check_init__(self):
@@ -206,11 +199,6 @@ class DryFriction(Friction):
             raise ValueError(
                 "Argument `slip` must be given with `push`: the velocity that friction stops."
             )
-
-    @property
-    def is_dry(self) -> bool:
-        """True, since it may hold a body anywhere."""
-        return True
 
     def speed_of_slip(self, machine, s, state):
         if self.slip is not None:
@@ -316,7 +304,7 @@ class ContactFriction(Friction):
         count("along", self.along)
 
     @property
-    def rubs_on(self) -> int:
+    def rubs_on(self) -> int:  # pyright: ignore
         """The number of the stop that it is friction on."""
         return self.stop
 

@@ -20,9 +20,9 @@ from .cycles import Turn, counter_of
 from .event import AbstractEvent, AbstractSwitch
 from .friction import ContactFriction
 from .own import says, with_static
-from .reset import Reset
 from .soft import SoftStop
 from .stop import RigidStop
+from .user_events import Reset
 
 
 def listed(parts: object) -> tuple[Any, ...]:

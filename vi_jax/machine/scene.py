@@ -1,12 +1,14 @@
-"""The scene of the paper: oscillator, crank, drive and stops, in the phase or the time clock."""
+"""Machines whose cycle is a turn of a shaft, in the phase or the time clock; the paper's scene."""
 
 import dataclasses
 from collections.abc import Iterable
-from math import pi
-from typing import Any, ClassVar
+from math import cos, pi, sin
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import (
@@ -16,20 +18,138 @@ from .._checks import (
     concrete,
     instance_of,
     number,
+    one_of,
     optional_real,
     real,
     require,
     require_ranges,
+    state_of_numbers,
     tuple_of,
 )
 from .._types import Number, Scalar, State
-from ._drawn import draw_scene
+from .base import AbstractMachine
 from .drives import UNITS, AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, SliderCrank
 from .own import changed
-from .shaft import ShaftMachine
 from .shown import Shown
 from .soft import SoftStop
 from .stop import RigidStop
+
+# A state that was carried to the section lies on it to rounding, in single precision too, where
+# that of a turn is 5e-7.
+_ON_SECTION = 1e-5
+
+
+class ShaftMachine(AbstractMachine):
+    """A machine driven by a shaft that turns once in a cycle.
+
+    Its clock is `"phase"`, with the angle of the shaft as the independent variable, or `"time"`. A
+    shaft whose speed W is part of the state must turn forward in the phase clock; by time it need
+    not, and its angle is a component `phase` of the state.
+    """
+
+    clock_name: eqx.AbstractVar[str]
+
+    def __check_init__(self):
+        one_of("clock_name", self.clock_name, ("phase", "time"))
+
+    @property
+    def state_type(self) -> type:
+        """The class of a state in the phase clock."""
+        raise NotImplementedError
+
+    @property
+    def timed_states(self) -> dict[type, type]:
+        """For each class of states that has the speed of the shaft, that of the same states by
+        time, with `phase` as one more component at the end."""
+        raise NotImplementedError
+
+    def is_timed(self, state: State) -> bool:
+        """Whether the angle of the shaft is part of the state."""
+        return type(state) in self.timed_states.values()
+
+    def is_paced(self, state: State) -> bool:
+        """Whether time is not the independent variable, but passes by the speed of the shaft in the
+        state."""
+        return type(state) in self.timed_states
+
+    def in_clock(self, clock: str) -> Self:
+        """The same machine in the `"phase"` or the `"time"` clock."""
+        one_of("clock", clock, ("phase", "time"))
+        return dataclasses.replace(self, clock_name=clock)
+
+    def adopt(self, start: State) -> State:
+        """A start made for either clock, as this machine's clock needs it."""
+        wanted = self.state_type
+        if self.clock_name == "time" and wanted in self.timed_states:
+            if type(start) is wanted:
+                components = vars(start).values()
+                return self.timed_states[wanted](*components, jnp.zeros_like(start.Y))
+            wanted = self.timed_states[wanted]
+        _require_state("start", start, wanted)
+        return state_of_numbers("start", start)
+
+    def in_cycle_state(self, name: str, state: State) -> State:
+        """A state on the section that was made for the time clock, without the angle of the shaft;
+        any other as it is.
+
+        **Raises:** `ValueError` that names the argument if the angle is known and not 0,
+        `TypeError` for what is no state of this machine.
+        """
+        if not self.is_timed(state):
+            _require_state(name, state, self.state_type)
+            return state
+        phase = concrete(state.phase)
+        if phase is not None and not (abs(phase) <= _ON_SECTION).all():
+            raise ValueError(
+                f"Argument `{name}` must lie on the section, where its phase is 0, but has "
+                f"{abs(phase).max():g}."
+            )
+        return self.state_type(*list(vars(state).values())[:-1])
+
+    def _clock(self, state: State) -> Scalar | None:
+        return state.phase if self.is_timed(state) else None
+
+    def rewound(self, state: State) -> State:
+        """The state with a full turn taken off the angle."""
+        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+
+    def alive(self, state: State) -> jax.Array | None:
+        """Whether the shaft turns forward, in the phase clock; `None` in another."""
+        return state.W > 0 if self.is_paced(state) else None
+
+    def check_start(self, start: State) -> None:
+        """Raise a `ValueError` if the shaft does not turn forward in the phase clock, or is beyond
+        its section."""
+        if self.is_paced(start):
+            speed = concrete(self.section_speed(start))
+            if speed is not None and not (speed > 0).all():
+                raise ValueError(
+                    "Argument `start` must have W > 0 in the phase clock, but has "
+                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
+                )
+        if self.is_timed(start):
+            phase = concrete(start.phase)
+            if phase is not None and not (phase < 2 * pi).all():
+                raise ValueError(
+                    "Argument `start` must have its phase, counted from the last section, below "
+                    f"2π, but has {phase.max():g}."
+                )
+
+    def section_speed(self, state: State) -> Any:
+        """W of a state on the section."""
+        return state.W
+
+
+def _require_state(name: str, state: object, wanted: type) -> None:
+    """**Raises:** `TypeError` if this argument is no state of the wanted class."""
+    if type(state) is wanted:
+        return
+    parts = [x for x in ("last", "state") if type(getattr(state, x, None)) is wanted]
+    hint = f"; take its `{parts[0]}`" if parts else ""
+    raise TypeError(
+        f"Argument `{name}` must be a `{wanted.__name__}` for this machine (use its "
+        f"`start(...)`), but got a `{type(state).__name__}`{hint}."
+    )
 
 
 class Oscillator(Shown):
@@ -302,5 +422,60 @@ class Scene(ShaftMachine):
         return one + other
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """See `plot_sketch`."""
-        draw_scene(self, pen, state, phase)
+        """The crank with its slider, the spring and the body between its stops."""
+        crank = self.crank
+        size = pen.size = max(0.8, 0.25 * pen.reach)  # beside a crank of radius 1
+        rod = float(crank.drawn_rod)
+        pin = cos(phase), sin(phase)
+        slider = rod + float(crank.slide(jnp.asarray(phase)).U)
+        spring = pen.reach + 1.0 + size + 0.5  # never shorter than half a crank in this motion
+        rest = rod + spring
+        body = rest + float(state.Y)
+        ends = rest + pen.reach + 2.0 * size
+        floor = -0.5 * size
+        pen.floor(rod - 1.5, ends, floor)
+        self._sketch_crank(pen, pin, slider)
+        pen.body(slider, width=0.55, height=0.7, color=pen.red)
+        pen.spring((slider + 0.28, 0.0), (body - size / 2, 0.0))
+        pen.body(body, width=size, height=size)
+        if float(self.damping_ratio) > 0:
+            post, low = rest - pen.reach - 0.9 * size, floor - 0.55 * size
+            pen.line((body, floor), (body, low), lw=1.3)
+            pen.damper((post, low), (body, low))
+            pen.wall(post, -1, low=low - 0.35 * size, high=low + 0.35 * size, color="0.5")
+            pen.label((post + body) / 2, low - 0.42 * size, "$c$")
+        for stop in (*self.stops, *self.soft_stops):
+            back = pen.stop(stop, rest=rest, slot=0.34 * size)  # the spring passes through it
+            words = "soft stop" if stop in self.soft_stops else "stop, $k$"
+            if stop.sign > 0 or stop in self.soft_stops:
+                pen.label(back + stop.sign * 0.3 * size, 0.8 * size + 0.25, words, color=pen.green)
+        pen.label(slider, -0.7, "$m_B$", color=pen.red)
+        pen.label(body, 0.0, "$m_C$", color=pen.blue)
+        pen.label(slider + 0.9, 0.2 * size + 0.3, "$k_0$")
+        top = 0.5 * size + 0.45
+        pen.mark(rest, 0.5 * size, top + 0.6)
+        if float(state.Y):
+            pen.mark(body, 0.5 * size, top + 0.1)
+            pen.length(rest, body, top, "$Y$", down=0.22)
+        for stop in self.stops:
+            place = rest + float(stop.place)
+            if stop.sign > 0:
+                pen.mark(place, 0.5 * size, top + 0.6)
+                pen.length(rest, place, top + 0.5, "$d$", down=0.22)
+
+    def _sketch_crank(self, pen: Any, pin: tuple[float, float], slider: float) -> None:
+        pen.disc(0.0, 0.0, 1.0)
+        pen.line((0.0, 0.0), pin)
+        pen.line(pin, (slider, 0.0), lw=2.6)
+        pen.pin(*pin)
+        pen.pin(slider, 0.0)
+        if not pen.labels:
+            return
+        angle = np.linspace(0, np.arctan2(pin[1], pin[0]), 40)
+        pen.line((0.0, 0.0), (1.35, 0.0), color="0.5", lw=0.8, ls=":")
+        pen.line(*zip(0.45 * np.cos(angle), 0.45 * np.sin(angle), strict=True), lw=1.0)
+        pen.label(0.62, 0.2, "$\\varphi$")
+        pen.label(pin[0] / 2 - 0.18, pin[1] / 2 + 0.12, "$a$")
+        pen.label((pin[0] + slider) / 2, pin[1] / 2 + 0.28, "$l$")
+        pen.arrow((-0.15, 1.2), (-0.95, 0.75), bend=0.3)
+        pen.label(0.1, 1.45, self.drive.caption)

@@ -1,6 +1,7 @@
-"""Compliant stops: a force while the body penetrates, no jump."""
+"""Compliant stops, whose force is that of a contact law while the body penetrates: no jump."""
 
-from math import pi
+import abc
+from math import pi, sqrt
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -16,13 +17,117 @@ from .._checks import (
     number,
     one_of,
     optional_real,
+    require,
     require_ranges,
 )
 from .._types import Machine, Number, Scalar, State
 from .contacts import push_of
 from .event import AbstractSwitch
-from .law import AbstractContactLaw, HuntCrossley, PowerLaw
+from .shown import Shown
 from .stop import Wall
+
+
+class AbstractContactLaw(Shown):
+    """Force away from a `SoftStop` by the depth δ > 0 and its rate δ'.
+
+    A subclass defines `force`. It may use the stiffness K and the damping α of the stop, or
+    parameters of the law.
+    """
+
+    exponent: float = eqx.field(static=True, default=1.0, converter=float)
+    """p, the power of the depth in the spring's force, at least 1; the step length depends on it.
+    Static."""
+
+    def __check_init__(self):
+        require("exponent", self.exponent, low=1.0)
+
+    @property
+    def is_analytic(self) -> bool:
+        """Whether the force has a power series at first touch."""
+        return self.exponent == 1
+
+    @abc.abstractmethod
+    def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
+        """The force away from the stop on a body that touches, without prestress; it may pull (be
+        negative)."""
+
+    def pulls(self, stiffness: Any, damping: Any, prestress: Any, depth: Any, rate: Any) -> Any:
+        """A function with the sign of the pull: positive where the stop would pull the body. It
+        ends a contact that may not pull, and should be smooth at first touch.
+
+        **Arguments:** `stiffness` K and `damping` α; `prestress` F0, or `None`; `depth` δ and its
+        `rate` δ' with respect to time.
+        """
+        force = self.force(stiffness, damping, depth, rate)
+        return -force if prestress is None else -(prestress + force)
+
+    def damping_of(self, restitution: Any) -> Any:
+        """α that gives this restitution at every speed; `None` for a law whose restitution depends
+        on it."""
+        return None
+
+    def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
+        """The frequency with which a body oscillates on the stop, at the depth that it will
+        reach; `stiffness` is that per unit of its mass."""
+        p, deepest = self.exponent, jnp.maximum(depth, 1e-12)
+        if p > 1:
+            reach = (0.5 * (p + 1) * rate**2 / stiffness + 1e-30) ** (1 / (p + 1))
+            deepest = jnp.maximum(deepest, reach)
+        return jnp.sqrt(p * stiffness * power(deepest, p - 1))
+
+
+class PowerLaw(AbstractContactLaw):
+    """K δᵖ + α √K δ^((p-1)/2) δ': p = 1 is a spring with a dashpot, p = 3/2 Hertz's contact.
+
+    Its coefficient of restitution does not depend on the speed,
+    α = √(2(p+1)) (-ln e)/√(π² + ln² e) (Feng, arXiv 2603.27764).
+    """
+
+    def force(self, stiffness, damping, depth, rate):
+        """K δ^p of the spring and α √K δ^((p-1)/2) δ' of the dashpot; on a body of another mass
+        than 1 the stop gives α √m for α."""
+        p = self.exponent
+        resist = damping * jnp.sqrt(stiffness) * power(depth, 0.5 * (p - 1)) * rate
+        return stiffness * power(depth, p) + resist
+
+    def pulls(self, stiffness, damping, prestress, depth, rate):
+        """The pull over δ^((p-1)/2), which is smooth at first touch."""
+        root = power(depth, 0.5 * (self.exponent + 1))
+        pull = -stiffness * root - damping * jnp.sqrt(stiffness) * rate
+        flat = power(depth, 0.5 * (self.exponent - 1))
+        return pull if prestress is None else pull * flat - prestress
+
+    def damping_of(self, restitution):
+        """α from e in (0, 1]."""
+        require("restitution", restitution, low=0.0, high=1.0, open_low=True)
+        drop = -jnp.log(jnp.asarray(restitution, float))
+        return sqrt(2 * (self.exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
+
+
+class HuntCrossley(AbstractContactLaw):
+    """K δᵖ (1 + α δ'), whose restitution falls with the speed."""
+
+    def force(self, stiffness, damping, depth, rate):
+        """The spring's force with a damping in proportion to it."""
+        spring = stiffness * power(depth, self.exponent)
+        return spring + damping * spring * rate
+
+    def pulls(self, stiffness, damping, prestress, depth, rate):
+        """The pull over the spring's force, without prestress: that vanishes at first touch."""
+        if prestress is None:
+            return -(1 + damping * rate)
+        return super().pulls(stiffness, damping, prestress, depth, rate)
+
+
+def power(x: Any, n: float) -> Any:
+    """xⁿ inside; for n = 0 and 1 continued smoothly to where a step may look beyond the surface."""
+    if n == 0:
+        return jnp.ones_like(x)
+    if n == 1:
+        return x
+    inside = x > 0
+    return jnp.where(inside, jnp.where(inside, x, 1.0) ** n, 0.0)
+
 
 # Modes: the body touches; it has been let go of, but has not yet come out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
@@ -83,6 +188,7 @@ class SoftStop(Wall, AbstractSwitch):
     mass: Float[Array, "..."] | None
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
+    looked_at_within: ClassVar = False  # steps are short compared with a contact (`longest_step`)
     ranges: ClassVar = {
         "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "dashpot": NOT_NEGATIVE,
         "prestress": NOT_NEGATIVE, "mass": POSITIVE,
@@ -131,21 +237,16 @@ class SoftStop(Wall, AbstractSwitch):
         require_ranges(self)
 
     @property
-    def analytic(self) -> bool:
+    def analytic(self) -> bool:  # pyright: ignore
         """Whether the force has a power series at first touch: where it is straight in the depth.
         Others have a kink or a root there."""
         return self.law.is_analytic
 
     @property
-    def may_slide(self) -> bool:
+    def may_slide(self) -> bool:  # pyright: ignore
         """Only at a prestressed contact, whose force jumps as it is touched: else the force on a
         body that goes in is that on one that comes out."""
         return self.prestress is not None
-
-    @property
-    def looked_at_within(self) -> bool:
-        """False: steps are short compared with a contact (`longest_step`)."""
-        return False
 
     def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
         """δ and δ' (by time); δ is negative apart from the stop."""

@@ -24,9 +24,9 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Machine, Number, Scalar, State
+from .contacts import shown_modes
 from .event import AbstractEvent, Modes
 from .events import modes_after, struck_modes
-from .field import shown_modes
 from .own import by_default, is_own
 from .shown import Shown
 
@@ -123,6 +123,7 @@ class RigidStop(Wall, AbstractEvent):
         "tangential_restitution": SHARE,
     }  # fmt: skip
     word: ClassVar = "impact"
+    from_below: ClassVar = False  # behind an impact the body goes away from the stop
 
     def __check_init__(self):
         require_ranges(self)
@@ -166,11 +167,6 @@ class RigidStop(Wall, AbstractEvent):
     def speed(self, machine, state, rate):
         """V⁻, the speed of approach."""
         return self.approach(machine.coordinates[self.coordinate].velocity(state))
-
-    @property
-    def from_below(self):
-        """False: behind an impact the body goes away from the stop."""
-        return False
 
     @property
     def is_one_number(self) -> bool:

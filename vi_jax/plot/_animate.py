@@ -17,8 +17,7 @@ from ..flow import Run
 from ..machine import AbstractMachine, logged_turn, phase_at, stops_of, without_turns
 from ..orbit import Orbit
 from .colors import BLUE, RED
-from .motion import counts_by_angle, plot_history
-from .path import drawn_path, motion_path, turns
+from .motion import counts_by_angle, drawn_path, motion_path, plot_history, turns
 from .schematic import pen_for, sketch
 
 # Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.

@@ -51,10 +51,6 @@ def plot_branch(
     `special`, whether to mark the special points; `legend`, whether to draw one: the period and the
     impacts that the colour stands for (or the branch's `label`), what solid and dashed lines are,
     and the marks; options of `Axes.plot`.
-
-    **Returns:** the axes.
-
-    **Raises:** `TypeError` or `ValueError` if there is no such branch or array.
     """
     instance_of("branch", branch, Branch, "a `Branch`, from `continue_orbit`")
     y = _moving(branch) if y is None else y
@@ -140,10 +136,6 @@ def plot_sweep(
 
     **Arguments:** one sweep; `ax`; names of its arrays with a number for each value, as for
     `plot_branch`; options of `Axes.plot`.
-
-    **Returns:** the axes.
-
-    **Raises:** `TypeError` or `ValueError` if there is no such sweep or array.
     """
     instance_of("sweep", sweep, Sweep, "a `Sweep`, from `sweep`")
     y = _moving(sweep) if y is None else y
@@ -170,10 +162,6 @@ def plot_boundary(
     **Arguments:** the curve; `ax`; `special`, whether to mark the points of codimension two;
     `legend`, whether to draw one: what the dash means (or the curve's `label`), and the marks;
     options of `Axes.plot`.
-
-    **Returns:** the axes.
-
-    **Raises:** `TypeError` if it is no boundary.
     """
     instance_of("curve", curve, Boundary, "a `Boundary`, from `boundary`")
     ax = new_axes(ax)

@@ -1,4 +1,4 @@
-"""Pictures of grids: maps of the regimes of motion, and basins of attraction."""
+"""Pictures of grids: maps of regimes, basins of attraction, and how basins erode."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -13,13 +13,13 @@ from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from .._checks import flag
+from .._checks import flag, instance_of, one_of
 from .._messages import so_many
 from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
-from ..scans import NOT_COMPUTED, REGIMES, Basins
+from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
 from .branch import axis_name
-from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, shades
+from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, shades, thick
 from .motion import new_axes
 
 # What was not computed lies below all regimes.
@@ -60,8 +60,6 @@ def plot_regimes(
     periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
     into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
     the second of the scan if left out; `legend`, whether to draw one, on the right of the axes.
-
-    **Returns:** the axes.
 
     **Raises:** `ValueError` if there is no period and no outcome in the data, or not over two axes.
     """
@@ -153,8 +151,6 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     as in all pictures; further motions of the same kind have other shades of it.
 
     **Arguments:** what `basins` found; `ax`, axes to draw into, a new figure if left out.
-
-    **Returns:** the axes.
 
     **Raises:** `ValueError` if the region does not span two parts of the start.
     """
@@ -277,3 +273,55 @@ def _legend(ax: Axes, entries: list[tuple[str, str]], marks: Sequence[Line2D] = 
     ]
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
     ax.legend(handles=[*patches, *marks], frameon=False, fontsize="small", **place)
+
+
+_WORDS = {
+    "share": "part of the starts, %",
+    "local": "largest ball of starts around the motion",
+    "factor": "largest ball of starts",
+}
+# Motions named one by one in its legend.
+_NAMED_LINES = 8
+
+
+def plot_integrity(
+    profile: IntegrityProfile, *, y: str = "share", ax: Axes | None = None, legend: bool = True
+) -> Axes:
+    """Draw an erosion profile: the share or the integrity of each motion over the parameter.
+
+    A line has the colour of its motion's period, as in all pictures; further motions of the same
+    kind have other shades of it. At a fall of a line, the motion loses its basin although it may
+    still be stable. The band around a share is its standard error, that around a radius the
+    resolution of the grid. Open circles are radii limited by the edge of the region.
+
+    **Arguments:** what `integrity_profile` found; `y`, `"share"`, `"local"` (local integrity
+    measure) or `"factor"` (integrity factor); `ax`, axes to draw into, a new figure if left out;
+    `legend`, whether to draw one, which names the first eight motions.
+    """
+    instance_of("profile", profile, IntegrityProfile, "from `integrity_profile`")
+    y, legend = one_of("y", y, tuple(_WORDS)), flag("legend", legend)
+    ax = new_axes(ax)
+    kinds: dict[str, Iterator[str]] = {}
+    percent = 100.0 if y == "share" else 1.0
+    for i, row in enumerate(getattr(profile, y)):
+        color = color_of(int(profile.period[i]), float(profile.impacts[i]))
+        color = next(kinds.setdefault(color, shades(color)))
+        error = profile.error[i] if y == "share" else profile.resolution
+        low, high = percent * np.maximum(row - error, 0.0), percent * (row + error)
+        name = profile.name_of(i) if i < _NAMED_LINES else None
+        ax.plot(profile.values, percent * row, ".-", ms=4, lw=thick(1.6), color=color, label=name)
+        if y != "share":
+            cut = getattr(profile, f"{y}_at_edge")[i]
+            ax.plot(profile.values[cut], row[cut], "o", ms=4, mec=color, mfc="w", zorder=3)
+        ax.fill_between(profile.values, low, high, color=color, alpha=0.2, lw=0)
+    irregular = sum(profile.irregular.values())
+    if y == "share" and np.any(irregular):
+        ax.plot(profile.values, 100 * irregular, ":", color="0.4", label="no periodic motion")
+    if y != "share" and getattr(profile, f"{y}_at_edge").any():
+        open_circle = {"ls": "none", "marker": "o", "ms": 4, "mec": "0.4", "mfc": "w"}
+        ax.plot([], [], **open_circle, label="cut by the region's edge")
+    if legend and ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize="small", frameon=False)
+    parameter = axis_name(profile.parameter, profile.basins[0].machine.units)
+    ax.set(xlabel=parameter, ylabel=_WORDS[y], ylim=(0.0, None))
+    return ax
