@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, UInt32
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
+    RigidStop,
     clock_of,
     events_of,
     is_autonomous,
@@ -133,12 +134,8 @@ class Lane(NamedTuple):
     steps."""
 
     def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
-        """The lane with a reason to end.
-
-        **Arguments:** `where`, whether the event was met; `when`, whether it ends the lane, `None`
-        if it never can; `reason`, the name of one of `RESULTS`, or a number as the loop
-        carries it.
-        """
+        """The lane with a reason to end, the name of one of `RESULTS` or its number, if the event
+        was met (`where`) and ends the lane (`when`, `None` if it never can)."""
         if when is None:
             return self
         number = code(reason) if isinstance(reason, str) else reason
@@ -156,12 +153,8 @@ class Lane(NamedTuple):
     def noting(
         self, when: Flag, clock: Scalar, kind: EventKind | Scalar, number: Any, value: Any
     ) -> "Lane":
-        """The lane with an event in the log of all events, behind those that it holds, if there is
-        room.
-
-        **Arguments:** `when`, whether the event happened; `clock`, the reading of `Plan.clock`;
-        `number` and `value`, as in `EventLog`.
-        """
+        """The lane with an event in the log of all events, if it happened (`when`) and there is
+        room; `kind`, `number` and `value` as in `EventLog`."""
         events = self.record.events
         if events is None:
             return self
@@ -249,7 +242,7 @@ class Plan(eqx.Module):
     less than 1; else 1, and of a machine whose numbers are about 1 absent."""
 
     def extent(self, k: int) -> Scalar | float:
-        """A length by which those of coordinate number k are judged."""
+        """A length by which those of coordinate number k are judged, or of place k in `extents`."""
         return 1.0 if self.extents is None else self.extents[k]
 
     def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
@@ -264,12 +257,6 @@ class Plan(eqx.Module):
             slack, _ = self.rounding(stop.coordinate, state)
             found = found | (stop_gradient(stop.beyond(place)) > slack)
         return found
-
-    def guard_extent(self, place: int) -> Scalar | float:
-        """A size by which the guard of one of `others` is judged, by its place among them."""
-        if self.extents is None:
-            return 1.0
-        return self.extents[len(self.machine.coordinates) + place]
 
     @property
     def kept(self) -> int:
@@ -319,11 +306,6 @@ class Plan(eqx.Module):
         events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
-    @property
-    def to_section(self) -> float:
-        """The target of a step that is aimed at the end of a cycle, where an event is that."""
-        return to_event(section_number(self.machine))
-
     def end(self, part: Scalar) -> Scalar:
         """Clock reading at the end of the `part`-th piece of a cycle: an interval, or the way from
         one impulse of noise to the next."""
@@ -331,9 +313,8 @@ class Plan(eqx.Module):
         return cycle * (part + 1) / self.instants if self.instants > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
-        """`Lane.part` at the begin of a cycle, when so many intervals are done: 0, unless the cycle
-        is not recorded. Such a cycle is one interval, as if only its last part were left. With
-        noise it has all of its impulses."""
+        """`Lane.part` as a cycle begins, when so many intervals are done: 0, or in a cycle that is
+        not recorded the last one, so that it is one interval; with noise it has all impulses."""
         if self.noise is not None:
             return jnp.zeros_like(done)
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
@@ -361,11 +342,8 @@ class Plan(eqx.Module):
         return bool(switches_of(self.machine) or others_of(self.machine))
 
     def meets_turns(self, done: Scalar) -> Flag:
-        """Whether steps end on every turning point, for extremes too, or only on those close to a
-        stop.
-
-        **Arguments:** `done`, how many intervals are complete.
-        """
+        """Whether steps end on every turning point, for extremes too, when so many intervals are
+        done; else only on those close to a stop."""
         if self.motion and not self.meets_every_turn:
             return done >= self.settle
         return jnp.full_like(done, self.meets_every_turn, bool)
@@ -393,23 +371,19 @@ class Plan(eqx.Module):
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
-    def place(self, k: int, contact: Scalar, otherwise: Scalar) -> Scalar:
-        """The position of coordinate number k while it rests on the stop named by `contact` (see
-        `Lane.contact`); `otherwise` while it rests on none."""
-        place = otherwise
+    def at_stop(
+        self, k: int, contact: Scalar, part: Callable[[RigidStop], Any], otherwise: Scalar
+    ) -> Scalar:
+        """A part of the stop that coordinate number k rests on (see `Lane.contact`); `otherwise`
+        while it rests on none."""
         for i, stop in enumerate(stops_of(self.machine)):
             if stop.coordinate == k:
-                place = jnp.where(contact == to_event(i), stop.place, place)
-        return place
+                otherwise = jnp.where(contact == to_event(i), part(stop), otherwise)
+        return otherwise
 
     def away(self, k: int, contact: Scalar) -> Scalar:
-        """The sign of the direction of coordinate number k away from the stop named by `contact`; 0
-        if it rests on none."""
-        away = jnp.zeros_like(contact)
-        for i, stop in enumerate(stops_of(self.machine)):
-            if stop.coordinate == k:
-                away = jnp.where(contact == to_event(i), -float(stop.sign), away)
-        return away
+        """The sign of the direction away from the stop that coordinate number k rests on, or 0."""
+        return self.at_stop(k, contact, lambda stop: -float(stop.sign), jnp.zeros_like(contact))
 
     def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named

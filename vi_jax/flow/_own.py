@@ -175,10 +175,8 @@ _TRIED, _MODES, _FAR = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 def check_values(machine: AbstractMachine, start: State) -> None:
     """Warn once of a field that is not the same at both ends of its cycle, and of an event whose
-    guard is not below zero in any of many states around the start.
-
-    Machines of this package and machines with traced numbers are not checked.
-    """
+    guard is not below zero in any of many states around the start. Machines of this package and
+    machines with traced numbers are not checked."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or any(isinstance(x, Tracer) for x in leaves):
@@ -208,10 +206,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
     """The cycle; the field where it begins and where it ends, if `s` `ticks`; which guards are
-    below zero in any state around the start.
-
-    **Arguments:** `zero`, the number: what is computed from constants alone is compiled by itself.
-    """
+    below zero in any state around the start. `zero` is an argument, since what is computed from
+    constants alone is compiled by itself."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     ends = (zero, cycle) if ticks else ()
@@ -479,11 +475,8 @@ def has_quantities(machine: AbstractMachine) -> bool:
 
 
 def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
-    """The names of a machine's averages in their order, by name.
-
-    **Raises:** `TypeError` for averages that are no numbers by name; `ValueError` for a name that
-    something else has.
-    """
+    """The names of a machine's averages in their order. **Raises:** `TypeError` for averages that
+    are no numbers by name; `ValueError` for a name that something else has."""
     if not has_averages(machine):
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
@@ -527,13 +520,8 @@ def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> d
 def _names(
     machine: AbstractMachine, which: str, function: Callable, start: State, arguments: tuple
 ) -> tuple[str, ...]:
-    """The names of a machine's averages or quantities, sorted.
-
-    **Arguments:** `which`, the method's name; `function`, the method; `start`, a state, whose own
-    names are taken; `arguments`, those of the method.
-
-    **Raises:** as `average_names`.
-    """
+    """The names of a machine's averages or quantities (`which`), sorted; those of `start` are
+    taken. **Raises:** as `average_names`."""
     whose = f"`{which}` of a {type(machine).__name__}"
     with in_words_of(whose):
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)

@@ -177,12 +177,12 @@ def simulate_pool(
     wanted: Array | None = None,
     noise_of: Callable[[Any], tuple[Any, Any]] | None = None,
 ) -> Run:
-    """As `simulate` under `vmap`, for lanes some of which are not wanted; forward mode only.
+    """As `simulate` under `vmap`, for lanes some of which are not wanted (they are not run and come
+    back as failed); forward mode only.
 
-    **Arguments:** machine and start of one lane from its values; the values of all lanes, a pytree
-    with one leading axis; the cycles to record; the options of each run; flags of the lanes that
-    are wanted, all by default (the others are not run and come back as failed); noise and key of
-    one lane from its values, where there is noise.
+    **Arguments:** `lane_of`, machine and start of one lane from its values; the `values` of all
+    lanes, with one leading axis; `wanted`, a flag of each lane, by default all; `noise_of`, noise
+    and key of one lane from its values.
     """
 
     def one(value, wanted):
@@ -198,11 +198,8 @@ def simulate_pool(
 
 
 def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Record) -> Run:
-    """The run from what the loop stored for each interval.
-
-    **Arguments:** `sampled`, whether the states are given as samples; `lane`, how it ended;
-    `points` and `records`, the states and records of the intervals, as `run_lane` returns them.
-    """
+    """The run from how a lane ended, and the states (`points`) and records of its intervals, as
+    `run_lane` returns them; if `sampled`, the states are given as samples."""
     machine, parts = plan.machine, plan.parts
     points, modes = bare(points), modes_of(points) or ()
     records = jtu.tree_map(lambda x: x[1:], records)

@@ -87,12 +87,9 @@ class RunOptions:
     `None` where it cannot tell; `first`, whether recording begins there. A pytree."""
 
     def checked(self, machine: AbstractMachine | None) -> "RunOptions":
-        """The same options once each is known to be one, with the method that they choose.
-
-        **Arguments:** the machine; `None` if it is not known yet.
-
-        **Raises:** `TypeError` or `ValueError` that names the option.
-        """
+        """The same options once each is known to be one, with the method that they choose for the
+        machine (`None` if it is not known yet). **Raises:** `TypeError` or `ValueError` that names
+        the option."""
         most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
         return dataclasses.replace(
             self,
@@ -123,12 +120,8 @@ def largest_count(dtype: object) -> int:
 def planned(
     machine: AbstractMachine, start: State, cycles: int | Int[Array, ""], options: RunOptions
 ) -> tuple[Plan, State]:
-    """What `simulate` was asked, checked and put in the form in which the loop needs it.
-
-    **Returns:** the plan, and the start as this machine has it.
-
-    **Raises:** as `simulate`.
-    """
+    """What `simulate` was asked, checked and put in the form in which the loop needs it: the plan,
+    and the start as this machine has it. **Raises:** as `simulate`."""
     machine = machine_of(machine)
     start = machine.start() if start is None else start
     check_parts(machine)
@@ -214,21 +207,14 @@ def _warn_of_single_precision() -> None:
 
 def machine_of(machine: Machine) -> AbstractMachine:
     """The machine as every verb takes it, so that other numbers are not another program: each
-    number that is a `float` is an array. Whole numbers, truth values and words stay what they are,
-    and a part of the program.
-
-    **Raises:** `TypeError` if it is none.
-    """
+    number that is a `float` is an array. **Raises:** `TypeError` if it is none."""
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     return jtu.tree_map(strongly_typed, machine)
 
 
 def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
     """`settle` as the loop needs it: NaN, with which no lane starts, if it is traced and no number
-    of cycles that can be counted.
-
-    **Raises:** `ValueError` if it is known and cannot be counted.
-    """
+    of cycles that can be counted. **Raises:** `ValueError` if it is known and cannot be counted."""
     most = largest_count(dtype) // parts
     if concrete(settle) is not None:
         if settle + cycles > most:
@@ -249,10 +235,9 @@ def as_floats(machine: AbstractMachine, state: State) -> State:
 
 
 def of_one_type(machine: AbstractMachine, start: State) -> tuple[AbstractMachine, State]:
-    """Scene and start with all their floating-point numbers of one type, the widest among them.
-
-    Numbers of a machine made before double precision was switched on are promoted, with a warning.
-    """
+    """Scene and start with all their floating-point numbers of one type, the widest among them;
+    numbers of a machine made before double precision was switched on are promoted, with a
+    warning."""
     dtype = _type_of(machine, start)
     for name, tree in {"machine": machine, "start": start}.items():
         short = [path for path, x in jtu.tree_leaves_with_path(tree) if narrow(x)]

@@ -59,21 +59,14 @@ def _written_out(tangents: Any) -> Any:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
     """`moving` after a further `offset` of s: in value only to first order, which is enough for an
-    offset of 1e-9, but with the exact derivatives of the flow.
-
-    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `offset`, how
-    far in s.
-    """
+    offset of 1e-9, but with the exact derivatives of the flow."""
     return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
     """`drifted` by an offset that is zero in value, but has derivatives: `moving` itself, with
-    those of the flow.
-
-    **Arguments:** as `drifted`.
-    """
+    those of the flow."""
     return moving
 
 
@@ -107,12 +100,7 @@ def met_after(
     rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
 ) -> Scalar:
     """When the motion comes to the zero of a guard: `offset` itself, which must be that to
-    rounding, with the derivatives of the implicit function.
-
-    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `guard`, a
-    function like the rate that is zero at the event; `offset`, how far in s the event is from
-    `moving`.
-    """
+    rounding, with the derivatives of the implicit function."""
     return offset
 
 
@@ -147,13 +135,9 @@ def height_of_turn(
     fixed: Any,
     rest: Any,
 ) -> Scalar:
-    """The height of a turning point: `height` itself, with its derivatives.
-
-    **Arguments:** `rate`, `moving`, `fixed` and `rest`, as at the top of this file; `place`, the
-    position as a function like the rate; `height`, its value at the turn; `turns`, whether there is
-    one (if not, the derivatives are those of the position in `moving`); `offset`, how far in s the
-    turn is from `moving`.
-    """
+    """The height of a turning point of `place`, which is a function like the rate: `height` itself,
+    with its derivatives, if the motion `turns` after a further `offset` of s; else with those of
+    the position in `moving`."""
     return height
 
 
@@ -183,15 +167,15 @@ height_of_turn.defjvp(_height_of_turn_jvp, symbolic_zeros=True)
 
 
 class FlowToEvent:
-    """The motion close to an event.
+    """The motion close to an event, from `moving` on.
 
     Its rate, and guards, positions and forces along it, are functions of `(moving, fixed, rest)`:
     `moving` is s, the state, and the integrals beside it, `fixed` what may have a derivative
-    besides, `rest` the arrays that have none. `drift` is given them as functions that close over no
-    number, so that JAX can differentiate them again.
+    besides, `rest` the arrays that have none. They close over no number, so that JAX can
+    differentiate them again.
 
     **Arguments:** `smooth`, the machine in its modes; `part`, the index of the interval within its
-    cycle; `moving`, where the motion begins.
+    cycle.
     """
 
     def __init__(self, plan: Plan, smooth: SmoothMachine, part: Scalar, moving: tuple):

@@ -54,14 +54,9 @@ def force_rate(
     machine: SmoothMachine, position: Callable[[State], Scalar], holding: SmoothMachine, s: Scalar,
     state: State,
 ) -> Scalar:  # fmt: skip
-    """d/ds of the acceleration that a body would have if it were free, while it moves along with a
-    machine in which it may be held.
-
-    A constant for differentiation: it tells where to look.
-
-    **Arguments:** `machine`, in which the body is free; `position`, its coordinate as a function of
-    the state; `holding`, the machine that moves.
-    """
+    """d/ds of the acceleration that a body would have if it were free, as it is in `machine`, while
+    it moves along with `holding`, a machine in which it may be held. A constant for
+    differentiation: it tells where to look."""
     s, state = jax.lax.stop_gradient((s, state))
 
     def force(s, state):

@@ -50,14 +50,12 @@ _SMALL, _GROWS, _INSTANTS = 1e-2, 1e-3, 7
 
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """About how large each number of the state will be, if that is much less than 1; else 1.
-    `None` of a machine whose numbers are about 1 by definition.
+    """About how large each number of the state will be, if that is much less than 1; else 1. `None`
+    of a machine whose numbers are about 1 by definition.
 
     It is the value in the start, or what the rates there make of it in the 2π-th part of a cycle,
-    or what the other numbers make of it. The numbers of an array have one size. Nothing is known
-    of a number that is zero and that nothing moves yet.
-
-    **Arguments:** `s`, `start` and `modes`, in which the motion begins.
+    or what the other numbers make of it. The numbers of an array have one size. Nothing is known of
+    a number that is zero and that nothing moves yet.
     """
     if scales_known(machine):
         return None
@@ -90,11 +88,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
 def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State) -> Scalars:
     """As `Plan.extents`: of each coordinate, then of the guard of each event that is no stop, how
-    small it is, if it is much less than 1; else 1.
-
-    **Arguments:** `sizes`, as from `sizes_of`; `s`, `start` and `modes`, in which the motion
-    begins.
-    """
+    small it is, if it is much less than 1; else 1. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
     s, start = stop_gradient((s, start))
@@ -122,11 +116,8 @@ def _size_of_friction(
     plan: Plan, number: int, s: Scalar, start: State, modes: Scalars, contact: Scalars,
     sizes: State,
 ) -> Scalar:  # fmt: skip
-    """The larger of the slip and of the force that holds a body, where each is a guard of friction.
-
-    **Arguments:** as `extents_of`; `number`, that of the friction among the events; `contact`, of
-    bodies of which none rests.
-    """
+    """The larger of the slip and of the force that holds a body, where each is a guard of friction;
+    `contact` is of bodies of which none rests."""
     machine, event = plan.machine, events_of(plan.machine)[number]
     assert isinstance(event, Friction)
     own = mode_number(machine, number)

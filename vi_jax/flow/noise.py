@@ -23,10 +23,10 @@ from ..machine import (
     leaf_names,
     others_of,
     prepared,
-    stops_of,
 )
 from ._lane import Impulses, Plan, has_fixed_cycle, ticks
 from ._own import in_words_of
+from .smooth import limited_of
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -120,11 +120,8 @@ class WhiteNoise(eqx.Module):
 
 
 def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> Plan:
-    """The plan of a run with its noise, as the loop needs it.
-
-    **Raises:** `TypeError` or `ValueError` as `simulate` for noise, key or samples that do not fit
-    together or do not fit the machine.
-    """
+    """The plan of a run with its noise. **Raises:** `TypeError` or `ValueError` as `simulate` for
+    noise, key or samples that do not fit together or do not fit the machine."""
     machine = plan.machine
     check_noise(machine, start, noise)
     if samples and noise.impulses % samples:
@@ -144,10 +141,7 @@ def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> 
 
 def in_modes_of(way: Prepared, noise: Impulses, start: State) -> Impulses:
     """The noise of a machine that is followed in its natural modes: its impulses act on the
-    machine's own velocities.
-
-    **Arguments:** `start`, a state of the machine itself.
-    """
+    machine's own velocities. `start` is a state of the machine itself."""
     leaves, tree = jtu.tree_flatten(start)
 
     def matrix(i: int) -> Array:
@@ -252,7 +246,7 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
         for x, a in zip(leaves, amplitudes, strict=True)
     ]
-    for k in sorted({stop.coordinate for stop in stops_of(machine)}):
+    for k in limited_of(machine):
         place = machine.coordinates[k].position
         moved = concrete(jax.jvp(place, (start,), (tree.unflatten(along),))[1])
         if moved is not None and np.any(moved):
@@ -268,10 +262,7 @@ def lane_key(key: UInt32[Array, "2"], number: UInt32[Array, ""]) -> UInt32[Array
 
 
 def words_of(key: Any) -> UInt32[Array, "2"]:
-    """The two words of a key of JAX's.
-
-    **Raises:** `TypeError` or `ValueError` for what is none.
-    """
+    """The two words of a key of JAX's. **Raises:** `TypeError` or `ValueError` for what is none."""
     what = "one key of JAX's Threefry generator, as `jax.random.key(0)` makes it"
     if key is None:
         raise TypeError(f"Argument `key` must be {what}, where there is noise.")
@@ -289,11 +280,11 @@ def with_impulse(
     noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State,
     elapsed: Scalar | None,
 ) -> State:  # fmt: skip
-    """The state behind the impulse of an instant, where there is one.
+    """The state behind the impulse of an instant, `when` there is one.
 
-    **Arguments:** whether there is one; the cycle, counted from the start of the run with those
-    that settle, and the number of the instant in it; the time since the last impulse, `None` where
-    it is known beforehand.
+    **Arguments:** the `cycle`, counted from the start of the run with those that settle, and the
+    number of the `instant` in it; the time `elapsed` since the last impulse, `None` where it is
+    known beforehand.
     """
     leaves, tree = jtu.tree_flatten(state)
     sizes = [0 if x is None else leaf.size for x, leaf in zip(noise.scales, leaves, strict=True)]

@@ -170,11 +170,9 @@ def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
 
 
 def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
-    """Of a data set what lies along one of its dimensions, so that it makes a table with one
-    row for each of its places; all of it by default.
-
-    **Raises:** `ValueError` if there is no such dimension.
-    """
+    """Of a data set what lies along one of its dimensions, so that it makes a table with one row
+    for each of its places; all of it by default. **Raises:** `ValueError` if there is no such
+    dimension."""
     if along is None:
         return data
     columns = {}
@@ -350,11 +348,8 @@ _CYCLES, _EVENTS = 8, 6
 
 
 def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
-    """How many there are, and those of the first cycles one by one.
-
-    **Arguments:** what is listed; which places of the log, (cycles, size) and batch axes before
-    them, are used; and what stands at such a place, in words.
-    """
+    """How many there are of `what`, and those of the first cycles one by one, by the `word` for a
+    place of the log, of which `used` tells which are: (cycles, size), batch axes before them."""
     used = np.asarray(used)
     if used.ndim > 2:
         return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"

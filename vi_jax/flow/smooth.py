@@ -41,6 +41,11 @@ def unit_of(machine: AbstractMachine) -> Scalar | float:
     return jnp.where((unit > 1 / _USUAL) & (unit < _USUAL), 1.0, unit)
 
 
+def limited_of(machine: AbstractMachine) -> list[int]:
+    """The numbers of the coordinates that stops limit."""
+    return sorted({stop.coordinate for stop in stops_of(machine)})
+
+
 class SmoothMachine(eqx.Module):
     """What a step asks of a machine: smooth, since its modes stay as they are and the bodies that
     rest are held."""
@@ -53,8 +58,8 @@ class SmoothMachine(eqx.Module):
     def field(self, s: Scalar, state: State) -> State:
         """d(state)/ds, without motion of a body that is held."""
         traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
-        once: Any = _traced_once
-        return once(self, s, state) if traced else self.held_field(s, state)
+        field: Any = _traced_once if traced else SmoothMachine.held_field
+        return field(self, s, state)
 
     def held_field(self, s: Scalar, state: State) -> State:
         """The same, traced anew."""
@@ -62,7 +67,7 @@ class SmoothMachine(eqx.Module):
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
             return flow
-        limited = sorted({stop.coordinate for stop in stops_of(machine)}) if self.contact else []
+        limited = limited_of(machine) if self.contact else []
         several = len(limited) > 1 or rubs(machine)
         if several or dry:
             flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
@@ -71,27 +76,16 @@ class SmoothMachine(eqx.Module):
             flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)
         return flow
 
-    def pace(self, s: Scalar, state: State) -> Scalar | None:
-        """d(time)/ds of the machine, `None` where `s` measures time."""
-        return self.machine.pace(s, state)
-
-    def averages(self, s: Scalar, state: State) -> dict[str, Any]:
-        """What is averaged over time, in these modes."""
-        return self.machine.averages(s, state, *shown_modes(self.machine, self.modes))
-
 
 @eqx.filter_jit
 def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
-    """The field of a machine as a jitted function. A step calls it about sixty times; JAX traces,
-    differentiates and batches it once. Inlined instead, it would double the time of the first call
-    of a small machine."""
+    # A step calls it about sixty times. Inlined, it would double a small machine's first call.
     return smooth.held_field(s, state)
 
 
 def _held_still(coordinate: Coordinate, state: State, flow: State) -> State:
-    """The rate at which a state changes along `flow` while this coordinate keeps its place and
-    velocity: the derivative of `placed`, which need not be linear (bodies with a radius, a contact
-    that moves along with the state)."""
+    """The rate of a state along `flow` while this coordinate keeps its place and velocity: the
+    derivative of `placed`, which need not be linear."""
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     zero = jnp.zeros_like(place)
     along = (state, place, velocity), (flow, zero, jnp.zeros_like(velocity))
@@ -154,10 +148,8 @@ def rounding(
     unit: Scalar | float = 1.0,
 ) -> tuple[Scalar | float, Scalar | float]:  # fmt: skip
     """How far coordinate number k may be beyond its stop, and its velocity from zero, by rounding
-    alone: not at all where the place is a number of the state itself.
-
-    **Arguments:** `least`, the size of a place at least; `unit`, that of `s`.
-    """
+    alone: not at all where the place is a number of the state itself. A place has the size `least`
+    at least, in `unit`s of s."""
     if exact(machine, state):
         return 0.0, 0.0
     body = machine.coordinates[k]
@@ -184,15 +176,13 @@ TIME = "elapsed time"
 def rate_of_integrals(
     smooth: SmoothMachine, s: Scalar, state: State, integrals: Integrals
 ) -> Integrals:
-    """Return d/ds of the integrals of these names.
-
-    **Arguments:** `smooth`, the machine in its modes, with which its averages are evaluated.
-    """
+    """Return d/ds of the integrals of these names."""
     if not integrals:
         return {}
-    pace, rates = smooth.pace(s, state), {}
+    pace, rates = smooth.machine.pace(s, state), {}
     if set(integrals) - {TIME}:
-        for name, value in smooth.averages(s, state).items():
+        modes = shown_modes(smooth.machine, smooth.modes)
+        for name, value in smooth.machine.averages(s, state, *modes).items():
             value = jnp.asarray(value, s.dtype)
             rates[name] = value if pace is None else pace * value
     if TIME in integrals:
@@ -202,16 +192,12 @@ def rate_of_integrals(
 
 def carried(smooth: SmoothMachine, s: Scalar, state: State, integrals: Integrals) -> Integrals:
     """Return those integrals that a method has to carry along: not a time that `s` measures."""
-    paced = TIME in integrals and smooth.pace(s, state) is not None
+    paced = TIME in integrals and smooth.machine.pace(s, state) is not None
     return {name: x for name, x in integrals.items() if name != TIME or paced}
 
 
 def elapsed(old: Integrals, new: Integrals, h: Scalar) -> Integrals:
-    """Return the integrals after a step.
-
-    **Arguments:** `old`, those before it; `new`, those that were `carried`; `h`, the length of the
-    step, which is the time where s measures that.
-    """
+    """Return the integrals after a step of length h, from those before it and those `carried`."""
     return {TIME: old[TIME] + h, **new} if TIME in old else new
 
 

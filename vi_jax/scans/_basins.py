@@ -340,11 +340,8 @@ def _sorted_out(
     longest: int,
     method: AbstractMethod,
 ) -> Basins:
-    """The basins in what a scan of starts found.
-
-    **Arguments:** what `_scanned` found; the machine; a start, of which the region's
-    parts are replaced; `apart`, `longest` and `method` as for `basins`.
-    """
+    """The basins in what `_scanned` found, by a start (`begin`) of which the region's parts are
+    replaced."""
     names = list(components(begin))
 
     def sections(state: np.ndarray, cycles: int) -> np.ndarray:
@@ -411,10 +408,7 @@ def _check_options(
     verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
 ) -> None:
     """**Raises:** `TypeError` for an option that is none of `scan`'s, or one that a verb which
-    scans starts does not take.
-
-    **Arguments:** `refused`, those that this verb alone does not take.
-    """
+    scans starts does not take; `refused` are those that this verb alone does not take."""
     who = verb.__name__
     own, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
@@ -449,9 +443,7 @@ def starts_in(
     seed: int | tuple[int, ...],
 ) -> dict[str, np.ndarray]:
     """The starts in a region, as axes of a scan: those of a grid, or random ones in pairs.
-
-    **Raises:** `ValueError` or `TypeError` that names the argument.
-    """
+    **Raises:** `ValueError` or `TypeError` that names the argument."""
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
         if not name.startswith(START):
@@ -493,9 +485,9 @@ def _labelled(
     """A label for each lane, and the section states (period, components) of each motion, that of
     the most lanes first.
 
-    **Arguments:** what the scan found; the names of a state's components; how far states of one
-    motion may differ; what gives the section states of a motion from one of them and its period;
-    which of the components are angles; the size of motions that have these states.
+    **Arguments:** `names` of a state's components; how far states of one motion may be `apart`;
+    `followed`, which gives the section states of a motion from one of them and its period; `angles`
+    among the components; the `size` of motions that have these states.
     """
     period = np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)

@@ -78,12 +78,9 @@ class Ball(NamedTuple):
 
 
 def entropy_of(label: np.ndarray, *, box: int, there: np.ndarray | None = None) -> BasinEntropy:
-    """Basin entropy of labels on a grid of any dimension.
-
-    **Arguments:** `label`, an integer for each outcome; `box`, cells along each side of a box:
-    boxes do not overlap, and cells left over at the ends of the axes are left out; `there`, which
-    cells hold a start at all (all by default).
-    """
+    """Basin entropy of labels on a grid of any dimension, by boxes of `box` cells along each side,
+    which do not overlap; cells left over at the ends of the axes are left out. `there` is which
+    cells hold a start at all (all by default)."""
     there = np.ones(label.shape, bool) if there is None else there
     cells, held = _boxes(label, box), _boxes(there, box)
     many = held.sum(axis=1)
@@ -115,17 +112,15 @@ def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
 def uncertainty_of(
     label: np.ndarray, *, confidence: float = 0.95, there: np.ndarray | None = None
 ) -> Uncertainty:
-    """Uncertainty exponents of the boundaries between labels on a grid of any dimension.
+    """Uncertainty exponents of the boundaries between labels on a grid of any dimension; `there` is
+    which cells hold a start at all (all by default): one without is no other outcome.
 
     The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, three at least.
-    The same starts are looked at for all of them: those that have neighbours at the largest one.
-    An exponent is the slope of ln(fraction) over ln(distance) by least squares. Its interval has
-    two parts, added in quadrature: what the slope varies by as one tile of the grid after the
-    other is left out (jackknife), which is the chance of where the region lies, and the scatter
-    about the straight line.
-
-    **Arguments:** `label`, an integer for each outcome; `confidence` of the intervals; `there`,
-    which cells hold a start at all (all by default): one without is no other outcome.
+    The same starts are looked at for all of them: those that have neighbours at the largest one. An
+    exponent is the slope of ln(fraction) over ln(distance) by least squares. Its interval has two
+    parts, added in quadrature: what the slope varies by as one tile of the grid after the other is
+    left out (jackknife), which is the chance of where the region lies, and the scatter about the
+    straight line.
     """
     there = np.ones(label.shape, bool) if there is None else there
     farthest = max(int(min(label.shape) * _FARTHEST), 3)
@@ -146,10 +141,8 @@ def uncertainty_of(
 def _power(
     distances: np.ndarray, uncertain: np.ndarray, starts: np.ndarray, confidence: float
 ) -> tuple[float, float]:
-    """The exponent by which uncertain starts grow with the distance, and half of its interval.
-
-    **Arguments:** distances; uncertain starts, (distances, tiles); starts, (tiles,); confidence.
-    """
+    """The exponent by which uncertain starts (distances, tiles) grow with the distance, and half of
+    its interval."""
     from scipy.special import stdtrit  # slow to load
 
     total = uncertain.sum(axis=1)
@@ -197,10 +190,7 @@ def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
 
 
 def _jackknife(across: np.ndarray, uncertain: np.ndarray, starts: np.ndarray) -> float:
-    """Standard error of the slope, from its values with each tile left out.
-
-    **Arguments:** logarithms of the distances; uncertain starts (distances, tiles); starts.
-    """
+    """Standard error of the slope, from its values with each tile left out."""
     slopes = []
     for tile in np.flatnonzero(starts):
         rest = uncertain.sum(axis=1) - uncertain[:, tile]
@@ -251,13 +241,9 @@ class Cells(NamedTuple):
 
 
 def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
-    """The largest ball around a point that meets neither foreign cells nor an edge.
-
-    Cells are boxes around their starts, of which the whole counts as foreign. The radius is NaN
-    for a point outside of the region.
-
-    **Arguments:** `point`, (axes,); `foreign`, which cells have another outcome; the grid.
-    """
+    """The largest ball around a point that meets neither foreign cells, of another outcome, nor an
+    edge. Cells are boxes around their starts, of which the whole counts as foreign. The radius is
+    NaN for a point outside of the region."""
     low, high = cells.edges.T
     if not ((point >= low) & (point <= high)).all():
         return Ball(np.nan, point, False)
@@ -274,11 +260,8 @@ def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
 
 def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     """The largest ball around a start (or a corner or face of its cell) of one outcome that meets
-    neither foreign cells nor an edge, by an exact Euclidean distance transform.
-
-    **Arguments:** `own`, which cells have the outcome, one at least; the others as for
-    `ball_around`. Cells that are neither hold no start, and do not end a ball.
-    """
+    neither foreign cells nor an edge, by an exact Euclidean distance transform. At least one cell
+    is `own`; cells that are neither hold no start, and do not end a ball."""
     from scipy.ndimage import distance_transform_edt  # slow to load
 
     # Half a turn more on both sides of an angle, from where the cells go on.

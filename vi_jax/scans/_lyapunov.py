@@ -285,10 +285,7 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
 
 
 def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
-    """The exponents by what was observed.
-
-    **Arguments:** `carry` and `seen`, as `_observer`'s function gives them, the latter in a row.
-    """
+    """The exponents by what `_observer`'s function gives: `carry`, and `seen` in a row."""
     ((x, modes), _, result), (rates, duration, integrals) = carry, seen
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)

@@ -88,11 +88,9 @@ class Workplace(NamedTuple):
 
 
 def workplace(workers: int | None, devices: int | None, cluster: object) -> Workplace:
-    """As many threads and devices as are asked for, or as there are.
-
-    **Raises:** `TypeError` or `ValueError` for what are no such numbers, more devices than there
-    are, or a cluster that is none.
-    """
+    """As many threads and devices as are asked for, or as there are. **Raises:** `TypeError` or
+    `ValueError` for what are no such numbers, more devices than there are, or a cluster that is
+    none."""
     if not (cluster is None or isinstance(cluster, Executor) or hasattr(cluster, "get_executor")):
         raise TypeError(
             "Argument `cluster` must be a `dask.distributed.Client` or a "
@@ -111,13 +109,8 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
 def computed(
     program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False
 ) -> "xr.Dataset":
-    """What a program finds on a grid, checked before any work.
-
-    **Arguments:** `blocks`, the grid; `place`, where it is computed; `store`, a path to keep it at,
-    `None` for the memory; `progress`, whether a bar is shown.
-
-    **Raises:** as `scan`.
-    """
+    """What a program finds on a grid (`blocks`), checked before any work; `store` is a path to keep
+    it at, `None` for the memory. **Raises:** as `scan`."""
     program = check_corners(program, blocks)
     variables = variables_of(program, blocks)
     per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
@@ -170,14 +163,9 @@ def in_blocks(
     lanes: int | None = None,
     numbers: np.ndarray | None = None,
 ) -> Blocks:
-    """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace.
-
-    **Arguments:** `grid`, values by axis; `place`, where it is computed; `paired`, whether the axes
-    have one length and are gone along together; `store`, a path or `None`; `lanes`, `None` to
-    choose; `numbers` of the lanes, by which noise tells them apart, by default their places.
-
-    **Raises:** `ValueError` if a block would not fit into the memory.
-    """
+    """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace. By
+    the `numbers` of lanes, by default their places, noise tells them apart. **Raises:**
+    `ValueError` if a block would not fit into the memory."""
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
@@ -204,10 +192,8 @@ def _lanes_in(path: Path) -> int | None:
 
 
 def _block_size(total: int, place: Workplace) -> int:
-    """Lanes in a block of a grid of `total` lanes where the user names no number.
-
-    Few sizes, because each is a program of its own; small enough to occupy every core.
-    """
+    """Lanes in a block of a grid of `total` lanes where the user names no number: few sizes,
+    because each is a program of its own; small enough to occupy every core."""
     if jax.default_backend() != "cpu":
         most, share = _ON_ACCELERATOR * place.devices, total
     else:
@@ -383,9 +369,6 @@ def compute(
     A block is filled up to `lanes`, so that all blocks are one program. With several devices the
     lanes are dealt to them in turn, since neighbours take alike long. `dry` only compiles: none of
     the lanes is run.
-
-    **Arguments:** the program; the axes' values of each lane; the size of a full block; over how
-    many local devices it is spread; whether to compile only.
     """
     size = next(iter(values.values())).size
     deal = np.arange(lanes).reshape(-1, devices).T.ravel()
@@ -507,11 +490,7 @@ def _verified(
     store: str | Path | None,
 ) -> dict[str, Any]:  # fmt: skip
     """How some of the lanes, drawn by chance, come out by a better program; attributes by their
-    names.
-
-    **Arguments:** `data`, what was found, and the `store` that keeps it, if any; `lanes`, how many
-    (at most all); `program`, the better one; `place`, where it is computed.
-    """
+    names."""
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))

@@ -167,10 +167,8 @@ class Sweep(Summarized):
         ]
 
     def _jumps(self) -> list[list[str]]:
-        """What changes at each value by far more than at the values beside it.
-
-        Not looked for within motions without a period, whose extremes differ by chance.
-        """
+        """What changes at each value by far more than at the values beside it; not within motions
+        without a period, whose extremes differ by chance."""
         name, units = name_in(self.labels[0]), dict(self.units)
         numbers = {
             f"min {name}": (self.y_min, unit_of(units, "position")),
@@ -297,10 +295,8 @@ def _counted(start: State, lane_noise: LaneNoise | None) -> Any:
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
-    """The values of a sweep, and the same on the host where they are known.
-
-    **Raises:** `ValueError` unless they are finite and in one row.
-    """
+    """The values of a sweep, and the same on the host where they are known. **Raises:**
+    `ValueError` unless they are finite and in one row."""
     values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
     finite = numbers is None or bool(np.isfinite(numbers).all())
@@ -330,11 +326,8 @@ def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, regime, max_steps,
     lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
-    """The state after the last value, and what was found at each.
-
-    **Arguments:** as `sweep`, all of them checked; `start` as `_counted` has it; `regime`, the
-    measure of periods; `first`, the state at the first value of all.
-    """
+    """The state after the last value, and what was found at each; `start` is as `_counted` has it,
+    `first` the state at the first value of all."""
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}

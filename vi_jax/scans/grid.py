@@ -22,10 +22,8 @@ LANE = "lane number"
 
 
 def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
-    """The axes as rows of numbers.
-
-    **Raises:** `ValueError` that names the axis, or `TypeError` for what is no mapping.
-    """
+    """The axes as rows of numbers. **Raises:** `ValueError` that names the axis, or `TypeError` for
+    what is no mapping."""
     if not isinstance(axes, Mapping) or not axes:
         raise TypeError(
             f"Argument `{argument}` must map names of numbers to rows of values, such as "
@@ -142,11 +140,8 @@ class LaneNoise(eqx.Module):
     def noise_of(
         self, values: Mapping[str, Any], names: tuple[str, ...] = (), nudge: Array | None = None
     ) -> WhiteNoise:
-        """The noise of the lane with these values on the axes.
-
-        **Arguments:** the values; the numbers by which is differentiated, and what is added to each
-        of them.
-        """
+        """The noise of the lane with these values on the axes; `nudge` is added to the numbers
+        (`names`) by which is differentiated."""
         amplitudes = dict(self.noise.amplitudes)
         for name, value in values.items():
             if part_of(name) == NOISE and (own := name.removeprefix(NOISE)) in amplitudes:
@@ -179,13 +174,8 @@ def lane_noise_of(
     derivatives: Iterable[str],
     measures: Iterable[AbstractMeasure],
 ) -> LaneNoise | None:
-    """The noise of a scan, `None` for none.
-
-    **Arguments:** `noise` and `key` as for `scan`; the names of the axes, and of the numbers by
-    which is differentiated; what is measured.
-
-    **Raises:** `TypeError` or `ValueError` for what does not fit together.
-    """
+    """The noise of a scan, `None` for none; `axes` and `derivatives` are names. **Raises:**
+    `TypeError` or `ValueError` for what does not fit together."""
     given = {"axes": axes, "derivatives": derivatives}
     names = [
         (which, name) for which, row in given.items() for name in row if part_of(name) == NOISE

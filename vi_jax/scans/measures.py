@@ -96,17 +96,14 @@ def least_period(
     `REGIMES.unsettled`.
 
     A motion that still spirals in may repeat better after several turns of the spiral than after
-    its period. So it counts as settled if some period fits within the tolerance, and of the
-    periods that fit within a hundred times the tolerance the least is taken; but none that fits ten
+    its period. So it counts as settled if some period fits within the tolerance, and of the periods
+    that fit within a hundred times the tolerance the least is taken; but none that fits ten
     thousand times worse than another, for no spiral does so. A period fits only if as many impacts
     come in each cycle: beside a grazing these tell apart what sections hardly do.
 
-    **Arguments:** section states one after the other, a pytree with leaves (cycles,), more than
-    `longest` of them; the impacts of the cycle that ends at each; the longest period looked for;
-    how far sections a period apart may differ (relative to `size` + |state|), by default 1e-6 or,
-    if that is more, ten times what they wander by; what the sections of a motion that repeats
-    wander by under its method (`AbstractMethod.wander`); the size of the motion (`size_of`); which
-    of their numbers are angles (`angles_in`).
+    **Arguments:** `sections`, more than `longest` of them; the `impacts` of the cycle that ends at
+    each; `tolerance`, relative to `size` (`size_of`) + |state|, by default 1e-6 or, if that is
+    more, ten times what they `wander` by under their method; which of their numbers are `angles`.
     """
     states = in_rows(sections).T
     if tolerance is None:
@@ -204,11 +201,8 @@ class AbstractMeasure(eqx.Module):
         pass_number: Any = 0,
         rests: bool | None = None,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that need them; they replace those found.
-
-        **Arguments:** `state`, that after the cycles observed, at every pass; `found`, the numbers
-        so far; `pass_number`, from 0; `rests` as for `simulate`.
-        """
+        """Costlier numbers, only for lanes that need them, from the state after the cycles
+        observed; they replace those found. `rests` is as for `simulate`."""
         return {}
 
 

@@ -77,13 +77,9 @@ class ScanProgram(eqx.Module):
     def lane(
         self, values: Mapping[str, Any], nudge: Array | None = None
     ) -> tuple[AbstractMachine, State]:
-        """Machine and start of the lane with these values on the axes, in the scan's clock.
-
-        **Arguments:** the values by the names of the axes; what is added to each of the numbers
-        that derivatives are asked for.
-
-        **Raises:** `TypeError` if the function that makes the machine makes something else.
-        """
+        """Machine and start of the lane with these values on the axes, in the scan's clock; `nudge`
+        is added to the numbers that derivatives are asked for. **Raises:** `TypeError` if the
+        function that makes the machine makes something else."""
         of_machine = {name: x for name, x in values.items() if part_of(name) == MACHINE}
         if self.build is not None:
             machine = self.build(**of_machine)
@@ -173,12 +169,8 @@ class ScanProgram(eqx.Module):
     def _again(
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
-        """`out` with what a measure finds at another pass, at the lanes that need it only.
-
-        **Arguments:** each of all lanes: `values` of the axes; `wanted`, whether it is computed;
-        `state`, after the cycles observed; `out`, the numbers so far; `pass_number`, for a measure
-        that counts its passes.
-        """
+        """`out` with what a measure finds at another pass, at the lanes that need it only; of all
+        lanes `wanted` is whether it is computed, `state` that after the cycles observed."""
         needed = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(out)
         if needed is None:
             return out
@@ -208,12 +200,8 @@ def make_program(
     noise: Any = None,
     key: Any = None,
 ) -> ScanProgram:
-    """The program of a scan, its arguments checked as far as they can be without the axes' values.
-
-    **Arguments:** `names` of the axes; the options of each run; all others as for `scan`.
-
-    **Raises:** `TypeError` or `ValueError`, as `scan`.
-    """
+    """The program of a scan, its arguments checked as far as they can be without the axes' values;
+    `names` are those of the axes. **Raises:** `TypeError` or `ValueError`, as `scan`."""
     build, own = None, [name for name in names if part_of(name) == MACHINE]
     template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
     if template is not None:
@@ -279,10 +267,8 @@ def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known
 def _known_of_made(
     build: Callable[..., Any], names: list[str], method: MethodLike, start: State
 ) -> _Known:
-    """The same of the machines that a function makes, whatever its values.
-
-    **Raises:** `ValueError` if the function does not take these names.
-    """
+    """The same of the machines that a function makes, whatever its values. **Raises:** `ValueError`
+    if the function does not take these names."""
     try:
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
@@ -410,10 +396,8 @@ class Custom(AbstractMeasure):
 
 def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
     """Measures by name, as objects, or functions of a machine and a run; one or several. A name may
-    be that of one of the machine's own `averages`, which comes first.
-
-    **Raises:** `ValueError` for an unknown name, `TypeError` for anything else.
-    """
+    be that of one of the machine's own `averages`, which comes first. **Raises:** `ValueError` for
+    an unknown name, `TypeError` for anything else."""
     if isinstance(measure, str) or callable(measure) or not isinstance(measure, Iterable):
         measure = (measure,)
     found = tuple(_measure(one, averages) for one in measure)
@@ -440,10 +424,8 @@ def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
 
 
 def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
-    """The cycles to observe: those asked for, or as many as these measures need.
-
-    **Raises:** `ValueError` if they are too few for one of them.
-    """
+    """The cycles to observe: those asked for, or as many as these measures need. **Raises:**
+    `ValueError` if they are too few for one of them."""
     needed = max(m.cycles for m in measures)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:

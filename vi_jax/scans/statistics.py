@@ -45,9 +45,7 @@ class _Observed(AbstractMeasure):
 
     def row(self, machine: Machine, run: Run, name: Of) -> tuple[Array, Array]:
         """The quantity at all instants, and at those behind the first, or in all cycles.
-
-        **Raises:** `ValueError` for a name that has none.
-        """
+        **Raises:** `ValueError` for a name that has none."""
         if not isinstance(name, str):
             found = jnp.asarray(name(machine, run))
             if found.ndim != 1:
@@ -267,12 +265,8 @@ class Escape(_Observed):
         }
 
     def leaves(self, machine: Machine, state: State, record: Any, first: Any) -> Any:
-        """Whether a lane has left, seen from the loop at a record point, so that it need not go on;
-        `None` where only the whole record tells.
-
-        **Arguments:** the state there; the record of the interval that ends there; `first`, whether
-        recording begins there.
-        """
+        """Whether a lane has left, seen from the loop at a record point, where recording begins at
+        the `first`, so that it need not go on; `None` where only the whole record tells."""
         parts, name = components(state), self.of
         if not isinstance(name, str) or has_quantities(machine):
             return None

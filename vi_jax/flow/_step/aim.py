@@ -38,12 +38,9 @@ _SHORTEST, _SHORTEST_SINGLE, _SHORTEST_DIP = 1e-6, 1e-3, 1e-3
 def _corner(
     begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar], h: Scalar, bent: Flag
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Where the tangents at both ends of a step meet, from its begin on, and how high: no curve
-    that is bent one way goes beyond. And where the curve is greatest, if its slope changes evenly.
-
-    **Arguments:** `begin` and `end`, value and slope there; `h`, the step's length; `bent`, where
-    the curve is bent.
-    """
+    """Where, after the begin of a step, the tangents at both ends meet, and how high: no curve that
+    is bent one way goes beyond. And where the curve is greatest, if its slope changes evenly.
+    `begin` and `end` are value and slope there."""
     (x0, v0), (x1, v1) = begin, end
     fall = jnp.where(bent, v0 - v1, 1.0)
     place = (x1 - v1 * h - x0) / fall
@@ -68,12 +65,9 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
 def crests(
     plan: Plan, sides: list[Side], below: list[Flag], shares: tuple[float, ...], h: Scalar
 ) -> list[tuple[Flag, Scalar]]:
-    """Return of functions that end a step below zero whether each may have been positive within
-    it, and the first place where.
-
-    **Arguments:** `sides`, the functions; `below`, whether they end so, without which nothing is
-    asked of one; `shares`, the places of the stages; `h`, the length of the step.
-    """
+    """Return of functions whether each may have been positive within a step, and the first place
+    where; of those that do not end it `below` zero nothing is asked. `shares` are the places of the
+    stages."""
     ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
     values = [stop_gradient(x.within) for x in sides]
     slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
@@ -106,14 +100,12 @@ def crests(
 def _crest(
     plan: Plan, shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
 ) -> tuple[Flag, Scalar]:
-    """As `crests` for one function.
+    """As `crests` for one function, by value and slope at the `ends`, and the `values` at the
+    stages.
 
     The function is taken for the cubic through both ends of the step, plus what it is off at the
     stages: that is divided by the shape of the cubic's error and interpolated linearly. By how much
     it differs from stage to stage is the margin of doubt.
-
-    **Arguments:** `ends`, value and slope where the step begins and ends; `values`, at the stages;
-    `slack`, what counts as zero.
     """
     x0, v0, x1, v1 = ends
     over, rises, over_end, falls = x0 - slack, h * v0, x1 - slack, h * v1
@@ -155,12 +147,9 @@ def _inner(shares: tuple[float, ...]) -> list[int]:
 
 
 def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar]:
-    """Return whether a curve is positive between its ends, and where first, as a share of the way:
-    by parabolas through its heights at equal distances, and through its slopes at the ends.
-
-    **Arguments:** `heights`, ends included; `rise` and `fall`, the slopes at both ends, by that
-    distance.
-    """
+    """Whether a curve is positive between its ends, and where first, as a share of the way: by
+    parabolas through its heights at equal distances, ends included, and through its slopes there by
+    that distance."""
     parts = heights.size - 1
     before, here, after = heights[:-2], heights[1:-1], heights[2:]
     bend, tilt = 2 * here - before - after, after - before
@@ -186,11 +175,9 @@ def _bump(share: np.ndarray) -> np.ndarray:
 
 
 def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
-    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero.
-
-    Such a step is halved until the turns lie apart or the dip is too short to matter. Where the
-    force's rate of change is known, a force that sags between the ends is not taken for straight.
-    """
+    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero; then
+    the step is halved, until the turns lie apart or the dip is too short to matter. A force that
+    sags, by how fast it changes, is not taken for straight."""
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
@@ -269,9 +256,8 @@ def first_event(
     """The first event of a step.
 
     **Arguments:** `guards` and `courses`, what is known of the events and of each coordinate, not
-    both empty; `met`, whether the step landed on an event that it was aimed at; `corrections`, how
-    often a root is corrected: a motion's own polynomial is worth it, one through a step's ends only
-    says where to aim.
+    both empty; `met`, whether the step landed where it was aimed; `corrections` of a root: a
+    motion's own polynomial is worth them, one through a step's ends only says where to aim.
     """
     found, crossed, any_turn = [], jnp.zeros_like(met), jnp.zeros_like(met)
     for guard, over, curve in guards:
@@ -315,7 +301,7 @@ def first_event(
 
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
-    """The earliest of what a step met: its target, the curve that rises through zero there, and
+    """Of what a step met the earliest: its target, the curve that rises through zero there, and
     whether that is where the step begins (`None` if it cannot be).
 
     **Arguments:** `found`, of each of these before the three its place: infinite if it was not met,
@@ -360,12 +346,8 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
 
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
-    """Whether a step may have to end at a turning point of coordinate number k: by a bound, before
-    the place of the turn is known.
-
-    **Arguments:** `begin` and `end`, the coordinate's rates at the ends of the step, `h` its
-    length.
-    """
+    """Whether a step of length h may have to end at a turning point of coordinate number k: by a
+    bound, before the place of the turn is known."""
 
     def bound(stop: RigidStop) -> Scalar:
         gap = stop_gradient(stop.gap)
@@ -378,11 +360,8 @@ def _has_to_be_met(
     plan: Plan, lane: Lane, k: int, depth: Callable[[RigidStop], Scalar], margin: float
 ) -> Flag:
     """Whether a step has to end at a turning point of coordinate number k: at each one (see
-    `Plan.meets_turns`), or if it is close to a stop.
-
-    **Arguments:** `depth`, how far the turn is beyond a stop; `margin`, how far short of a stop is
-    close.
-    """
+    `Plan.meets_turns`), or at one that is `depth` beyond a stop, or short of it by less than
+    `margin`."""
     close = plan.meets_turns(lane.done)
     if plan.meets_every_turn:
         return close
@@ -393,12 +372,9 @@ def _has_to_be_met(
 
 
 def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
-    """The lane with its next step cut at the first event of `motion`, of a method that knows the
-    motion before it takes a step (`Taylor`).
-
-    Only steps that are not aimed already are cut, at stops and at a clock in the state; other
-    events are found by `aim_at`, once the step was tried.
-    """
+    """The lane with its next step cut at the first event of `motion`, of a method that knows it
+    before it takes a step (`Taylor`): at stops and a clock in the state. `aim_at` finds other
+    events."""
     limit = stop_gradient(jnp.asarray(plan.method.longest(plan.machine, lane.s, lane.state)))
     h = jnp.minimum(lane.attempt, motion.reach(limit))
     if plan.ticks(lane.state):
@@ -458,11 +434,7 @@ def _foreseen(
 
 def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, Scalar, Scalar]:
     """Whether a tried step has to be shortened to end at an event, to what length, and its target
-    (see `Lane.target`).
-
-    **Arguments:** `foreseen`, whether the motion was known before the step (see `aim_ahead`);
-    static.
-    """
+    (see `Lane.target`). If the motion is `foreseen`, `aim_ahead` has looked before."""
     # What is found out here is only where to look.
     trial = trial._replace(h=stop_gradient(trial.h), paths=stop_gradient(trial.paths))
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
@@ -499,10 +471,7 @@ class _Seen(NamedTuple):
 
 
 def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: bool) -> Flag:
-    """Whether a step may have met anything; if not, `_aimed` need not be evaluated.
-
-    **Arguments:** `seen`, what the step's ends say; `foreseen` as for `aim_at`.
-    """
+    """Whether a step may have met anything; if not, `_aimed` need not be evaluated."""
     if any(path.leaves is not None for path in trial.paths):
         anything = jnp.ones_like(trial.good)
         return anything if trial.clear is None else ~trial.clear

@@ -29,7 +29,7 @@ from .._lane import Lane, Plan, any_of, in_place, select, to_event, to_turn_of
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, rates, to_turn
 from ..results import EventKind, code_of_outcome
-from ..smooth import exact, holding, in_modes
+from ..smooth import exact, holding, in_modes, limited_of
 from .guards import JUMPED, Crossing, furthest_landing
 from .impact import is_compound, strike_in_turn, strike_once
 from .settle import settle, stilled
@@ -40,8 +40,8 @@ from .trial import Release, Situation, Trial
 _ROUNDS = 4
 
 
-class _Instant(NamedTuple):
-    """What happens at one instant, between two of its events."""
+class _Due(NamedTuple):
+    """What is still due at one instant, between two of its events."""
 
     lane: Lane
     due: Scalars
@@ -60,17 +60,17 @@ def happened(
     happens next: one that it takes from below zero to above happens, and so does one that was at
     zero as well and is not any more. An event does not set off itself.
 
-    **Arguments:** `taken`, whether the step is taken; of the events by their numbers, which are
-    `due`, and which are `near`: their guards are at zero to rounding.
+    **Arguments:** of the events by their numbers, which are `due`, and which are `near`: their
+    guards are at zero to rounding.
     """
     zero = jnp.zeros_like(lane.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
-    begin = _Instant(lane, due_, near_)
+    begin = _Due(lane, due_, near_)
     if len(due) == 1:
         end = _next(plan, taken, tuple(due), begin)
     else:
 
-        def turn(x: _Instant, _: None) -> tuple[_Instant, None]:
+        def turn(x: _Due, _: None) -> tuple[_Due, None]:
             left = sum(x.due, start=zero) > 0
             return jax.lax.cond(
                 left, lambda x: _next(plan, taken, tuple(due), x), lambda x: x, x
@@ -87,12 +87,12 @@ def set_off(
     plan: Plan, lane: Lane, when: Flag, before: tuple[State, Scalars],
     turns: dict[int, Flag], near: Scalars,
 ) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
-    """The lane with those guards to come from below anew (see `Lane.below`) that a jump has put
-    on their surface or beyond, and of what happened; which events the jump sets off; and what is
-    left of those near.
+    """The lane with those guards to come from below anew (see `Lane.below`) that a jump has put on
+    their surface or beyond, and of what happened; which events the jump sets off; and what is left
+    of those near.
 
-    **Arguments:** `when`, where state or modes jumped; state and modes `before`; `turns`, of each
-    event whether it was its turn; `near`, as in `_Instant`.
+    **Arguments:** `when` state or modes jumped; these `before`; `turns`, of each event whether it
+    was its turn; `near`, as in `_Due`.
     """
     (old, modes), contact, machine = before, lane.contact or (), plan.machine
     below, nearby, off = [], [], {}
@@ -119,7 +119,7 @@ def set_off(
     return lane._replace(below=tuple(below)), off, tuple(nearby)
 
 
-def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _Instant:
+def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
     """The instant after the first listed of the events that are due."""
     machine, lane, old = plan.machine, x.lane, x.lane.state
     modes_before, contact = lane.modes, lane.contact or ()
@@ -165,7 +165,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Instant) -> _In
     last = off.get(section_number(machine))
     if last is not None:
         lane = lane.completing(last)
-    return _Instant(lane, tuple(due), near)
+    return _Due(lane, tuple(due), near)
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -179,11 +179,8 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
 def _comes_back(
     machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: State
 ) -> Flag | None:
-    """Whether the field behind a switch points back at its surface, as that before it did: the
-    motion would slide along it. `None` for a kind of switch whose motion cannot.
-
-    **Arguments:** `i`, the number of the event; `modes`, `s` and `state` behind it.
-    """
+    """Whether the field behind a switch, event number i, points back at its surface, as that before
+    it did: the motion would slide along it. `None` for a kind of switch whose motion cannot."""
     if not events_of(machine)[i].may_slide:
         return None
     smooth = in_modes(machine, modes)
@@ -199,12 +196,8 @@ def _comes_back(
 def _turned_over(
     plan: Plan, lane: Lane, when: Flag, number: int, before: tuple[State, Scalars]
 ) -> Flag:
-    """Whether the guard of a switch has jumped above zero, as that of friction does that held a
-    pull which is another one now: it has no place where it passes zero.
-
-    **Arguments:** `when`, where state or modes jumped; `number`, the switch's; state and modes
-    `before`.
-    """
+    """Whether the guard of a switch has jumped above zero with state or modes, as that of friction
+    does that held a pull which is another one now: it has no place where it passes zero."""
     contact, (old, modes_before) = lane.contact or (), before
     was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
     now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
@@ -217,18 +210,18 @@ def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], resting: Scalars | None = None,
 ) -> Lane:  # fmt: skip
-    """With those bodies free that were pressed on their stops before an event, and are pulled away
-    behind it: a force that jumps has no place where it passes zero.
+    """The lane with those bodies free that were pressed on their stops before an event, and are
+    pulled away behind it: a force that jumps has no place where it passes zero.
 
-    **Arguments:** whether the event happens; state and modes before it; what rested then, if that
-    may be another than now (as in `Lane.contact`).
+    **Arguments:** `when` the event happens; state and modes `before` it; what rested then
+    (`resting`), if that may be another than now.
     """
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
         return lane
     old, modes_before = before
     freed, direction = list(contact), list(lane.direction)
-    for k in sorted({stop.coordinate for stop in stops_of(machine)}):
+    for k in limited_of(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = holding(machine, modes, contact, but=k)
@@ -247,12 +240,9 @@ def release_pulled(
 
 
 def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
-    """The lane behind an event: which way the motion goes on, by the modes that it has then, and
-    which bodies still rest. A lane whose body was put beyond a stop ends.
-
-    **Arguments:** `lane`, with state and modes behind the event; whether an event `happens`, and
-    whether one that may move the state, as it `jumps`; `old`, the state before.
-    """
+    """The lane behind an event that `happens`, and may move the state where it `jumps`: which way
+    the motion goes on, in its modes then, and which bodies still rest. A lane whose body was put
+    beyond a stop ends."""
     if stops_of(plan.machine) and others_of(plan.machine):
         lane = lane.ended(jumps, plan.beyond_a_stop(lane.state), "bad_reset")
         lane = lane._replace(contact=contacts_after_jump(plan, lane, jumps, old))
@@ -264,20 +254,14 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
 
 
 def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
-    """The lane with the directions of all coordinates, and the stops rested on, after its state was
-    put in place of another one.
-
-    **Arguments:** `when`, where the state was replaced; `old`, the state before.
-    """
+    """The lane with the directions of all coordinates, and the stops rested on, `when` its state
+    was put in place of an `old` one."""
     lane = lane._replace(contact=contacts_after_jump(plan, lane, when, old))
     return lane._replace(direction=_directions(plan, lane, when, old))
 
 
 def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
-    """The stops rested on after the state was replaced: what was moved rests no longer.
-
-    **Arguments:** as `after_jump`.
-    """
+    """The stops rested on after the state was replaced: what was moved rests no longer."""
     if lane.contact is None:
         return None
     contacts = list(lane.contact)
@@ -293,10 +277,7 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
 
 
 def _directions(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
-    """The directions of all coordinates behind an event, in the modes that the lane has then.
-
-    **Arguments:** as `after_jump`.
-    """
+    """The directions of all coordinates behind an event, in the modes that the lane has then."""
     found, new = list(lane.direction), lane.state
     smooth = holding(plan.machine, lane.modes, lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
@@ -382,12 +363,9 @@ def _along(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
 
 
 def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
-    """The lane after the event that the step landed on, and Y there: first the last part of the
-    way, then the jump. A step lands on one event; another one at the same instant is landed upon by
-    the next step, which has no length.
-
-    **Arguments:** `lane`, at the step's end; `places`, Y there, and before a jump.
-    """
+    """The lane after the event that the step landed on, and Y there and before a jump: first the
+    last part of the way, then the jump. Another event at the same instant is landed upon by the
+    next step, which has no length."""
     plan, trial, way = at.plan, at.trial, at.way
     landed = {c.number: c.landed for c in trial.crossings}
     before = places[1:]
@@ -413,10 +391,8 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
 
 
 def _landed(at: Situation, lane: Lane, there: State) -> Lane:
-    """The lane after the event that the step landed on, and all that it sets off.
-
-    **Arguments:** `lane`, at the event; `there`, the state in which it is met.
-    """
+    """The lane after the event that the step landed on, in the state `there`, and all that it sets
+    off."""
     plan, machine, trial = at.plan, at.plan.machine, at.trial
     landed = {c.number: c.landed for c in trial.crossings}
     near = _near(at)
@@ -479,10 +455,7 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
 
 
 def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
-    """The lane with coordinate number k free, where the step ended at its release.
-
-    **Arguments:** `leaves`, where the body leaves its stop.
-    """
+    """The lane with coordinate number k free, where the step ended at its release."""
     plan, way, contact = at.plan, at.way, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
@@ -491,7 +464,7 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     _, state, integrals = way.drifted(offset, moving)
     if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
-        limited = sorted({stop.coordinate for stop in stops_of(plan.machine)})
+        limited = limited_of(plan.machine)
         walls = {i: contact[i] for i in limited}
         put, _ = stilled(plan, lane.s, state, {i: walls[i] > 0 for i in limited}, walls)
         state = select(walls[k] > 0, put, state)
@@ -524,11 +497,8 @@ def _offset(at: Situation, c: Crossing) -> Scalar:
 
 
 def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) -> Lane:
-    """The lane after the rebound from a stop, or at rest on it.
-
-    **Arguments:** `landed`, whether the step landed on the event of each number; `there`, the state
-    in which the stop is met.
-    """
+    """The lane after the rebound from the stops `landed` upon in the state `there`, or at rest on
+    them."""
     plan, machine, before = at.plan, at.plan.machine, at.old
     landed = {number: landed[number] for number in range(len(stops_of(machine)))}
     strike = strike_in_turn if is_compound(machine) else strike_once
@@ -563,11 +533,9 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
 
 
 def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
-    """Greatest and smallest Y so far in this interval, and the smallest distance to a stop at a
-    turning point; each `None` if it is not recorded.
-
-    **Arguments:** `places`, Y where the step leads, and before a jump.
-    """
+    """Greatest and smallest Y so far in this interval, by the `places` where the step leads and
+    before a jump, and the smallest distance to a stop at a turning point; `None` if it is not
+    recorded."""
     plan, lane, trial, taken = at.plan, at.old, at.trial, at.taken
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance

@@ -33,7 +33,7 @@ from ...machine import (
 from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
-from ..smooth import SmoothMachine, exact, is_affine
+from ..smooth import SmoothMachine, exact, is_affine, limited_of
 
 # Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -113,14 +113,13 @@ def within(
     """Return the guards at the stages of a step.
 
     **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
-    `ends`, its rates where the step begins and ends; `at(share)`, the state at a share of the step,
-    asked for where the stages have none; `h`, the length of the step; `longest`, that of the
-    longest one.
+    `ends`, its rates at both ends; `at(share)`, the state at a share of the step, asked for where
+    the stages have none; `longest`, the length of the longest step.
     """
     if not stages:
         return Within({}, {}, {})
     machine, around = plan.machine, (lane.modes, lane.contact or ())
-    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if plan.rests else []
+    limited = limited_of(machine) if plan.rests else []
     contacts: Any = lane.contact
     looked_at = events_looked_at(plan, lane.state)
 
@@ -195,14 +194,12 @@ def may_be_above(
     begin: Sequence[Scalar], end: Sequence[Scalar], inner: Array, shares: Sequence[float],
     zero: Scalar | float,
 ) -> Flag:  # fmt: skip
-    """Whether a function may be above zero within a step, at a glance.
+    """Whether a function may be above `zero` within a step, at a glance: by value and slope at both
+    ends, and its values at stages.
 
     The top of a parabola between two places is above both by at most an eighth of what it falls to
     the next place; half of that is granted here. Where the function falls at the begin of the step,
     or rises at its end, it has no top there.
-
-    **Arguments:** `begin`, `end`, its value and slope there; `inner`, its values at stages, and
-    their places as `shares` of the step; `zero`, what counts as zero.
     """
     (x0, v0), (x1, v1) = begin, end
     seen = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
@@ -308,9 +305,9 @@ def crossings(
 ) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
     """The events that a step saw, and `Lane.below` at its end.
 
-    **Arguments:** `holding`, the machine as the step saw it; `paths`, what the step saw of each
-    coordinate; `there`, s at its end, its length and the state at its end; `ends`, whether it was
-    good, and whether it ends an interval; `seen`, guards at the stages.
+    **Arguments:** `holding`, the machine as the step saw it; `paths`, what it saw of each
+    coordinate; `there`, s at its end, its length and the state; `ends`, whether it was good, and
+    ends an interval; `seen`, guards at the stages.
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, (s1, new), seen)
@@ -363,11 +360,7 @@ def _others(
     plan: Plan, lane: Lane, moving: SmoothMachine, there: tuple[Scalar, State], seen: Within
 ) -> tuple[list[Crossing], Scalars]:
     """The events besides stops as a step sees them, with that of a clock in the state, which counts
-    the cycles; and `Lane.below` at the step's end.
-
-    **Arguments:** `moving`, the machine as the step saw it; `there`, s and the state at its end;
-    `seen`, guards at the stages.
-    """
+    the cycles; and `Lane.below` at the step's end, `there`."""
     machine, found, below = plan.machine, [], []
     numbers, around = plan.others(lane.state), (lane.modes, lane.contact or ())
     clocked = clock_of(machine, lane.state) is not None
@@ -395,7 +388,7 @@ def _others(
         event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
         both = zip(begins[place], arrives[place], strict=True)
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
-        scale = plan.guard_extent(place) + plan.in_units(
+        scale = plan.extent(len(machine.coordinates) + place) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         )
         if event.from_below:
@@ -422,23 +415,16 @@ def _others(
 def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
     """The rates of a guard where a step begins, without a rise that is rounding's: behind an event
     that has just been landed upon the guard may be zero with its slope, as the velocity of a body
-    that begins to slip, and it is the second derivative by which it falls.
-
-    **Arguments:** `scale`, of the guard.
-    """
+    that begins to slip, and it is the second derivative by which it falls."""
     x, v, a = stop_gradient(begin)
     near = jnp.abs(x) <= 4 * float(jnp.finfo(x.dtype).eps) * scale
-    risen = near & (v > 0) & (2 * v <= -plan.in_units(_landing_tolerance(x)) * a)
+    risen = near & (v > 0) & (2 * v <= -plan.in_units(landing_tolerance(x)) * a)
     return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
 def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
     """Whether a guard counts that does so only once it has been below zero, and `Lane.below` at the
-    step's end. One that begins at zero and falls counts.
-
-    **Arguments:** `below`, as in `Lane`; the guard's rates where the step begins and ends; `scale`,
-    its size, by which rounding is judged.
-    """
+    step's end. One that begins at zero and falls counts."""
     # On it is also what a search's step left so close to it: a cycle is no shorter.
     rounding = _rounding(scale)
     here = stop_gradient(begin)
@@ -472,11 +458,9 @@ def _seen(
 ) -> Crossing:  # fmt: skip
     """The event, with whether a step that was aimed at it landed on it, or has to be aimed again.
 
-    A step that ends an interval as it meets a stop, to rounding, is aimed at it: an impact on the
-    section belongs to the cycle that ends there, so that it is not now in one, now in the next.
-
-    **Arguments:** `ends`, whether the step was good and ends an interval; `good`, whether it was
-    good; `h`, its length; `guard`, the event; `all_of_them`, all events that the step saw.
+    A step that ends an interval (`ends`) as it meets a stop, to rounding, is aimed at it: an impact
+    on the section belongs to the cycle that ends there, so that it is not now in one, now in the
+    next.
     """
     end = guard.end
     aimed = good & (lane.target == to_event(guard.number))
@@ -497,7 +481,7 @@ def _seen(
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
-    close = size <= _landing_tolerance(h) * leniency(plan, lane)
+    close = size <= landing_tolerance(h) * leniency(plan, lane)
     there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # One that is there may have no way left along a parabola: a body that is at rest on a surface.
@@ -524,7 +508,7 @@ def leniency(plan: Plan, lane: Lane) -> Scalar:
     return plan.in_units(jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims)))
 
 
-def _landing_tolerance(x: Scalar) -> float:
+def landing_tolerance(x: Scalar) -> float:
     """Largest accepted |δ|, the distance in `s` from the step's end to the event. State and
     derivatives are carried over it to first order (`drift.drifted`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
@@ -532,7 +516,7 @@ def _landing_tolerance(x: Scalar) -> float:
 
 def furthest_landing(x: Scalar) -> float:
     """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
-    return max(turn_tolerance(x), 1e3 * _landing_tolerance(x))
+    return max(turn_tolerance(x), 1e3 * landing_tolerance(x))
 
 
 def turn_tolerance(x: Scalar) -> float:

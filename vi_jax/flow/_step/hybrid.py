@@ -25,6 +25,7 @@ from ...machine import (
     others_of,
     rewound,
     section_in,
+    section_number,
     stops_of,
     struck_modes,
     switches_of,
@@ -49,10 +50,8 @@ _LONG = 1e-3
 
 
 def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
-    """One step of one lane: advance, aim or land. A lane that has ended is left as it is.
-
-    **Returns:** the lane after it; whether an interval ended with it; what is recorded of that.
-    """
+    """One step of one lane: advance, aim or land. A lane that has ended is left as it is. Returns
+    the lane; whether an interval ended; what is recorded of that."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     smooth = holding(plan.machine, lane.modes, lane.contact)
     beside = carried(smooth, lane.s, lane.state, lane.record.integrals)
@@ -92,10 +91,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
     """The length of the next step that is aimed at nothing. One that was aimed at an event and fell
-    short of it is followed by one as long: so the place where a guard jumps is halved down to.
-
-    **Arguments:** `length`, that of an ordinary step.
-    """
+    short of it is followed by one as long: so the place where a guard jumps is halved down to."""
     if not plan.others(lane.state):
         return length
     short = taken & (lane.target >= to_event(len(stops_of(plan.machine))))
@@ -108,10 +104,7 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
 def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:
     """Whether a motion has died out, to rounding, in an equilibrium that lies on the machine's
     section: a step changes nothing, and it is twice as long on its way as a cycle is expected to
-    take. It would meet the section by accident of rounding only, or never.
-
-    **Arguments:** the lane before the step and after it.
-    """
+    take. It would meet the section by accident of rounding only, or never."""
     old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, there.state))
     slack = 8 * float(jnp.finfo(there.s.dtype).eps)
     cycle, size = plan.machine.cycle, jnp.ones_like(there.s)
@@ -125,12 +118,8 @@ def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:
 
 
 def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
-    """The lane as its next interval begins, where one was completed; and as its next cycle begins,
-    where that was the cycle's last.
-
-    **Arguments:** `there`, the lane after the step; whether it `reached` the end of a piece of its
-    cycle, and `completed` an interval with it; `done`, how many are complete.
-    """
+    """The lane as its next interval begins, where one was `completed`; and as its next cycle
+    begins, where that was the cycle's last. The step `reached` the end of a piece of its cycle."""
     turned, part, state = reached, there.part, there.state
     if plan.instants > 1:
         part = part + jnp.where(reached, 1.0, 0.0)
@@ -150,11 +139,8 @@ def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scala
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
-    """The length proposed for the next ordinary step.
-
-    **Arguments:** `taken` and `rejected`, whether the step was; one that is to be shortened to an
-    event was neither.
-    """
+    """The length proposed for the next ordinary step. A step that is to be shortened to an event
+    was neither `taken` nor `rejected`."""
     if not plan.method.adaptive:
         return lane.length
     h = stop_gradient(trial.h)
@@ -168,10 +154,7 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
 
 
 def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
-    """The lane behind the impulse at the end of a piece of its cycle.
-
-    **Arguments:** whether that end is `reached`; whether an interval is `completed` with it.
-    """
+    """The lane behind the impulse at the end of a piece of its cycle, if that is `reached`."""
     assert plan.noise is not None
     old, since = lane, None
     if lane.last_impulse is not None:
@@ -199,12 +182,8 @@ def _may_change_modes(plan: Plan) -> bool:
 def _faults(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag, new: Lane
 ) -> list[tuple[Flag, Scalar | float]]:
-    """What ends a lane, the first that holds being the reason.
-
-    **Arguments:** `taken` and `rejected`, whether the trial was; `new`, the lane after it.
-
-    **Returns:** pairs of a condition and a reason, a code of `RESULTS`.
-    """
+    """What ends a lane, and the reason's number; the first that holds is the reason. `new` is the
+    lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
     many = impacts > _MANY
     if is_alive(plan.machine, trial.state) is not None:
@@ -241,6 +220,6 @@ def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
         others = target >= to_event(first + len(switches_of(machine)))
         reason = jnp.where(others, code("reset_unresolved"), reason)
     if not plan.ticks(lane.state):
-        ends = target == plan.to_section
+        ends = target == to_event(section_number(machine))
         reason = jnp.where(ends, code("section_unresolved"), reason)
     return reason

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar, Scalars, State
+from ..._types import Flag, Scalar, State
 from ...machine import (
     AbstractMachine,
     Coordinate,
@@ -22,6 +22,7 @@ from ...machine import (
 )
 from .._lane import Lane, Plan, select, to_event, written
 from ..results import EventKind
+from ..smooth import limited_of
 
 # By so many roundings a rebound may be faster than the approach: a choice, a few more than the one
 # or two that a law's own arithmetic makes.
@@ -41,7 +42,7 @@ class Blow(NamedTuple):
 
 def is_compound(machine: AbstractMachine) -> bool:
     """Whether several velocities change in an impact, across stops or along them; static."""
-    return len({stop.coordinate for stop in stops_of(machine)}) > 1 or rubs(machine)
+    return len(limited_of(machine)) > 1 or rubs(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -57,11 +58,8 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 def recorded(
     plan: Plan, lane: Lane, there: State, hit: Flag, number: int, approach: Scalar
 ) -> Lane:
-    """The lane with an impact counted and logged.
-
-    **Arguments:** `there`, the state in which the stop is met; `hit`, whether it is, by a step that
-    is taken; `number`, the stop's; `approach`, V⁻.
-    """
+    """The lane with an impact counted and logged, if a stop is `hit` by a step that is taken, in
+    the state `there`."""
     clock, record = plan.clock(lane.s, there), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
@@ -77,11 +75,8 @@ def strike_once(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
 ) -> tuple[Lane, dict[int, Blow]]:
     """The lane after an impact, and what it was to the coordinate, by its number, where stops limit
-    one coordinate and nothing rubs.
-
-    **Arguments:** `taken`, whether the step is taken; `landed`, of each stop, by its number,
-    whether the step landed on it; `there`, the state in which it did.
-    """
+    one coordinate and nothing rubs. By the stops' numbers, `landed` is whether the step landed on
+    it, in the state `there`."""
     machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
@@ -96,15 +91,12 @@ def strike_once(
         energy = lane.record.impact_energy
         if energy is not None:
             lost = stop.loss(approach, share)
-            lost = lost if _is_one(body.mass) else body.mass_at(lane.s, there) * lost
+            if not (isinstance(body.mass, float) and body.mass == 1.0):
+                lost = body.mass_at(lane.s, there) * lost
             lane = lane.recording(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
     return lane, {k: blow}
-
-
-def _is_one(mass: object) -> bool:
-    return isinstance(mass, float) and mass == 1.0
 
 
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
@@ -128,9 +120,9 @@ class _Round(NamedTuple):
     """A sequence of impacts between two of them."""
 
     lane: Lane
-    struck: Scalars
-    """Of each coordinate, as in `Blow`."""
-    approach: Scalars
+    struck: dict[int, Scalar]
+    """By coordinate, as in `Blow`."""
+    approach: dict[int, Scalar]
     most: Scalar
     """The greatest speed of approach that there was."""
     goes_on: Scalar
@@ -147,22 +139,24 @@ class _Instant(NamedTuple):
     """Whether any stop is landed upon."""
     there: State
     """The state before."""
-    limited: list[int]
-    """The numbers of the coordinates that stops limit."""
-    bodies: list[Coordinate]
-    """The coordinates of these numbers."""
-    before: list[Scalar]
+    bodies: dict[int, Coordinate]
+    """The coordinates that stops limit, by their numbers, as all that follows but stops."""
+    before: dict[int, Scalar]
     """Their velocities before."""
     gains: list[list[Scalar]]
     """What they gain by each other's force (see `machine.contacts`)."""
     landed: dict[int, Flag]
     touches: dict[int, Flag]
     """Of each stop, whether its contact is closed."""
-    coupled: list[Flag]
-    """Of each coordinate, whether one of those landed upon acts on it, through contacts that are
-    closed."""
-    slow: list[Scalar | float]
-    """Of each coordinate, how much of its velocity is rounding."""
+    coupled: dict[int, Flag]
+    """Whether one of those landed upon acts on it, through contacts that are closed."""
+    slow: dict[int, Scalar | float]
+    """How much of its velocity is rounding."""
+
+    def forces(self, on: dict[int, Flag], wanted: dict[int, Scalar]) -> dict[int, Scalar]:
+        """`forces` of the machine's contacts, by coordinate."""
+        found = forces(self.gains, list(on.values()), list(wanted.values()))
+        return dict(zip(self.bodies, found, strict=True))
 
 
 def strike_in_turn(
@@ -176,29 +170,24 @@ def strike_in_turn(
     without an end (several balls without restitution) goes to its limit: the contacts that are
     still being struck come to rest against each other.
     """
-    limited = sorted({stop.coordinate for stop in stops_of(plan.machine)})
-    instant = _instant(plan, taken, lane, landed, there, limited)
+    instant = _instant(plan, taken, lane, landed, there)
     zero = jnp.zeros_like(lane.s)
-    nothing = tuple(zero for _ in limited)
+    nothing = dict.fromkeys(instant.bodies, zero)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
-    touched = list(nothing)
+    touched = dict(nothing)
     for number, stop in enumerate(stops_of(plan.machine)):
-        i = limited.index(stop.coordinate)
-        touched[i] = jnp.where(landed[number], to_event(number), touched[i])
-    first = select(instant.met, there, lane.state)
-    begin = _Round(
-        lane._replace(state=first), tuple(touched), nothing, zero,
-        jnp.where(instant.met, 1.0, zero), zero,
-    )  # fmt: skip
+        k = stop.coordinate
+        touched[k] = jnp.where(landed[number], to_event(number), touched[k])
+    lane = lane._replace(state=select(instant.met, there, lane.state))
+    begin = _Round(lane, touched, nothing, zero, jnp.where(instant.met, 1.0, zero), zero)
     end = jax.lax.while_loop(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
     )
     endless = end.rounds >= _ROUNDS
     lane = end.lane.ended(instant.met, endless, "simultaneous")
     blows = {}
-    for k, body, struck, fastest in zip(
-        limited, instant.bodies, end.struck, end.approach, strict=True
-    ):
+    for k, body in instant.bodies.items():
+        struck, fastest = end.struck[k], end.approach[k]
         leaves = -plan.wall(k, struck)[0] * body.velocity(lane.state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
         blows[k] = Blow(struck, fastest, jnp.clip(share, 0.0, 1.0))
@@ -206,54 +195,40 @@ def strike_in_turn(
 
 
 def _instant(
-    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State,
-    limited: list[int],
-) -> _Instant:  # fmt: skip
-    """What is known of an instant before its impacts.
-
-    **Arguments:** as `strike_in_turn`.
-    """
-    bodies = [plan.machine.coordinates[k] for k in limited]
-    gains_ = shares(bodies, there, [push_of(body, there) for body in bodies])
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+) -> _Instant:
+    """What is known of an instant before its impacts."""
+    bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
+    each = list(bodies.values())
+    gains = shares(each, there, [push_of(body, there) for body in each])
     met = jnp.zeros_like(taken)
-    coupled = [met for _ in limited]
-    touches = {}
+    coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
-        at, here = limited.index(stop.coordinate), landed[number]
-        met, coupled[at] = met | here, coupled[at] | here
-        depth = stop_gradient(stop.beyond(bodies[at].position(there)))
-        slack = (
-            256
-            * float(jnp.finfo(depth.dtype).eps)
-            * (plan.extent(stop.coordinate) + jnp.abs(stop_gradient(stop.gap)))
-        )
-        closed = here | (jnp.abs(depth) <= slack)
+        k, here = stop.coordinate, landed[number]
+        met, coupled[k] = met | here, coupled[k] | here
+        depth = stop_gradient(stop.beyond(bodies[k].position(there)))
+        size = plan.extent(k) + jnp.abs(stop_gradient(stop.gap))
+        closed = here | (jnp.abs(depth) <= 256 * float(jnp.finfo(depth.dtype).eps) * size)
         if lane.contact is not None:
-            closed = closed | (lane.contact[stop.coordinate] == to_event(number))
+            closed = closed | (lane.contact[k] == to_event(number))
         touches[number] = closed
-    coupled = _coupled(plan, limited, gains_, touches, coupled)
-    before = [body.velocity(there) for body in bodies]
+    coupled = _coupled(plan, gains, touches, coupled)
+    before = {k: body.velocity(there) for k, body in bodies.items()}
+    slow = {k: plan.rounding(k, there)[1] for k in bodies}
     return _Instant(
-        plan, taken, lane.s, met, there, limited, bodies, before, gains_, landed, touches,
-        coupled, [plan.rounding(k, there)[1] for k in limited],
-    )  # fmt: skip
+        plan, taken, lane.s, met, there, bodies, before, gains, landed, touches, coupled, slow
+    )
 
 
 def _coupled(
-    plan: Plan, limited: list[int], gains: list[list[Scalar]], touches: dict[int, Flag],
-    coupled: list[Flag],
-) -> list[Flag]:  # fmt: skip
-    """Of each coordinate, whether a blow on one of those marked is felt by it through closed
-    contacts.
-
-    **Arguments:** `limited`, the numbers of the coordinates; `gains` as from `shares`; `touches`,
-    of each stop whether its contact is closed; `coupled`, the marks.
-    """
-    closed = [jnp.zeros((), bool) for _ in limited]
+    plan: Plan, gains: list[list[Scalar]], touches: dict[int, Flag], landed: dict[int, Flag]
+) -> dict[int, Flag]:
+    """Of each coordinate, whether a blow on one of those `landed` upon is felt by it through closed
+    contacts. `gains` are from `shares`; `touches` is of each stop whether its contact is closed."""
+    closes = dict.fromkeys(landed, jnp.zeros((), bool))
     for number, stop in enumerate(stops_of(plan.machine)):
-        i = limited.index(stop.coordinate)
-        closed[i] = closed[i] | touches[number]
-    size, coupled = len(limited), list(coupled)
+        closes[stop.coordinate] = closes[stop.coordinate] | touches[number]
+    closed, coupled, size = list(closes.values()), list(landed.values()), len(landed)
     # There and back takes each mark two contacts further, whatever their numbers.
     for _ in range(max(1, size // 2)):
         for i in (*range(size), *reversed(range(size - 1))):
@@ -261,14 +236,14 @@ def _coupled(
                 if j != i:
                     acts = jnp.abs(stop_gradient(gains[i][j])) > _APART
                     coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts)
-    return coupled
+    return dict(zip(landed, coupled, strict=True))
 
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
     """The sequence after its next impacts: those of the contacts that close fastest."""
     plan, lane = instant.plan, x.lane
     stops, state = stops_of(plan.machine), lane.state
-    velocities = [body.velocity(state) for body in instant.bodies]
+    velocities = {k: body.velocity(state) for k, body in instant.bodies.items()}
     closing = _closing(instant, x, velocities)
     fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
     most = jnp.maximum(x.most, fastest)
@@ -285,97 +260,94 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     for number, hit in hits.items():
         hits[number], found = hit & ~(alone & found), found | hit
     # In the limit what is still being struck comes to rest.
-    slow = [
-        weak & (struck > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
-        for struck, V in zip(x.struck, velocities, strict=True)
-    ]
+    slow = {
+        k: weak & (x.struck[k] > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
+        for k, V in velocities.items()
+    }
     new, pushed = _pushed_state(instant, state, velocities, slow, hits, rebounds)
     lane = _with_losses(instant, lane._replace(state=new), state, pushed)
-    struck, approaches = list(x.struck), list(x.approach)
+    struck, approaches = dict(x.struck), dict(x.approach)
     for number, hit in hits.items():
-        stop, i = stops[number], instant.limited.index(stops[number].coordinate)
+        stop, k = stops[number], stops[number].coordinate
         speed = jnp.maximum(closing[number], 0.0)
         lane = lane.ended(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
         lane = recorded(plan, lane, instant.there, instant.taken & hit, number, speed)
         if stop.modes is not None:
             given = plan.machine, lane.s, state, new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
-        struck[i] = jnp.where(hit, to_event(number), struck[i])
-        approaches[i] = jnp.where(hit, jnp.maximum(approaches[i], speed), approaches[i])
-    return _Round(
-        lane, tuple(struck), tuple(approaches), most,
-        jnp.where(goes_on & ~weak, 1.0, 0.0), x.rounds + 1.0,
-    )  # fmt: skip
+        struck[k] = jnp.where(hit, to_event(number), struck[k])
+        approaches[k] = jnp.where(hit, jnp.maximum(approaches[k], speed), approaches[k])
+    goes_on = jnp.where(goes_on & ~weak, 1.0, 0.0)
+    return _Round(lane, struck, approaches, most, goes_on, x.rounds + 1.0)
 
 
 def _each_by_itself(
-    instant: _Instant, velocities: list[Scalar], hits: dict[int, Flag], rebounds: dict[int, Scalar]
-) -> Flag:
+    instant: _Instant, velocities: dict[int, Scalar], hits: dict[int, Flag],
+    rebounds: dict[int, Scalar],
+) -> Flag:  # fmt: skip
     """Whether contacts that close equally fast are struck one after the other all the same, in
     their order: with friction, where one would have to pull, and where laws that differ would gain
     energy together."""
     if rubs(instant.plan.machine):
         return jnp.ones((), bool)
-    size = range(len(instant.bodies))
-    on, wanted = [jnp.zeros((), bool) for _ in size], [jnp.zeros_like(V) for V in velocities]
-    signs = list(wanted)
+    on = dict.fromkeys(velocities, jnp.zeros((), bool))
+    wanted = {k: jnp.zeros_like(V) for k, V in velocities.items()}
+    signs = dict(wanted)
     for number, hit in hits.items():
         stop = stops_of(instant.plan.machine)[number]
-        i = instant.limited.index(stop.coordinate)
-        on[i] = on[i] | hit
-        wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
-        signs[i] = jnp.where(hit, float(stop.sign), signs[i])
-    amounts = stop_gradient(forces(instant.gains, on, wanted))
+        k = stop.coordinate
+        on[k] = on[k] | hit
+        wanted[k] = jnp.where(hit, rebounds[number] - velocities[k], wanted[k])
+        signs[k] = jnp.where(hit, float(stop.sign), signs[k])
+    amounts = stop_gradient(instant.forces(on, wanted))
     gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
-    for i, body in enumerate(instant.bodies):
-        work = (
-            body.mass_at(instant.s, instant.there) * amounts[i] * (velocities[i] + 0.5 * wanted[i])
-        )
+    for k, body in instant.bodies.items():
+        amount, V, change = amounts[k], velocities[k], wanted[k]
+        work = body.mass_at(instant.s, instant.there) * amount * (V + 0.5 * change)
         gained, size_of = gained + work, size_of + jnp.abs(work)
-        pulls = pulls | (amounts[i] * signs[i] > _EQUAL * jnp.abs(wanted[i]))
+        pulls = pulls | (amount * signs[k] > _EQUAL * jnp.abs(change))
     return stop_gradient(pulls | (gained > _EQUAL * size_of))
 
 
 def _pushed_state(
-    instant: _Instant, state: State, velocities: list[Scalar], slow: list[Flag],
+    instant: _Instant, state: State, velocities: dict[int, Scalar], slow: dict[int, Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
 ) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
     """The state after the next impacts, and by how much each coordinate's velocity was pushed.
 
-    **Arguments:** `state` and `velocities` before them; `slow`, which coordinates come to rest; of
-    each stop, by its number, in `hits` whether it is hit, in `rebounds` the velocity after that.
+    **Arguments:** `slow`, which coordinates come to rest; of each stop, by its number, in `hits`
+    whether it is hit, in `rebounds` the velocity after that.
     """
-    machine = instant.plan.machine
-    on, wanted, places = list(slow), [-V for V in velocities], []
-    for i, body in enumerate(instant.bodies):
-        place = body.position(state)
+    machine, stops = instant.plan.machine, stops_of(instant.plan.machine)
+    on, wanted, places = dict(slow), {k: -V for k, V in velocities.items()}, {}
+    for k, body in instant.bodies.items():
+        places[k] = body.position(state)
         for number, hit in hits.items():
-            if stops_of(machine)[number].coordinate == instant.limited[i]:
-                on[i], place = on[i] | hit, jnp.where(hit, stops_of(machine)[number].place, place)
-                wanted[i] = jnp.where(hit, rebounds[number] - velocities[i], wanted[i])
-        places.append(place)
-    amounts = forces(instant.gains, on, wanted)
+            if stops[number].coordinate == k:
+                on[k], places[k] = on[k] | hit, jnp.where(hit, stops[number].place, places[k])
+                wanted[k] = jnp.where(hit, rebounds[number] - velocities[k], wanted[k])
+    amounts = instant.forces(on, wanted)
     new = state
-    for i, body in enumerate(instant.bodies):
-        moved = body.placed(state, places[i], velocities[i] + amounts[i])
+    for k, body in instant.bodies.items():
+        moved = body.placed(state, places[k], velocities[k] + amounts[k])
         new = jtu.tree_map(
-            lambda a, b, c, on=on[i]: a if c is b else a + jnp.where(on, c - b, 0.0),
+            lambda a, b, c, on=on[k]: a if c is b else a + jnp.where(on, c - b, 0.0),
             new, state, moved,
         )  # fmt: skip
     pushed = []
     for number, hit in hits.items():
         friction = rubbing_on(machine, number)
         if friction is not None:
-            i = instant.limited.index(stops_of(machine)[number].coordinate)
+            k = stops[number].coordinate
             rough = rubbed(machine, number, friction, instant.s, state, new)
             new = select(hit, rough.state, new)
-            amounts[i] = jnp.where(hit, rough.pushed, amounts[i])
+            amounts[k] = jnp.where(hit, rough.pushed, amounts[k])
             along = machine.coordinates[friction.along]
             pushed.append((along, jnp.where(hit, rough.dragged, 0.0)))
-    return new, [*pushed, *zip(instant.bodies, amounts, strict=True)]
+    return new, [*pushed, *((body, amounts[k]) for k, body in instant.bodies.items())]
 
 
-def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int, Scalar]:
+def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dict[int, Scalar]:
     """Of each stop the speed of approach, if it may be hit next; else a negative number.
 
     Two bodies that meet their stops at one instant, of which neither feels the other, are two
@@ -384,11 +356,11 @@ def _closing(instant: _Instant, x: _Round, velocities: list[Scalar]) -> dict[int
     """
     found = {}
     for number, stop in enumerate(stops_of(instant.plan.machine)):
-        i = instant.limited.index(stop.coordinate)
-        speed = stop.approach(velocities[i])
+        k = stop.coordinate
+        speed = stop.approach(velocities[k])
         size = stop_gradient(speed)
-        changed = jnp.abs(stop_gradient(velocities[i] - instant.before[i])) > _NONE * x.most
-        mine = instant.landed[number] | ((changed | instant.coupled[i]) & (size > instant.slow[i]))
+        changed = jnp.abs(stop_gradient(velocities[k] - instant.before[k])) > _NONE * x.most
+        mine = instant.landed[number] | ((changed | instant.coupled[k]) & (size > instant.slow[k]))
         found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
     return found
 

@@ -22,39 +22,15 @@ from .guards import (
     apart,
     crossings,
     guards_error,
+    landing_tolerance,
     leniency,
     looks_within,
     turn_tolerance,
     within,
 )
 
-
-class _Precision(NamedTuple):
-    """Thresholds of coming to rest and of release, for one floating-point type."""
-
-    # A release is approached by steps taken from the pressed side, each this share short of where
-    # the last one says that it is, until one is so short that the force is straight over it; it is
-    # met if it is this close then.
-    short: float
-    straight: float
-    close: float
-    # How much of a chatter may be left when it is completed, as a share of the longest step: its
-    # error is of second order, 6e-11 of that step in double precision.
-    brief: float
-
-
-# `close` is the tolerance of landings (`guards`). The others are choices.
-_DOUBLE = _Precision(short=1e-3, straight=1e-5, close=1e-9, brief=8e-6)
-_SINGLE = _Precision(short=1e-2, straight=1e-3, close=1e-4, brief=8e-3)
-
-
 # After so many aims at a release in turn its place is halved: a choice, three or four are usual.
 _PATIENCE = 8.0
-
-
-def allowed(s: Scalar) -> _Precision:
-    """The thresholds of rest and release for the precision of `s`."""
-    return _DOUBLE if s.dtype == jnp.float64 else _SINGLE
 
 
 class Release(NamedTuple):
@@ -73,18 +49,18 @@ class Release(NamedTuple):
 def release(
     plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> Release:
-    """Where coordinate number k leaves the stop that it rests on, if it does.
+    """Where coordinate number k leaves the stop that it rests on, if it does, by the rates of the
+    free coordinate at both ends of the step.
 
     It is held while it is pressed on, and leaves when the force changes sign: the acceleration that
     a free body would have there. The drive goes on turning, with the reaction of a spring whose end
     is held.
-
-    **Arguments:** `begin` and `end`, the free coordinate's rates at the ends of the step; `good`,
-    whether the step was; `h`, its length.
     """
     assert lane.contact is not None
-    known = allowed(h)
-    close, straight = plan.in_units(known.close), plan.in_units(known.straight)
+    # It is approached by steps taken from the pressed side, each a share short of where the last
+    # one says that it is, until one is so short that the force is straight over it: choices.
+    short, straight = (1e-3, 1e-5) if h.dtype == jnp.float64 else (1e-2, 1e-3)
+    close, straight = plan.in_units(landing_tolerance(h)), plan.in_units(straight)
     away = plan.away(k, lane.contact[k])
     before, after = pin((away * begin.a, away * end.a))
     rise = stop_gradient(after - before)
@@ -100,7 +76,7 @@ def release(
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
     # Over a force that is hardly positive, but for long, chords do not get on: half the way does.
-    share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - known.short)
+    share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > straight, share * place, place)
     # By rounding's measure late rather than early, when it would be pressed on again; and no step
     # towards it is so short that it would not move on.
@@ -182,7 +158,7 @@ def attempt(
     """Try the next step and see what it meets; of length zero for a lane that has ended.
 
     **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with those
-    bodies held that rest; `motion`, that ahead, of a method that knows it; else `None`.
+    bodies held that rest; `motion`, that ahead, of a method that knows it.
     """
     machine, method = plan.machine, plan.method
     free = lane.target == FREE
@@ -281,16 +257,19 @@ def _path(
     """What a step shows of coordinate number k.
 
     **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
-    the machine that the step was taken with; `ends`, the rates of the coordinate in the former at
-    both ends of the step; `there`, s and state at its end, its length and the longest length;
-    `good`, whether the step was; `seen`, guards at the stages.
+    that with which the step was taken; `ends`, the rates in the former at both ends; `there`, s and
+    state at its end, its length and the longest length; `good`, whether the step was; `seen`,
+    guards at the stages.
     """
     (begin, end), (s1, new, h, limit) = ends, there
     position = plan.machine.coordinates[k].position
     if lane.contact is not None and not exact(plan.machine, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
-        rests, place = lane.contact[k] > 0, plan.place(k, lane.contact[k], begin.x)
+        rests, place = (
+            lane.contact[k] > 0,
+            plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x),
+        )
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)

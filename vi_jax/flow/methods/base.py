@@ -77,8 +77,7 @@ class AbstractMethod(eqx.Module):
         return 0.0
 
     def with_sizes(self, sizes: State) -> "AbstractMethod":
-        """The method for a motion whose numbers are about so large, one size for each array of the
-        state."""
+        """The method for a motion of numbers about so large, one for each array of the state."""
         return self
 
     def holds(self, machine: AbstractMachine) -> bool:
@@ -93,7 +92,6 @@ class AbstractMethod(eqx.Module):
 
     def check(self, machine: AbstractMachine) -> None:
         """Raise a `ValueError` if this method cannot move `machine`."""
-        return None
 
     @property
     def follows_fading(self) -> bool:
@@ -127,16 +125,10 @@ class AbstractMethod(eqx.Module):
     def step(
         self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
     ) -> tuple[State, Integrals, Scalar]:
-        """State, and what is integrated `beside` it, at `s1` from those at `s0`, and the step's
-        error.
-
-        The error is relative to the tolerance (a step is accepted up to 1). Methods that are not
-        adaptive return 0, or more than 1 where `may_be_unstable` and the step is.
-
-        **Arguments:** `smooth`, the machine in its modes; `beside`, the integrals of averages, and
-        the elapsed time of a machine with a `pace`, where they are asked for; their rates are
-        `rate_of_integrals`.
-        """
+        """State, and what is integrated `beside` it (rates: `rate_of_integrals`), at `s1` from
+        those at `s0`, and the step's error relative to the tolerance: a step is accepted up to 1.
+        Methods that are not adaptive return 0, or more than 1 where `may_be_unstable` and the step
+        is."""
 
     def step_with_stages(
         self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
@@ -152,13 +144,10 @@ class AbstractMethod(eqx.Module):
         self, stages: list[Stage], values: Array, h: Scalar, longest: Scalar, *, acts: bool,
         size: Scalar | float,
     ) -> Scalar | None:  # fmt: skip
-        """Return the error of the integral of a guard over a step, relative to the tolerance, or
-        `None` of a method that estimates none.
-
-        **Arguments:** `values`, the guard at each of the `stages`; `h`, the length of the step;
-        `longest`, that of the longest one; `acts`, whether the guard is a force on a body that is
-        held; `size`, that of the integral.
-        """
+        """Return the error of the integral of a guard, by its `values` at the `stages` of a step,
+        relative to the tolerance, or `None` of a method that estimates none. `acts` is whether the
+        guard is a force on a body that is held, `longest` the longest step, `size` that of the
+        integral."""
         return None
 
     def foresee(

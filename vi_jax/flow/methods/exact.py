@@ -31,7 +31,7 @@ from ...machine import (
     stops_of,
     switches_of,
 )
-from ..smooth import Integrals, SmoothMachine, rate_of_integrals
+from ..smooth import Integrals, SmoothMachine, limited_of, rate_of_integrals
 from .base import AbstractMethod
 
 # The series of a matrix exponential is summed over lengths in which things change by twice
@@ -61,9 +61,7 @@ def modal_flight(
     """The state a time h after that at s, exact to rounding for any h.
 
     Free flight of uncoupled modes is the closed form of each. All else is a matrix exponential:
-    modes coupled by damping, bodies at rest on stops, a force in resonance with a mode.
-
-    **Arguments:** `contact`, of each coordinate whether it rests, as in `Lane.contact`.
+    modes coupled by damping, bodies at rest on stops (`contact`), a force in resonance with a mode.
     """
     free = machine.plain > 0
     for rests in contact:
@@ -76,11 +74,8 @@ def modal_flight(
 
 def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     """A tenth of the period of the fastest mode that matters, or of the force; a fifth where there
-    is but one mode.
-
-    A mode matters if its free motion moves a contact by more than rounding: others cannot make or
-    hide an event. Those that have faded away so cost no steps.
-    """
+    is but one mode. A mode matters if its free motion moves a contact by more than rounding: others
+    cannot make or hide an event. Those that have faded away so cost no steps."""
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady(machine, s)
     pace = machine.pace_of
@@ -157,11 +152,8 @@ def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -
 
 @jax.custom_jvp
 def _pair(known: tuple, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
-    """e^(-at) cos(wt) and e^(-at) sin(wt)/w for w² of any sign.
-
-    **Arguments:** `known`, of the machine `swing`, `swing_time` and `oscillates`; `half`, a;
-    `square`, w².
-    """
+    """e^(-at) cos(wt) and e^(-at) sin(wt)/w for w² (`square`) of any sign, and a (`half`); `known`
+    are `swing`, `swing_time` and `oscillates` of the machine."""
     swing, swing_time, oscillates = known
     fade = jnp.exp(-half * h)
     pair = fade * jnp.cos(swing * h), fade * (swing_time * jnp.sin(swing * h))
@@ -211,12 +203,7 @@ def _by_series(
     machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State, wanted: Flag
 ) -> tuple[Any, Any]:
     """The matrix exponential by its series, in parts so short that it converges at once; of none
-    where it is not wanted.
-
-    The force turns with the motion, as two numbers more.
-
-    **Arguments:** `contact` as in `modal_flight`; `state`, q and p.
-    """
+    where it is not wanted. The force turns with the motion, as two numbers more."""
     length = stop_gradient(jnp.abs(h)) * machine.fastest
     count = stop_gradient(jnp.where(wanted, jnp.maximum(jnp.ceil(length / _LONGEST), 1.0), 0.0))
     part, change = h / jnp.maximum(count, 1.0), length / jnp.maximum(count, 1.0)
@@ -250,7 +237,7 @@ def _by_series(
 def _holding(machine: ModalMachine, contact: Scalars) -> Any:
     """What is left of an acceleration where bodies rest on stops: as much of each contact's push as
     keeps its velocity is added."""
-    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
+    limited = limited_of(machine) if contact else []
     if not limited:
         return lambda pull: pull
     rows, pushes = ([x[k] for k in limited] for x in (machine.rows, machine.pushes))
@@ -383,12 +370,8 @@ def _linear(
 def _integrated(
     smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Integrals
 ) -> Integrals:
-    """Integrals beside a flight from `s0` to `s1`, by quadrature.
-
-    **Arguments:** `smooth`, the machine in its modes; `state`, where the flight begins, and where a
-    body that is held stays; `along`, the state of the flight at a share of its length; `beside`,
-    the integrals before.
-    """
+    """Integrals beside a flight from `s0` to `s1`, by quadrature; a body that is held stays where
+    it is in `state`, and `along` is the state of the flight at a share of its length."""
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
@@ -450,15 +433,13 @@ def _numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
 def flight(
     zeta: Scalar, xi: Scalar, phase: Scalar, Y: Scalar, V: Scalar, tau: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Y and V after a time τ of free flight from (Y, V) at crank angle `phase`.
+    """Y and V after a time τ of free flight from (Y, V) at crank angle `phase`; zeta and xi are ζ
+    and ξ.
 
     Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less under
-    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping.
-
-    What is summed are changes, each of the order of τ: the rounding of a short flight is that of
-    its own length, as it has to be where a body leaves the stop by less than its position rounds.
-
-    **Arguments:** `zeta` and `xi`, ζ and ξ; `phase` in radians.
+    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping. What is summed are changes, each
+    of the order of τ: the rounding of a short flight is that of its own length, as it has to be
+    where a body leaves the stop by less than its position rounds.
     """
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
     square = (1 - xi * xi) * tau * tau
@@ -511,13 +492,12 @@ def _minus(a, b):
 
 
 def _from_rest(zeta, xi, begin, turn, tau):
-    """Y and V at a time `tau` after a start from rest, near resonance only.
+    """Y and V at a time `tau` after a start from rest, near resonance only; `begin` are cosine and
+    sine of the phase at the start, `turn` their changes since.
 
     With p = -ξ + iω_d it is Re{[τ e^{pτ} E(w) e^{iφ0} - (e^{iφ1} - e^{p̄τ} e^{iφ0})/(iζ - p̄)] /
     (2iω_d)}, w = (iζ - p)τ, where E(w) = (e^w - 1)/w stays smooth through resonance. Complex
     numbers are pairs, because pairs of floats fuse.
-
-    **Arguments:** `begin`, cosine and sine of the phase at the start; `turn`, their changes since.
     """
     omega = (1 - xi * xi) ** 0.5
     loss = _less_one(-xi * tau)

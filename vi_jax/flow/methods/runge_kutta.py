@@ -37,15 +37,13 @@ def implicit_stages(
     y0: Vector,
     tolerance: Scalar | float,
 ) -> tuple[list[Vector], Scalar]:
-    """The slopes of all stages, and what the last steps of Newton's method still changed.
+    """The slopes of all stages, and what the last steps of Newton's method still changed, of a step
+    of length h from `y0`, flattened.
 
     All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
     Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to 1 + |y|; where that
     fails what is left is infinite. Derivatives are those of the solution, by the implicit function
     theorem.
-
-    **Arguments:** `tableau`, diffrax's Butcher tableau; `field`, dy/ds; `s0`, `h` and `y0`, where
-    the step begins, its length and the state, flattened.
     """
     gamma = float(tableau.a_diagonal[-1])
     still = stop_gradient((s0, y0))
@@ -211,10 +209,7 @@ class Unrolled(diffrax.AbstractSolver):
         return jtu.tree_map(lambda x: control * x, change)
 
     def _implicit(self, terms, t0, t1, y0, args, control):
-        """The step of an implicit solver; its error is infinite where a stage was not solved.
-
-        **Arguments:** as `step`; `control`, the length of the step.
-        """
+        """The step of an implicit solver; its error is infinite where a stage was not solved."""
         tableau = _tableau(self.solver)
         flat, unravel = ravel_pytree(y0)
         tolerance = 1e-12 if self.tolerance is None else self.tolerance
@@ -289,10 +284,6 @@ def _number(x: Any) -> Any:
     return x if isinstance(x, Tracer) else np.asarray(x)
 
 
-def _number_or_none(x: Any) -> Any:
-    return None if x is None else _number(x)
-
-
 class _RungeKutta(AbstractMethod):
     """A method whose steps have stages."""
 
@@ -319,7 +310,9 @@ class Adaptive(_RungeKutta):
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
     # Arrays, so that another tolerance is not another program.
     rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
-    atol: Any = eqx.field(kw_only=True, default=None, converter=_number_or_none)
+    atol: Any = eqx.field(
+        kw_only=True, default=None, converter=lambda x: x if x is None else _number(x)
+    )
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
     """How large the numbers of the state are, as `with_sizes` sets it."""
@@ -453,11 +446,8 @@ class FixedStep(_RungeKutta):
     def _unstable(
         self, ends: tuple[State, State], slopes: list[State], h: Scalar, unit: Scalar | float
     ) -> Scalar:
-        """More than 1 if a step is unstable, else 0.
-
-        **Arguments:** the state at both `ends`; `slopes`, of the state at each stage; `h`, the
-        step's length; `unit`, as `unit_of` the machine.
-        """
+        """More than 1 if a step is unstable, else 0, by the state at both `ends` and its slopes at
+        each stage; `unit` as `unit_of` the machine."""
         # Of bodies at rest in zero all that is left is rounding.
         rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
         before, after = (jnp.maximum(_size(x), rounding) for x in ends)

@@ -73,10 +73,7 @@ def convolution(
     a: Series, b: Series, n: int, begin: int = 0, weight: Callable[[int], float] | None = None
 ) -> Coefficient:
     """The n-th coefficient of a product of two series, or a part of that sum: Σ weight(j) a_j
-    b_{n-j} over j from `begin` to n.
-
-    **Arguments:** `weight`, 1 if left out.
-    """
+    b_{n-j} over j from `begin` to n."""
     terms = []
     # What is known longest comes first: only the last products wait for the newest coefficients.
     for j in sorted(range(begin, n + 1), key=lambda j: max(j, n - j)):
@@ -219,11 +216,8 @@ def _quotient(eqn, n, operands, results, extra):
 
 
 def _power(series: Series, own: Series, p: float, n: int, first: Any, extra: dict) -> Coefficient:
-    """The n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}.
-
-    **Arguments:** `series`, a; `own`, the coefficients c before it; `first`, a^p of a number;
-    `extra`, what is kept from one n to the next.
-    """
+    """The n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}; `own` are those
+    before it, `first` gives a^p of a number."""
     if n == 0:
         return first(series[0])
     total = convolution(series, own, n, 1, lambda j: (p * j - (n - j)) / n)
@@ -373,16 +367,10 @@ RULES: dict[str, Callable] = {
 def expand(
     field: Callable[[Scalar, State], State], s: Scalar, state: State, order: int
 ) -> tuple[Any, list[Series]]:
-    """Coefficients of the solution of d(state)/ds = field(s, state) in powers of s - s0.
-
-    **Arguments:** `order`, the last power.
-
-    **Returns:** their tree, and the coefficients of each leaf, each a list of `order + 1` (`None`
-    for zero).
-
-    **Raises:** `NoSeries` if the field has a primitive without a recursion, `NotSmooth` if one that
-    is not smooth acts on what moves.
-    """
+    """Coefficients of the solution of d(state)/ds = field(s, state) in powers of s - s0, up to one:
+    their tree, and those of each leaf, each a list of `order + 1` (`None` for zero). **Raises:**
+    `NoSeries` if the field has a primitive without a recursion, `NotSmooth` if one that is not
+    smooth acts on what moves."""
     leaves, treedef = jtu.tree_flatten(state)
 
     def flat(s, *leaves):
@@ -399,8 +387,7 @@ def expand(
 
 
 def along(function: Callable[[State], Scalar], treedef: object, series: list[Series]) -> "Along":
-    """A scalar function of the state along a motion, as a power series; `treedef` and `series` as
-    from `expand`."""
+    """A scalar function of the state along a motion, as a power series; as from `expand`."""
 
     def flat(*leaves):
         return jtu.tree_leaves(function(jtu.tree_unflatten(treedef, leaves)))
