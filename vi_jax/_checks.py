@@ -45,10 +45,8 @@ REAL, POSITIVE, NOT_NEGATIVE, SHARE = Range(), Range(0.0, open_low=True), Range(
 
 def require(name: str, value: object, **bounds: Any) -> None:
     """Raise a `ValueError` unless every concrete number in `value` is finite and in range, the
-    `Range` of these bounds.
-
-    **Raises:** `TypeError` for what is no real number; placeholders and tracers pass.
-    """
+    `Range` of these bounds. **Raises:** `TypeError` for what is no real number; placeholders and
+    tracers pass."""
     numbers, range_ = _real(name, value), Range(**bounds)
     if numbers is None:
         return
@@ -67,24 +65,25 @@ def fields_with(kind: type, about: str) -> dict[str, Any]:
 
 def require_ranges(part: Any) -> None:
     """`require` for every number of a module whose field has a range."""
-    for name, range_ in fields_with(type(part), "range").items():
-        value = getattr(part, name)
-        if value is not None and not callable(value):
-            require(name, value, **range_._asdict())
+    for name, range_, value in _ranged(part):
+        require(name, value, **range_._asdict())
 
 
 def in_range(tree: object) -> Bool[Array, ""]:
-    """Whether all numbers of all modules in a tree are in their ranges, traced ones too.
-
-    What is put into a module by `eqx.tree_at`, or is being traced, has passed no other check.
-    """
+    """Whether all numbers of all modules in a tree are in their ranges, traced ones too: what is
+    put into a module by `eqx.tree_at`, or is being traced, has passed no other check."""
     good = jnp.asarray(True)
     for part in {id(part): part for part in _modules(tree)}.values():
-        for name, range_ in fields_with(type(part), "range").items():
-            value = getattr(part, name)
-            if value is not None and not callable(value):
-                good = good & jnp.all(range_.holds(jnp.asarray(value)))
+        for _, range_, value in _ranged(part):
+            good = good & jnp.all(range_.holds(jnp.asarray(value)))
     return good
+
+
+def _ranged(part: Any) -> Iterator[tuple[str, Range, Any]]:
+    for name, range_ in fields_with(type(part), "range").items():
+        value = getattr(part, name)
+        if value is not None and not callable(value):
+            yield name, range_, value
 
 
 def _modules(node: object) -> Iterator[eqx.Module]:
@@ -133,14 +132,15 @@ def one_of(name: str, value: object, allowed: tuple[str, ...]) -> str:
     return value
 
 
+def _is_real(kind: Any) -> bool:
+    return bool(jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer))
+
+
 def _real(name: str, value: object) -> np.ndarray | None:
     """The numbers behind `value`, or `None` for tracers and placeholders."""
     numbers = concrete(value)
-    kind = None if numbers is None else numbers.dtype
     wrong = isinstance(value, bool | str | bytes | complex | list | tuple | set | dict)
-    if kind is not None and not wrong:
-        wrong = not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer))
-    if wrong:
+    if wrong or (numbers is not None and not _is_real(numbers.dtype)):
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
     return numbers
 
@@ -168,18 +168,15 @@ def interval(name: str, value: Any) -> tuple[float, float]:
 
 
 def row_of_numbers(values: object) -> np.ndarray | None:
-    """Finite real numbers in one row, one at least, or `None` if `values` is none such.
-
-    Texts, truth values, dates and complex numbers are no real numbers, even where NumPy takes them.
-    """
+    """Finite real numbers in one row, one at least, or `None` if `values` is none such. Texts,
+    truth values, dates and complex numbers are no real numbers, even where NumPy takes them."""
     if isinstance(values, list | tuple) and any(isinstance(x, bool | np.bool_) for x in values):
         return None
     try:
         row = np.asarray(values)
     except (TypeError, ValueError):
         return None
-    real = jnp.issubdtype(row.dtype, jnp.floating) or jnp.issubdtype(row.dtype, jnp.integer)
-    if not real or row.ndim != 1 or not row.size:
+    if not _is_real(row.dtype) or row.ndim != 1 or not row.size:
         return None
     row = row.astype(float)
     return row if np.isfinite(row).all() else None
@@ -190,13 +187,6 @@ def flag(name: str, value: object) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"Argument `{name}` must be True or False, but got {value!r}.")
     return bool(value)
-
-
-def count_or_traced(name: str, value: object) -> Any:
-    """As `count`, where the number may be traced, or a JAX array."""
-    if isinstance(value, Tracer):
-        return value
-    return count(name, value)
 
 
 def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
@@ -233,10 +223,8 @@ def short(value: object) -> str:
 
 
 def state_of_numbers(name: str, state: object) -> Any:
-    """`state`, each part of which is a real number or an array of them.
-
-    **Raises:** `TypeError` that names the part which is none.
-    """
+    """`state`, each part of which is a real number or an array of them. **Raises:** `TypeError`
+    that names the part which is none."""
     for part, value in vars(state).items():
         require_real(name, part, value)
     return state
@@ -247,7 +235,7 @@ def require_real(name: str, part: str, value: object) -> None:
     a real number nor an array of them, traced or not."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(value, jax.Array | np.ndarray | np.generic):  # tracers are among the first
-        real = any(jnp.issubdtype(value.dtype, kind) for kind in (jnp.floating, jnp.integer))
+        real = _is_real(value.dtype)
     if not real:
         got = f"its {part} is {value!r}" if part else f"got {value!r}"
         raise TypeError(f"Argument `{name}` must hold real numbers, but {got}.")
@@ -273,12 +261,9 @@ def fits_memory(name: str, size: int | float) -> None:
 
 
 def number(name: str, value: object) -> jax.Array:
-    """A real number or array of numbers as a floating-point JAX array.
-
-    What is no tracer stays a known number inside of `jit` too, so that it can be checked there.
-
-    **Raises:** `TypeError` if `value` is not real-valued.
-    """
+    """A real number or array of numbers as a floating-point JAX array; what is no tracer stays a
+    known number inside of `jit` too, so that it can be checked there. **Raises:** `TypeError` if
+    `value` is not real-valued."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         return _floating(name, value)
     if isinstance(value, bool | str) or value is None:
@@ -302,9 +287,7 @@ def _type_of(value: object) -> tuple[Any, ...]:
 
 def strongly_typed(value: object) -> Any:
     """A number as an array of a certain type; all else, whole numbers and rows among it, as it is.
-
-    What is no tracer stays a known number inside of `jit` too.
-    """
+    What is no tracer stays a known number inside of `jit` too."""
     if isinstance(value, jax.Array):
         return value.astype(value.dtype) if value.weak_type else value
     if isinstance(value, float | np.floating) or (
@@ -331,7 +314,7 @@ def real_or_law(name: str) -> Callable[[Any], Any]:
 
 
 def _floating(name: str, array: jax.Array) -> jax.Array:
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+    if not _is_real(array.dtype):
         raise TypeError(
             f"Argument `{name}` must be a real number, but its dtype is {array.dtype.name}."
         )

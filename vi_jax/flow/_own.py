@@ -32,6 +32,7 @@ from ..machine import (
     check_takes,
     clock_of,
     components,
+    contacts_in,
     event_of,
     events_of,
     field_in,
@@ -316,7 +317,7 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop that names no velocity, or an angle of `wrap_angles`."""
-    for stop in listed(machine.contacts):
+    for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
         named = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
         wrapped = [x for x in named if is_angle(machine, x)]
@@ -327,15 +328,12 @@ def _check_names(machine: AbstractMachine) -> None:
             )
         if isinstance(machine, Mechanical):
             continue
-        if isinstance(stop, RigidStop | SoftStop) and on is not None and not _is_pair(on):
+        pair = isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
+        if isinstance(stop, RigidStop | SoftStop) and on is not None and not pair:
             raise ValueError(
                 f"Argument `on` of a stop of a {type(machine).__name__} must be the names of "
                 f'position and velocity, `on=("x", "u")`, but got {on!r}.'
             )
-
-
-def _is_pair(on: Any) -> bool:
-    return isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
 
 
 def _check_frictions(machine: AbstractMachine) -> None:
@@ -403,7 +401,7 @@ def _check_event(
     _, own, more = event_of(machine, number, modes, contact)
     around = machine, s, state, *modes[own]
     guard = _traced(f"`guard` of {whose}", lambda: event.guard(*around, **more))
-    if not _is_number(guard):
+    if getattr(guard, "shape", None) != () or not jnp.issubdtype(guard.dtype, jnp.floating):
         raise TypeError(
             f"`guard` of {whose} must return one floating-point number, but returned "
             f"{in_short(guard)}."
@@ -425,19 +423,12 @@ def _check_event(
         )
     new, changed = found
     _check_state(f"The state after {whose}", state, new)
-    if not event.holds_mode and _length(changed) != len(modes):
+    number = len(changed) if isinstance(changed, Sequence) else -1
+    if not event.holds_mode and number != len(modes):
         raise TypeError(
             f"The modes after {whose} must be {len(modes)} in number, as many as the machine has "
             f"(those of its switches, then those of its `begin`), but are {in_short(changed)}."
         )
-
-
-def _is_number(x: Any) -> bool:
-    return getattr(x, "shape", None) == () and jnp.issubdtype(x.dtype, jnp.floating)
-
-
-def _length(modes: object) -> int:
-    return len(modes) if isinstance(modes, Sequence) else -1
 
 
 def _check_state(whose: str, state: State, found: Any) -> None:

@@ -230,9 +230,6 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         time = jnp.concatenate([jnp.zeros_like(interval[:1]), jnp.cumsum(interval)])
         place = jnp.arange(plan.kept + 1, dtype=time.dtype) / parts
         dense = Samples(place, time, points, quantities, modes)
-    log = None
-    if plan.log:
-        log = _log(plan, records.log)
     return Run(
         sections=jtu.tree_map(lambda x: x[::parts], points),
         y_max=per_cycle(records.y_max, jnp.max),
@@ -245,7 +242,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         duration=duration,
         frequency_ratio=None if duration is None else frequency_ratio(machine, duration),
         samples=dense,
-        impact_log=log,
+        impact_log=_log(plan, records.log) if plan.log else None,
         event_log=_events(plan, records.events) if plan.events else None,
         errors=None,
         result=reason_of(lane.fault),

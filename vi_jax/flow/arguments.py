@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Int
 
 from .. import lanes
 from .._checks import (
     concrete,
     count,
-    count_or_traced,
     fits_records,
     flag,
     instance_of,
@@ -95,7 +95,7 @@ class RunOptions:
             self,
             **{name: count(name, getattr(self, name)) for name in counts},
             method=chosen(machine, self.method),
-            settle=count_or_traced("settle", self.settle),
+            settle=self.settle if isinstance(self.settle, Tracer) else count("settle", self.settle),
             rests=None if self.rests is None else flag("rests", self.rests),
             max_steps=None if most is None else count("max_steps", most, least=1),
             record=one_of("record", self.record, ("motion", "sections")),
@@ -153,7 +153,11 @@ def planned(
     quantity_names(machine, start)  # what is none is refused
     columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
-    _warn_of_single_precision()
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        warn(
+            "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
+            'double precision call `jax.config.update("jax_enable_x64", True)` first.'
+        )
     dtype = machine.position(start).dtype
     options.check_limits(dtype)
     most, rests = options.max_steps, options.rests
@@ -195,14 +199,6 @@ def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> 
 
 def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
     return None if given is None else jnp.asarray(given, dtype)
-
-
-def _warn_of_single_precision() -> None:
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        warn(
-            "vi_jax is running in single precision: errors near 1e-6 and tolerances to match. For "
-            'double precision call `jax.config.update("jax_enable_x64", True)` first.'
-        )
 
 
 def machine_of(machine: Machine) -> AbstractMachine:

@@ -1,5 +1,6 @@
 """`suggest_method`: the fastest method for an error, measured on the user's own machine."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -134,9 +135,10 @@ def suggest_method(
         tried = [bench.tried(best, "ExactFlight()")]
     else:
         tried = [] if stiff else _fixed(bench, error)
-        tried += _adaptive(bench, error, Verner9())
-        tried += _adaptive(bench, error, diffrax.Kvaerno5()) if stiff else []
-        tried += _series(bench, error)
+        tried += _until(bench, error, _adaptive(Verner9()))
+        tried += _until(bench, error, _adaptive(diffrax.Kvaerno5())) if stiff else []
+        with contextlib.suppress(NotImplementedError):  # the field uses what has no recursion
+            tried += _until(bench, error, _series(error))
     good = [t for t in tried if t.error <= error]
     timed = bench.race(good)
     tried = [timed.get(t.name, t) for t in tried]
@@ -154,16 +156,26 @@ def _is_stiff(machine: AbstractMachine, start: State) -> bool:
     return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
 
 
-def _adaptive(bench: "_Bench", error: float, solver: diffrax.AbstractSolver) -> list[Tried]:
-    """The loosest tolerance that keeps to the error."""
+def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMethod]]) -> list[Tried]:
+    """Methods from loose to tight, up to the first that keeps to the error."""
     tried: list[Tried] = []
-    for tolerance in _TOLERANCES[:-1]:
-        method = Adaptive(solver, rtol=tolerance)
-        name = f"Adaptive({type(solver).__name__}(), rtol={tolerance:.0e})"
+    for name, method in methods:
         tried.append(bench.tried(method, name))
         if tried[-1].error <= error:
             break
     return tried
+
+
+def _adaptive(solver: diffrax.AbstractSolver) -> list[tuple[str, AbstractMethod]]:
+    name = f"Adaptive({type(solver).__name__}(), rtol="
+    return [(f"{name}{x:.0e})", Adaptive(solver, rtol=x)) for x in _TOLERANCES[:-1]]
+
+
+def _series(error: float) -> list[tuple[str, AbstractMethod]]:
+    """Taylor series of an order for the error: another tolerance is no other program."""
+    order = int(np.clip(round(1.2 * -np.log10(error)), 6, 20))
+    tolerances = np.clip(np.array([100.0, 10.0, 1.0, 0.1]) * error, 1e-15, 0.1).tolist()
+    return [(f"Taylor({order}, rtol={x:.0e})", Taylor(order, rtol=x)) for x in tolerances]
 
 
 def _fixed(bench: "_Bench", error: float) -> list[Tried]:
@@ -181,28 +193,8 @@ def _fixed(bench: "_Bench", error: float) -> list[Tried]:
     return tried
 
 
-def _series(bench: "_Bench", error: float) -> list[Tried]:
-    """Taylor series of an order for the error: another tolerance is no other program."""
-    order = int(np.clip(round(1.2 * -np.log10(error)), 6, 20))
-    tried: list[Tried] = []
-    try:
-        for looser in (100.0, 10.0, 1.0, 0.1):
-            tolerance = float(np.clip(looser * error, 1e-15, 0.1))
-            method = Taylor(order, rtol=tolerance)
-            tried.append(bench.tried(method, f"Taylor({order}, rtol={tolerance:.0e})"))
-            if tried[-1].error <= error:
-                break
-    except NotImplementedError:
-        pass  # the field uses what has no recursion
-    return tried
-
-
 class _Bench:
-    """The run that methods are compared on.
-
-    **Arguments:** `start`, a state; `quantity`, what is compared (see `suggest_method`); `cycles`
-    to simulate; `lanes`, how many, which differ in their first velocity.
-    """
+    """The run that methods are compared on, of lanes that differ in their first velocity."""
 
     truth: np.ndarray
 

@@ -121,6 +121,7 @@ from .own import section_in as section_in
 from .own import stops_of as stops_of
 from .own import switches_of as switches_of
 from .parameters import Parameters as Parameters
+from .parts import contacts_in as contacts_in
 from .parts import listed as listed
 from .parts import names_on as names_on
 from .parts import number_on as number_on

@@ -112,30 +112,22 @@ _JOINED = {
 }  # fmt: skip
 
 
-class _Kink(NamedTuple):
-    """What is not smooth in some of its operands."""
-
-    word: str
-    """How a field writes it."""
-    places: tuple[int | None, int | None]
-    """The first of those operands, and the one behind the last; `None` for an end."""
-
-
-# A series goes on as the step begins. Comparisons count where something is chosen by them.
+# What is not smooth in some of its operands: how a field writes it, and these. A series goes on as
+# the step begins. Comparisons count where something is chosen by them.
 KINKS = {
-    "abs": _Kink("abs", (0, None)),
-    "max": _Kink("maximum", (0, None)),
-    "min": _Kink("minimum", (0, None)),
-    "sign": _Kink("sign", (0, None)),
-    "round": _Kink("round", (0, None)),
-    "floor": _Kink("floor", (0, None)),
-    "ceil": _Kink("ceil", (0, None)),
-    "select_n": _Kink("where", (0, 1)),
-    "gather": _Kink("an index", (1, None)),
-    "dynamic_slice": _Kink("an index", (1, None)),
-    "dynamic_update_slice": _Kink("an index", (2, None)),
-    "scatter": _Kink("an index", (1, 2)),
-    "scatter-add": _Kink("an index", (1, 2)),
+    "abs": ("abs", slice(None)),
+    "max": ("maximum", slice(None)),
+    "min": ("minimum", slice(None)),
+    "sign": ("sign", slice(None)),
+    "round": ("round", slice(None)),
+    "floor": ("floor", slice(None)),
+    "ceil": ("ceil", slice(None)),
+    "select_n": ("where", slice(1)),
+    "gather": ("an index", slice(1, None)),
+    "dynamic_slice": ("an index", slice(1, None)),
+    "dynamic_update_slice": ("an index", slice(2, None)),
+    "scatter": ("an index", slice(1, 2)),
+    "scatter-add": ("an index", slice(1, 2)),
 }
 
 # What is decided by the value where the step begins.
@@ -483,8 +475,9 @@ class _Flow:
             if name not in RULES:
                 raise NoSeries(name)
             moves = [id(x) in self.moving for x in operands]
-            if name in KINKS and any(moves[slice(*KINKS[name].places)]):
-                raise NotSmooth(KINKS[name].word)
+            word, places = KINKS.get(name, ("", slice(0)))
+            if any(moves[places]):
+                raise NotSmooth(word)
             results: list[Series] = [[] for _ in eqn.outvars]
             if any(moves):
                 self.moving.update(map(id, results))
