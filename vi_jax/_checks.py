@@ -241,6 +241,11 @@ def require_real(name: str, part: str, value: object) -> None:
         raise TypeError(f"Argument `{name}` must hold real numbers, but {got}.")
 
 
+def named_leaves(tree: object) -> list[tuple[str, Any]]:
+    """The leaves of a tree with their names; "" for a tree that is one."""
+    return [(jtu.keystr(path).lstrip("."), x) for path, x in jtu.tree_leaves_with_path(tree)]
+
+
 def fits_records(name: str, records: int, numbers: int) -> None:
     """**Raises:** `ValueError` if so many records of so many numbers cannot be held."""
     count(name, records, most=2**31 - 2)
@@ -340,13 +345,12 @@ def _bits(value: Any) -> int:
 def require_session(name: str, tree: object) -> None:
     """**Raises:** `TypeError` for JAX arrays of double precision in a session of single precision,
     in which operations on them are not defined."""
-    wide = [path for path, x in jtu.tree_leaves_with_path(tree) if _bits(x) > 0]
+    wide = [part for part, x in named_leaves(tree) if _bits(x) > 0]
     if wide:
-        names = ", ".join(jtu.keystr(path).lstrip(".") for path in wide)
         raise TypeError(
             f"Argument `{name}` must be of single precision, as this session is, but has numbers "
-            f"of double precision ({names}), made while that was switched on. Make it again, or "
-            'switch it on: `jax.config.update("jax_enable_x64", True)`.'
+            f"of double precision ({', '.join(wide)}), made while that was switched on. Make it "
+            'again, or switch it on: `jax.config.update("jax_enable_x64", True)`.'
         )
 
 

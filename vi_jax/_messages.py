@@ -53,15 +53,14 @@ def at_work(
     total: int | None = None,
     done: int = 0,
 ) -> Iterator[Tell]:
-    """Show a progress bar during a long part of a function, and keep its results on Ctrl-C.
-
-    Gives a function that is called with the units that were done. It also raises an interrupt that
-    Python dropped.
+    """Show a progress bar during a long part of a function, and keep its results on Ctrl-C. Gives a
+    function that is called with the units that were done; it also raises an interrupt that Python
+    dropped.
 
     **Arguments:** `what`, the word before the bar; `kept`, called on Ctrl-C, returns an
     `Interrupted` with what was computed, or `None` if there is nothing to keep yet; `progress`,
-    whether a bar is shown (only in a terminal or a notebook); the `unit` of work; `total`, how many
-    there are in all, if that is known; `done`, how many are done already.
+    whether a bar is shown (only in a terminal or a notebook); the `total` of units, if known; those
+    `done` already.
 
     **Raises:** what `kept` returns, on Ctrl-C; else the `KeyboardInterrupt` itself.
     """
@@ -92,11 +91,11 @@ def in_parts(
     joined: Callable[[Any, list[Any]], R],
     **options: Any,
 ) -> R:
-    """Do a long computation piece by piece, so that an interrupt loses one of them.
+    """Do a long computation (`what`) piece by piece, so that an interrupt loses one of them.
 
-    **Arguments:** `what` it is, in words; `step(carry, piece)` returns the next carry and a part of
-    the result; `pieces` with their sizes; `joined(carry, parts)` makes the result, also the partial
-    one of an `Interrupted`; `options` as for `at_work`.
+    **Arguments:** `step(carry, piece)` returns the next carry and a part of the result; `pieces`
+    with their sizes; `joined(carry, parts)` makes the result, also the partial one of an
+    `Interrupted`; `options` as for `at_work`.
     """
     import jax
 

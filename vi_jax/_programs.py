@@ -105,12 +105,11 @@ _watch = _Watch()
 
 
 class CompiledFunction:
-    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped.
+    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped. (A
+    `LaneProgram` is another thing: the loop of a lane within such a function.)
 
-    (A `LaneProgram` is another thing: the loop of a lane within such a function.)
-
-    **Arguments:** the function; XLA's compiler options where its lanes are vector code; further
-    arguments of `eqx.filter_jit` for where they run on XLA's backend.
+    **Arguments:** the function; XLA's compiler options where its lanes are vector code (`quick`);
+    further arguments of `eqx.filter_jit` for where they run on XLA's backend.
     """
 
     def __init__(
@@ -138,10 +137,8 @@ class CompiledFunction:
                 getattr(cached, "clear_cache", jax.clear_caches)()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """What the function returns, by its compiled program.
-
-        **Raises:** `KeyboardInterrupt` also for an interrupt that Python dropped meanwhile.
-        """
+        """What the function returns, by its compiled program. **Raises:** `KeyboardInterrupt` also
+        for an interrupt that Python dropped meanwhile."""
         with interrupts_heard():
             return self._called(arguments, keywords)
 

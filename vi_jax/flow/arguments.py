@@ -19,6 +19,7 @@ from .._checks import (
     fits_records,
     flag,
     instance_of,
+    named_leaves,
     narrow,
     one_of,
     require_ranges,
@@ -236,10 +237,9 @@ def of_one_type(machine: AbstractMachine, start: State) -> tuple[AbstractMachine
     warning."""
     dtype = _type_of(machine, start)
     for name, tree in {"machine": machine, "start": start}.items():
-        short = [path for path, x in jtu.tree_leaves_with_path(tree) if narrow(x)]
-        if short:
-            names = ", ".join(jtu.keystr(path).lstrip(".") for path in short)
-            warn_of_narrow(f"Argument `{name}` has numbers ({names})")
+        found = [part for part, x in named_leaves(tree) if narrow(x)]
+        if found:
+            warn_of_narrow(f"Argument `{name}` has numbers ({', '.join(found)})")
     machine = jtu.tree_map(lambda x: x.astype(dtype) if narrow(x) else x, machine)
     return machine, as_floats(machine, start)
 
@@ -251,21 +251,22 @@ def _type_of(machine: AbstractMachine, state: State) -> Any:
 
 def _check_scalars(**arguments: Any) -> None:
     for name, tree in arguments.items():
-        for path, leaf in jtu.tree_leaves_with_path(eqx.filter(tree, eqx.is_array)):
-            if leaf.ndim:
-                where = jtu.keystr(path).lstrip(".")
+        for part, x in named_leaves(eqx.filter(tree, eqx.is_array)):
+            if x.ndim:
                 raise ValueError(
                     f"Argument `{name}` must hold scalars (use `jax.vmap` for a batch), but its "
-                    f"{where} has shape {leaf.shape}."
+                    f"{part} has shape {x.shape}."
                 )
 
 
 def _check_numbers(machine: AbstractMachine) -> None:
-    for path, leaf in jtu.tree_leaves_with_path(machine):
-        numbers = concrete(leaf)
+    for part, x in named_leaves(machine):
+        numbers = concrete(x)
         if numbers is not None and numbers.dtype.kind == "f" and np.isnan(numbers).any():
-            where = f"{_leaf_in_words(path)} is {short(numbers)}"
-            raise ValueError(f"Argument `machine` must hold numbers, but {where}.")
+            where = f"its {part}" if part else "it"
+            raise ValueError(
+                f"Argument `machine` must hold numbers, but {where} is {short(numbers)}."
+            )
 
 
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
@@ -283,22 +284,18 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
 
 def check_leaves(argument: str, state: State) -> None:
     """**Raises:** `ValueError` if an array in a state holds no number."""
-    for path, leaf in jtu.tree_leaves_with_path(state):
-        if 0 in jnp.shape(leaf):
+    for part, x in named_leaves(state):
+        if 0 in jnp.shape(x):
+            where = f"its {part}" if part else "it"
             raise ValueError(
-                f"Argument `{argument}` must hold numbers, but {_leaf_in_words(path)} has shape "
-                f"{jnp.shape(leaf)}."
+                f"Argument `{argument}` must hold numbers, but {where} has shape {jnp.shape(x)}."
             )
-
-
-def _leaf_in_words(path: Any) -> str:
-    return f"its {jtu.keystr(path).lstrip('.')}" if path else "it"
 
 
 def check_reals(name: str, state: State) -> None:
     """**Raises:** `TypeError` that names what is no real number in a state of any form."""
-    for path, leaf in jtu.tree_leaves_with_path(state):
-        require_real(name, jtu.keystr(path).lstrip("."), leaf)
+    for part, x in named_leaves(state):
+        require_real(name, part, x)
 
 
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
@@ -329,11 +326,10 @@ def check_start(machine: AbstractMachine, start: State) -> None:
             'of arrays, `on=("x[0]", "v[0]")`, or `position` and `velocity` of the machine pick '
             "them."
         )
-    for path, leaf in jtu.tree_leaves_with_path(start):
-        numbers = concrete(leaf)
+    for part, x in named_leaves(start):
+        numbers = concrete(x)
         if numbers is not None and not np.isfinite(numbers).all():
-            name = jtu.keystr(path).lstrip(".")
-            raise ValueError(f"Argument `start` must be finite, but its {name} is {numbers}.")
+            raise ValueError(f"Argument `start` must be finite, but its {part} is {numbers}.")
     if isinstance(machine, ShaftMachine):
         machine.check_start(start)
     if isinstance(start, eqx.Module):

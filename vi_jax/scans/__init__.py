@@ -16,12 +16,9 @@ from ._lyapunov import lyapunov as lyapunov
 from ._scan import LanesFailed as LanesFailed
 from ._scan import ScanInterrupted as ScanInterrupted
 from ._scan import scan as scan
-from ._sweep import COLUMNS as COLUMNS
 from ._sweep import Sweep as Sweep
 from ._sweep import sweep as sweep
 from ._sweep import taken_along as taken_along
-from .grid import Blocks as Blocks
-from .grid import axes_of as axes_of
 from .measures import REGIMES as REGIMES
 from .measures import AbstractMeasure as AbstractMeasure
 from .measures import Exponent as Exponent

@@ -215,7 +215,6 @@ class Cells(NamedTuple):
 
     @property
     def widths(self) -> np.ndarray:
-        """Width of the cells along each axis."""
         return np.array([(x[-1] - x[0]) / (x.size - 1) for x in self.centres])
 
     @property

@@ -83,16 +83,12 @@ class Lyapunov(Summarized):
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """These exponents, or a batch of them, as an `xarray.Dataset`.
+        """These exponents, or a batch of them, as an `xarray.Dataset`. The state at the end becomes
+        a variable for each component (`state_Y`), and `result` is the reason's name. Not to be
+        traced.
 
-        The state at the end becomes a variable for each component (`state_Y`), and `result` is the
-        reason's name. Host-side: not to be traced.
-
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        given along one dimension: `"exponent"`, or a batch axis.
-
-        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
-        such dimension.
+        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only what is given
+        along one dimension: `"exponent"`, or a batch axis.
         """
         batch = batch_names(dims, self.exponents.ndim - 1)
         each = *batch, "exponent"

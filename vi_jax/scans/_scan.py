@@ -150,7 +150,6 @@ def computed(
 
 
 def size_of(where: Where) -> int:
-    """Number of lanes in a block."""
     return math.prod(part.stop - part.start for part in where)
 
 
@@ -240,10 +239,10 @@ def run_blocks(
                 compute(program, blocks.values(todo[0]), blocks.lanes, dry=True)
             pool = stack.enter_context(ThreadPoolExecutor(at_once))
             devices, one_core = place.devices, True
+        x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
         task = functools.partial(
-            _task, parcel, lanes_of_block=blocks.lanes, devices=devices, x64=_x64(),
-            one_core=one_core,
-        )  # fmt: skip
+            _task, parcel, lanes_of_block=blocks.lanes, devices=devices, x64=x64, one_core=one_core
+        )
         waiting, running = iter(todo), dict[Future, Where]()
 
         def begin(where: Where) -> None:
@@ -318,10 +317,6 @@ def _task(
     with jax.enable_x64(x64), threads:  # a thread has its own
         program = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parcel)
         return compute(program, values, lanes_of_block, devices)
-
-
-def _x64() -> bool:
-    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _how_to_go_on(kept: MemoryStore) -> str:

@@ -108,16 +108,12 @@ class Sweep(Summarized):
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """This sweep, or a batch of them, as an `xarray.Dataset` over its values.
+        """This sweep, or a batch of them, as an `xarray.Dataset` over its values, a coordinate with
+        the parameter's name. Section states are a variable for each component (`section_Y`), and
+        `result` is the reason's name. Not to be traced.
 
-        The values are the coordinate that has the parameter's name, section states a variable for
-        each component (`section_Y`), and `result` is the reason's name. Not to be traced.
-
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what is
-        given along one dimension: `"value"`, or `"cycle"` (the sections).
-
-        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
-        such dimension.
+        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only what is given
+        along one dimension: `"value"`, or `"cycle"` (the sections).
         """
         each = (*batch_names(dims, self.values.ndim - 1), "value")
         variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)

@@ -58,7 +58,6 @@ class REGIMES(IntEnum):
     meaning: str
 
     def __new__(cls, code: int, meaning: str):
-        """A number with a meaning in words."""
         self = int.__new__(cls, code)
         self._value_, self.meaning = code, meaning
         return self
@@ -282,11 +281,9 @@ class Average(AbstractMeasure):
     name: str = eqx.field(static=True)
 
     def described(self, start):
-        """In the unit that the machine states for it."""
         return {self.name: {"unit_of": self.name, "long_name": f"mean {self.name}"}}
 
     def __call__(self, machine, run):
-        """The machine's own average over all cycles of one lane."""
         found = run.mean_averages()
         if self.name not in found:
             raise ValueError(
@@ -306,7 +303,6 @@ class Sections(AbstractMeasure):
         count("number", self.number, least=1)
 
     def described(self, start):
-        """Each component of the state."""
         return {
             name: {"unit_of": name, "long_name": f"{name} on the section", "dims": ("cycle",)}
             for name in components(start)
@@ -314,11 +310,9 @@ class Sections(AbstractMeasure):
 
     @property
     def cycles(self):
-        """As many as are kept."""
         return self.number
 
     def __call__(self, machine, run):
-        """Of one lane, arrays of shape (number,)."""
         return {name: x[-self.number :] for name, x in components(run.sections, 1).items()}
 
 
@@ -339,11 +333,9 @@ class Exponent(AbstractMeasure):
         return {"exponent": jnp.full((), jnp.nan, _dtype(run))}
 
     def needs_refinement(self, found, pass_number=0):
-        """True: every lane has an exponent to be found."""
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """The exponent of one lane."""
         found_out = lyapunov(
             machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
@@ -401,7 +393,6 @@ class Regime(AbstractMeasure):
         return dataclasses.replace(self, wander=method.wander)
 
     def begun(self, start):
-        """The measure, knowing how large the motion was."""
         return dataclasses.replace(self, start=bare(start))
 
     @property

@@ -70,7 +70,6 @@ class ScanProgram(eqx.Module):
 
     @property
     def method(self) -> AbstractMethod:
-        """The method that moves the machines."""
         assert isinstance(self.options.method, AbstractMethod)
         return self.options.method
 
@@ -375,7 +374,6 @@ class Custom(AbstractMeasure):
     function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, machine, run):
-        """What the function names of one lane, as arrays."""
         found = self.function(machine, run)
         if not isinstance(found, Mapping):
             raise TypeError(

@@ -112,11 +112,9 @@ class Statistics(_Observed):
 
     @property
     def cycles(self):
-        """At least one cycle in each batch."""
         return self.batches
 
     def described(self, start):
-        """In the unit of the quantity."""
         name = _called(self.of)
         words = {
             "mean": f"mean of {name}", "error": f"standard error of the mean of {name}",
@@ -126,7 +124,6 @@ class Statistics(_Observed):
         return {f"{name}_{k}": {"unit_of": name, "long_name": x} for k, x in words.items()}
 
     def __call__(self, machine, run):
-        """Means, spreads and their errors over one lane's cycles."""
         _, row = self.row(machine, run, self.of)
         if row.size < self.batches:
             raise ValueError(
@@ -189,7 +186,6 @@ class Density(_Observed):
         self.samples = count("samples", samples)
 
     def described(self, start):
-        """Over bins of each name."""
         rows = zip(self.of, self.edges, strict=True)
         edges = {f"{name}_edges": np.asarray(x).tolist() for name, x in rows}
         words = " and ".join(self.of)
@@ -203,7 +199,6 @@ class Density(_Observed):
         }
 
     def __call__(self, machine, run):
-        """Histogram of one lane's record, as a density."""
         rows = [self.row(machine, run, name)[1] for name in self.of]
         sizes = [edges.size - 1 for edges in self.edges]
         place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
@@ -257,7 +252,6 @@ class Escape(_Observed):
         count("samples", self.samples)
 
     def described(self, start):
-        """With the time between two samples, in cycles."""
         words, step = "cycles until it escapes, or was watched", 1.0 / max(1, self.samples)
         return {
             "escape_cycle": {"units": "cycle", "long_name": words, "step": step},
@@ -281,7 +275,6 @@ class Escape(_Observed):
         return (value < self.low) | (value > self.high)
 
     def __call__(self, machine, run):
-        """When one lane first leaves, in cycles."""
         row, behind = self.row(machine, run, self.of)
         # What is known of cycles begins with the first cycle's end.
         row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])

@@ -3,7 +3,7 @@
 from ..._checks import one_of
 from ...machine import AbstractMachine, scales_known
 from .base import AbstractMethod
-from .exact import ExactFlight
+from .exact import ExactFlight, lack_of_closed_form
 from .runge_kutta import Adaptive, FixedStep
 
 MethodLike = AbstractMethod | str | None
@@ -44,7 +44,7 @@ def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractM
 
 def _named(machine: AbstractMachine | None, name: str, argument: str) -> AbstractMethod:
     steps, tolerance = _PRESETS[one_of(argument, name, tuple(_PRESETS))]
-    if machine is not None and _flies(machine):
+    if machine is not None and lack_of_closed_form(machine) is None:
         return ExactFlight()
     if machine is None or scales_known(machine):
         return FixedStep(steps_per_cycle=steps)
@@ -65,7 +65,7 @@ def chosen(
     Whether the method can move the machine is not looked at: `AbstractMethod.check` says so.
     """
     if method is None:
-        if otherwise is None or (machine is not None and _flies(machine)):
+        if otherwise is None or (machine is not None and lack_of_closed_form(machine) is None):
             return preset(machine)
         return otherwise
     if isinstance(method, str):
@@ -76,11 +76,3 @@ def chosen(
             f"`ExactFlight()` or the name of a preset, but got {method!r}."
         )
     return method
-
-
-def _flies(machine: AbstractMachine) -> bool:
-    try:
-        ExactFlight().check(machine)
-    except ValueError:
-        return False
-    return True

@@ -312,7 +312,6 @@ class ExactFlight(AbstractMethod):
         return isinstance(machine, ModalMachine)
 
     def check(self, machine):
-        """Refuse machines whose flight has no closed form."""
         lack = lack_of_closed_form(machine)
         if lack is not None:
             raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")

@@ -156,11 +156,9 @@ class Unrolled(diffrax.AbstractSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        """The interpolant of the wrapped solver."""
         return self.solver.interpolation_cls
 
     def order(self, terms):
-        """Order of the wrapped solver."""
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
@@ -168,11 +166,9 @@ class Unrolled(diffrax.AbstractSolver):
         return None
 
     def func(self, terms, t0, y0, args):
-        """The vector field at a point."""
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step over [t0, t1]."""
         y1, error, slopes, _ = self.step_with_stages(terms, t0, t1, y0, args)
         control = terms.contr(t0, t1)
         stages = [terms.prod(slope, control) for slope in slopes]
@@ -288,7 +284,6 @@ class _RungeKutta(AbstractMethod):
     """A method whose steps have stages."""
 
     def step(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, and its error."""
         return self.step_with_stages(smooth, s0, s1, state, beside)[:3]
 
 
@@ -325,7 +320,6 @@ class Adaptive(_RungeKutta):
 
     @property
     def adaptive(self) -> bool:
-        """True: steps are resized by their errors."""
         return True
 
     @property

@@ -90,5 +90,4 @@ class Verner9(diffrax.AbstractERK):
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
-        """9, the order of the solution that is continued."""
         return 9
