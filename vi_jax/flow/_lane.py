@@ -91,10 +91,8 @@ class Record(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """One trajectory on its way. All floats: other types would keep the loop from fusing.
-
-    A step makes another lane of it, and so does each event that is met there.
-    """
+    """One trajectory on its way. All floats: other types would keep the loop from fusing. A step
+    makes another lane of it, and so does each event that is met there."""
 
     s: Scalar
     state: State
@@ -301,8 +299,7 @@ class Plan(eqx.Module):
         return list(range(len(stops_of(self.machine)), last))
 
     def from_below(self, state: State) -> list[int]:
-        """Those of `others` that happen only once their guard has been below zero (see
-        `AbstractEvent.from_below`)."""
+        """Those of `others` that happen only from below (see `AbstractEvent.from_below`)."""
         events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
@@ -337,8 +334,7 @@ class Plan(eqx.Module):
 
     @property
     def meets_every_turn(self) -> bool:
-        """Whether steps always end on every turning point, since switches and events may be
-        there."""
+        """Whether steps always end on every turning point: switches and events may be there."""
         return bool(switches_of(self.machine) or others_of(self.machine))
 
     def meets_turns(self, done: Scalar) -> Flag:
@@ -349,8 +345,7 @@ class Plan(eqx.Module):
         return jnp.full_like(done, self.meets_every_turn, bool)
 
     def point(self, state: State, modes: Scalars) -> State:
-        """What is kept of the end of an interval: the state, with the machine's own modes if it has
-        some."""
+        """What is kept of the end of an interval: the state, with the machine's own modes."""
         return with_modes(state, own_modes(self.machine, modes))
 
     def fresh(self, state: State) -> Record:

@@ -122,8 +122,7 @@ def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
 
 @contextlib.contextmanager
 def in_words_of(whose: str) -> Iterator[None]:
-    """Errors about traced numbers and about assignments as one sentence that says what to write
-    instead."""
+    """Errors about traced numbers and assignments as one sentence that says what to write."""
     try:
         yield
     except jax.errors.TracerBoolConversionError as error:

@@ -98,11 +98,9 @@ def slope(c: Scalars) -> Scalars:
 
 
 def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
-    """The θ in [0, 1] at which a polynomial that ends positive first rises through zero.
-
-    Newton's method kept inside a bracket. A polynomial that starts at zero and falls (the body
-    leaves the stop) has its root later; one that falls at a positive value has passed it.
-    """
+    """The θ in [0, 1] at which a polynomial that ends positive first rises through zero. Newton's
+    method kept inside a bracket. A polynomial that starts at zero and falls (the body leaves the
+    stop) has its root later; one that falls at a positive value has passed it."""
     derivative = slope(c)[:-1]
     low, high = jnp.zeros_like(c[0]), jnp.ones_like(c[0])
     end, end_rate = sum(c[1:], c[0]), sum(derivative[1:], derivative[0])
@@ -123,9 +121,7 @@ def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
 
 def landing(gap: Rates) -> tuple[Scalar, Scalar]:
     """Offset δ at which gap + gap'·δ + ½ gap''·δ² rises through zero, and the slope there squared.
-
-    Where the square is negative the coordinate turns short of the stop, and δ is meaningless.
-    """
+    Where the square is negative the coordinate turns short of the stop, and δ is meaningless."""
     square = gap.v * gap.v - 2 * gap.x * gap.a
     real = square > 0
     root = jnp.sqrt(jnp.where(real, square, 1.0))

@@ -200,18 +200,16 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
 
 
 def _check_machine(machine: AbstractMachine, start: State) -> None:
-    what = None
+    who = type(machine).__name__
     if is_autonomous(machine, start):
-        what = (
-            "whose cycles end with its drive's; shake one that an event ends at equal intervals, "
-            "as `machine.observed_every(interval)`"
-        )
-    elif others_of(machine):
-        what = "without resets and other events that its velocities may pass in a jump"
-    if what is not None:
         raise ValueError(
-            f"Argument `noise` must be left out but for a machine {what}, but got a "
-            f"{type(machine).__name__}."
+            f"Argument `noise` needs a machine whose cycles end with its drive's, but got a {who}. "
+            "Observe it at equal intervals, as `machine.observed_every(interval)`."
+        )
+    if others_of(machine):
+        raise ValueError(
+            "Argument `noise` needs a machine without resets and user-defined events, which its "
+            f"velocities may pass in a jump, but got a {who}."
         )
 
 

@@ -642,24 +642,18 @@ def integrity_profile(
     progress: bool = True,
     **options: Any,
 ) -> IntegrityProfile:
-    """Compute basins, their shares and their integrity over one parameter (an erosion profile).
+    """Compute basins, their shares and their integrity over one parameter (an erosion profile), as
+    one scan by one compiled program.
 
-    All values are one scan, by one compiled program.
-
-    **Arguments:**
-
-    - `machine`, `parameter`: the machine and the name of the number that is changed, such as
-      `"drive.frequency_ratio"`.
-    - `values`: its values; they are taken in rising order.
-    - `region`, `resolution`: as for `basins`; the same starts at each value.
-    - `scales`: as for `Basins.integrity`.
-    - `settle`, `longest`, `tolerance`, `apart`, `method`, `start`, `progress`, and further options:
-      as for `basins` (`start`: by default the machine's own at each value).
+    **Arguments:** `machine` and `parameter`, the name of the number that is changed, such as
+    `"drive.frequency_ratio"`; its `values`, which are taken in rising order; `scales`, as for
+    `Basins.integrity`; all others and further options as for `basins`, with the same starts at each
+    value (`start`: by default the machine's own there).
 
     **Returns:** an `IntegrityProfile`.
 
-    **Raises:** as `basins`; `ValueError` for values that are no rising row of numbers, or scales
-    of what is not in the region.
+    **Raises:** as `basins`; `ValueError` for values that are no rising row of numbers, or scales of
+    what is not in the region.
     """
     machine = machine_of(machine)
     check_leaf(machine, parameter)
@@ -717,10 +711,8 @@ def _profile(
 
 
 def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which attractor at each value is which motion, -1 for none: (motions, values).
-
-    Of the motions of a kind those nearest to each other are one, the nearest pair first.
-    """
+    """Which attractor at each value is which motion, -1 for none: (motions, values). Of the motions
+    of a kind those nearest to each other are one, the nearest pair first."""
     names = [name.removeprefix(START) for name in axes]
     angles = np.array([is_angle(found[0].machine, name) for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])

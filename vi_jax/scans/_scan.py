@@ -132,7 +132,7 @@ def computed(
     with contextlib.closing(kept):
         todo = kept.open_blocks()
         _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
-        done = total - sum(map(size_of, todo))
+        done = total - sum(map(_size_of, todo))
         with at_work(
             "scan", lambda: ScanInterrupted(collected(), store),
             progress=progress, unit="lane", total=total, done=done,
@@ -140,7 +140,7 @@ def computed(
 
             def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
                 kept.write(where, numbers)
-                tell(size_of(where))
+                tell(_size_of(where))
 
             try:
                 run_blocks(program, blocks, todo, place, write)
@@ -149,7 +149,7 @@ def computed(
         return collected()
 
 
-def size_of(where: Where) -> int:
+def _size_of(where: Where) -> int:
     return math.prod(part.stop - part.start for part in where)
 
 
@@ -359,12 +359,9 @@ def compute(
     *,
     dry: bool = False,
 ) -> dict[str, np.ndarray]:
-    """The numbers of a block of lanes, by name, as the program finds them.
-
-    A block is filled up to `lanes`, so that all blocks are one program. With several devices the
-    lanes are dealt to them in turn, since neighbours take alike long. `dry` only compiles: none of
-    the lanes is run.
-    """
+    """The numbers of a block of lanes, by name, as the program finds them. A block is filled up to
+    `lanes`, so that all blocks are one program. With several devices the lanes are dealt to them in
+    turn, since neighbours take alike long. `dry` only compiles: none of the lanes is run."""
     size = next(iter(values.values())).size
     deal = np.arange(lanes).reshape(-1, devices).T.ravel()
     place = np.minimum(deal, size - 1)

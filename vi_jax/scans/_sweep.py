@@ -163,8 +163,7 @@ class Sweep(Summarized):
         ]
 
     def _jumps(self) -> list[list[str]]:
-        """What changes at each value by far more than at the values beside it; not within motions
-        without a period, whose extremes differ by chance."""
+        """What changes at each value by far more than at those beside it; not without a period."""
         name, units = name_in(self.labels[0]), dict(self.units)
         numbers = {
             f"min {name}": (self.y_min, unit_of(units, "position")),

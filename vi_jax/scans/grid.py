@@ -42,11 +42,9 @@ def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.nda
 
 
 class Blocks:
-    """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order.
-
-    If its axes are `paired`, their values are taken together, one lane for each place in the rows.
-    With `numbers`, one for each lane in the grid's order, they are among the lanes' values.
-    """
+    """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order. If its
+    axes are `paired`, their values are taken together, one lane for each place in the rows. With
+    `numbers`, one for each lane in the grid's order, they are among the lanes' values."""
 
     def __init__(
         self,

@@ -388,8 +388,7 @@ class Regime(AbstractMeasure):
         count("lasting", self.lasting)
 
     def under(self, method):
-        """The measure, knowing by how much sections of a motion that repeats differ under this
-        method."""
+        """This measure, for sections that differ by as much as they do under this method."""
         return dataclasses.replace(self, wander=method.wander)
 
     def begun(self, start):

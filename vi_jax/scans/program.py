@@ -339,12 +339,11 @@ def _corners(blocks: Blocks) -> np.ndarray:
 
 def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
     """The program, once machine, start and method are checked at the corners of the grid.
+    **Raises:** `ValueError` or `TypeError` for what cannot be run.
 
     What the gaps are at the corners says whether a body can come to rest anywhere on the grid; if
     none can, the program leaves that out. (Where a function makes the machines, the program knows
     it already.) Axes that are paired have no corners: machines are checked at all their lanes.
-
-    **Raises:** `ValueError` or `TypeError` for what cannot be run.
     """
     rests = False
     if blocks.paired and program.machine is not None:

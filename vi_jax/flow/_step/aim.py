@@ -101,12 +101,9 @@ def _crest(
     plan: Plan, shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
 ) -> tuple[Flag, Scalar]:
     """As `crests` for one function, by value and slope at the `ends`, and the `values` at the
-    stages.
-
-    The function is taken for the cubic through both ends of the step, plus what it is off at the
-    stages: that is divided by the shape of the cubic's error and interpolated linearly. By how much
-    it differs from stage to stage is the margin of doubt.
-    """
+    stages. The function is taken for the cubic through both ends of the step, plus what it is off
+    at the stages: that is divided by the shape of the cubic's error and interpolated linearly. By
+    how much it differs from stage to stage is the margin of doubt."""
     x0, v0, x1, v1 = ends
     over, rises, over_end, falls = x0 - slack, h * v0, x1 - slack, h * v1
     grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
@@ -198,10 +195,8 @@ def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag
 
 def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Scalar]:
     """Whether the force, of one sign at both ends, may have had the other in between for a body
-    that is slow enough to notice, and where it turned.
-
-    It releases a body at rest for a moment, or turns one twice that has just left the stop.
-    """
+    that is slow enough to notice, and where it turned. It releases a body at rest for a moment, or
+    turns one twice that has just left the stop."""
     assert path.surge is not None
     begin, end, (rate0, rate1, brief) = path.begin, path.end, path.surge
     a0, a1 = begin.a, end.a
@@ -575,8 +570,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
-    """The goal, where a step aimed at it came so close that Newton's step from its end is better
-    than a root of the quintic."""
+    """The goal, where Newton's step is better than a root of the quintic: close to it."""
     turns, h = goal.before, trial.h
     for k, path in enumerate(trial.paths):
         shift, turn = to_turn(path.end), to_turn_of(k)

@@ -54,10 +54,10 @@ class Within(NamedTuple):
     slow: dict[int, Flag]
     """By coordinate, whether it is so slow, and so close to a stop, that it may turn twice within
     the step and touch in between."""
+    slack: dict[int, Scalar]
+    """What rounding leaves of the forces."""
     error: Scalar | None = None
     """The largest error of the forces, relative to the tolerance."""
-    slack: dict[int, Scalar] | None = None
-    """What rounding leaves of the forces."""
 
     def only(self, places: list[int]) -> "Within":
         """The values at some of the stages."""
@@ -117,7 +117,7 @@ def within(
     the stages have none; `longest`, the length of the longest step.
     """
     if not stages:
-        return Within({}, {}, {})
+        return Within({}, {}, {}, {})
     machine, around = plan.machine, (lane.modes, lane.contact or ())
     limited = limited_of(machine) if plan.rests else []
     contacts: Any = lane.contact
@@ -157,7 +157,7 @@ def within(
 
     events = seen(guards)(places) if looked_at else {}
     if not limited:
-        return Within({}, events, slow)
+        return Within({}, events, slow, {})
     # The integral of a force is a velocity.
     size = 1.0 if isinstance(plan.unit, float) else 1 / plan.unit
 
@@ -176,15 +176,13 @@ def within(
 
     asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
     forces, error, slack = jax.lax.cond(asked, of_forces, of_none, places)
-    return Within(forces, events, slow, error, slack)
+    return Within(forces, events, slow, slack, error)
 
 
 def for_each(function: Callable[..., Any], given: tuple) -> Any:
-    """Constant values of a function for each of some arguments, stacked along their first axis.
-
-    On a CPU a loop, which is compiled once. On a GPU each turn of a loop starts kernels of its own,
-    and `vmap` took 0.7 of its time (H200, 100,000 lanes).
-    """
+    """Constant values of a function for each of some arguments, stacked along their first axis. On
+    a CPU a loop, which is compiled once. On a GPU each turn of a loop starts kernels of its own,
+    and `vmap` took 0.7 of its time (H200, 100,000 lanes)."""
     if jax.default_backend() != "cpu":
         return jax.vmap(lambda x: stop_gradient(function(*x)))(given)
     return jax.lax.scan(lambda c, x: (c, stop_gradient(function(*x))), None, given)[1]
@@ -456,12 +454,10 @@ def _seen(
     plan: Plan, lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing,
     all_of_them: list[Crossing],
 ) -> Crossing:  # fmt: skip
-    """The event, with whether a step that was aimed at it landed on it, or has to be aimed again.
-
-    A step that ends an interval (`ends`) as it meets a stop, to rounding, is aimed at it: an impact
+    """The event, with whether a step that was aimed at it landed on it, or has to be aimed again. A
+    step that ends an interval (`ends`) as it meets a stop, to rounding, is aimed at it: an impact
     on the section belongs to the cycle that ends there, so that it is not now in one, now in the
-    next.
-    """
+    next."""
     end = guard.end
     aimed = good & (lane.target == to_event(guard.number))
     eps = float(jnp.finfo(h.dtype).eps)

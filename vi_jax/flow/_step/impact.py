@@ -348,12 +348,9 @@ def _pushed_state(
 
 
 def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dict[int, Scalar]:
-    """Of each stop the speed of approach, if it may be hit next; else a negative number.
-
-    Two bodies that meet their stops at one instant, of which neither feels the other, are two
-    instants to derivatives: only what a blow brought together, or acts on what is landed upon,
-    takes part.
-    """
+    """Of each stop the speed of approach, if it may be hit next; else a negative number. Two bodies
+    that meet their stops at one instant, of which neither feels the other, are two instants to
+    derivatives: only what a blow brought together, or acts on what is landed upon, takes part."""
     found = {}
     for number, stop in enumerate(stops_of(instant.plan.machine)):
         k = stop.coordinate

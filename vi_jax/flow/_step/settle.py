@@ -190,10 +190,8 @@ def _before_it_presses(
     rebound: Scalar, pressing: Scalar, growth: Scalar
 ) -> tuple[Flag, Scalar, Scalar]:
     """Whether a body is not pressed on yet but will be, since its force grows; then how long its
-    next hop lasts at most, and the time until it is pressed on.
-
-    A hop that begins against a force f, growing at the rate j, is over within 3 |f|/j + √(6 v/j).
-    """
+    next hop lasts at most, and the time until it is pressed on. A hop that begins against a force
+    f, growing at the rate j, is over within 3 |f|/j + √(6 v/j)."""
     v, pull, grows = stop_gradient((rebound, -pressing, growth))
     not_yet = (pull >= 0) & (grows > 0)
     rate = jnp.where(not_yet, grows, 1.0)
@@ -218,11 +216,9 @@ def _broken(plan: Plan, lane: Lane, there: State, met: Flag, blows: dict[int, Bl
 def _together(
     plan: Plan, lane: Lane, blows: dict[int, Blow]
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
-    """Of each coordinate that was struck, whether it comes to rest, and the time that takes.
-
-    What presses on a body may be another one that comes to rest on it at the same instant: which of
-    them do is found by trying, those that rest being held while the others are looked at.
-    """
+    """Of each coordinate that was struck, whether it comes to rest, and the time that takes. What
+    presses on a body may be another one that comes to rest on it at the same instant: which of them
+    do is found by trying, those that rest being held while the others are looked at."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)

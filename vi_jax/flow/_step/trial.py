@@ -266,10 +266,8 @@ def _path(
     if lane.contact is not None and not exact(plan.machine, lane.state):
         # Of a body at rest place and velocity are known better than the state tells them, where
         # the coordinate is a difference. Its force is that on a free body.
-        rests, place = (
-            lane.contact[k] > 0,
-            plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x),
-        )
+        rests = lane.contact[k] > 0
+        place = plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x)
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
@@ -302,6 +300,5 @@ def _path(
                 )
                 for r, rate in ((begin, surge[0]), (end, surge[1]))
             )
-            assert seen.slack is not None
             pull = Side(first, last, seen.forces[k], seen.slack[k], rests | slow)
     return Path(begin, end, at_turn, leaves, surge, pull)

@@ -58,11 +58,9 @@ _BEND = tuple((-1) ** n * n / factorial(2 * n + 1) for n in range(1, 10))
 def modal_flight(
     machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State
 ) -> Any:
-    """The state a time h after that at s, exact to rounding for any h.
-
-    Free flight of uncoupled modes is the closed form of each. All else is a matrix exponential:
-    modes coupled by damping, bodies at rest on stops (`contact`), a force in resonance with a mode.
-    """
+    """The state a time h after that at s, exact to rounding for any h. Free flight of uncoupled
+    modes is the closed form of each. All else is a matrix exponential: modes coupled by damping,
+    bodies at rest on stops (`contact`), a force in resonance with a mode."""
     free = machine.plain > 0
     for rests in contact:
         free = free & (rests == 0)
@@ -90,12 +88,10 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
 
 
 def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
-    """How long no stop can be met in free flight from here; 0 where that is not known.
-
-    A mode that swings and fades stays within its amplitude a, and is accelerated by κa at most; so
-    the distance to a stop is at least what a parabola leaves of it, and infinite where the sum of
-    all amplitudes does not reach.
-    """
+    """How long no stop can be met in free flight from here; 0 where that is not known. A mode that
+    swings and fades stays within its amplitude a, and is accelerated by κa at most; so the distance
+    to a stop is at least what a parabola leaves of it, and infinite where the sum of all amplitudes
+    does not reach."""
     machine, s, state = stop_gradient((machine, s, state))  # a length has no derivative
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady(machine, s)
