@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._programs import compiled
 from .._types import Scalar, State, Vector
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, units_of, with_leaf
 from ..machine import quantity_of as measured
 from ._chatter import Hops
-from ._corrector import Step, jacobian_at
+from ._corrector import Step, jacobian_at, on_host
 from ._shooting import Observed, Shooting
 from ._sliding import SLIDING, holding
 from ._words import DOUBLING, REST, TORUS, TOUCHING
@@ -83,7 +82,7 @@ def _on_section(problem: Shooting, x: Vector) -> State:
     return problem.state_at(x, legs[0], places[0])
 
 
-@compiled
+@on_host
 def rates_at(
     problem: Shooting, names: tuple[str, ...], x: Vector, direction: Vector
 ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
@@ -159,21 +158,21 @@ class HeldMultiplier(AbstractCondition):
         return float(max(others, np.real((values[i] - values[j]) ** 2)))
 
 
-def alone(problem: Shooting, step: Step, scale: np.ndarray) -> tuple[Shooting, Step, np.ndarray]:
+def alone(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
     """The equations of a motion in the last of their parameters only, without conditions, the
-    others as they are at a step; and the step and the sizes of the unknowns as theirs."""
+    others as they are at a step; and the step as theirs."""
     count = len(problem.parameters)
     if not problem.conditions:
-        return problem, step, scale
+        return problem, step
     gone, machine = list(range(-count, -1)), problem.machine
     for i in gone:
         machine = with_leaf(machine, problem.parameters[i], step.x[i])
     one = dataclasses.replace(
-        problem, machine=machine, parameters=problem.parameters[-1:], conditions=()
-    )
-    x, tangent, sizes = (np.delete(np.asarray(a), gone) for a in (step.x, step.tangent, scale))
-    size = float(np.linalg.norm(tangent)) or 1.0
-    return one, step._replace(x=x, tangent=tangent / size), sizes
+        problem, machine=machine, parameters=problem.parameters[-1:], widths=problem.widths[-1:],
+        conditions=(),
+    )  # fmt: skip
+    x, tangent = (np.delete(np.asarray(a), gone) for a in (step.x, step.tangent))
+    return one, step._replace(x=x, tangent=tangent / (float(np.linalg.norm(tangent)) or 1.0))
 
 
 def as_held(values: dict[str, float], multipliers: np.ndarray) -> tuple[AbstractCondition, ...]:
@@ -239,13 +238,11 @@ class Exchange(eqx.Module):
         return missing + self.left * (left @ jacobian[:, -1] - self.left @ missing)
 
 
-def exchange_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> Exchange | None:
+def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
     """The exchange at a motion at which branches cross, by the singular vectors of its Jacobian
-    without the columns of the parameters; `None` if the second parameter takes them apart.
-
-    **Arguments:** the equations in two parameters; the motion; the size of each unknown.
-    """
-    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * scale
+    without the columns of the two parameters; `None` if the second one takes them apart."""
+    scale = problem.scale
+    jacobian = jacobian_at(problem, x) * scale
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
     if abs(left[:, -1] @ jacobian[:, -2]) > _APART * sizes[0]:
         return None
@@ -328,6 +325,6 @@ def minors(matrix: Array | np.ndarray) -> Array:
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
     """Whether a double multiplier has one eigenvector. With two of them, as where a motion folds
     and loses a symmetry, no pair of it becomes complex."""
-    sizes, M = np.asarray(problem.scale(())[-problem.states :]), step.seen.monodromy
+    sizes, M = np.asarray(problem.sizes)[1:], step.seen.monodromy
     values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
     return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

@@ -105,15 +105,13 @@ def continue_orbit(
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
     problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    widths = [0.5 * (high - low) for low, high in ranges]
-    start = _first_point(problem, x, problem.scale(widths), orbit)
-    before = problem.scale(widths)
+    problem = _scaled(problem, ranges)
+    start, before = _first_point(problem, x, orbit), problem.scale
     problem = sized(problem, start.x, start.seen.largest)
-    scale = problem.scale(widths)
-    (start,) = rescaled([start], before, scale)
-    start = advance(problem, start.x, start.tangent, scale, 0.0)
+    (start,) = rescaled([start], before, problem.scale)
+    start = advance(problem, start.x, start.tangent, 0.0)
     return both_ways(
-        lambda: MotionTable(problem, scale, ranges, sought, watched),
+        lambda: MotionTable(problem, ranges, sought, watched),
         start,
         Branch,
         what="branch", progress=progress, settings=settings,
@@ -221,7 +219,13 @@ def _watched(
     return watch
 
 
-def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orbit) -> Step:
+def _scaled(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
+    """The equations with the sizes of their parameters: half their intervals."""
+    widths = jnp.asarray([0.5 * (high - low) for low, high in ranges])
+    return dataclasses.replace(problem, widths=widths)
+
+
+def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     """The orbit as a solution of its equations from event to event.
 
     It is refined at its parameter, unless it lies at a fold: then across the branch, which takes a
@@ -229,7 +233,7 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
 
     **Raises:** `ValueError` where there is no solution close to it, or many.
     """
-    start, moved = _refined(problem, x, np.eye(problem.size)[-1], scale)
+    start, moved = _refined(problem, x, np.eye(problem.size)[-1])
     if problem.conditions:
         if bool(start.good):
             return start
@@ -239,7 +243,7 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
             "parameters: an extreme on a stop, say, does not depend on any."
         )
     if moved > _SAME:
-        start, moved = _refined(problem, x, tangent_at(problem, x, scale), scale)
+        start, moved = _refined(problem, x, tangent_at(problem, x))
     if moved > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
@@ -255,12 +259,11 @@ def _first_point(problem: Shooting, x: np.ndarray, scale: np.ndarray, orbit: Orb
     return start
 
 
-def _refined(
-    problem: Shooting, x: np.ndarray, tangent: np.ndarray, scale: np.ndarray
-) -> tuple[Step, float]:
+def _refined(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step, float]:
     """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
-    start = advance(problem, x, tangent, scale, 0.0)
-    return start, float(np.max(np.abs(start.x - x) / scale)) if bool(start.good) else np.inf
+    start = advance(problem, x, tangent, 0.0)
+    moved = float(np.max(np.abs(start.x - x) / problem.scale))
+    return start, moved if bool(start.good) else np.inf
 
 
 # A unit tangent (scaled) of a curve has this component along its second parameter at least, if the
@@ -310,14 +313,13 @@ def boundary(
     progress = flag("progress", progress)
     _check_point(point)
     ranges = _checked_bounds(point, parameter, bounds)
-    problem, condition, x = _special_motion(point, parameter, ranges)
-    scale = problem.scale([0.5 * (high - low) for low, high in ranges])
+    problem, x = _special_motion(point, parameter, ranges)
 
     # Ahead the second parameter rises. Where it hardly does, the tangent takes its own program.
-    start = advance(problem, x, np.eye(x.size)[-2], scale, 0.0)
+    start = advance(problem, x, np.eye(x.size)[-2], 0.0)
     if not bool(start.good) or start.tangent[-2] < _STEEP:
-        tangent = tangent_at(problem, x, scale)
-        start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), scale, 0.0)
+        tangent = tangent_at(problem, x)
+        start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), 0.0)
     if not bool(start.good):
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
@@ -325,7 +327,7 @@ def boundary(
         )
 
     return both_ways(
-        lambda: SpecialTable(problem, condition, scale, ranges),
+        lambda: SpecialTable(problem, ranges),
         start,
         lambda special, **found: Boundary(**found),
         what="boundary", progress=progress, settings=settings,
@@ -369,11 +371,9 @@ def _checked_bounds(point: Point, parameter: str, bounds: Any) -> Intervals:
     return second, first
 
 
-def _special_motion(
-    point: Point, parameter: str, bounds: Intervals
-) -> tuple[Shooting, Special, np.ndarray]:
-    """The equations of the curve, the condition among them that makes its motions special, and
-    their unknowns at the point where it begins."""
+def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Shooting, np.ndarray]:
+    """The equations of the curve, with the condition that makes its motions special, and their
+    unknowns at the point where it begins."""
     old, start, impact = point.problem, np.asarray(point.step.x), point.impact
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the part that vanishes it could not be solved for beyond
@@ -381,12 +381,12 @@ def _special_motion(
     two = dataclasses.replace(old, parameters=(parameter, *old.parameters))
     corners = two.corners(bounds)
     steps = max(old.steps, steps_of(old.method, corners, old.like, flown(old, start)))
-    problem = dataclasses.replace(two, steps=steps)
+    problem = _scaled(dataclasses.replace(two, steps=steps), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)
     exchange = None
     if point.kind in (SYMMETRY, CROSSING):
-        exchange = exchange_at(problem, x, problem.scale([0.5 * (b - a) for a, b in bounds]))
+        exchange = exchange_at(problem, x)
         if exchange is None:
             raise ValueError(
                 "Argument `parameter` must keep the symmetry, or other property, by which the "
@@ -394,4 +394,4 @@ def _special_motion(
             )
     double = point.kind == FOLD and not is_defective(point.problem, point.step, 1.0)
     condition = Special(point.kind, impact, exchange, double=double)
-    return dataclasses.replace(problem, conditions=(condition,)), condition, x
+    return dataclasses.replace(problem, conditions=(condition,)), x

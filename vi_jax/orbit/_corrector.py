@@ -6,6 +6,7 @@ A curve is the solutions of n - 1 equations in n unknowns (pseudo-arclength).
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,11 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._programs import compiled
 from .._types import Flag, Scalar
-from ._shooting import Observed, Shooting
+from ._shooting import Shooting, Unknowns
 from .root_finders import smallest_solution
 
 Vector = Float[Array, " n"]
@@ -29,16 +31,13 @@ _TOLERANCE = 1e-11
 # singular value is zero within this share of the greatest. A choice.
 _DOUBLE = 1e-6
 
-# Of an orbit, as numbers of the host or of a compiled call.
-Unknowns = np.ndarray | Array
-
 
 class Step(NamedTuple):
     """A point of the curve, as one corrector finds it."""
 
-    x: Vector
+    x: Any
     """The unknowns, the curve's parameter last."""
-    tangent: Vector
+    tangent: Any
     """Unit tangent in scaled unknowns, in the sense of the step."""
     size: Scalar
     """Largest component of the last correction (scaled)."""
@@ -50,14 +49,23 @@ class Step(NamedTuple):
     """What is observed there, an `Observed` of arrays of the host."""
 
 
-def way(here: Step, at: Step, scale: np.ndarray) -> float:
-    """How far along the first one's tangent the second lies, in unknowns divided by `scale`."""
-    return float(np.dot(here.tangent, (at.x - here.x) / scale))
+def way(problem: Shooting, here: Step, at: Step) -> float:
+    """How far along the first one's tangent the second lies, in scaled unknowns."""
+    return float(np.dot(here.tangent, (at.x - here.x) / problem.scale))
 
 
-def array_of(tree: object) -> Any:
-    """Host copies of a compiled call's results, so that what follows costs no dispatch."""
-    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
+def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator: the function compiled, with arrays and floats of the host as arguments and arrays
+    of the host as results, so that what follows costs no dispatch."""
+    program = compiled(function)
+
+    @functools.wraps(function)
+    def called(*args: Any) -> Any:
+        numbers = (float, np.ndarray, np.generic)
+        args = tuple(jnp.asarray(np.asarray(a)) if isinstance(a, numbers) else a for a in args)
+        return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program(*args))
+
+    return called
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
@@ -71,7 +79,7 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
     return columns.T, values[0]
 
 
-@compiled
+@on_host
 def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
     """As `advance`. Newton's method on the equations and the plane: nothing is close to singular at
     a fold, since the parameter is one of the unknowns."""
@@ -103,29 +111,23 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
     return Step(y * scale, along, size, count, good, problem.observe(y * scale))
 
 
-def advance(
-    problem: Shooting, x: Unknowns, tangent: Unknowns, scale: Unknowns, length: float | Array
-) -> Step:
+def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
     """The solution on the plane across a tangent.
 
     **Arguments:** the equations; `x`, the unknowns from where; `tangent`, a unit vector, and
-    `length`, how far along it, both in unknowns divided by `scale`.
+    `length`, how far along it, both in scaled unknowns.
     """
-    return array_of(_advanced(problem, *map(jnp.asarray, (x, tangent, scale, length))))
+    return _advanced(problem, x, tangent, problem.scale, float(length))
 
 
-@compiled
-def _compiled_observe(problem, x):
+@on_host
+def observe(problem: Shooting, x):
+    """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
     return problem.observe(x)
 
 
-def observe(problem: Shooting, x: np.ndarray) -> Observed:
-    """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
-    return array_of(_compiled_observe(problem, jnp.asarray(x)))
-
-
-@compiled
-def _compiled_lacks(problem, x):
+@on_host
+def _lacks(problem: Shooting, x):
     ends = problem.lacks(x)[: problem.legs * problem.states]
     return ends.reshape(-1, problem.states) / problem.sizes[1:]
 
@@ -134,37 +136,28 @@ def off_by(problem: Shooting, x: Unknowns) -> float:
     """How much twice the steps change the states where each flight ends, relative to their
     sizes."""
     finer = dataclasses.replace(problem, steps=2 * problem.steps)
-    one, other = (_compiled_lacks(each, jnp.asarray(x)) for each in (finer, problem))
-    return float(np.max(np.abs(np.asarray(one) - np.asarray(other))))
+    return float(np.max(np.abs(_lacks(finer, x) - _lacks(problem, x))))
 
 
-@compiled
-def _tangent(problem, x, scale):
-    jacobian, _ = _jacobian(lambda y: problem.residual(y * scale), x / scale)
-    tangent = jnp.linalg.svd(jacobian, full_matrices=True)[2][-1]
-    return tangent * jnp.where(tangent[-1] < 0, -1.0, 1.0)
-
-
-def tangent_at(problem: Shooting, x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
     """The unit tangent (scaled) of the solutions through `x`, the last unknown rising."""
-    if not problem.is_double:
-        return np.asarray(_tangent(problem, jnp.asarray(x), jnp.asarray(scale)))
-    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * scale
-    plane = np.linalg.svd(jacobian)[2][-2:]  # one direction in it moves the parameters
-    tangent = np.linalg.svd(plane[:, -2:])[0][:, 0] @ plane
+    null = np.linalg.svd(jacobian_at(problem, x) * problem.scale)[2]
+    tangent = null[-1]
+    if problem.is_double:  # of the plane one direction moves the parameters
+        tangent = np.linalg.svd(null[-2:, -2:])[0][:, 0] @ null[-2:]
     return tangent * np.copysign(1.0, tangent[-1])
 
 
-@compiled
+@on_host
 def state_at(problem: Shooting, x, leg, s):
-    """The state at clock `s` within the leg of this number."""
-    return problem.state_at(x, leg, s)
+    """The numbers of the state at clock `s` within the leg of this number."""
+    return ravel_pytree(problem.state_at(x, leg, s))[0]
 
 
-@compiled
+@on_host
 def jacobian_at(problem: Shooting, x):
     """The derivatives of the equations by all unknowns."""
-    return jax.jacfwd(problem.residual)(x)
+    return _jacobian(problem.residual, x)[0]
 
 
 # How far short of a place that has no solution (as a share of the step) one is looked for: choices.
@@ -199,28 +192,26 @@ class _CloseError(ArithmeticError):
     """The corrector has had no answer so often that no closer place is to be had."""
 
 
-def located(
-    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float]
-) -> Step | None:
+def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
     """The point between two, along the first one's tangent, at which a test is zero; `None` if
     there is none.
 
-    **Arguments:** `here` and `new`, the points, which may lie against that tangent; `scale`, the
-    size of each unknown; `test`, a function of a point that changes its sign between them.
+    **Arguments:** `here` and `new`, the points, which may lie against that tangent; `test`, a
+    function of a point that changes its sign between them.
     """
-    length = way(here, new, scale)
+    length = way(problem, here, new)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []
 
     def reached(s: float) -> Step:
         """There, or where there is no answer, as close to where branches cross, right beside."""
-        step = advance(problem, here.x, here.tangent, scale, s)
+        step = advance(problem, here.x, here.tangent, s)
         for short in _SHORT_OF:
             if bool(step.good):
                 break
             if short == _SHORT_OF[0]:
                 silent.append(s)
-            step = advance(problem, here.x, here.tangent, scale, s - short * length)
+            step = advance(problem, here.x, here.tangent, s - short * length)
         return step
 
     def value(s: float) -> float:
@@ -264,18 +255,13 @@ def located(
     return min(good, key=off)[1] if good else None
 
 
-def zero_near(
-    problem: Shooting, x: np.ndarray, scale: np.ndarray, test: Callable[[Step], float]
-) -> Step | None:
+def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
     """The solution close to one at which a test is zero, by the secant method on the parameter;
-    `None` if there is none.
-
-    **Arguments:** the equations; about their solution; the size of each unknown; the test.
-    """
+    `None` if there is none."""
     found: list[Step] = []
 
     def value(shift: float) -> float:
-        step = advance(problem, x, np.eye(x.size)[-1], scale, shift)
+        step = advance(problem, x, np.eye(x.size)[-1], shift)
         found.append(step)
         if not bool(step.good):
             raise NoValueError  # else the secant goes on with NaN, fifty times

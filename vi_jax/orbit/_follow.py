@@ -18,10 +18,9 @@ from jax.flatten_util import ravel_pytree
 
 from .._checks import count, given_number
 from .._messages import Interrupted, Tell, at_work, warn
-from .._programs import compiled
 from .._types import Vector
 from ..machine import angles_in, nearest_images
-from ._corrector import Step, advance, located, off_by, way
+from ._corrector import Step, advance, located, off_by, on_host, way
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
 from .special import Point
@@ -93,13 +92,18 @@ class Event(NamedTuple):
 class Table(abc.ABC):
     """The equations of a curve, and what can happen on it.
 
-    **Arguments:** the equations; the size of each unknown; the intervals of the parameters, which
-    are the last unknowns, in their order.
+    **Arguments:** the equations; the intervals of the parameters, which are the last unknowns, in
+    their order.
     """
 
-    def __init__(self, problem: Shooting, scale: np.ndarray, bounds: Sequence[tuple[float, float]]):
-        self.problem, self.scale, self.bounds = problem, scale, bounds
+    def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
+        self.problem, self.bounds = problem, bounds
         self.closing = Closing(self)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """The size of each unknown."""
+        return self.problem.scale
 
     @abc.abstractmethod
     def ends(self, here: Step, new: Step) -> list[Event]:
@@ -107,14 +111,14 @@ class Table(abc.ABC):
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """The point at this length along the tangent."""
-        new = advance(self.problem, x, tangent, self.scale, length)
+        new = advance(self.problem, x, tangent, length)
         gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
         aside = gone > _TINY and not abs(length) >= _ASIDE * gone
         return new._replace(good=np.asarray(False)) if aside else new
 
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """The point between two at which a test is zero."""
-        return located(self.problem, here, new, self.scale, test)
+        return located(self.problem, here, new, test)
 
     def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
         """What happens between two points without ending the curve, in its order."""
@@ -155,15 +159,16 @@ def both_ways(
 
     def found() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
-        scale = np.maximum(back.table.scale, ahead.table.scale)
-        behind, before = (rescaled(w.steps, w.table.scale, scale) for w in (back, ahead))
+        sizes = jnp.maximum(back.table.problem.sizes, ahead.table.problem.sizes)
+        problem = dataclasses.replace(problem, sizes=sizes)
+        behind, before = (rescaled(w.steps, w.table.scale, problem.scale) for w in (back, ahead))
         first = len(behind) - 1
         special = [
             *(dataclasses.replace(p, index=first - p.index) for p in reversed(back.special)),
             *(dataclasses.replace(p, index=first + p.index) for p in ahead.special),
         ]
         return result(
-            problem=problem, steps=[*reversed(behind[1:]), *before], scale=scale,
+            problem=problem, steps=[*reversed(behind[1:]), *before],
             ends=(back.end, ahead.end), special=special,
         )  # fmt: skip
 
@@ -261,9 +266,8 @@ class _Walk:
                 continue
             # What falls together with the first one is not looked for, nor what comes later.
             first = ending
-            end = self.table.advance(
-                here.x, here.tangent, (1 - _SHORT) * way(here, first.last, self.table.scale)
-            )
+            length = (1 - _SHORT) * way(self.table.problem, here, first.last)
+            end = self.table.advance(here.x, here.tangent, length)
             if first.reason == SHORTER or not bool(end.good):
                 return first
 
@@ -275,7 +279,7 @@ class _Walk:
             for bound in ends:
                 length = (bound - float(last.x[i])) / table.scale[i]
                 if abs(length) < _STALLED_AT:
-                    at = advance(table.problem, last.x, axes[i], table.scale, length)
+                    at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
                         return Ending(at, BOUNDS)
         return table.stalled(self.steps)
@@ -303,7 +307,6 @@ class _Walk:
         if larger is None:
             return
         table.problem = larger
-        table.scale = larger.scale(before[-len(larger.parameters) :])
         self.steps = rescaled(self.steps, before, table.scale)
         table.closing.begin(self.steps[:-1])
 
@@ -427,11 +430,11 @@ class Closing:
         """Take unknowns and tangent of the first motion, and of the same one observed
         otherwise."""
         self.cycle = self._cycle(first)
-        x, scale, problem = jnp.asarray(first.x), self.table.scale, self.table.problem
-        found = _others_with_rates(problem, x, jnp.asarray(first.tangent * scale))
-        others = ((np.asarray(other), np.asarray(rate) / scale) for other, rate in found)
+        scale = self.table.scale
+        found = _others_with_rates(self.table.problem, first.x, first.tangent * scale)
+        others = ((other, rate / scale) for other, rate in found)
         self.begins = [
-            (np.asarray(x), np.asarray(first.tangent)),
+            (first.x, np.asarray(first.tangent)),
             *(other for other in others if self._apart(first, other[0]) > _AGAIN),
         ]
 
@@ -440,7 +443,7 @@ class Closing:
         problem = self.table.problem
         if not problem.events or problem.autonomous:
             return 0.0
-        return float(problem.at(jnp.asarray(step.x)).cycle)
+        return float(problem.period(jnp.asarray(step.x))) / problem.cycles
 
     def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
         """The motion counted from the cycle in which its first event is nearest to that of another
@@ -461,7 +464,7 @@ class Closing:
         return xs
 
 
-@compiled
+@on_host
 def _others_with_rates(problem: Shooting, x, along):
     """The same motion observed otherwise, each with its derivative along a direction."""
     return list(zip(*jax.jvp(partial(_observed_otherwise, problem), (x,), (along,)), strict=True))

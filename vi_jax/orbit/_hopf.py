@@ -14,10 +14,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._programs import compiled
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, renews, section_in
-from ._corrector import Step, observe
+from ._corrector import Step, observe, on_host
 from ._flight import section_of
 from ._shooting import Shooting
 
@@ -35,14 +34,14 @@ _ZERO = 1e-9
 _ONE = 1e-6
 
 
-@compiled
+@on_host
 def _size(problem: Shooting, x: Vector) -> Scalar:
     machine = problem.at(x)
     u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
     return jnp.linalg.norm(_rate(problem, machine, u)) * problem.period(x)
 
 
-@compiled
+@on_host
 def _flow(problem: Shooting, x: Vector, u: Vector) -> tuple[Vector, Array, Scalar, Vector]:
     """Field and section in the state u, each with its derivatives by it."""
     machine = problem.at(x)
@@ -58,7 +57,7 @@ def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
 
 def size_of(problem: Shooting, x: np.ndarray | Array) -> float:
     """How far an autonomous motion would get in its period as fast as it leaves the section."""
-    return float(_size(problem, jnp.asarray(x)))
+    return float(_size(problem, x))
 
 
 def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:

@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._programs import compiled
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
-from ._corrector import tangent_at
+from ._corrector import on_host, tangent_at
 from ._flight import Event, Flight
 from ._shooting import Shooting
 from ._surgery import of_least_period, without_events
@@ -64,12 +63,10 @@ def soft_kick(
 
     **Raises:** `ValueError` if the field beyond the surface does not turn the motion back.
     """
-    at = jnp.asarray(x)
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The field, and what it is more beyond the surface."""
-        places = jnp.asarray(clock), jnp.asarray(u)
-        before, after = np.asarray(_jump_of_field(problem, at, number, leg, *places))
+        before, after = _jump_of_field(problem, x, number, leg, clock, u)
         return before, after - before
 
     def greatest(length: float) -> tuple[float, np.ndarray]:
@@ -77,7 +74,7 @@ def soft_kick(
         y = length * np.sqrt(rate / 8)
         return y, u - gradient / (gradient @ gradient) * y * y
 
-    length = _SHARE * float(problem.period(at)) / problem.cycles
+    length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deep) = fields(u), greatest(length)
     push = fields(deep)[1]
     # A stiff stop pushes by rounding, as far as the place of the touch is known.
@@ -101,7 +98,7 @@ def soft_kick(
     orders: list[float] = []
     for _ in range(_TRIES):
         y, deep = greatest(length)
-        measured.append((y, _flown(problem, at, number, leg, clock, jnp.asarray(deep), length)))
+        measured.append((y, _flown(problem, x, number, leg, clock, deep, length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
             order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
@@ -122,7 +119,7 @@ def _modes(problem: Shooting, machine, number, leg, s, u):
     return before, after_event(machine, number, s, problem.unravel(u), before)[1]
 
 
-@compiled
+@on_host
 def _jump_of_field(problem: Shooting, x, number: int, leg, s, u):
     """The field on either side of the surface."""
     machine = problem.at(x)
@@ -132,7 +129,7 @@ def _jump_of_field(problem: Shooting, x, number: int, leg, s, u):
     return jnp.stack([ravel_pytree(flight.smooth.field(s, state))[0] for flight in flights])
 
 
-@compiled
+@on_host
 def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
     """The state at `s1` and the guard there, in contact or apart."""
     machine = problem.at(x)
@@ -164,13 +161,13 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
         return float(found)
 
     def apart(s1):
-        return _fly(problem, x, number, leg, False, jnp.asarray(s), jnp.asarray(s1), deep)
+        return _fly(problem, x, number, leg, False, s, s1, deep)
 
     enters = root(apart, s - length, s)
     begin = apart(enters)[0]
 
     def inside(s1):
-        return _fly(problem, x, number, leg, True, jnp.asarray(enters), jnp.asarray(s1), begin)
+        return _fly(problem, x, number, leg, True, enters, s1, begin)
 
     places = enters + length * np.linspace(0, 1.5, 49)[1:]
     values = [float(inside(place)[1]) for place in places]
@@ -185,8 +182,8 @@ def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     leaves = places[out]
     if out > 0 and values[out - 1] < 0:
         leaves = root(inside, places[out - 1], places[out])
-    free = _fly(problem, x, number, leg, False, jnp.asarray(enters), jnp.asarray(leaves), begin)[0]
-    return np.asarray(inside(leaves)[0]) - np.asarray(free)
+    free = _fly(problem, x, number, leg, False, enters, leaves, begin)[0]
+    return inside(leaves)[0] - free
 
 
 # A turn this near to a stop, as a share of the motion, touches it: as for the special points.
@@ -220,7 +217,7 @@ class Touch(NamedTuple):
     """What the state loses by an impact, by the depth."""
 
 
-@compiled
+@on_host
 def _rooms(problem: Shooting, x):
     """Distance and clock of each turn; (legs, events, steps) each."""
     machine = problem.at(x)
@@ -247,10 +244,8 @@ def touched(
     **Arguments:** the equations and their solution; event and clock of the touch that is known,
     which may fall on the end of a flight, where no turn is seen; how far the body goes.
     """
-    at = jnp.asarray(x)
-    rooms, places = (np.asarray(a) for a in _rooms(problem, at))
-    period = float(problem.period(at))
-    leg, within = problem.leg_at(at, clock)
+    (rooms, places), period = _rooms(problem, x), float(problem.period(x))
+    leg, within = problem.leg_at(x, clock)
     found = [(number, int(leg), float(within))]
     for leg, other, step in np.argwhere(np.abs(rooms) <= _TOUCHES * length):
         place = float(places[leg, other, step])
@@ -264,7 +259,7 @@ def touched(
     return found
 
 
-@compiled
+@on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
     """What the machine says where its motion grazes: state, ∂h, a, d(h)/d(parameter), the gradient
     of dh/ds, and the jump's derivative."""
@@ -291,7 +286,7 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
     return u, gradient, rates(u).a, slope, fast
 
 
-@compiled
+@on_host
 def _struck(problem: Shooting, x, number: int, leg, s, u, push):
     """How fast the jump of an impact changes along a direction."""
     machine = problem.at(x)
@@ -312,10 +307,7 @@ def touch_at(
     parameter; the event's number, the leg and the clock of the touch.
     """
     event = events_of(problem.machine)[number]
-    at, s = jnp.asarray(x), jnp.asarray(clock)
-    u, gradient, rate, slope, fast = (
-        np.asarray(a) for a in _at_touch(problem, at, jnp.asarray(along), number, leg, s)
-    )
+    u, gradient, rate, slope, fast = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
         raise ValueError(
             f"Argument `point` must be a grazing at which the motion turns, but the "
@@ -325,7 +317,7 @@ def touch_at(
         push = fast / (fast @ fast)
         unit = np.linalg.norm(gradient * np.asarray(problem.sizes)[1:]) / problem.radian
         near = u - _SLOW * unit * push
-        after = np.asarray(_struck(problem, at, number, leg, s, *map(jnp.asarray, (near, push))))
+        after = _struck(problem, x, number, leg, clock, near, push)
         kick = Kick(-np.sqrt(2 * rate) * (after - push), 0.5)
     elif event.holds_mode:
         kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
@@ -426,15 +418,14 @@ def graze_at(point: Point) -> Graze:
     """
     problem, x, number, clock = _without_touch(point)
     problem, x = of_least_period(problem, x)
-    scale = problem.scale(point.scale[-1])
-    tangent = tangent_at(problem, x, scale)
+    scale, tangent = problem.scale, tangent_at(problem, x)
     if abs(tangent[-1]) < _STEEP:
         raise ValueError(
             "Argument `point` must be a grazing away from a fold, but the motion without the "
             "impact turns back there in its parameter."
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
-    period = float(problem.period(jnp.asarray(x)))
+    period = float(problem.period(x))
     touches = sorted(
         (
             touch_at(problem, x, along, *found)
@@ -487,11 +478,11 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
         beside = [j % old.legs for j in (i - 1, i + 1)]
         which += [j for j in beside if old.events[j].number == old.events[i].number][:1]
     which += [j for j in point.lost if j not in which]
-    clock = float(np.asarray(old.parts(jnp.asarray(x))[0])[i])
+    clock = float(old.values(x)[0][i])
     return *without_events(old, x, sorted(which)), old.events[i].number, clock
 
 
-@compiled
+@on_host
 def _carried(problem: Shooting, x, leg, s0, s1):
     """Derivative of the flight of a leg between two readings of the clock."""
     machine = problem.at(x)
@@ -500,7 +491,7 @@ def _carried(problem: Shooting, x, leg, s0, s1):
     return jax.jacfwd(lambda u: flight.fly(s0, s1, u, problem.steps)[0])(u)
 
 
-@compiled
+@on_host
 def _through(problem: Shooting, x, leg):
     """The saltation matrix of the event that begins a leg."""
     clock, states = problem.parts(x)
@@ -513,22 +504,20 @@ def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) 
     **Arguments:** the equations of the motion and their solution; the leg in which `s0` lies;
     the later clock `s1`.
     """
-    at, M = jnp.asarray(x), np.eye(problem.states)
-    clock, period = np.asarray(problem.parts(at)[0]), float(problem.period(at))
+    M, (clock, _, period) = np.eye(problem.states), problem.values(x)
     turn, begin, n = 0.0, s0, leg
     while True:
         end = (clock[n + 1] if n + 1 < len(clock) else clock[0] + period) + turn
         last = min(end, s1)
         if last > begin:
-            between = jnp.asarray(begin - turn), jnp.asarray(last - turn)
-            M = np.asarray(_carried(problem, at, n, *between)) @ M
+            M = _carried(problem, x, n, begin - turn, last - turn) @ M
         if s1 <= end:
             return M
         n = (n + 1) % problem.legs
         turn += period * (n == 0)
         begin = end
         if problem.events:
-            M = np.asarray(_through(problem, at, n)) @ M
+            M = _through(problem, x, n) @ M
 
 
 def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) -> Section:
@@ -536,18 +525,17 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
     **Arguments:** as `touch_at`; the first touch.
     """
-    at = jnp.asarray(x)
-    period = float(problem.period(at))
+    period = float(problem.period(x))
     place = period * (np.floor(touch.clock / period) + 1)
-    leg, within = problem.leg_at(at, place if problem.events else 0.0)
-    state, slope = _placed(problem, at, jnp.asarray(along), leg, within)
+    leg, within = problem.leg_at(x, place if problem.events else 0.0)
+    state, slope = _placed(problem, x, along, leg, within)
     matrix = transport(problem, x, touch.leg, touch.clock, place)
     if problem.events and problem.events[0].cycle is not None:  # the section is an event
-        matrix = np.asarray(_through(problem, at, 0)) @ matrix
-    return Section(np.asarray(state), np.asarray(slope), matrix)
+        matrix = _through(problem, x, 0) @ matrix
+    return Section(state, slope, matrix)
 
 
-@compiled
+@on_host
 def _placed(problem: Shooting, x, along, leg, s):
     """The state at a clock, and its derivative along the unknowns."""
 

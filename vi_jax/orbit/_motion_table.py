@@ -26,7 +26,6 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ._conditions import alone, overtaken, rates_at
@@ -128,16 +127,16 @@ Passed = list[tuple[Point, Step]]
 class MotionTable(Table):
     """What can happen on a branch, for each of its steps (see `_follow.Table`).
 
-    **Arguments:** the equations of the motions, with the parameter as their last unknown; the size
-    of each unknown; the intervals of its parameters, in their order; names of the numbers whose
-    extremes are sought; functions of the orbit whose zeros are, by name.
+    **Arguments:** the equations of the motions, with the parameter as their last unknown; the
+    intervals of its parameters, in their order; names of the numbers whose extremes are sought;
+    functions of the orbit whose zeros are, by name.
     """
 
     def __init__(
-        self, problem: Shooting, scale: np.ndarray, bounds: list[tuple[float, float]],
+        self, problem: Shooting, bounds: list[tuple[float, float]],
         extrema: tuple[str, ...], watched: Mapping[str, Callable[[Orbit], float]],
     ):  # fmt: skip
-        super().__init__(problem, scale, bounds)
+        super().__init__(problem, bounds)
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.size, self.duration = None, None
@@ -165,10 +164,10 @@ class MotionTable(Table):
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
         """The point at this share of the way between two."""
-        return self.advance(here.x, here.tangent, share * way(here, last, self.scale))
+        return self.advance(here.x, here.tangent, share * way(self.problem, here, last))
 
     def _point(self, kind: str, step: Step, *args: Any, **more: Any) -> Point:
-        return point_at(self.problem, step, self.scale, kind, *args, **more)
+        return point_at(self.problem, step, kind, *args, **more)
 
     def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
         """The end of a branch at a special point."""
@@ -182,14 +181,12 @@ class MotionTable(Table):
     def _merged(self, at: Step, release: int) -> Point:
         """The point where two rests become one, of the motion without the flight between them."""
         both = [release, (release + 1) % self.problem.legs]
-        clock = float(self.problem.parts(jnp.asarray(at.x))[0][release])
+        clock = float(self.problem.values(at.x)[0][release])
         detail = RESTS[REORDERED].format(place=place_in_words(self.problem, at, clock))
-        old, at, scale = alone(self.problem, at, self.scale)
-        new, x = without_events(old, np.asarray(at.x), both)
-        along = np.eye(x.size)[-1]
-        scale = new.scale(scale[-1:])
-        at = advance(new, x, along, scale, 0.0)
-        return point_at(new, at, scale, REST, detail, springs=True)
+        old, at = alone(self.problem, at)
+        new, x = without_events(old, at.x, both)
+        at = advance(new, x, np.eye(x.size)[-1], 0.0)
+        return point_at(new, at, REST, detail, springs=True)
 
     def _not_too_long(self, here: Step) -> Callable[[Step], float]:
         """How far an autonomous motion is from being longer than its steps, as many as ever,
@@ -233,7 +230,7 @@ class MotionTable(Table):
             return Ending(at, REST, self._merged(at, flight))
         change = change_at(self.problem, at)
         if change is not None:
-            at = refined(self.problem, at, self.scale, change)
+            at = refined(self.problem, at, change)
         if change is not None and change.kind is not None:
             name = MotionEvent(change.number).called(self.problem.machine)
             place = place_in_words(self.problem, at, change.clock)
@@ -287,23 +284,21 @@ class MotionTable(Table):
     def _sprung(self, at: Step) -> tuple[Step, Point] | None:
         """Where the branch springs from a motion of half its period: as a step of the branch, and
         as a special point of that motion; `None` if that is not close."""
-        apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at, self.scale)
+        apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at)
         if apart > _ALMOST * ALIKE:
             return None
         begins, half, step = origin(*before)
         if apart > ALIKE and begins is before[1]:
             return None
         at = at if self.problem.conditions else begins
-        scale = half.scale(self.scale[-1])
-        point = point_at(half, step, scale, DOUBLING, DETAILS[FROM_HALF], springs=True)
-        further = further_of(self.problem, at, self.scale)
-        return at, dataclasses.replace(point, further=further)
+        point = point_at(half, step, DOUBLING, DETAILS[FROM_HALF], springs=True)
+        return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
     def passed(self, here: Step, last: Step) -> Passed:
         """The bifurcations between two points, the extremes and the zeros of what is watched, in
         their order."""
         found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
-        return sorted(found, key=lambda f: way(here, f[1], self.scale))
+        return sorted(found, key=lambda f: way(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Where a number is larger, or less, than at all points close by, and where one that is
@@ -336,11 +331,11 @@ class MotionTable(Table):
         there: how it changes along the branch, or itself."""
         found = {}
         if self.extrema:
-            direction = jnp.asarray(step.tangent * self.scale)
-            values, rates = rates_at(self.problem, self.extrema, jnp.asarray(step.x), direction)
+            direction = step.tangent * self.scale
+            values, rates = rates_at(self.problem, self.extrema, step.x, direction)
             found = {(EXTREMUM, n): (float(values[n]), float(rates[n])) for n in self.extrema}
         if self.watched:
-            orbit = orbit_of(*alone(self.problem, step, self.scale)[:2])
+            orbit = orbit_of(*alone(self.problem, step))
             values = {name: float(function(orbit)) for name, function in self.watched.items()}
             found |= {(WATCHED, name): (x, x) for name, x in values.items()}
         return found
@@ -378,7 +373,7 @@ class MotionTable(Table):
         at = self.where(here, last, lambda step: tests_of(step)[TURNS])
         if at is None:
             return ()
-        root, length = (way(here, step, self.scale) for step in (at, last))
+        root, length = (way(self.problem, here, step) for step in (at, last))
         if not BESIDE < root < length - BESIDE:
             return ()
         sides = [self.advance(here.x, here.tangent, root + x) for x in (-BESIDE, BESIDE)]
@@ -462,7 +457,7 @@ class MotionTable(Table):
             # So close to where they cross the corrector may find the other branch.
             return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)
 
-        root = way(here, at, self.scale)
+        root = way(self.problem, here, at)
         tested = lambda step: tests_of(step)[kind]
         return crossing(self.problem, self.advance, here, root, tested, admits) or at
 
@@ -485,9 +480,8 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
     between two events; `None` without one."""
     if not problem.landings:
         return None
-    x = jnp.asarray(at.x)
-    clock = problem.parts(x)[0]
-    lengths = np.asarray(problem.ends(clock, problem.period(x)) - clock)
+    clock, _, period = problem.values(at.x)
+    lengths = np.append(clock[1:], clock[0] + period) - clock
     first = int(np.argmin(lengths))
     this, after = (problem.events[i % problem.legs] for i in (first, first + 1))
     lands = this.use == LEAVES and after == this._replace(use=LANDS)

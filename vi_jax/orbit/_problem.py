@@ -49,9 +49,9 @@ from ..machine import (
     with_leaf,
     with_modes,
 )
-from ._corrector import Unknowns, off_by
+from ._corrector import off_by
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
-from ._shooting import Shooting
+from ._shooting import Shooting, Unknowns
 from .results import Orbit, unit_of
 
 
@@ -122,9 +122,8 @@ def cycles_flown(
 
 def flown(problem: Shooting, x: Unknowns) -> int:
     """The `cycles_flown` of a solution."""
-    x = jnp.asarray(x)
-    places = np.asarray(problem.parts(x)[0])
-    return cycles_flown(places, problem.events, float(problem.period(x)), problem.cycles)
+    places, _, period = problem.values(x)
+    return cycles_flown(places, problem.events, period, problem.cycles)
 
 
 @compiled
@@ -242,12 +241,11 @@ def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> P
 
     **Arguments:** the equations and a solution; the largest moduli in its course.
     """
-    x = jnp.asarray(x)
-    if largest is None or not np.isfinite(largest).all():
-        sizes = _sizes(np.asarray(problem.parts(x)[1]))
-    else:
+    _, states, period = problem.values(x)
+    sizes = _sizes(states)
+    if largest is not None and np.isfinite(largest).all():
         sizes = _sizes(largest, _NOTHING)
-    turn = float(problem.period(x)) / problem.cycles / (2 * np.pi)
+    turn = period / problem.cycles / (2 * np.pi)
     return dataclasses.replace(problem, sizes=jnp.append(turn, sizes))
 
 

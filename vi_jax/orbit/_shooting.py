@@ -142,6 +142,9 @@ _HOP = 0.2
 # The number of a leg, which may be traced.
 Leg = int | Array
 
+# Of an orbit, as numbers of the host or of a program.
+Unknowns = np.ndarray | Array
+
 
 class Shooting(eqx.Module):
     """The equations of an orbit with given events: multiple shooting from each event to the next.
@@ -173,9 +176,11 @@ class Shooting(eqx.Module):
     """Steps of the flight of a leg."""
     parameters: tuple[str, ...] = eqx.field(static=True)
     """Names of the machine's numbers that are unknowns."""
-    sizes: Array | None = None
+    sizes: Any = None
     """How large the clock and each number of the state are along the motion, (1 + states,): the
-    scales by which differences between motions are judged; 1 if not given."""
+    scales by which differences between motions are judged (see `sized`)."""
+    widths: Any = ()
+    """The sizes of the parameters: half their intervals."""
     held: tuple[float, ...] = eqx.field(static=True, default=())
     """Of each coordinate that rests all the time its contact (see `Flight.contact`), of others 0;
     empty if nothing rests."""
@@ -237,21 +242,20 @@ class Shooting(eqx.Module):
             found.append(tuple(held))
         return tuple(found[self.legs :])
 
-    def at(self, x: Vector) -> AbstractMachine:
+    def at(self, x: Unknowns) -> AbstractMachine:
         """The machine with the parameters of `x`."""
-        machine = self.machine
-        count = len(self.parameters)
-        for i, name in enumerate(self.parameters):
-            machine = with_leaf(machine, name, x[x.shape[0] - count + i])
+        machine, x = self.machine, jnp.asarray(x)
+        for i, name in enumerate(self.parameters, x.shape[0] - len(self.parameters)):
+            machine = with_leaf(machine, name, x[i])
         return machine
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
         """The machines at the ends of these intervals of the parameters."""
         return [self.at(jnp.asarray(ends)) for ends in itertools.product(*intervals)]
 
-    def parts(self, x: Vector) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
+    def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Clock and state at the start of each leg (before its event)."""
-        legs = self.legs
+        legs, x = self.legs, jnp.asarray(x)
         if not self.events:
             return jnp.zeros((1,), x.dtype), x[: self.states][None]
         end = legs * (1 + self.states)
@@ -260,10 +264,15 @@ class Shooting(eqx.Module):
             clock = jnp.concatenate([jnp.zeros((1,), x.dtype), clock[1:]])
         return clock, x[legs:end].reshape(legs, self.states)
 
-    def period(self, x: Vector) -> Array:
+    def values(self, x: Unknowns) -> tuple[np.ndarray, np.ndarray, float]:
+        """The `parts` and the period of a solution; host-side."""
+        clock, states = self.parts(x)
+        return np.asarray(clock), np.asarray(states), float(self.period(x))
+
+    def period(self, x: Unknowns) -> Array:
         """The period by the clock."""
         if self.autonomous:
-            return x[0]
+            return jnp.asarray(x[0])
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
     def pack(self, clock: Any, states: Any, parameters: Any, period: Any = None) -> Vector:
@@ -277,26 +286,23 @@ class Shooting(eqx.Module):
             clock = clock.at[0].set(period)
         return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
 
-    def scale(self, parameters: Any) -> np.ndarray:
-        """The size of each unknown; host-side.
-
-        **Arguments:** the sizes of the parameters.
-        """
-        sizes = np.ones(1 + self.states) if self.sizes is None else np.asarray(self.sizes)
+    @property
+    def scale(self) -> np.ndarray:
+        """The size of each unknown; host-side."""
+        sizes = np.asarray(self.sizes)
         clocks = np.full(len(self.events), sizes[0])
-        return np.concatenate([clocks, np.tile(sizes[1:], self.legs), np.atleast_1d(parameters)])
+        return np.concatenate([clocks, np.tile(sizes[1:], self.legs), np.asarray(self.widths)])
 
     @property
     def radian(self) -> float:
         """The size of the clock, a cycle through 2π; host-side."""
-        return 1.0 if self.sizes is None else float(self.sizes[0])
+        return float(self.sizes[0])
 
     def half_scale(self) -> np.ndarray:
         """The sizes of the clocks and states of half a period; host-side."""
-        half, scale = len(self.events) // 2, self.scale(())
-        if not half:
-            return scale
-        return np.concatenate([scale[:half], scale[len(self.events) :][: half * self.states]])
+        half, scale = len(self.events) // 2, self.scale
+        end = len(self.events) + max(1, half) * self.states
+        return np.concatenate([scale[:half], scale[len(self.events) : end]])
 
     def unravel(self, u: Vector) -> State:
         """A state from its vector."""
@@ -346,7 +352,7 @@ class Shooting(eqx.Module):
         """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
-    def leg_at(self, x: Vector, s: Any) -> tuple[Array, Array]:
+    def leg_at(self, x: Unknowns, s: Any) -> tuple[Array, Array]:
         """The leg in which a clock lies, any number of periods later, and the clock there."""
         clock, _ = self.parts(x)
         place = clock[0] + jnp.mod(s - clock[0], self.period(x))

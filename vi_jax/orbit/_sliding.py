@@ -16,9 +16,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from .._programs import compiled
 from .._types import Scalar, State
 from ..flow import Rates, guard_rates
 from ..machine import (
@@ -29,7 +27,7 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from ._corrector import Step, observe, state_at, zero_near
+from ._corrector import Step, observe, on_host, state_at, zero_near
 from ._flight import Event, Flight
 from ._shooting import Leg, Shooting
 from ._surgery import without_events
@@ -108,17 +106,11 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
     return float(problem.modes[leg % problem.legs][mode_number(problem.machine, number)])
 
 
-def _clocks(problem: Shooting, at: Step) -> tuple[np.ndarray, np.ndarray, float]:
-    """Clock of each event, time to the next one, and the period."""
-    x = jnp.asarray(at.x)
-    clock, period = np.asarray(problem.parts(x)[0]), float(problem.period(x))
-    return clock, np.append(clock[1:], clock[0] + period) - clock, period
-
-
 def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     """The briefest part of the motion between two events of one switch, if it is as brief (as a
     share of the period)."""
-    clock, lengths, period = _clocks(problem, at)
+    clock, _, period = problem.values(at.x)
+    lengths = np.append(clock[1:], clock[0] + period) - clock
     events, found = problem.events, []
     for i, event in enumerate(events):
         if event != events[(i + 1) % len(events)] or not holds(event.of(problem.machine)):
@@ -140,7 +132,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     nearest, number = at.seen.nearest, int(at.seen.nearest.event)
     if not holds(Event(number).of(problem.machine)):
         return None
-    leg, place = map(float, problem.leg_at(jnp.asarray(at.x), float(nearest.clock)))
+    leg, place = map(float, problem.leg_at(at.x, float(nearest.clock)))
     leg, mode = int(leg), _mode(problem, int(leg), number)
     if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
         return None
@@ -157,8 +149,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
 
 def _beginning(problem: Shooting, at: Step) -> Change | None:
     """An event of a switch at which it is only just held, or only just not."""
-    clock, _, _ = _clocks(problem, at)
-    found = []
+    clock, found = problem.values(at.x)[0], []
     for i, event in enumerate(problem.events):
         if not holds(event.of(problem.machine)):
             continue
@@ -192,7 +183,7 @@ def holding(
     return guard_rates(held.smooth.field, guard, s, state)
 
 
-@compiled
+@on_host
 def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     machine, states = problem.at(x), problem.parts(x)[1]
     # An event's state is that before it; in a leg it is flown to.
@@ -206,17 +197,15 @@ def holding_force(
 ) -> tuple[float, float]:
     """How far what drives a switch off its surface exceeds what holds it there, and how fast that
     grows while it is held."""
-    x = jnp.asarray(at.x)
-    begins = bool(s == problem.parts(x)[0][leg])
-    found = _held_at(problem, x, jnp.asarray(leg), number, jnp.asarray(s), begins)
-    return float(found[0]), float(found[1])
+    begins = bool(s == problem.values(at.x)[0][leg])
+    force, rate = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
+    return float(force), float(rate)
 
 
 def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float:
     """The mode in which a switch that is just held would leave its surface."""
-    x = jnp.asarray(at.x)
-    state, modes = problem.state_at(x, leg, jnp.asarray(s)), problem.modes_in(leg)
-    machine = problem.at(x)
+    x, machine, modes = jnp.asarray(at.x), problem.at(at.x), problem.modes_in(leg)
+    state = problem.state_at(x, leg, jnp.asarray(s))
     contact = problem.flight(machine, leg).contact
     new = after_event(machine, number, jnp.asarray(s), state, modes, contact)[1]
     return float(new[mode_number(problem.machine, number)])
@@ -226,14 +215,10 @@ def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float
 _CLOSE = 1e-8
 
 
-def refined(problem: Shooting, at: Step, scale: np.ndarray, change: Change) -> Step:
+def refined(problem: Shooting, at: Step, change: Change) -> Step:
     """The special point at which a part of the motion vanishes, from one that is close to it; the
-    same where it is close enough, or no other is found.
-
-    **Arguments:** the equations of the motion with that part; the size of each unknown; what
-    vanishes.
-    """
-    clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
+    same where it is close enough, or no other is found."""
+    clock = problem.values(at.x)[0]
     close = abs(float(at.seen.apart)) < _CLOSE * problem.radian
     if not change.there or problem.conditions or close:
         return at
@@ -245,10 +230,10 @@ def refined(problem: Shooting, at: Step, scale: np.ndarray, change: Change) -> S
     def test(step: Step) -> float:
         if event is None:
             return float(step.seen.nearest.room)
-        place = float(np.asarray(new.parts(jnp.asarray(step.x))[0])[event])
+        place = float(new.values(step.x)[0][event])
         return holding_force(new, step, event, change.number, place)[0]
 
-    found = zero_near(new, x, new.scale(scale[-1:]), test)
+    found = zero_near(new, x, test)
     return at if found is None else _with_part(problem, at, new, found, first, event is None)
 
 
@@ -258,8 +243,7 @@ def without_part(
     """The equations of a motion without the part that vanishes at a special point, and the unknowns
     that solve them; and its event at which the switch is only just held, `None` where its surface
     is touched."""
-    clock = np.asarray(problem.parts(jnp.asarray(at.x))[0])
-    first = int(np.argmin(np.abs(clock - change.clock)))
+    first = int(np.argmin(np.abs(problem.values(at.x)[0] - change.clock)))
     alike = change.modes[0] == change.modes[2]
     if not change.there:
         return problem, np.asarray(at.x), None if alike else first
@@ -276,19 +260,16 @@ def _with_part(
     **Arguments:** `new` and `step`, the equations without it and their solution; `first`, the
     number of the event with which the part begins; `alike`, whether both its events were left out.
     """
-    x = jnp.asarray(step.x)
-    clock, states = (np.asarray(a) for a in new.parts(x))
+    clock, states, period = new.values(step.x)
     if not new.events:
         clock, states = np.zeros(0), np.zeros((0, problem.states))
-    place, period = clock[first] if not alike else float(step.seen.nearest.clock), new.period(x)
     if alike:
-        leg = max(0, first - 1)
-        before = float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[first])
-        place = place + float(period) * np.round((before - place) / float(period))
-        there = ravel_pytree(state_at(new, x, jnp.asarray(leg), jnp.asarray(place)))[0]
-        extra = np.stack([np.asarray(there)] * 2)
+        place, before = float(step.seen.nearest.clock), problem.values(at.x)[0][first]
+        place = place + period * np.round((before - place) / period)
+        there = state_at(new, step.x, np.asarray(max(0, first - 1)), place)
+        extra = np.stack([there] * 2)
     else:
-        extra = states[first][None]
+        place, extra = clock[first], states[first][None]
     clock = np.insert(clock, first, [place] * len(extra))
     states = np.insert(states, [first] * len(extra), extra, axis=0)
     whole = np.asarray(problem.pack(clock, states, step.x[-1:], period))

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._messages import so_many
-from .._programs import compiled
 from ._conditions import Special, is_defective, minors
 from ._corrector import (
     BESIDE,
@@ -35,6 +34,7 @@ from ._corrector import (
     crossing,
     jacobian_at,
     located,
+    on_host,
     way,
 )
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
@@ -85,15 +85,15 @@ Intervals = tuple[tuple[float, float], tuple[float, float]]
 class SpecialTable(Table):
     """What can happen on a curve of special motions, for each of its steps (see `_follow.Table`).
 
-    **Arguments:** the equations of the motions, with two parameters as their last unknowns; the
-    condition that makes them special; the size of each unknown; the parameters' intervals.
+    **Arguments:** the equations of the motions, with two parameters as their last unknowns and
+    the condition that makes them special; the parameters' intervals.
     """
 
-    def __init__(self, problem: Shooting, condition: Special, scale: np.ndarray, bounds: Intervals):
-        super().__init__(problem, scale, bounds)
-        self.condition = condition
+    def __init__(self, problem: Shooting, bounds: Intervals):
+        super().__init__(problem, bounds)
+        self.condition: Special = problem.conditions[0]
         # Along a curve of symmetric motions the images are alike everywhere.
-        self.symmetric = condition.kind != SYMMETRY and may_be_symmetric(
+        self.symmetric = self.condition.kind != SYMMETRY and may_be_symmetric(
             problem, [problem.machine, *problem.corners(bounds)]
         )
 
@@ -103,7 +103,7 @@ class SpecialTable(Table):
         last = steps[-1]
         if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
             for here in reversed(steps):
-                root = way(here, last, self.scale)
+                root = way(self.problem, here, last)
                 if root > MOST * BESIDE:
                     at = self._symmetric(here, root, beyond=False)
                     return super().stalled(steps) if at is None else Ending(at, SYMMETRY)
@@ -141,7 +141,7 @@ class SpecialTable(Table):
         """The end at a place at which an impact grazes, where the monodromy matrix has a pole."""
         found = None
         if self.condition.kind not in TOUCHING and at is not here:
-            root = way(here, at, self.scale)
+            root = way(self.problem, here, at)
             found = crossing(self.problem, self.advance, here, root, test)
         if found is None:
             return Ending(at, GRAZING)
@@ -167,7 +167,7 @@ class SpecialTable(Table):
         def ending(at: Step) -> Ending | None:
             if np.linalg.norm(self._images(at)) >= ALIKE:
                 return None
-            return Ending(self._symmetric(here, way(here, at, self.scale)) or at, SYMMETRY)
+            return Ending(self._symmetric(here, way(self.problem, here, at)) or at, SYMMETRY)
 
         yield Event(lambda step: float(np.dot(begin, self._images(step))), ending)
 
@@ -209,15 +209,13 @@ class Vectors(NamedTuple):
 Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 
-def points_of(
-    problem: Shooting, condition: Special, steps: list[Step], ends: tuple[str, str],
-    scale: np.ndarray,
-) -> list[Point]:  # fmt: skip
+def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> list[Point]:
     """The points of codimension two on a curve, in its order."""
+    condition: Special = problem.conditions[0]
 
     def point(kind: str, step: Step, detail: str | None = None, **fields: Any) -> Point:
         detail = detail or AT_CODIMENSION_TWO.get(kind)
-        return point_at(problem, step, scale, kind, detail, curve=condition.kind, **fields)
+        return point_at(problem, step, kind, detail, curve=condition.kind, **fields)
 
     found: list[tuple[float, Point]] = []
     for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
@@ -226,15 +224,15 @@ def points_of(
             found.append((place, point(GRAZING, steps[place], impact=impact, index=place)))
         if end in (RESONANCE_1, RESONANCE_2, SYMMETRY):
             found.append((place, point(end, steps[place], index=place)))
-    for kind, test in _tests_of(problem, condition, scale).items():
-        for place, step in _zeros(problem, steps, scale, test):
+    for kind, test in _tests_of(problem, condition).items():
+        for place, step in _zeros(problem, steps, test):
             if kind in _DOUBLE and not is_defective(problem, step, _DOUBLE[kind]):
                 continue
             symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
         with contextlib.suppress(ValueError):  # the local map is not known
-            for place, step, what in _resonances(problem, condition, steps, scale):
+            for place, step, what in _resonances(problem, condition.impact, steps):
                 found.append((place, point(RESONANT, step, what, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
 
@@ -244,8 +242,7 @@ _DOUBLE = {RESONANCE_1: 1.0, RESONANCE_2: -1.0}
 
 
 def _symmetric(problem: Shooting, step: Step) -> bool:
-    x = jnp.asarray(step.x)
-    if not may_be_symmetric(problem, [problem.machine, problem.at(x)]):
+    if not may_be_symmetric(problem, [problem.machine, problem.at(step.x)]):
         return False
     return bool(np.linalg.norm(halves_apart(problem, step, mirrored=True)) < ALIKE)
 
@@ -262,7 +259,7 @@ def _grazes(step: Step) -> int | None:
 
 
 def _resonances(
-    problem: Shooting, condition: Special, steps: list[Step], scale: np.ndarray
+    problem: Shooting, impact: int | None, steps: list[Step]
 ) -> Iterator[tuple[float, Step, str]]:
     """The resonant grazings of a curve: after which step, with the fraction of the way to the next
     one, the point, and what begins there.
@@ -271,7 +268,7 @@ def _resonances(
     """
 
     def local(step: Step) -> LocalMap:
-        return graze_at(point_at(problem, step, scale, GRAZING, "", condition.impact)).map
+        return graze_at(point_at(problem, step, GRAZING, "", impact)).map
 
     known = [local(step) for step in steps]
     both = problem.states == 2  # folds and doublings begin at the same point
@@ -285,21 +282,21 @@ def _resonances(
         for i, (before, after) in enumerate(itertools.pairwise(values)):
             if not before * after < 0:
                 continue
-            step = located(problem, steps[i], steps[i + 1], scale, test)
+            step = located(problem, steps[i], steps[i + 1], test)
             if step is None or not bool(step.good):
                 continue
             small = _ENTRY * max(abs(before), abs(after))
             if abs(test(step)) <= small and (local(step).passages(n) >= small).all():
-                yield _place(i, steps[i], step, steps[i + 1], scale), step, what
+                yield _place(problem, i, steps, step), step, what
 
 
-def _place(i: int, here: Step, at: Step, new: Step, scale: np.ndarray) -> float:
+def _place(problem: Shooting, i: int, steps: list[Step], at: Step) -> float:
     """Where on a curve a point is: the number of the step before it, and the share of the way."""
-    whole = (new.x - here.x) / scale
-    return i + float(whole @ ((at.x - here.x) / scale) / (whole @ whole))
+    whole, part = ((step.x - steps[i].x) / problem.scale for step in (steps[i + 1], at))
+    return i + float(whole @ part / (whole @ whole))
 
 
-def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[str, Test]:
+def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     """Functions that change their sign at the points of each kind, by the curve's kind."""
 
     def plain(function: Callable[[Step], float]) -> Test:
@@ -311,7 +308,7 @@ def _tests_of(problem: Shooting, condition: Special, scale: np.ndarray) -> dict[
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
     double = plain(lambda s: _others(s, 1 if condition.kind == DOUBLING else -1))
     if condition.kind == FOLD:
-        tests = {CUSP: _cusp(bare, scale, 2 if condition.double else 1), FLIP: doubling}
+        tests = {CUSP: _cusp(bare, 2 if condition.double else 1), FLIP: doubling}
         return tests if condition.double else tests | {RESONANCE_1: double}
     if condition.kind == DOUBLING:
         return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
@@ -353,7 +350,7 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp(bare: Shooting, scale: np.ndarray, many: int) -> Test:
+def _cusp(bare: Shooting, many: int) -> Test:
     """How fast the parameters move along a curve of folds, with a sign.
 
     With the left null vector l of F_x both change so that l·F_p dp = 0: along the line across the
@@ -362,8 +359,8 @@ def _cusp(bare: Shooting, scale: np.ndarray, many: int) -> Test:
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
-        jacobian = np.array(jacobian_at(bare, jnp.asarray(step.x)))
-        jacobian[:, -2:] *= scale[-2:]
+        jacobian = np.array(jacobian_at(bare, step.x))
+        jacobian[:, -2:] *= bare.scale[-2:]
         nulls = _nulls(jacobian[:, :-2], like)
         if many > 1:
             lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
@@ -377,7 +374,7 @@ def _cusp(bare: Shooting, scale: np.ndarray, many: int) -> Test:
     return test
 
 
-@compiled
+@on_host
 def _bent(problem: Shooting, x, right, bend):
     """Second and third derivative of the equations along x + t right + t² bend/2, at t = 0."""
 
@@ -404,21 +401,18 @@ def _cubic(bare: Shooting, *, twice: bool) -> Test:
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
         x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)
-        at = jnp.asarray(x)
-        matrix = np.asarray(jacobian_at(whole, at))[:, :-2]
+        matrix = jacobian_at(whole, x)[:, :-2]
         nulls = _nulls(matrix)
-        right = jnp.asarray(np.append(nulls.right, [0.0, 0.0]))
-        second, _ = _bent(whole, at, right, jnp.zeros_like(at))
-        bend = np.linalg.lstsq(matrix, -np.asarray(second))[0]
-        _, third = _bent(whole, at, right, jnp.asarray(np.append(bend, [0.0, 0.0])))
-        return float(nulls.left @ np.asarray(third)) / 6, None
+        right = np.append(nulls.right, [0.0, 0.0])
+        second, _ = _bent(whole, x, right, np.zeros_like(x))
+        bend = np.linalg.lstsq(matrix, -second)[0]
+        _, third = _bent(whole, x, right, np.append(bend, [0.0, 0.0]))
+        return float(nulls.left @ third) / 6, None
 
     return test
 
 
-def _zeros(
-    problem: Shooting, steps: list[Step], scale: np.ndarray, test: Test
-) -> Iterator[tuple[float, Step]]:
+def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[float, Step]]:
     """Where a test changes its sign along a curve: which step, with a fraction, and the point."""
     seen: list[tuple[float, Vectors | None]] = []
     for step in steps:
@@ -431,19 +425,17 @@ def _zeros(
         if not (before * after < 0 or (after == 0 and before != 0)):
             continue
         most = max(abs(before), abs(after))
-        at = _zero(problem, here, new, scale, lambda s, like=like: test(s, like)[0], most)
-        if at is None:
-            continue
-        yield _place(i, here, at, new, scale), at
+        at = _zero(problem, here, new, lambda s, like=like: test(s, like)[0], most)
+        if at is not None:
+            yield _place(problem, i, steps, at), at
 
 
 def _zero(
-    problem: Shooting, here: Step, new: Step, scale: np.ndarray, test: Callable[[Step], float],
-    most: float,
-) -> Step | None:  # fmt: skip
+    problem: Shooting, here: Step, new: Step, test: Callable[[Step], float], most: float
+) -> Step | None:
     """The point between two at which a test is zero; `None` where it has a pole. `most` is the
     larger of its values at both."""
-    at = located(problem, here, new, scale, test)
+    at = located(problem, here, new, test)
     if at is None or abs(test(at)) <= _ZERO * most:
         return at
     # Where another curve crosses this one the corrector has no answer.
@@ -451,5 +443,5 @@ def _zero(
     def admits(step: Step, length: float) -> bool:
         return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
 
-    ahead = lambda x, tangent, length: advance(problem, x, tangent, scale, length)
-    return crossing(problem, ahead, here, way(here, at, scale), test, admits)
+    ahead = partial(advance, problem)
+    return crossing(problem, ahead, here, way(problem, here, at), test, admits)

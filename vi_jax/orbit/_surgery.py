@@ -13,9 +13,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._programs import compiled
 from ..machine import AbstractMachine, stops_of
-from ._corrector import Step, advance, observe, state_at, tangent_at, zero_near
+from ._corrector import Step, advance, observe, on_host, state_at, tangent_at, zero_near
 from ._flight import Event
 from ._shooting import ROUNDING, Shooting
 from ._solution import sections_of
@@ -57,7 +56,7 @@ def may_repeat(problem: Shooting) -> bool:
     return problem.cycles % 2 == 0 and events[:half] == later
 
 
-@compiled
+@on_host
 def _halves(
     problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
 ) -> Float[Array, " differences"]:
@@ -80,8 +79,7 @@ def _halves(
 def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
     """How the second half of the period differs from the first one, or from its image under the
     symmetry of the machine, in the sizes of the unknowns."""
-    apart = _halves(problem, jnp.asarray(step.x), mirrored)
-    return np.asarray(apart) / problem.half_scale()
+    return _halves(problem, step.x, mirrored) / problem.half_scale()
 
 
 def several(old: Shooting, n: int) -> Shooting:
@@ -98,15 +96,14 @@ def several(old: Shooting, n: int) -> Shooting:
 
 def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndarray:
     """The unknowns of a motion that is gone through several times, as those of `new`."""
-    clock, states = (np.asarray(a) for a in problem.parts(jnp.asarray(x)))
-    turn, n = float(problem.period(jnp.asarray(x))), new.cycles // problem.cycles
+    (clock, states, turn), n = problem.values(x), new.cycles // problem.cycles
     if problem.events:
         clock = (clock + turn * np.arange(n)[:, None]).ravel()
         states = np.tile(states, (n, 1))
     return np.asarray(new.pack(clock, states, x[-len(problem.parameters) :], n * turn))
 
 
-def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooting, Step]:
+def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
     """The point where a branch springs, on the branch and on the motion of half the period, with
     the problem of that motion; on the latter it is located.
 
@@ -114,39 +111,35 @@ def origin(problem: Shooting, at: Step, scale: np.ndarray) -> tuple[Step, Shooti
     mean of the two halves is a motion of half the period but for a term of second order.
     """
     count = len(problem.parameters)
-    legs, x = len(problem.events) // 2, jnp.asarray(at.x)
-    turn = float(problem.period(x)) / 2
+    legs, (clock, states, period) = len(problem.events) // 2, problem.values(at.x)
+    turn = period / 2
     half = dataclasses.replace(
         problem, cycles=problem.cycles // 2, events=problem.events[:legs],
         modes=problem.modes[: max(1, legs)],
         steps=problem.steps if legs else problem.steps // 2,
     )  # fmt: skip
-    clock, states = (np.asarray(a) for a in problem.parts(x))
     if legs:
         clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
         states = 0.5 * (states[:legs] + states[legs:])
     else:
         states = states + 0.5 * halves_apart(problem, at) * problem.half_scale()
     mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
-    scale = half.scale(scale[-count:])
 
     def doubling(step: Step) -> float:
         return float(np.linalg.det(step.seen.monodromy + np.eye(problem.states)))
 
-    found = zero_near(half, mean, scale, doubling)
+    found = zero_near(half, mean, doubling)
     if found is None:
-        return at, half, advance(half, mean, np.eye(mean.size)[-1], scale, 0.0)
+        return at, half, advance(half, mean, np.eye(mean.size)[-1], 0.0)
     x = repeated(half, found.x, problem)
     return at._replace(x=x, size=found.size, seen=observe(problem, x)), half, found
 
 
-def admissible_beside(
-    problem: Shooting, x: np.ndarray, scale: np.ndarray, distance: float
-) -> Step | None:
+def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step | None:
     """The admissible motion at a distance from a solution, on whichever side there is one."""
-    tangent = tangent_at(problem, x, scale)
+    tangent = tangent_at(problem, x)
     for sense in (1.0, -1.0):
-        found = advance(problem, x, sense * tangent, scale, distance)
+        found = advance(problem, x, sense * tangent, distance)
         seen = found.seen
         inside = min(seen.nearest.room, seen.pull.room, *seen.approach) > 0
         together = ROUNDING * problem.radian
@@ -164,18 +157,13 @@ def without_events(
     old: Shooting, x: np.ndarray, which: Sequence[int]
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of a motion without events that change nothing in it (it grazes there), and the
-    unknowns that solve them.
-
-    **Arguments:** the equations; their solution; which events to leave out.
-    """
-    at = jnp.asarray(x)
-    clock, states = (np.asarray(a) for a in old.parts(at))
-    period, keep = float(old.period(at)), [i for i in range(old.legs) if i not in which]
+    unknowns that solve them."""
+    clock, states, period = old.values(x)
+    keep = [i for i in range(old.legs) if i not in which]
     if keep:
         clock, states = clock[keep], states[keep]
     else:
-        section = state_at(old, at, jnp.asarray(0), jnp.asarray(period))
-        clock, states = np.zeros(0), np.asarray(ravel_pytree(section)[0])[None]
+        clock, states = np.zeros(0), state_at(old, x, np.asarray(0), period)[None]
     modes = tuple(old.modes[i] for i in keep) or (old.modes[which[-1]],)
     new = dataclasses.replace(old, events=tuple(old.events[i] for i in keep), modes=modes)
     count = len(old.parameters)
@@ -183,10 +171,7 @@ def without_events(
 
 
 def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    """The equations of the same motion over its least period, and the unknowns that solve them.
-
-    **Arguments:** the equations; their solution.
-    """
+    """The equations of the same motion over its least period, and the unknowns that solve them."""
     leaves = jax.tree.leaves(sections_of(old, x)[0])
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):
@@ -196,8 +181,8 @@ def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]
             break
     else:
         return old, x
-    at, legs, count = jnp.asarray(x), max(1, len(old.events) // turns), len(old.parameters)
-    clock, states = (np.asarray(a)[:legs] for a in old.parts(at))
+    legs, count = max(1, len(old.events) // turns), len(old.parameters)
+    clock, states, period = old.values(x)
     events = tuple(
         e if e.cycle is None else e._replace(cycle=e.cycle % cycles) for e in old.events[:legs]
     )
@@ -205,5 +190,5 @@ def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]
     new = dataclasses.replace(
         old, cycles=cycles, events=events, modes=old.modes[:legs], steps=steps
     )
-    period = float(old.period(at)) / turns
-    return new, np.asarray(new.pack(clock, states, np.asarray(x)[-count:], period))
+    x = np.asarray(x)[-count:]
+    return new, np.asarray(new.pack(clock[:legs], states[:legs], x, period / turns))

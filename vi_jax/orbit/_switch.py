@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from .._types import State
 from ..flow import simulate
@@ -62,36 +61,35 @@ def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
     return orbit_of(problem, step)
 
 
-def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray, np.ndarray]:
-    """The equations of a motion that is gone through n times, the unknowns and their sizes, and the
-    right singular vectors of the derivative by all but the parameter."""
+def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
+    """The equations of a motion that is gone through n times, the unknowns, and the right singular
+    vectors of the derivative by all but the parameter."""
     new = several(point.problem, n)
-    x, scale = repeated(point.problem, point.step.x, new), new.scale(point.scale[-1:])
-    jacobian = np.asarray(jacobian_at(new, jnp.asarray(x))) * scale
-    return new, x, scale, np.linalg.svd(jacobian[:, :-1])[2]
+    x = repeated(point.problem, point.step.x, new)
+    return new, x, np.linalg.svd((jacobian_at(new, x) * new.scale)[:, :-1])[2]
 
 
 def _doubled(point: Point, distance: float) -> Orbit:
     """A motion of twice the period, along what the multiplier -1 makes possible, or of half of it
     where the branch springs from one."""
     if point.springs:
-        problem, x, scale = point.problem, np.asarray(point.step.x), point.scale
-        step = advance(problem, x, tangent_at(problem, x, scale), scale, distance)
+        problem, x = point.problem, point.step.x
+        step = advance(problem, x, tangent_at(problem, x), distance)
         return _found(problem, step, "half the period", distance)
-    new, x, scale, vectors = _repeated(point, 2)
-    step = advance(new, x, np.append(vectors[-1], 0.0), scale, distance)
+    new, x, vectors = _repeated(point, 2)
+    step = advance(new, x, np.append(vectors[-1], 0.0), distance)
     return _found(new, step, "twice the period", distance)
 
 
 def _crossed(point: Point, distance: float) -> Orbit:
     """A motion of the branch that crosses here."""
-    problem, x = point.problem, np.asarray(point.step.x)
-    jacobian = np.asarray(jacobian_at(problem, jnp.asarray(x))) * point.scale
+    problem, x = point.problem, point.step.x
+    jacobian = jacobian_at(problem, x) * point.scale
     # Here the equations have two null vectors: one leads along this branch, the other off it.
     plane = np.linalg.svd(jacobian)[2][-2:]
     along = plane.T @ (plane @ point.step.tangent)
     off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
-    step = advance(problem, x, off / np.linalg.norm(off), point.scale, distance)
+    step = advance(problem, x, off / np.linalg.norm(off), distance)
     return _found(problem, step, "the other branch", distance)
 
 
@@ -100,7 +98,7 @@ def _held_otherwise(point: Point, distance: float) -> Orbit:
     problem, change = point.problem, change_at(point.problem, point.step)
     if change is not None and change.there and change.modes[0] == change.modes[2]:
         new, start, _ = without_part(problem, point.step, change)
-        found = admissible_beside(new, start, new.scale(point.scale[-1:]), distance)
+        found = admissible_beside(new, start, distance)
         if found is not None:
             return orbit_of(new, found)
     other = lambda orbit: len(events_in(orbit)) != len(problem.events)
@@ -112,7 +110,7 @@ def _resting_otherwise(point: Point, distance: float) -> Orbit:
     if not point.springs:
         other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
         return _beside(point, distance, "another number of rests", other)
-    found = admissible_beside(point.problem, np.asarray(point.step.x), point.scale, distance)
+    found = admissible_beside(point.problem, point.step.x, distance)
     if found is None:
         raise ValueError(f"No motion with one rest was found at distance {distance:g}.")
     return orbit_of(point.problem, found)
@@ -120,12 +118,12 @@ def _resting_otherwise(point: Point, distance: float) -> Orbit:
 
 def _reordered(point: Point, distance: float) -> Orbit:
     """The motion beside a place where two events fall together, with others or in another order."""
-    problem, x = point.problem, jnp.asarray(point.step.x)
+    problem, (clock, _, period) = point.problem, point.problem.values(point.step.x)
     here, begins = list(problem.events), range(len(problem.events))
     if all(event.cycle is None for event in here):
         # The same motion may be observed whole cycles later, not from any other of its events.
-        cycle, clock = float(problem.period(x)) / problem.cycles, np.asarray(problem.parts(x)[0])
-        begins = [int(np.sum(clock < n * cycle)) for n in range(problem.cycles)]
+        n = problem.cycles
+        begins = [int(np.sum(clock < i * period / n)) for i in range(n)]
     turned = [here[i:] + here[:i] for i in begins]
     other = lambda orbit: [event for _, event in events_in(orbit)] not in turned
     return _beside(point, distance, "its events in another order", other, list(_swapped(point)))
@@ -163,7 +161,7 @@ def _beside(
     **Raises:** `ValueError` if none is found.
     """
     problem, step, guesses = point.problem, point.step, list(guesses)
-    for place in (advance(problem, step.x, step.tangent, point.scale, distance), step):
+    for place in (advance(problem, step.x, step.tangent, distance), step):
         if np.all(np.isfinite(place.x)):
             guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, place.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
@@ -201,12 +199,11 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
             "beyond it the motion has another number of cycles. Find it with `find_orbit`."
         )
     if point.impact is not None:
-        new, start = without_events(old, np.asarray(step.x), point.lost)
+        new, start = without_events(old, step.x, point.lost)
     else:
         nearest = step.seen.nearest
-        touch = int(nearest.event), float(nearest.clock)
-        new, start = _with_touch(old, np.asarray(step.x), *touch)
-    found = admissible_beside(new, start, new.scale(point.scale[-1:]), distance)
+        new, start = _with_touch(old, step.x, int(nearest.event), float(nearest.clock))
+    found = admissible_beside(new, start, distance)
     if found is not None:
         return orbit_of(new, found)
     raise ValueError(
@@ -227,16 +224,10 @@ def _check_plain(problem: Shooting) -> None:
 def _with_touch(
     old: Shooting, x: np.ndarray, number: int, touch: float
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion at a touch, which is an event there, and their unknowns.
-
-    **Arguments:** the equations of the motion, without modes, and their solution; the number of the
-    event, and its clock.
-    """
-    at, events = jnp.asarray(x), list(old.events)
-    clock, states = (np.asarray(a) for a in old.parts(at))
-    period = float(old.period(at))
-    there = state_at(old, at, *old.leg_at(at, touch))
-    u, hit = np.asarray(ravel_pytree(there)[0])[None], Event(number)
+    """The equations of a motion, without modes, at a touch of this event, which is one of its
+    events there; and their unknowns."""
+    (clock, states, period), events = old.values(x), list(old.events)
+    u, hit = state_at(old, x, *old.leg_at(x, touch))[None], Event(number)
     if not events:
         clock, states, events = np.array([touch]), u, [hit]
     else:
@@ -251,23 +242,21 @@ def _with_touch(
 def _as_kind(kind: str, point: Point, distance: float) -> Point:
     """The motion at a point of a boundary as a special point of another kind."""
     impact = point.impact if kind == GRAZING else None
-    found = point_at(point.problem, point.step, point.scale, kind, impact=impact)
+    found = point_at(point.problem, point.step, kind, impact=impact)
     return dataclasses.replace(found, further=point.further)
 
 
 def _in_two(
     point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
-) -> tuple[Shooting, np.ndarray, np.ndarray]:
+) -> tuple[Shooting, np.ndarray]:
     """The equations of motions beside a point of a boundary in its two parameters and under a
-    condition, the unknowns, and their sizes.
-
-    **Arguments:** the point; equations and unknowns in the first parameter.
-    """
+    condition, and the unknowns, from those in the first parameter."""
     ((name, (value, size)),) = point.further.items()
     two = dataclasses.replace(
-        problem, parameters=(name, *problem.parameters), conditions=(condition,)
-    )
-    return two, np.insert(x, -1, value), problem.scale([size, point.scale[-1]])
+        problem, parameters=(name, *problem.parameters), conditions=(condition,),
+        widths=jnp.insert(problem.widths, 0, size),
+    )  # fmt: skip
+    return two, np.insert(x, -1, value)
 
 
 def _of_periods(n: int, point: Point, distance: float) -> Orbit:
@@ -276,12 +265,12 @@ def _of_periods(n: int, point: Point, distance: float) -> Orbit:
     The derivative of n periods is the identity in a plane. Each direction in it leads to such
     motions, at some values of both parameters.
     """
-    new, x, scale, vectors = _repeated(point, n)
+    new, x, vectors = _repeated(point, n)
     second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
-    row = first[:-1] / scale
+    row = first[:-1] / new.scale
     apart = Apart(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
-    two, begin, sizes = _in_two(point, new, x, apart)
-    step = advance(two, begin + distance * first * sizes, second, sizes, 0.0)
+    two, begin = _in_two(point, new, x, apart)
+    step = advance(two, begin + distance * first * two.scale, second, 0.0)
     return _found(two, step, f"{n} times the period", distance)
 
 
@@ -308,39 +297,34 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
     fast = min(point.step.seen.fastest, np.sqrt(2 * touch.rate) * deep(n))
     long = several(problem, n)
     new, x = _with_touch(long, repeated(problem, graze.x, long), touch.number, touch.clock)
-    impact = int(np.argmin(np.abs(np.asarray(new.parts(jnp.asarray(x))[0]) - touch.clock)))
+    impact = int(np.argmin(np.abs(new.values(x)[0] - touch.clock)))
 
-    def found(share: float) -> tuple[Shooting, np.ndarray, Step | None, float]:
+    def found(share: float) -> tuple[Shooting, Step | None, float]:
         slow = Special(GRAZING, impact, speed=jnp.asarray(share * distance * fast))
-        two, begin, scale = _in_two(point, new, x, slow)
-        at = _changes(two, begin, scale, distance, CROSSING if kind == FOLD else kind)
-        return two, scale, at, np.nan if at is None else float(at.x[-2] - begin[-2])
+        two, begin = _in_two(point, new, x, slow)
+        at = _changes(two, begin, distance, CROSSING if kind == FOLD else kind)
+        return two, at, np.nan if at is None else float(at.x[-2] - begin[-2])
 
-    (two, scale, at, off), (*_, half) = found(1.0), found(0.5)
+    (two, at, off), (*_, half) = found(1.0), found(0.5)
     if at is not None and _HALF[0] < half / off < _HALF[1] and at.seen.admissible(range(new.legs)):
-        return point_at(two, at, scale, kind)
+        return point_at(two, at, kind)
     raise ValueError(
         f"No {kind} of a motion with one impact was found at distance {distance:g} from this "
         "resonant grazing. Try a shorter distance."
     )
 
 
-def _changes(
-    two: Shooting, x: np.ndarray, scale: np.ndarray, distance: float, test: str
-) -> Step | None:
+def _changes(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step | None:
     """Where a test changes its sign along the motions whose impact has a given low speed, a curve
-    in both parameters; the place next to that of the resonance.
-
-    **Arguments:** the equations; about the solution at the resonance; the sizes of the unknowns.
-    """
-    begin = advance(two, x, np.eye(len(x))[-2], scale, 0.0)
+    in both parameters; the place next to that of the resonance, which is about at `x`."""
+    begin = advance(two, x, np.eye(len(x))[-2], 0.0)
     heads = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
     value = lambda step: tests_of(step)[test]
     for i, side in itertools.product(range(_LOOKED), (0, 1)):
         here = heads[side]
-        step = advance(two, here.x, here.tangent, scale, _FIRST * distance * 2**i)
+        step = advance(two, here.x, here.tangent, _FIRST * distance * 2**i)
         if bool(step.good) and value(here) * value(step) < 0:
-            return located(two, here, step, scale, value)
+            return located(two, here, step, value)
         heads[side] = step if bool(step.good) else here
     return None
 

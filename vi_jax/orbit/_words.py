@@ -1,8 +1,5 @@
 """The kinds of special points, and what is said of them."""
 
-import jax.numpy as jnp
-import numpy as np
-
 from ..machine import RigidStop, SoftStop, clock_in_words
 from ._corrector import Step
 from ._flight import LANDS, LEAVES, Event
@@ -81,7 +78,7 @@ def one(kind: str) -> str:
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
     """Where within its period a motion is at this reading of its clock, which is counted from the
     section on."""
-    period = float(problem.period(jnp.asarray(at.x)))
+    period = float(problem.period(at.x))
     return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
 
 
@@ -95,6 +92,6 @@ def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
         if isinstance(event, RigidStop | SoftStop):
             what = "touches a stop" if isinstance(event, RigidStop) else f"grazes the {called}"
         return f"{what} {place_in_words(problem, at, clock)}"
-    clock = float(np.asarray(problem.parts(jnp.asarray(at.x))[0])[impact])
+    clock = float(problem.values(at.x)[0][impact])
     lost = problem.events[impact].of(machine)
     return f"the {lost.name or lost.word} {place_in_words(problem, at, clock)} is lost"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import given_number, one_of
+from .._checks import count, given_number, one_of
 from .._messages import so_many
 from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names, tidy
@@ -27,7 +27,7 @@ from ..machine import (
 from ._conditions import Special, held_in_words
 from ._corrector import Step, located
 from ._shooting import Observed, Shooting
-from ._solution import Counted, counted_of, energies_of, orbit_at, orbit_of, sections_of
+from ._solution import Hits, energies_of, hits_of, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
 from .floquet import stability_of
@@ -91,8 +91,6 @@ class Curve(InWords, abc.ABC):
     """The equations of the motions."""
     steps: list[Step]
     """Their solutions, point by point."""
-    scale: np.ndarray
-    """The size of each unknown."""
     ends: tuple[str, str]
     """Why the curve ends on each side."""
     special: list[Point] = dataclasses.field(init=False)
@@ -100,6 +98,11 @@ class Curve(InWords, abc.ABC):
 
     def _each(self, get: Callable[[Observed], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.seen)) for step in self.steps])
+
+    @property
+    def scale(self) -> np.ndarray:
+        """The size of each unknown."""
+        return self.problem.scale
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,7 +146,7 @@ class Curve(InWords, abc.ABC):
         motion; (points, impacts). Of a chatter that ends in a rest only the first one: `orbit(i)`
         lists all."""
         problem, places = self.problem, list(self.problem.impacts)
-        phases = (phase_at(problem.at(jnp.asarray(x.x)), x.x[places]) for x in self.steps)
+        phases = (phase_at(problem.at(x.x), x.x[places]) for x in self.steps)
         return np.stack([np.asarray(phase) for phase in phases])
 
     @cached_property
@@ -204,12 +207,12 @@ class Curve(InWords, abc.ABC):
     @property
     def fastest_impact(self) -> np.ndarray:
         """Largest V⁻ in the period, at each point; 0 without impacts."""
-        return np.array([x.max(initial=0.0) for x in self._speeds])
+        return np.array([hits.speed.max(initial=0.0) for hits in self._hits])
 
     @property
     def slowest_impact(self) -> np.ndarray:
         """Smallest V⁻ in the period, at each point; infinite without impacts."""
-        return np.array([x.min(initial=np.inf) for x in self._speeds])
+        return np.array([hits.speed.min(initial=np.inf) for hits in self._hits])
 
     @cached_property
     def impact_energy(self) -> np.ndarray:
@@ -218,24 +221,15 @@ class Curve(InWords, abc.ABC):
         hit = bool(self.problem.impacts)
         return energies_of(self.problem, self.steps) if hit else np.zeros(len(self.steps))
 
-    @property
-    def _speeds(self) -> list[np.ndarray]:
-        """V⁻ of each impact, at each point."""
-        if self._counted:
-            return [np.asarray(c.speed)[np.asarray(c.stop) >= 0] for c in self._counted]
-        return list(self.impact_speed)
-
     @cached_property
-    def _counted(self) -> list[Counted]:
-        """The impacts of each motion, if they rest."""
-        rest = self.problem.landings
-        return [counted_of(self.problem, step) for step in self.steps] if rest else []
+    def _hits(self) -> list[Hits]:
+        """The impacts of each motion."""
+        return [hits_of(self.problem, step) for step in self.steps]
 
     @property
     def impacts(self) -> np.ndarray:
         """Number of impacts in the period, at each point."""
-        none = len(self.problem.impacts)
-        return np.array([int(c.impacts) for c in self._counted] or [none] * len(self.steps))
+        return np.array([hits.number for hits in self._hits])
 
     @property
     def rests(self) -> np.ndarray:
@@ -249,7 +243,7 @@ class Curve(InWords, abc.ABC):
         rows = []
         for step in self.steps:
             first = jax.tree.map(lambda x: x[:1], sections_of(self.problem, step.x)[0])
-            own = quantities_on(self.problem.at(jnp.asarray(step.x)), first)
+            own = quantities_on(self.problem.at(step.x), first)
             rows.append(components(first, 1) | own)
         return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
 
@@ -309,7 +303,9 @@ class Curve(InWords, abc.ABC):
 
     def orbit(self, index: int) -> Orbit:
         """The motion at one point; a negative `index` counts from the end."""
-        return orbit_at(self.problem, self.steps, index)
+        many = len(self.steps)
+        index = count("index", index, least=-many, most=many - 1)
+        return orbit_of(self.problem, self.steps[index])
 
     def at(self, value: float) -> list[Orbit]:
         """The curve's motions at a value of its (first) parameter, solved for; in its order."""
@@ -328,7 +324,7 @@ class Curve(InWords, abc.ABC):
                 if i == 0 or new is not None or "closed" not in self.ends:
                     found.append(here)
             elif new is not None and apart(here) * apart(new) < 0:
-                found.append(located(self.problem, here, new, self.scale, apart))
+                found.append(located(self.problem, here, new, apart))
         return [orbit_of(self.problem, step) for step in found if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
@@ -438,7 +434,7 @@ class Boundary(Curve):
     def special(self) -> list[Point]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The points of codimension two on the curve, in order, each located to rounding at the
         first access."""
-        return points_of(self.problem, self.condition, self.steps, self.ends, self.scale)
+        return points_of(self.problem, self.steps, self.ends)
 
     @property
     def angle(self) -> np.ndarray:

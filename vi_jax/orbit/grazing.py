@@ -9,15 +9,14 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, so_many
-from .._programs import compiled
 from ..flow import NamedEnumeration, simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of, with_leaf
+from ._corrector import on_host
 from ._flight import Event
 from ._local_map import Graze, LocalMap, graze_at
 from ._shooting import Shooting
@@ -303,7 +302,7 @@ class Simulated(NamedTuple):
     """All impacts in `far` periods of the motion that grazes; in one of them if `far` is 0."""
 
 
-@compiled
+@on_host
 def _lanes(problem, method, name: str, values, states, cycles: int, settle):
     """Sections and impacts of the last cycles, (lanes, cycles)."""
 
@@ -323,11 +322,10 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
-    found = _lanes(
-        problem, problem.method, problem.parameters[0], jnp.asarray(value + offsets),
-        jnp.asarray(smooth), problem.cycles * LOOKED, settling(local) * problem.cycles,
+    rows, impacts, good = _lanes(
+        problem, problem.method, problem.parameters[0], value + offsets, smooth,
+        problem.cycles * LOOKED, settling(local) * problem.cycles,
     )  # fmt: skip
-    rows, impacts, good = (np.asarray(a) for a in found)
     last = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
     hits = impacts.reshape(len(rows), LOOKED, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
@@ -383,7 +381,7 @@ class Motions(NamedTuple):
     """Of the first coordinate on the section, less that of the smooth motion."""
 
 
-@compiled
+@on_host
 def _position_of(problem: Shooting, states):
     """The first coordinate in each state."""
     flat = states.reshape(-1, problem.states)
@@ -398,8 +396,8 @@ def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarr
     **Arguments:** the parameter's offsets; states, less the smooth motion's, (values, looked, n).
     """
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
-    there = _position_of(graze.problem, jnp.asarray(smooth[:, None] + beside))
-    return np.asarray(there) - np.asarray(_position_of(graze.problem, jnp.asarray(smooth)))[:, None]
+    there = _position_of(graze.problem, smooth[:, None] + beside)
+    return there - _position_of(graze.problem, smooth)[:, None]
 
 
 def beside_grazing(
@@ -699,5 +697,5 @@ def _called(graze: Graze, number: int) -> str:
 def _brief_depth(graze: Graze) -> float:
     """The depth of a passage beyond the stop that lasts a small share of a cycle."""
     problem = graze.problem
-    half = 0.5 * _BRIEF * float(problem.period(jnp.asarray(graze.x))) / problem.cycles
+    half = 0.5 * _BRIEF * float(problem.period(graze.x)) / problem.cycles
     return 0.5 * graze.touches[0].rate * half**2

@@ -56,8 +56,6 @@ class Point(InWords):
     """The equations of the motion in one parameter."""
     step: Step
     """Their solution."""
-    scale: np.ndarray
-    """The size of each unknown."""
     impact: int | None = None
     """The impact that grazes; `None` where the body touches a stop that it did not hit before."""
     further: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
@@ -71,6 +69,11 @@ class Point(InWords):
     """Of an extremum, or a number that is watched, its name."""
     index: int = -1
     """Which of the curve's points it is; -1 if it lies between two of them."""
+
+    @property
+    def scale(self) -> np.ndarray:
+        """The size of each unknown."""
+        return self.problem.scale
 
     @property
     def parameter(self) -> float:
@@ -159,22 +162,17 @@ class Point(InWords):
 
 
 def point_at(
-    problem: Shooting, step: Step, scale: np.ndarray, kind: str, detail: str | None = None,
-    impact: int | None = None, **more: Any,
+    problem: Shooting, step: Step, kind: str, detail: str | None = None, impact: int | None = None,
+    **more: Any,
 ) -> Point:  # fmt: skip
-    """A special point of a curve.
-
-    **Arguments:** the curve's equations, their solution, the size of each unknown; further fields
-    of the point.
-    """
+    """A special point of a curve, at a solution of its equations; `more`, further fields."""
     if detail is None:
         detail = grazing_in_words(problem, step, impact) if kind == GRAZING else DETAILS[kind]
-    further = further_of(problem, step, scale)
-    return Point(kind, detail, *alone(problem, step, scale), impact, further, **more)
+    further = further_of(problem, step)
+    return Point(kind, detail, *alone(problem, step), impact, further, **more)
 
 
-def further_of(problem: Shooting, step: Step, scale: np.ndarray) -> dict[str, tuple[float, float]]:
+def further_of(problem: Shooting, step: Step) -> dict[str, tuple[float, float]]:
     """Value and size of each parameter but the first, by name."""
-    names = problem.parameters[-2::-1]
-    places = range(-2, -len(names) - 2, -1)
-    return {n: (float(step.x[i]), float(scale[i])) for n, i in zip(names, places, strict=True)}
+    names, scale = problem.parameters[-2::-1], problem.scale
+    return {n: (float(step.x[-i]), float(scale[-i])) for i, n in enumerate(names, 2)}
