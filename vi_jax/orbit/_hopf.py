@@ -6,7 +6,7 @@ is the equilibrium that is solved for there, and the number at which two of its 
 imaginary.
 """
 
-from typing import Any, NamedTuple
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from .._types import Scalar, Vector
 from ..machine import AbstractMachine, renews, section_in
 from ._corrector import Step, observe, on_host
 from ._flight import section_of
-from ._shooting import Shooting
+from ._shooting import Shooting, Unknowns
 
 # The motion that stands for the branch there has so much of the size of the one before it. This and
 # the numbers below are choices.
@@ -34,30 +34,23 @@ _ZERO = 1e-9
 _ONE = 1e-6
 
 
-@on_host
-def _size(problem: Shooting, x: Vector) -> Scalar:
-    machine = problem.at(x)
-    u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
-    return jnp.linalg.norm(_rate(problem, machine, u)) * problem.period(x)
-
-
-@on_host
-def _flow(problem: Shooting, x: Vector, u: Vector) -> tuple[Vector, Array, Scalar, Vector]:
-    """Field and section in the state u, each with its derivatives by it."""
-    machine = problem.at(x)
-    section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
-    jacobian = jax.jacfwd(lambda u: _rate(problem, machine, u))(u)
-    return _rate(problem, machine, u), jacobian, section, slope
-
-
 def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
     moving = problem.flight(machine, 0).smooth
     return ravel_pytree(moving.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
 
 
-def size_of(problem: Shooting, x: np.ndarray | Array) -> float:
+@on_host
+def _leaving(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
+    """How fast a motion leaves its section, and its period."""
+    machine = problem.at(x)
+    u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
+    return _rate(problem, machine, u), problem.period(x)
+
+
+def size_of(problem: Shooting, x: Unknowns) -> float:
     """How far an autonomous motion would get in its period as fast as it leaves the section."""
-    return float(_size(problem, x))
+    rate, period = _leaving(problem, x)
+    return float(np.linalg.norm(rate) * period)
 
 
 def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
@@ -69,92 +62,79 @@ def hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     """
     if problem.events != (section_of(problem.machine, 0),) or renews(problem.machine):
         return None
-    rates = [_flow_at(problem, step.x, _state(problem, step.x))[0] for step in (here, new)]
+    rates = [_leaving(problem, step.x)[0] for step in (here, new)]
     if np.dot(*rates) >= 0:
         return None  # beyond an equilibrium the motion is turned round
     size, other = np.linalg.norm(rates, axis=1)
     guess = here.x + size / (size + other) * (new.x - here.x)
     found = _imaginary(problem, guess)
-    if found is None or np.linalg.norm(found.x - guess) > np.linalg.norm(new.x - here.x):
+    if found is None or np.linalg.norm(found[0] - guess) > np.linalg.norm(new.x - here.x):
         return None
-    return _about(problem, here, found)
+    return _about(problem, here, *found)
 
 
-class _Equilibrium(NamedTuple):
-    """An equilibrium, with that of its eigenvalues which turns as the cycle does."""
-
-    x: np.ndarray
-    """The unknowns of a motion there: period, state, parameter."""
-    value: complex
-    vector: np.ndarray
-    section: float
-    slope: np.ndarray
-    """Derivative of the section by the state."""
+@on_host
+def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
+    """Derivative of the field in the state of `x`, the section there and its derivative."""
+    machine, u = problem.at(x), problem.parts(x)[1][0]
+    section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
+    return jax.jacfwd(partial(_rate, problem, machine))(u), section, slope
 
 
-def _state(problem: Shooting, x: np.ndarray | Array) -> np.ndarray:
-    return np.asarray(x)[1 : 1 + problem.states]
+@on_host
+def _lacks(problem: Shooting, y: Vector, like: Array) -> tuple[Vector, Array]:
+    """What y = (u, p, ω, Re v, Im v) lacks to be an equilibrium u with an eigenvector v to iω, in
+    length and phase like another one; and the derivative of that."""
+    n = problem.states
+
+    def missing(y):
+        u, turn, (a, b) = y[:n], y[n + 1], y[n + 2 :].reshape(2, n)
+        field = partial(_rate, problem, problem.at(y[: n + 1]))
+        matrix = jax.jacfwd(field)(u)
+        sized = jnp.stack([like[0] @ a + like[1] @ b - 1, like[0] @ b - like[1] @ a])
+        return jnp.concatenate([field(u), matrix @ a + turn * b, matrix @ b - turn * a, sized])
+
+    return missing(y), jax.jacfwd(missing)(y)
 
 
-def _flow_at(problem: Shooting, x: np.ndarray | Array, u: np.ndarray) -> list[np.ndarray]:
-    return [np.asarray(a) for a in _flow(problem, jnp.asarray(x), jnp.asarray(u))]
-
-
-def _imaginary(problem: Shooting, guess: np.ndarray) -> _Equilibrium | None:
-    """The equilibrium near a guess with a pair of imaginary eigenvalues."""
-    from scipy.optimize import newton  # slow to load
-
-    turn, known = 2 * np.pi / guess[0], [guess]
-    found: list[_Equilibrium] = []
-
-    def growth(parameter: float) -> float:
-        there = _equilibrium(problem, np.append(known[-1][:-1], parameter), turn)
-        if there is None:
-            return np.nan
-        known.append(there.x)
-        found.append(there)
-        return there.value.real
-
-    near = guess[-1] + 1e-6 * (abs(guess[-1]) or 1.0)
-    root: Any = newton(growth, guess[-1], x1=near, tol=1e-300, rtol=1e-14, disp=False)
-    real = abs(growth(float(root)))
-    close = found and abs(found[-1].value - 1j * turn) < _ALIKE * turn
-    return found[-1] if close and real < _ZERO * turn else None
-
-
-def _equilibrium(problem: Shooting, x: np.ndarray, turn: float) -> _Equilibrium | None:
-    """The equilibrium near the state in `x`, at its parameter, by Newton's method, and its
-    eigenvalue nearest to i `turn`; `None` if there is none, or only real ones."""
-    u = _state(problem, x)
+def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The equilibrium near a guess with a pair of imaginary eigenvalues, as the unknowns of a
+    motion there, and its eigenvector."""
+    n, turn, matrix = problem.states, 2 * np.pi / guess[0], _linear(problem, guess)[0]
+    if not np.isfinite(matrix).all():
+        return None
+    values, vectors = np.linalg.eig(matrix)
+    first = vectors[:, np.argmin(np.abs(values - 1j * turn))]
+    like = np.stack([first.real, first.imag])
+    y, scale = np.concatenate([guess[1:], [turn], like.ravel()]), problem.scale[1:]
+    scale = np.concatenate([scale, [turn], np.ones(2 * n)])
     for _ in range(20):
-        rate, jacobian, *_ = _flow_at(problem, x, u)
-        if not (np.isfinite(rate).all() and np.isfinite(jacobian).all()):
+        missing, jacobian = _lacks(problem, y, like)
+        if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):
             return None
-        move = np.linalg.lstsq(jacobian, rate)[0]
-        u = u - move
-        if np.abs(move).max() <= 1e-14 * np.abs(u).max():
+        # The smallest move, where a component is neutral.
+        move = scale * np.linalg.lstsq(jacobian * scale, missing)[0]
+        y = y - move
+        size = np.abs(move / scale).max()
+        if size <= 1e-14:
             break
-    _, jacobian, section, slope = _flow_at(problem, x, u)
-    if not np.isfinite(jacobian).all():
+    if not size < _ZERO or abs(y[n + 1] - turn) >= _ALIKE * turn:
         return None
-    values, vectors = np.linalg.eig(jacobian)
-    i = int(np.argmin(np.abs(values - 1j * turn)))
-    if not values[i].imag > 0:
-        return None
-    x = np.concatenate([[2 * np.pi / values[i].imag], u, x[-1:]])
-    return _Equilibrium(x, complex(values[i]), vectors[:, i], float(section), slope)
+    a, b = y[n + 2 :].reshape(2, n)
+    return np.concatenate([[2 * np.pi / y[n + 1]], y[: n + 1]]), a + 1j * b
 
 
-def _about(problem: Shooting, here: Step, there: _Equilibrium) -> Step | None:
+def _about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
     """A motion of hardly any size about an equilibrium, at the moment at which it passes the
     section."""
-    seen, steep = there.slope @ there.vector, np.linalg.norm(there.slope)
-    apart = np.linalg.norm(_state(problem, here.x) - _state(problem, there.x))
-    if abs(seen) <= _ZERO * steep or abs(there.section) > _ZERO * steep * apart:
+    _, section, slope = _linear(problem, x)
+    seen, steep = slope @ vector, np.linalg.norm(slope)
+    apart = np.linalg.norm(here.x[1:-1] - x[1:-1])
+    if abs(seen) <= _ZERO * steep or abs(section) > _ZERO * steep * apart:
         return None  # the section does not see it
     # Of all the phases of the linear motion the one in which the section rises through zero.
-    way = (there.vector * (-1j * np.conj(seen))).real
+    way = (vector * (-1j * np.conj(seen))).real
     way = np.concatenate([[0.0], way / np.linalg.norm(way), [0.0]])
-    x = there.x + _SMALL * apart * way
+    x = x + _SMALL * apart * way
     found = here._replace(x=x, tangent=-way, seen=observe(problem, x))
     return found if np.abs(found.seen.multipliers - 1).min() < _ONE else None
