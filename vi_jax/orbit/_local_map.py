@@ -23,7 +23,7 @@ from ._corrector import on_host, tangent_at
 from ._flight import Event, Flight
 from ._shooting import Shooting
 from ._surgery import of_least_period, without_events
-from ._turns import rooms_of
+from ._turns import Path, turning
 from ._words import one
 from .special import Point
 
@@ -227,9 +227,8 @@ def _rooms(problem: Shooting, x):
         after = problem.after(machine, leg, s0, u)
         flight = problem.flight(machine, leg)
         _, _, path = flight.fly(s0, s1, after, problem.steps)
-        rooms = rooms_of(
-            flight, path[0], path[1], (s1 - s0) / problem.steps, closed=not problem.events
-        )
+        h = (s1 - s0) / problem.steps
+        _, rooms = turning(Path(flight, *path, h, not problem.events))
         return jnp.stack([r.room for r in rooms]), jnp.stack([r.clock for r in rooms])
 
     ends = problem.ends(clock, problem.period(x))

@@ -42,7 +42,7 @@ from ..machine import (
 )
 from ._chatter import Hops, escape, hopped, remaining
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
-from ._turns import Nearest, pull_of, turns_of
+from ._turns import Nearest, Path, pull_of, turns_of
 from .floquet import multipliers_of
 
 # A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred
@@ -477,10 +477,8 @@ class Shooting(eqx.Module):
                 carried, approach = carried @ saltation, rises[None]
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
-            turns = turns_of(
-                self.flight(machine, leg), path[0], path[1], (s1 - begin.s) / self.steps,
-                closed=not self.events,
-            )  # fmt: skip
+            h = (s1 - begin.s) / self.steps
+            turns = turns_of(Path(self.flight(machine, leg), *path, h, not self.events))
             largest = jnp.max(jnp.abs(path[1]), axis=0)
             return carried, passed, approach, order, turns, places, largest, begin
 
@@ -553,9 +551,9 @@ class Shooting(eqx.Module):
         for i, contact in enumerate(self.contacts):
             if any(contact):
                 begin = last(i)
-                places, path = self.flown(machine, i, begin, ends[i])[2]
+                path = self.flown(machine, i, begin, ends[i])[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
-                pull = pull_of(flight, places, path, h, closed=not self.events)
+                pull = pull_of(Path(flight, *path, h, not self.events))
                 least = jnp.minimum(least, pull.room)
         return least
 

@@ -26,6 +26,20 @@ _TURNED = 1e-3
 _ROUNDED = 1e-12
 
 
+class Path(NamedTuple):
+    """A flight, step by step."""
+
+    flight: Flight
+    places: Float[Array, " steps"]
+    """Clock at the start of each step."""
+    states: Float[Array, "steps states"]
+    """State there."""
+    h: Scalar
+    """Length of the steps."""
+    closed: bool
+    """Whether it ends in the state in which it begins (static)."""
+
+
 class Nearest(NamedTuple):
     """The turning point that is nearest to an event which does not happen there."""
 
@@ -135,21 +149,12 @@ class _Room(NamedTuple):
     """Clock of the turn."""
 
 
-def turns_of(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
-    h: Scalar, *, closed: bool,
-) -> Turns:  # fmt: skip
-    """The turning points of all coordinates and guards along a flight.
-
-    **Arguments:** the flight; clock and state at the start of each step, and its length; `closed`,
-    whether it ends in the state in which it begins (static).
-    """
-    bodies, rooms = _turning(flight, places, states, h, closed)
-    nearest = _nearest(dict(enumerate(rooms)), h)
+def turns_of(path: Path) -> Turns:
+    """The turning points of all coordinates and guards along a flight."""
+    bodies, rooms = turning(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    pull = pull_of(flight, places, states, h, closed=closed)
-    return Turns(low, high, nearest, pull)
+    return Turns(low, high, _nearest(dict(enumerate(rooms)), path.h), pull_of(path))
 
 
 def _nearest(rooms: dict[int, _Room], h: Scalar) -> Nearest:
@@ -163,27 +168,11 @@ def _nearest(rooms: dict[int, _Room], h: Scalar) -> Nearest:
     return least
 
 
-def rooms_of(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
-    h: Scalar, *, closed: bool,
-) -> list[_Room]:  # fmt: skip
-    """How near a flight comes to each of the machine's events but its section, in their order.
-
-    **Arguments:** as `turns_of`.
-    """
-    return _turning(flight, places, states, h, closed)[1]
-
-
-def _turning(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
-    h: Scalar, closed: bool,
-) -> tuple[list[_Found], list[_Room]]:  # fmt: skip
-    """The turning points of each coordinate, and how near the flight comes to each event.
-
-    **Arguments:** as `turns_of`.
-    """
-    machine, begin = flight.machine, places[0]
-    found = partial(_turns_in, flight, places, states, h, closed)
+def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
+    """The turning points of each coordinate, and how near the flight comes to each of the machine's
+    events but its section, in their order."""
+    flight, machine, begin = path.flight, path.flight.machine, path.places[0]
+    found = partial(_turns_in, path)
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
     rooms = []
     for stop in stops_of(machine):
@@ -191,17 +180,17 @@ def _turning(
         facing = at.turns & (stop.sign * at.before > 0)
         if flight.contact:  # one that is let go of begins to move with velocity zero
             free = flight.contact[stop.coordinate] == 0
-            facing = facing & free & (at.place > begin + _TURNED * h)
+            facing = facing & free & (at.place > begin + _TURNED * path.h)
         rooms.append(_Room(jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(machine)):
         if number < len(stops_of(machine)) or number == section_number(machine):
             continue
         at = found(_Guard(number))
         # A body that friction lets go begins to slide with velocity and acceleration zero.
-        away = at.place > begin + _TURNED * h
+        away = at.place > begin + _TURNED * path.h
         facing = at.turns & (at.before > 0) & away
         if event.from_below:  # it touches nothing where it has not been below zero
-            value = jax.vmap(partial(_Guard(number).at, flight))(places, states)
+            value = jax.vmap(partial(_Guard(number).at, flight))(path.places, path.states)
             # Right behind the event itself it is zero, to rounding of either sign.
             below = -_ROUNDED * jnp.max(jnp.abs(value))
             facing = facing & at.happens & (jax.lax.cummin(value) < below)
@@ -209,11 +198,9 @@ def _turning(
     return bodies, rooms
 
 
-def _turns_in(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
-    h: Scalar, closed: bool, watched: _Guard,
-) -> _Found:  # fmt: skip
+def _turns_in(path: Path, watched: _Guard) -> _Found:
     """The turning points of one function along a flight."""
+    flight, places, states, h, closed = path
     # The end of the last step is the next event: its velocity is that of a further step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
     v = jax.vmap(partial(watched.rate, flight))(places, states)
@@ -224,21 +211,15 @@ def _turns_in(
     return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
 
 
-def pull_of(
-    flight: Flight, places: Float[Array, " steps"], states: Float[Array, "steps states"],
-    h: Scalar, *, closed: bool,
-) -> Nearest:  # fmt: skip
-    """Where the force on a body that rests has its least turn, as if that were a distance.
-
-    **Arguments:** as `turns_of`.
-    """
-    forces = {}
+def pull_of(path: Path) -> Nearest:
+    """Where the force on a body that rests has its least turn, as if that were a distance."""
+    flight, forces = path.flight, {}
     for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
-        at = _turns_in(flight, places, states, h, closed, _Pull(number))
+        at = _turns_in(path, _Pull(number))
         rests = flight.contact[stop.coordinate] == 1.0 + number
         force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
         forces[number] = _Room(force, at.place)
-    return _nearest(forces, h)
+    return _nearest(forces, path.h)
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
