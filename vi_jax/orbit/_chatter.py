@@ -59,11 +59,8 @@ class Hops(NamedTuple):
 
 
 def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: int) -> Hops:
-    """The first impact of a chatter whose rebound is slow, or the last one before a clock.
-
-    **Arguments:** the flight with the body free; the number of its stop; `begin`, the first impact;
-    a clock beyond which no impact is wanted; the steps of a hop.
-    """
+    """The first impact of a chatter whose rebound is slow, or the last one before the clock
+    `until`; `free`, the flight with the body free, `begin`, the first impact."""
     stop = stops_of(free.machine)[number]
     averages = tuple(name for name in begin.passed if name != TIME)
 
@@ -128,11 +125,8 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
 
 
 def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
-    """About how long a chatter goes on after an impact: under the force that there is; infinite
-    where that pulls the body off.
-
-    **Arguments:** the flight with the body free; the number of its stop; the impact.
-    """
+    """About how long a chatter goes on after an impact under the force that there is; infinite
+    where that pulls the body off."""
     stop = stops_of(free.machine)[number]
     here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
     share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))

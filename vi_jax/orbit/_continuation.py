@@ -162,9 +162,6 @@ def _freed(
     """The equations with further parameters and as many conditions, their unknowns, and the
     intervals of all parameters.
 
-    **Arguments:** the equations and the unknowns that the orbit gives; `free`, `fixed` and `bounds`
-    as in `continue_orbit`; the orbit's `multipliers`.
-
     **Raises:** `ValueError` for what cannot be freed or held.
     """
     if not free:

@@ -112,11 +112,8 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
-    """The solution on the plane across a tangent.
-
-    **Arguments:** the equations; `x`, the unknowns from where; `tangent`, a unit vector, and
-    `length`, how far along it, both in scaled unknowns.
-    """
+    """The solution on the plane across a unit tangent, at this length along it from `x`, both in
+    scaled unknowns."""
     return _advanced(problem, x, tangent, problem.scale, float(length))
 
 
@@ -193,12 +190,8 @@ class _CloseError(ArithmeticError):
 
 
 def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-    """The point between two, along the first one's tangent, at which a test is zero; `None` if
-    there is none.
-
-    **Arguments:** `here` and `new`, the points, which may lie against that tangent; `test`, a
-    function of a point that changes its sign between them.
-    """
+    """The point between two, along the first one's tangent, at which a test that changes its sign
+    between them is zero; `None` if there is none. They may lie against that tangent."""
     length = way(problem, here, new)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []
@@ -284,18 +277,14 @@ def crossing(
     admits: Callable[[Step, float], bool] = lambda step, length: True,
 ) -> Step | None:  # fmt: skip
     """The point of a curve at which a test is zero, where its equations are singular: where
-    branches cross, or where an impact grazes.
+    branches cross, or where an impact grazes. `None` if too few points were found, or no zero.
 
     Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
-    polynomial through its neighbours tells where it is, and what the motion is there.
+    polynomial through its neighbours tells where it is, and what the motion is there. Where the
+    curve is found on the near side only, there are more neighbours of that one.
 
-    **Arguments:** the equations; `advance`, of unknowns, tangent and length, the curve's point; a
-    point of it, and about how far along its tangent the place is; the test; `admits`, of a point
-    and its length, whether it belongs to this curve.
-
-    Where the curve is found on the near side only, there are more neighbours of that one.
-
-    **Returns:** `None` if too few points were found, or no zero.
+    **Arguments:** `root`, about how far the place is along the tangent; `admits`, of a point and
+    its length, whether it belongs to this curve.
     """
     found: dict[float, Step] = {}
 

@@ -50,10 +50,6 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
 
     Only leaves that are being differentiated make columns. Inside of another derivative, as that of
     an orbit by the implicit function theorem, the columns are few and stay together.
-
-    **Arguments:** a function of pytrees that returns a pytree of floating-point arrays.
-
-    **Returns:** the function, with the same arguments; under `vmap` as under `jit`.
     """
 
     @eqx.filter_custom_jvp

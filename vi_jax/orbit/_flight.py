@@ -144,13 +144,9 @@ class Flight(eqx.Module):
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
     ) -> tuple[Vector, Integrals, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps.
-
-        **Arguments:** `averages`, the names of the machine's averages to integrate.
-
-        **Returns:** the state at s1; the time that passed and the integrals; clock and state before
-        each of the steps.
-        """
+        """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps: the state
+        then; the time that passed and the integrals of these averages; clock and state before each
+        of the steps."""
         way = prepared(self.machine)
         if way.machine is not self.machine:
             inward = way.inward(self.like)

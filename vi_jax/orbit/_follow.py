@@ -190,11 +190,7 @@ class _Walk:
         self._vain, self._worst = 0.0, (0.0, 0.0)  # how far off the states are, and where
 
     def follow(self, tell: Tell, *, step: float, max_step: float, max_points: int) -> str:
-        """Walk on, in the sense of the first point's tangent; why it ended.
-
-        **Arguments:** `tell`, told of each point; `step` and `max_step`, the first and the longest
-        step length; `max_points`, the most points.
-        """
+        """Walk on, in the sense of the first point's tangent; why it ended."""
         length, failed, steady, end, points = step, 0, 0, "max_points", 1
         while points < max_points:
             here = self.steps[-1]

@@ -56,10 +56,8 @@ def soft_kick(
     problem: Shooting, x: np.ndarray, number: int, leg: int, clock: float, u: np.ndarray,
     gradient: np.ndarray, fast: np.ndarray, rate: float,
 ) -> Kick:  # fmt: skip
-    """The kick of a switch that a motion grazes.
-
-    **Arguments:** the equations of the motion and their solution; event, leg and clock of the
-    touch; the state there, the gradients of the distance h and of dh/ds, and d²h/ds².
+    """The kick of a switch that a motion grazes at this clock in the state u: `gradient` and `fast`
+    are those of the distance h and of dh/ds, `rate` is d²h/ds².
 
     **Raises:** `ValueError` if the field beyond the surface does not turn the motion back.
     """
@@ -140,11 +138,8 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
 
 
 def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
-    """The state after a contact, less what it would be without.
-
-    **Arguments:** as `soft_kick`; the state at the greatest depth of the free flight, and how long
-    that would be beyond the surface.
-    """
+    """The state after a contact, less what it would be without; `deep`, the state at the greatest
+    depth of the free flight, and how long that would be beyond the surface."""
     from scipy.optimize import brentq  # slow to load
 
     unit = problem.radian
@@ -238,11 +233,8 @@ def _rooms(problem: Shooting, x):
 def touched(
     problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
 ) -> list[tuple[int, int, float]]:
-    """Event, leg and clock of each touch, each once.
-
-    **Arguments:** the equations and their solution; event and clock of the touch that is known,
-    which may fall on the end of a flight, where no turn is seen; how far the body goes.
-    """
+    """Event, leg and clock of each touch of a motion that goes as far as `length`, each once. The
+    one that is known may fall on the end of a flight, where no turn is seen."""
     (rooms, places), period = _rooms(problem, x), float(problem.period(x))
     leg, within = problem.leg_at(x, clock)
     found = [(number, int(leg), float(within))]
@@ -300,11 +292,7 @@ def _struck(problem: Shooting, x, number: int, leg, s, u, push):
 def touch_at(
     problem: Shooting, x: np.ndarray, along: np.ndarray, number: int, leg: int, clock: float
 ) -> Touch:
-    """All about one touch.
-
-    **Arguments:** the equations of the motion and their solution, with its derivative `along` the
-    parameter; the event's number, the leg and the clock of the touch.
-    """
+    """All about one touch; `along`, the derivative of the motion by the parameter."""
     event = events_of(problem.machine)[number]
     u, gradient, rate, slope, fast = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
@@ -498,11 +486,8 @@ def _through(problem: Shooting, x, leg):
 
 
 def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) -> np.ndarray:
-    """How a perturbation at clock `s0` is carried to a later clock, through all events between.
-
-    **Arguments:** the equations of the motion and their solution; the leg in which `s0` lies;
-    the later clock `s1`.
-    """
+    """How a perturbation at clock `s0`, in this leg, is carried to a later clock, through all
+    events between."""
     M, (clock, _, period) = np.eye(problem.states), problem.values(x)
     turn, begin, n = 0.0, s0, leg
     while True:

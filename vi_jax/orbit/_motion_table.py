@@ -220,11 +220,8 @@ class MotionTable(Table):
     def _ended(
         self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
     ) -> Ending:
-        """How a branch ends where an event is lost, something is touched, or events come otherwise.
-
-        **Arguments:** the point before, and the place; the number of the event that is lost; or
-        what else happens, by its name in `DETAILS`.
-        """
+        """How a branch ends where this event is lost, something is touched, or events come
+        otherwise (a name in `DETAILS`)."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
             return Ending(at, REST, self._merged(at, flight))

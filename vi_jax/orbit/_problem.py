@@ -65,10 +65,7 @@ def fixed_step_method(
 ) -> AbstractMethod:
     """A method of fixed steps for the branch of an orbit.
 
-    **Arguments:** the method that the caller asked for, or `None`; the one with which the orbit
-    was found; the orbit's machine.
-
-    **Returns:** the one asked for; else that of the orbit, if its steps are fixed; else
+    **Returns:** the one asked for, if any; else that of the orbit, if its steps are fixed; else
     `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13. Of an
     implicit solver equal steps. Where the motion paces its own clock, and of such a solver, there
     are as many steps as it takes (see `problem_of`).
@@ -96,11 +93,7 @@ def fixed_step_method(
 def steps_of(
     method: AbstractMethod, machines: list[AbstractMachine], like: State, cycles: int
 ) -> int:
-    """Steps that a flight over so many cycles needs, in the most demanding of the machines.
-
-    **Arguments:** the method; the machines at the ends of the interval of a parameter; a state, for
-    its structure; the cycles.
-    """
+    """Steps that a flight over so many cycles needs, in the most demanding of the machines."""
     # Turning points are looked for between steps: more of them than flying needs.
     fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
     return max(method.steps_per_cycle, 16, *fewest) * cycles
@@ -110,10 +103,7 @@ def cycles_flown(
     places: Sequence[float] | np.ndarray, events: Sequence[Event], period: float, cycles: int
 ) -> int:
     """Cycles for which each leg gets steps: those of the longest leg, rounded up, and one more,
-    since legs grow along a branch; all, where a chatter takes its share of them.
-
-    **Arguments:** the clock at the events; the events; the period by the clock, and in cycles.
-    """
+    since legs grow along a branch; all, where a chatter takes its share of them."""
     if not events or any(event.use == LANDS for event in events):
         return cycles
     longest = float(np.diff([*places, places[0] + period]).max())
@@ -175,11 +165,7 @@ def check_parameter(
     argument: str = "bounds",
 ) -> None:  # fmt: skip
     """**Raises:** `ValueError` unless the interval of a machine's number holds its value, and the
-    machine is valid with either end of it.
-
-    **Arguments:** `name` and `value`, the number's; `whose`, whose value that is, in words; the
-    argument that gives the interval.
-    """
+    machine is valid with either end of it; `whose`, whose value that is, in words."""
     low, high = interval
     if not low <= value <= high:
         raise ValueError(
@@ -237,10 +223,7 @@ def problem_of(
 
 def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> Problem:
     """The equations with the sizes of the clock, for which a cycle is 2π, and of the numbers of the
-    state, half their largest moduli.
-
-    **Arguments:** the equations and a solution; the largest moduli in its course.
-    """
+    state: half their largest moduli in the course of this solution."""
     _, states, period = problem.values(x)
     sizes = _sizes(states)
     if largest is not None and np.isfinite(largest).all():
@@ -250,11 +233,8 @@ def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> P
 
 
 def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
-    """The equations with the sizes of a motion that has become twice as large; `None` if it has
-    not.
-
-    **Arguments:** the equations; the largest moduli of the numbers of its state.
-    """
+    """The equations with the sizes of a motion whose numbers have these moduli, if one of them has
+    become twice as large; else `None`."""
     before, now = np.asarray(problem.sizes), 0.5 * np.asarray(largest)
     if not (now > 2 * before[1:]).any():
         return None
@@ -297,11 +277,9 @@ def sized_by_motion(problem: Shooting) -> bool:
 
 
 def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
-    """The equations with as many steps as the flights of a solution ask for, and a method by which
-    simulations of it are as exact; `None` where more change nothing, or more are not allowed.
-
-    **Arguments:** the equations and a solution; what `off_by` gives for them.
-    """
+    """The equations with as many steps as the flights of a solution ask for, which now is `off_by`
+    so much, and a method by which simulations of it are as exact; `None` where more change nothing,
+    or more are not allowed."""
     more = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
@@ -318,11 +296,7 @@ def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
 def _followed(
     blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
 ) -> _Way:
-    """A motion of one period, followed from event to event.
-
-    **Arguments:** `blank`, the problem without events; `state`, that on the section; `found`, clock
-    and event of all that is met within the period, in their order; `period`, by the clock.
-    """
+    """A motion of one period, followed from event to event; `blank`, the equations without events."""
     machine = blank.machine
     own, state = modes_of(state), bare(state)
     modes = begin_modes(machine, jnp.zeros(()), state, own)
@@ -436,8 +410,6 @@ def legs_of(
 ) -> tuple[Shooting, np.ndarray]:
     """The equations of a motion that rests on stops, and the unknowns that it gives.
 
-    **Arguments:** as `problem_of`.
-
     **Raises:** `ValueError` of a machine with friction on a stop, or whose cycles an event ends or
     begin anew; where bodies chatter together, or a switch changes with each hop.
     """
@@ -534,11 +506,7 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
 
 def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> list[Placed] | None:
     """The events of a period that begins with a release, if there is one, without the hops of its
-    chatters; `None` where a rest has no impact before it.
-
-    **Arguments:** clock since the section, kind and number of each event; the length of a cycle,
-    and of the period.
-    """
+    chatters, from clock, kind and number of each; `None` where a rest has no impact before it."""
     for number in {n for *_, n in log}:
         # A body that its stop lets go of on the section itself begins the motion as one in flight.
         kinds = [kind for _, kind, n in log if n == number]

@@ -232,12 +232,8 @@ def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
 def _turn(
     watched: _Guard, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
 ) -> _Found:
-    """The turning point within a step, if the rate changes its sign: by Newton's method on the
-    length from the step's start, each trial a step of the method itself.
-
-    **Arguments:** what turns; the flight; length of the step, clock and state where it begins, and
-    the rate at both ends.
-    """
+    """The turning point within a step, if the rate changes its sign (`v0` and `v1` at its ends): by
+    Newton's method on the length from the step's start, each trial a step of the method itself."""
     h, s, u, v0, v1 = inputs
     # A turn may fall on the end of a step.
     turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))

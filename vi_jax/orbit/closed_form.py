@@ -254,11 +254,7 @@ def _impacts(
 
 def _early(flight, k, d, v, period) -> Float[Array, "2"]:
     """A change of V just after the impact, in its last digits, by which the next one comes before
-    the section on which both fall, rather than where rounding puts it.
-
-    **Arguments:** `flight`, the matrix over a period; `k`, `d` and `v`, the restitution, the gap
-    and the speed of approach; `period`, the time between impacts.
-    """
+    the section on which both fall, rather than where rounding puts it."""
     rounding = 64 * jnp.finfo(v.dtype).eps * (1 + period) * (1 + jnp.abs(d) + v)
     rise = flight[0, 1]
     change = rounding * rise / (rise * rise + 0.01)
@@ -266,12 +262,7 @@ def _early(flight, k, d, v, period) -> Float[Array, "2"]:
 
 
 def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Scalar]:
-    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak.
-
-    **Arguments:** `rates`, the matrix of the motion; `flights`, those over 1, 2, 4, … grid steps;
-    `k`, `d` and `v`, the restitution, the gap and the speed of approach; `phase` and `period`, the
-    impact's crank angle and the time between impacts.
-    """
+    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak."""
     states = _after_impact(k, d, v, phase)[None]
     for flight in flights:  # over 1, 2, 4, … grid steps
         states = jnp.concatenate([states, _dot(states, flight.T)])
@@ -322,10 +313,6 @@ def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
 
     The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]], where
     damping drops out of k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
-
-    **Arguments:** `flight`, the matrix over a period; `xi`, ξ; `k`, `d` and `v`, the restitution,
-    the gap and the speed of approach; `phase` and `period`, the impact's crank angle and the time
-    between impacts.
     """
     kick = (1 + k) * (jnp.cos(phase) - d) / v
     half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))

@@ -56,15 +56,9 @@ def _missing(
 
 
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
-    """Where a root finder comes to from a guess.
-
-    **Arguments:** `arc`, the map over one arc; `guess`, a state on its section, in which the first
-    arc begins, the others where the motion from there is then; `root_finder`, which says how many
-    arcs there are.
-
-    **Returns:** `Found`, all its numbers floats; its `x` are the states in which the arcs begin, as
-    rows.
-    """
+    """Where a root finder comes to from a guess, the first arc's start; the others begin where the
+    motion from there is then. The `x` found are the starts of the arcs, in rows; all numbers are
+    floats."""
     x, unravel = raveled(guess)
     arcs = x[None]
     if root_finder.arcs > 1:
@@ -170,11 +164,8 @@ class ObservedArc(NamedTuple):
 
 def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> ObservedArc:
     """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
-    `forward_jacobian`).
-
-    **Arguments:** `second`, whether those of `jacobians` are, which are second derivatives of the
-    motion; zero if not.
-    """
+    `forward_jacobian`). `second`, whether those of `jacobians` are, which are second derivatives of
+    the motion; else zero."""
 
     # Apart from the motion: a program with second derivatives should hold no more than it must.
     def jacobians_from(arc, state):
@@ -292,11 +283,9 @@ def in_order(
     seen: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
     machine: AbstractMachine, place: Int[Array, ""] | None,
 ) -> Impacts:  # fmt: skip
-    """The impacts of a period, in one row and in their order from the section asked for.
-
-    **Arguments:** the motion, cycle by cycle; which entries of its list are impacts of the period;
-    the period in cycles; the machine; the eighths of a cycle by which the section searched on lies
-    behind the one asked for, `None` for an autonomous machine, whose cycles differ in length.
+    """The impacts of a period, in one row and in their order from the section asked for: `hit`,
+    which of those listed they are; `place`, the eighths of a cycle by which the section searched on
+    lies behind the one asked for, `None` for an autonomous machine, whose cycles differ in length.
     """
     phase, cycles = seen.listed.phase, seen.duration.shape[0]
     if place is not None:
@@ -566,12 +555,8 @@ def _verdict(
     found: Array, smaller: Array, near_grazing: Array, drifts: Array, still: Array, no_run: Array,
     other_modes: Array,
 ) -> ORBIT_RESULTS:  # fmt: skip
-    """The result of a search, from flags.
-
-    **Arguments:** `found`, an orbit; `smaller`, its period; `near_grazing`, where the search ended;
-    `drifts`, the motion; `still`, an equilibrium; `no_run`, the guess cannot be simulated;
-    `other_modes`, the motion ends where it began, but in other modes.
-    """
+    """The result of a search: `near_grazing`, where it ended; `no_run`, the guess cannot be
+    simulated; `other_modes`, the motion ends where it began, but in other modes."""
     where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
     missed = where(near_grazing, results.grazing, results.no_orbit)
     missed = where(drifts, results.drifts, missed)

@@ -186,11 +186,8 @@ def natural_depth(local: LocalMap) -> float:
 
 def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[str, float]:
     """What follows, by its name in `SCENARIOS`, and the share of offsets without a period. Whether
-    there is an attractor near, and whether that is the motion itself, the nearer half says.
-
-    **Arguments:** the map; offsets of the parameter on the side of the impacts, evenly spaced by
-    their logarithm; what it settles on there.
-    """
+    there is an attractor near, and whether that is the motion itself, the nearer half says. The
+    offsets lie on the side of the impacts, evenly spaced by their logarithm."""
     near = found.period >= 0
     close = np.abs(offsets) <= np.median(np.abs(offsets))
     if near[close].mean() < 0.5:
@@ -245,8 +242,6 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
     The depth y of the impact solves y² + Eₙ y = ε with Eₙ = ∂h (I - Nⁿ)⁻¹ Nⁿ kick, ε being how far
     the smooth motion is beyond the stop; at the other passages the distance has to be positive. The
     matrix of the motion is Nⁿ (I - kick ∂h/2y).
-
-    **Arguments:** the map; the greatest depth looked at (of h); how many.
     """
     N, h, kick = local.matrix, local.gradients[0], local.kicks[0]
     identity = np.eye(len(N))
@@ -391,10 +386,8 @@ def _position_of(problem: Shooting, states):
 
 
 def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """The first coordinate on the section, less that of the smooth motion.
-
-    **Arguments:** the parameter's offsets; states, less the smooth motion's, (values, looked, n).
-    """
+    """The first coordinate of states beside the smooth motion's on the section, less that of the
+    latter."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
     there = _position_of(graze.problem, smooth[:, None] + beside)
     return there - _position_of(graze.problem, smooth)[:, None]
@@ -403,11 +396,9 @@ def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarr
 def beside_grazing(
     graze: Graze, offsets: np.ndarray, found: Settled
 ) -> tuple[Motions, tuple[np.ndarray, np.ndarray], tuple[int, int] | None]:
-    """What the machine does at the same values; whether that is alike there, and (at some of them)
-    on the other side; and period and impacts of what it settles on if it goes far away.
-
-    **Arguments:** the parameter's offsets; what the local map settles on there.
-    """
+    """What the machine does at offsets where the local map settles on `found`; whether that is
+    alike there, and (at some of them) on the other side; and period and impacts of what it settles
+    on if it goes far away."""
     sparse, n = offsets[::_SPARSE], len(offsets)
     machine = simulated(graze, np.concatenate([offsets, -sparse]))
     here, there = (Simulated(*(part[which] for part in machine))
@@ -430,11 +421,8 @@ def _far(seen: Simulated, cycles: int) -> tuple[int, int] | None:
 def stretch(
     size: np.ndarray, here: np.ndarray, there: np.ndarray
 ) -> tuple[tuple[float, float] | None, float]:
-    """The longest stretch, in half decades, in which forecast and machine agree, and the share of
-    values there that do.
-
-    **Arguments:** sizes of the offsets, rising; where both agree, and on the other side.
-    """
+    """The longest stretch of sizes of offsets (rising), in half decades, in which forecast and
+    machine agree `here` and `there`, on the other side; and the share of values there that do."""
     parts = 2 * DECADES
     half = np.minimum((np.arange(len(size)) * parts) // (len(size) - 1), parts - 1)
     good = [

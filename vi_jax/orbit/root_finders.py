@@ -34,12 +34,9 @@ def rounding(dtype: object) -> float:
 
 
 def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None) -> Array:
-    """What solves `matrix @ step = missing`, where many do, the smallest one. What no step reaches
-    is left over: `missing - matrix @ step`.
-
-    **Arguments:** the equations; the share of the greatest singular value below which one is zero,
-    by default that of rounding.
-    """
+    """What solves `matrix @ step = missing`, where many do, the smallest one; singular values below
+    the share `least` of the greatest are zero. What no step reaches is left over: `missing - matrix
+    @ step`."""
     left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
     least = rounding(matrix.dtype) if least is None else least
     lost = sizes <= least * jnp.minimum(sizes[0], _STEEP)

@@ -141,10 +141,8 @@ def tracked(
     trail: list[Rows] | None = None,
     tell: Tell = silent,
 ) -> EdgeState:
-    """The edge state between a start that comes back and one that does not.
-
-    **Arguments:** `trail`, to which the sections along the edge are added; `tell`, told of rounds.
-    """
+    """The edge state between a start that comes back and one that does not. The sections along the
+    edge are added to `trail`."""
     recurs, trail = _RECURS, [] if trail is None else trail
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)

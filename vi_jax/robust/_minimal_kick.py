@@ -109,10 +109,7 @@ def spread(count: int, size: int, seed: int) -> Kicks:
 def exits(
     settling: Settling, kick: Kick, directions: Kicks, inside: Any, outside: Any, points: int
 ) -> Exits:
-    """Of so many points between two radii of each ray, the first that does not come back.
-
-    **Arguments:** `inside` and `outside`, the radii of each ray, of which the latter is judged too.
-    """
+    """Of so many points between two radii of each ray, the first that does not come back."""
     parts = np.arange(1, points + 1) / points
     inside = np.broadcast_to(inside, len(directions)).astype(float)
     outside = np.broadcast_to(outside, len(directions)).astype(float)
@@ -154,9 +151,6 @@ def first_exits(
 
     The rays grow until one leaves, then points are set as densely again on what is not longer than
     the shortest way out, until that is not shortened any more.
-
-    **Arguments:** numbers of rays and of points on each; the largest norm of a kick, `None` for as
-    large as it takes to leave.
     """
     rays = spread(directions, kick.size, seed)
     reach = largest
@@ -198,10 +192,8 @@ def nearer(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, rounds: int, seed: int
 ) -> tuple[Row, float, float]:
     """A direction near another one that leaves sooner, by looking ever more closely around the
-    best: for a boundary without a derivative.
-
-    **Returns:** the direction, the last radius that comes back and the first that does not.
-    """
+    best: for a boundary without a derivative; and the last radius that comes back and the first
+    that does not."""
     rng = np.random.default_rng(seed)
     best: tuple[Row, float, float] = unit, 0.0, radius
     for _ in range(rounds):
