@@ -47,10 +47,7 @@ def names_of(problem: Shooting) -> tuple[str, ...]:
 
 
 def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scalar:
-    """A number of a motion, one of `names_of`.
-
-    **Arguments:** the equations; a solution, and what is observed of it; the name.
-    """
+    """A number, one of `names_of`, of a solution of which `seen` is observed."""
     if name in seen.averages:
         return seen.averages[name]
     if name in ("y_min", "y_max", "duration"):
@@ -75,7 +72,6 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
 
 
 def _on_section(problem: Shooting, x: Vector) -> State:
-    """The state on the first section of a solution."""
     if not problem.events:
         return problem.unravel(problem.parts(x)[1][0])
     legs, places = problem.sections(x)
@@ -124,7 +120,6 @@ class Held(AbstractCondition):
     value: Scalar
 
     def missing(self, problem, x, seen, chatters):
-        """Its difference from that value."""
         return quantity_of(problem, x, seen, self.name) - self.value
 
 
@@ -138,7 +133,6 @@ class HeldMultiplier(AbstractCondition):
     pair: bool = eqx.field(static=True)
 
     def missing(self, problem, x, seen, chatters):
-        """The characteristic polynomial at the value held."""
         matrix, root = seen.monodromy, self.value
         if self.pair:
             matrix, root = compound(matrix), self.value**2
@@ -176,26 +170,20 @@ def alone(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
 
 
 def as_held(values: dict[str, float], multipliers: np.ndarray) -> tuple[AbstractCondition, ...]:
-    """The conditions that numbers of these names have these values.
-
-    **Arguments:** `multipliers`, those of the motion that is begun with.
-    """
+    """The conditions that numbers of these names have these values; `multipliers`, those of the
+    motion that is begun with."""
+    greatest = complex(multipliers[0])
+    pair = abs(greatest.imag) > 1e-9
+    sign = 1 if pair or greatest.real > 0 else -1
     return tuple(
-        _multiplier(value, complex(multipliers[0]))
+        HeldMultiplier(jnp.asarray(sign * value, float), pair)
         if name == "multiplier"
         else Held(name, jnp.asarray(value, float))
         for name, value in values.items()
     )
 
 
-def _multiplier(size: float, greatest: complex) -> HeldMultiplier:
-    pair = abs(greatest.imag) > 1e-9
-    value = size if pair or greatest.real > 0 else -size
-    return HeldMultiplier(jnp.asarray(value, float), pair)
-
-
 def held_in_words(problem: Shooting) -> str:
-    """What is held, and where; host-side."""
     held = (c for c in problem.conditions if isinstance(c, Held | HeldMultiplier))
     named = ((c.name if isinstance(c, Held) else "multiplier", float(c.value)) for c in held)
     units = units_of(problem.machine)
@@ -203,12 +191,6 @@ def held_in_words(problem: Shooting) -> str:
         f"{name} = {in_unit(f'{value:.9g}', units, measured(name) or name)}"
         for name, value in named
     )
-
-
-def overtaken(problem: Shooting, step: Step) -> float:
-    """Positive where another multiplier is greater than the one that is held."""
-    held = (c for c in problem.conditions if isinstance(c, HeldMultiplier))
-    return max((c.overtaken(step.seen) for c in held), default=-1.0)
 
 
 class Exchange(eqx.Module):
@@ -230,7 +212,6 @@ class Exchange(eqx.Module):
     """r, there."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        """The equations, given F as `missing`."""
         jacobian, n = jax.jacfwd(problem.lacks)(x), self.left.size
         corner = jnp.zeros((1, 1), x.dtype)
         bordered = jnp.block([[jacobian[:, :n].T, self.right[:, None]], [self.left[None], corner]])
@@ -256,7 +237,6 @@ class Apart(AbstractCondition):
     value: Scalar
 
     def missing(self, problem, x, seen, chatters):
-        """Its difference from that value."""
         return self.row @ x - self.value
 
 
@@ -290,11 +270,9 @@ class Special(AbstractCondition):
         return not (self.kind == REST or (self.kind in SLIDING and self.impact is not None))
 
     def exchanged(self, problem, x, missing):
-        """Where branches cross, one of the equations is exchanged."""
         return missing if self.exchange is None else self.exchange.instead(problem, missing, x)
 
     def missing(self, problem, x, seen, chatters):
-        """The determinant, V⁻ or the clearance."""
         if self.kind == REST:
             return problem.rest_lost(x, self.impact, chatters)
         i = self.impact

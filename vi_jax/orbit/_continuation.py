@@ -105,7 +105,6 @@ def continue_orbit(
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
     problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    problem = _scaled(problem, ranges)
     start, before = _first_point(problem, x, orbit), problem.scale
     problem = sized(problem, start.x, start.seen.largest)
     (start,) = rescaled([start], before, problem.scale)
@@ -119,7 +118,6 @@ def continue_orbit(
 
 
 def _check_orbit(orbit: Orbit) -> None:
-    """**Raises:** `ValueError` unless this is one orbit."""
     if not isinstance(orbit, Orbit) or orbit.residual.ndim:
         raise ValueError(
             f"Argument `orbit` must be one `Orbit`, not a batch or a state, but got {short(orbit)}."
@@ -165,7 +163,7 @@ def _freed(
     **Raises:** `ValueError` for what cannot be freed or held.
     """
     if not free:
-        return problem, x, [bounds]
+        return _scaled(problem, [bounds]), x, [bounds]
     machine, values, ranges = problem.machine, [], []
     for name, given in free.items():
         check_leaf(machine, name, argument="free")
@@ -183,15 +181,19 @@ def _freed(
             raise ValueError(
                 f"Argument `fixed` must name what the orbit has, but its {name} is {target:g}."
             )
-    ranges.append(bounds)
-    wide = dataclasses.replace(
-        problem, parameters=(*free, *problem.parameters), conditions=as_held(targets, multipliers)
-    )
-    corners = wide.corners(ranges)
-    needed = steps_of(problem.method, corners, problem.like, flown(problem, x))
-    steps = max(problem.steps, needed)
-    wide = dataclasses.replace(wide, steps=steps)
+    wide = dataclasses.replace(problem, conditions=as_held(targets, multipliers))
+    wide = _widened(wide, x, tuple(free), ranges := [*ranges, bounds])
     return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
+
+
+def _widened(
+    problem: Shooting, x: np.ndarray, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
+) -> Shooting:
+    """The equations with these parameters before their own, and as many steps as flights need
+    anywhere in the intervals of all of them."""
+    wide = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
+    steps = steps_of(problem.method, wide.corners(ranges), problem.like, flown(problem, x))
+    return _scaled(dataclasses.replace(wide, steps=max(problem.steps, steps)), ranges)
 
 
 def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
@@ -332,7 +334,6 @@ def boundary(
 
 
 def _check_point(point: Point) -> None:
-    """**Raises:** `TypeError` or `ValueError` unless this is a bifurcation that can be followed."""
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
     if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, CROSSING, *TOUCHING):
         raise ValueError(
@@ -375,10 +376,7 @@ def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Sh
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the part that vanishes it could not be solved for beyond
         old, start, impact = without_part(old, point.step, change)
-    two = dataclasses.replace(old, parameters=(parameter, *old.parameters))
-    corners = two.corners(bounds)
-    steps = max(old.steps, steps_of(old.method, corners, old.like, flown(old, start)))
-    problem = _scaled(dataclasses.replace(two, steps=steps), bounds)
+    problem = _widened(old, start, (parameter,), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)
     exchange = None

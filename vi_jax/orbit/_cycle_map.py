@@ -162,19 +162,16 @@ def cycle_map(
     if section is not None:
         require("section", section)
         machine = at_section(machine, section)
-    method = chosen(machine, method, _usual(machine))
+    usual = preset(machine)
+    if isinstance(usual, FixedStep):  # which errs more than an orbit should
+        usual = Adaptive(diffrax.Tsit5(), rtol=1e-11)
+    method = chosen(machine, method, usual)
     method.check(machine)
     # Tolerances are numbers: another one must not be another program.
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
     return CycleMap(machine, carried, count("cycles", cycles, least=1), may_rest(machine))
-
-
-def _usual(machine: AbstractMachine) -> AbstractMethod:
-    """The preset, unless its steps are fixed: they err more than an orbit should."""
-    usual = preset(machine)
-    return Adaptive(diffrax.Tsit5(), rtol=1e-11) if isinstance(usual, FixedStep) else usual
 
 
 def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:

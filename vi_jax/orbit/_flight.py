@@ -48,11 +48,9 @@ class Event(NamedTuple):
         return event.name or f"{event.word} {place}"
 
     def later(self, cycles: int) -> "Event":
-        """The same event so many cycles later in the motion."""
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
 
     def of(self, machine: AbstractMachine) -> AbstractEvent:
-        """The machine's event of this number."""
         return events_of(machine)[self.number]
 
 
@@ -84,7 +82,6 @@ def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
 
 
 def on_stop(machine: AbstractMachine, number: int, state: State) -> State:
-    """The state with its body at rest on stop number `number`."""
     stop = stops_of(machine)[number]
     body = machine.coordinates[stop.coordinate]
     return body.placed(state, stop.place, jnp.zeros_like(body.velocity(state)))
@@ -108,16 +105,13 @@ class Flight(eqx.Module):
         return SmoothMachine(self.machine, self.modes, self.contact)
 
     def holding(self, contact: Scalars) -> "Flight":
-        """The same with these contacts."""
         return Flight(self.machine, self.modes, self.method, self.like, contact)
 
     def letting_go(self, coordinate: int) -> "Flight":
-        """The same with the body of this coordinate free."""
         others = (0.0 * x if k == coordinate else x for k, x in enumerate(self.contact))
         return self.holding(tuple(others) if len(self.contact) > 1 else ())
 
     def unravel(self, u: Vector) -> State:
-        """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
     def step(

@@ -102,7 +102,6 @@ class Table(abc.ABC):
 
     @property
     def scale(self) -> np.ndarray:
-        """The size of each unknown."""
         return self.problem.scale
 
     @abc.abstractmethod
@@ -117,7 +116,6 @@ class Table(abc.ABC):
         return new._replace(good=np.asarray(False)) if aside else new
 
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-        """The point between two at which a test is zero."""
         return located(self.problem, here, new, test)
 
     def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
@@ -326,8 +324,6 @@ def _falls(row: Event, begin: float, new: Step) -> bool:
 
 
 def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
-    """Points with their tangents in unknowns of other sizes."""
-
     def tangent(step: Step) -> np.ndarray:
         along = np.asarray(step.tangent) * before / after
         return along / np.linalg.norm(along)
@@ -450,7 +446,6 @@ class Closing:
         return begin
 
     def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
-        """Motions with their angles at the turns nearest to those of another one."""
         problem, xs = self.table.problem, xs.copy()
         angles = angles_in(problem.machine, problem.like)
         if angles is not None:

@@ -105,9 +105,9 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
         return None
     values, vectors = np.linalg.eig(matrix)
     first = vectors[:, np.argmin(np.abs(values - 1j * turn))]
-    like = np.stack([first.real, first.imag])
-    y, scale = np.concatenate([guess[1:], [turn], like.ravel()]), problem.scale[1:]
-    scale = np.concatenate([scale, [turn], np.ones(2 * n)])
+    like = np.stack([np.real(first), np.imag(first)])
+    y, size = np.concatenate([guess[1:], [turn], like.ravel()]), np.inf
+    scale = np.concatenate([problem.scale[1:], [turn], np.ones(2 * n)])
     for _ in range(20):
         missing, jacobian = _lacks(problem, y, like)
         if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):

@@ -223,7 +223,7 @@ def _rooms(problem: Shooting, x):
         flight = problem.flight(machine, leg)
         _, _, path = flight.fly(s0, s1, after, problem.steps)
         h = (s1 - s0) / problem.steps
-        _, rooms = turning(Path(flight, *path, h, not problem.events))
+        _, rooms = turning(Path(flight, path[0], path[1], h, not problem.events))
         return jnp.stack([r.room for r in rooms]), jnp.stack([r.clock for r in rooms])
 
     ends = problem.ends(clock, problem.period(x))
@@ -252,8 +252,8 @@ def touched(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """What the machine says where its motion grazes: state, ∂h, a, d(h)/d(parameter), the gradient
-    of dh/ds, and the jump's derivative."""
+    """Where the motion grazes its state, ∂h, a, the derivative of h by the parameter, and the
+    gradient of dh/ds."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
@@ -471,7 +471,6 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
 
 @on_host
 def _carried(problem: Shooting, x, leg, s0, s1):
-    """Derivative of the flight of a leg between two readings of the clock."""
     machine = problem.at(x)
     u = ravel_pytree(problem.state_at(x, leg, s0))[0]
     flight = problem.flight(machine, leg)
@@ -480,7 +479,6 @@ def _carried(problem: Shooting, x, leg, s0, s1):
 
 @on_host
 def _through(problem: Shooting, x, leg):
-    """The saltation matrix of the event that begins a leg."""
     clock, states = problem.parts(x)
     return problem.saltation(problem.at(x), leg, clock[leg], states[leg])[0]
 
@@ -505,10 +503,7 @@ def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) 
 
 
 def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) -> Section:
-    """The smooth motion on its first section.
-
-    **Arguments:** as `touch_at`; the first touch.
-    """
+    """The smooth motion on its first section."""
     period = float(problem.period(x))
     place = period * (np.floor(touch.clock / period) + 1)
     leg, within = problem.leg_at(x, place if problem.events else 0.0)
@@ -521,8 +516,6 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    """The state at a clock, and its derivative along the unknowns."""
-
     def there(x):
         return ravel_pytree(problem.state_at(x, leg, s))[0]
 

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from ._conditions import alone, overtaken, rates_at
+from ._conditions import HeldMultiplier, alone, rates_at
 from ._corrector import BESIDE, Step, advance, crossing, way
 from ._flight import LANDS, LEAVES
 from ._flight import Event as MotionEvent
@@ -143,7 +143,6 @@ class MotionTable(Table):
         self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
-        """The point at this length along the tangent."""
         new = super().advance(x, tangent, length)
         if not self.problem.autonomous or not bool(new.good):
             return new
@@ -152,25 +151,23 @@ class MotionTable(Table):
         return new._replace(good=np.asarray(size_of(self.problem, new.x) > _STILL * self.size))
 
     def ends(self, here: Step, new: Step) -> list[Event]:
-        """The rows for a step between two points."""
         rows = bounds_of(self)
         if self.problem.autonomous:
             rows.append(Event(self._not_too_long(here), lambda at: Ending(at, "long")))
-        if self.problem.conditions:
-            ahead = lambda step: -overtaken(self.problem, step)
-            rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
+        for held in self.problem.conditions:
+            if isinstance(held, HeldMultiplier):
+                ahead = lambda step, held=held: -held.overtaken(step.seen)
+                rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
         rows += self._lost(here)
         return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
-        """The point at this share of the way between two."""
         return self.advance(here.x, here.tangent, share * way(self.problem, here, last))
 
     def _point(self, kind: str, step: Step, *args: Any, **more: Any) -> Point:
         return point_at(self.problem, step, kind, *args, **more)
 
     def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
-        """The end of a branch at a special point."""
         return Ending(at, kind, self._point(kind, at, detail, impact))
 
     def _divided(self, at: Step) -> Ending:
@@ -448,8 +445,6 @@ class MotionTable(Table):
         return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
-        """The point where branches cross (see `crossing`)."""
-
         def admits(step: Step, length: float) -> bool:
             # So close to where they cross the corrector may find the other branch.
             return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)

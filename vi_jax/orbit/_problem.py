@@ -4,7 +4,7 @@ flight (`problem_of`), or of one that rests (`legs_of`)."""
 import dataclasses
 from collections.abc import Sequence
 from math import ceil
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,14 +111,12 @@ def cycles_flown(
 
 
 def flown(problem: Shooting, x: Unknowns) -> int:
-    """The `cycles_flown` of a solution."""
     places, _, period = problem.values(x)
     return cycles_flown(places, problem.events, period, problem.cycles)
 
 
 @compiled
 def _fewest(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
-    """The number of steps in a cycle if each is as long as the method allows."""
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
@@ -148,16 +146,11 @@ _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
-class _Way(NamedTuple):
-    """A motion over one period, followed from event to event."""
+# The clock of an event, since the section.
+Placed = tuple[float, Event]
 
-    states: np.ndarray
-    """Just before each event, and at the end of the period; (events + 1, states)."""
-    modes: tuple[tuple[float, ...], ...]
-    """The machine's modes in each flight."""
-
-
-Problem = TypeVar("Problem", bound=Shooting)
+# The machine's modes in each flight.
+Modes = tuple[tuple[float, ...], ...]
 
 
 def check_parameter(
@@ -203,25 +196,22 @@ def problem_of(
     needed = cycles_flown(places, events, period, cycles)
     steps = steps_of(carried, corners, bare(orbit.state), needed)
     blank = Shooting(machine, carried, bare(orbit.state), cycles, (), (), steps, (parameter,))
-    way = _followed(blank, orbit.state, found, period)
-    _check_instants(blank, found, way)
-    while sized_by_motion(blank):
-        doubled = dataclasses.replace(blank, steps=2 * blank.steps)
-        again = _followed(doubled, orbit.state, found, period)
-        apart = np.max(np.abs(again.states - way.states) / _sizes(again.states))
-        if doubled.steps > _MOST:
-            break
-        blank, way = doubled, again  # the finer one: along the branch flights may ask for more
-        if apart < _SETTLED:
-            break
+    states, modes = _followed(blank, orbit.state, found, period)
+    _check_instants(blank, found, states, modes)
+    while sized_by_motion(blank) and 2 * blank.steps <= _MOST:
+        before = states
+        blank = dataclasses.replace(blank, steps=2 * blank.steps)
+        states, modes = _followed(blank, orbit.state, found, period)
+        if np.max(np.abs(states - before) / _sizes(states)) < _SETTLED:
+            break  # the finer one stays: along the branch flights may ask for more
         blank = dataclasses.replace(blank, method=blank.method.tighter())
-    problem = dataclasses.replace(blank, events=events, modes=way.modes)
-    states = way.states[:-1] if found else way.states
+    problem = dataclasses.replace(blank, events=events, modes=modes)
+    states = states[:-1] if found else states
     x = problem.pack(places, states, [leaf(machine, parameter)], period)
     return sized(problem, x), np.asarray(x)
 
 
-def sized(problem: Problem, x: Unknowns, largest: np.ndarray | None = None) -> Problem:
+def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
     """The equations with the sizes of the clock, for which a cycle is 2π, and of the numbers of the
     state: half their largest moduli in the course of this solution."""
     _, states, period = problem.values(x)
@@ -250,13 +240,15 @@ def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
     return 0.5 * np.where(most > small * largest, most, largest)
 
 
-def _check_instants(blank: Shooting, found: list[tuple[float, Event]], way: _Way) -> None:
+def _check_instants(
+    blank: Shooting, found: list[Placed], states: np.ndarray, in_flight: Modes
+) -> None:
     """**Raises:** `ValueError` for an event that another one sets off, or the clock as it begins
     anew: its guard is not zero there, so that the equations have no place for it."""
     machine, last = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
         if abs(place - last) <= _SAME_INSTANT and event.cycle is None:
-            state, modes = blank.unravel(jnp.asarray(way.states[i])), way.modes[i - 1]
+            state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
             if abs(float(guard_at(before, event, jnp.asarray(place), state))) > _OFF_ZERO:
@@ -294,9 +286,10 @@ def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
 
 
 def _followed(
-    blank: Shooting, state: State, found: list[tuple[float, Event]], period: float
-) -> _Way:
-    """A motion of one period, followed from event to event; `blank`, the equations without events."""
+    blank: Shooting, state: State, found: list[Placed], period: float
+) -> tuple[np.ndarray, Modes]:
+    """A motion of one period, from event to event: the states just before each of them and at the
+    end, and the modes; `blank`, the equations without events."""
     machine = blank.machine
     own, state = modes_of(state), bare(state)
     modes = begin_modes(machine, jnp.zeros(()), state, own)
@@ -315,10 +308,10 @@ def _followed(
     first = found[0][1] if found and found[0][1].cycle == 0 else None
     if first is not None and (renews(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
-    return _Way(np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),))
+    return np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),)
 
 
-def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
+def events_in(orbit: Orbit) -> list[Placed]:
     """The events of a motion, with the clock of each since the section, in their order."""
     machine, cycles = orbit.machine, int(orbit.cycles)
     autonomous = is_autonomous(machine, bare(orbit.state))
@@ -337,7 +330,7 @@ def events_in(orbit: Orbit) -> list[tuple[float, Event]]:
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
-def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[tuple[float, Event]]]:
+def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
     """When each cycle of a motion begins, and its impacts, switches and jumps, by a simulation."""
     machine, cycles = orbit.machine, int(orbit.cycles)
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LISTED + 1)
@@ -377,10 +370,7 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
 
 @compiled
 def _carry(blank: Shooting, modes, s0, s1, u):
-    """The state at clock `s1`, from the state `u` at `s0`, without an event in between.
-
-    **Arguments:** `blank`, the problem without events; `modes`, the machine's.
-    """
+    """The state at clock `s1`, from the state `u` at `s0`, without an event in between."""
     flight = Flight(blank.machine, modes, blank.method, blank.like)
     return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
 
@@ -401,8 +391,6 @@ _INSTEAD = (
 
 # A body this close to its stop (relative to the motion, see `distance`) is on it: a choice.
 _ON = 1e-9
-
-Placed = tuple[float, Event]
 
 
 def legs_of(
@@ -471,13 +459,9 @@ def _state_at(machine, method, like, row, own, clock):
     return in_rows(simulate_pool(start, row[None], 1, options).sections, 2)[0, -1]
 
 
-def _modes(
-    problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray
-) -> tuple[tuple[float, ...], ...]:
-    """The machine's modes in each leg.
-
-    **Arguments:** the equations; the state on the section; clock and state of each event.
-    """
+def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
+    """The machine's modes in each leg, from the state on the section, and clock and state of each
+    event."""
     machine, start = problem.machine, jnp.zeros(())
     modes = begin_modes(machine, start, bare(state), modes_of(state))
     found = [modes] * problem.legs

@@ -189,7 +189,6 @@ class Shooting(eqx.Module):
 
     @property
     def legs(self) -> int:
-        """Number of legs, from event to event: at least one."""
         return max(1, len(self.events))
 
     @property
@@ -209,7 +208,6 @@ class Shooting(eqx.Module):
 
     @property
     def impacts(self) -> tuple[int, ...]:
-        """Which of the events are impacts."""
         stops = len(stops_of(self.machine))
         events = enumerate(self.events)
         return tuple(i for i, event in events if event.number < stops and event.use != LEAVES)
@@ -305,11 +303,9 @@ class Shooting(eqx.Module):
         return np.concatenate([scale[:half], scale[len(self.events) : end]])
 
     def unravel(self, u: Vector) -> State:
-        """A state from its vector."""
         return ravel_pytree(self.like)[1](u)
 
     def modes_in(self, leg: Leg) -> tuple[Array, ...]:
-        """The machine's modes in a leg."""
         if not self.modes[0]:
             return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
@@ -349,7 +345,6 @@ class Shooting(eqx.Module):
         return self._each(leg, value, s, u)
 
     def ends(self, clock: Float[Array, " legs"], period: Scalar) -> Float[Array, " legs"]:
-        """Clock at the end of each leg."""
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
     def leg_at(self, x: Unknowns, s: Any) -> tuple[Array, Array]:
@@ -478,7 +473,8 @@ class Shooting(eqx.Module):
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
             h = (s1 - begin.s) / self.steps
-            turns = turns_of(Path(self.flight(machine, leg), *path, h, not self.events))
+            flight = self.flight(machine, leg)
+            turns = turns_of(Path(flight, path[0], path[1], h, not self.events))
             largest = jnp.max(jnp.abs(path[1]), axis=0)
             return carried, passed, approach, order, turns, places, largest, begin
 
@@ -553,7 +549,7 @@ class Shooting(eqx.Module):
                 begin = last(i)
                 path = self.flown(machine, i, begin, ends[i])[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
-                pull = pull_of(Path(flight, *path, h, not self.events))
+                pull = pull_of(Path(flight, path[0], path[1], h, not self.events))
                 least = jnp.minimum(least, pull.room)
         return least
 

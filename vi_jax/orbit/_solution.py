@@ -68,7 +68,7 @@ def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
 
 @compiled
 def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
-    """Number, clock, V⁻ and stop of the impacts of a motion from its section on."""
+    """Number, clock, V⁻ and stop of the impacts."""
     machine, cycles = problem.at(x), problem.cycles
     run = simulate(machine, state, cycles, method=problem.method, impact_log=_LISTED, rests=True)
     log = run.impact_log
@@ -96,7 +96,6 @@ def _lost(problem: Shooting, xs: Array, states: State) -> Array:
 
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
-    """The solution at a step as an `Orbit`."""
     seen, machine = step.seen, problem.at(step.x)
     sections, residual = sections_of(problem, step.x)
     state = _first(problem, step.x, sections)

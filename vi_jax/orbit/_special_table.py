@@ -39,7 +39,7 @@ from ._corrector import (
 )
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
-from ._motion_table import pulled, room
+from ._motion_table import pulled, room, tests_of
 from ._shooting import ROUNDING, Shooting
 from ._surgery import ALIKE, ROUNDED, halves_apart, may_be_symmetric, repeated, several
 from ._words import (
@@ -110,7 +110,6 @@ class SpecialTable(Table):
         return super().stalled(steps)
 
     def ends(self, here: Step, new: Step) -> list[Event]:
-        """The rows for a step between two points."""
         return [
             *bounds_of(self), *self._grazings(here), *self._resonances(), *self._mirror(here),
             *self.closing.rows(here, new),
@@ -302,7 +301,9 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     def plain(function: Callable[[Step], float]) -> Test:
         return lambda step, like: (function(step), None)
 
-    fold, doubling = plain(lambda s: _product(s, -1)), plain(lambda s: _product(s, 1))
+    fold, doubling = (
+        plain(lambda s, kind=kind: tests_of(s)[kind]) for kind in (CROSSING, DOUBLING)
+    )
     bare = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
@@ -320,20 +321,9 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
 
 
-def _product(step: Step, sign: int) -> float:
-    """det(M ± I)."""
-    M = step.seen.monodromy
-    return _determinant(M + sign * np.eye(len(M)))
-
-
 def _others(step: Step, sign: int) -> float:
     """The product of all eigenvalues of M ± I but one, where that one is zero."""
     return float(minors(step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))))
-
-
-def _determinant(matrix: np.ndarray) -> float:
-    """NaN of what is not finite, as where an impact is lost."""
-    return float(np.linalg.det(matrix)) if np.isfinite(matrix).all() else np.nan
 
 
 def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:

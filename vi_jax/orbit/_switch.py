@@ -82,7 +82,6 @@ def _doubled(point: Point, distance: float) -> Orbit:
 
 
 def _crossed(point: Point, distance: float) -> Orbit:
-    """A motion of the branch that crosses here."""
     problem, x = point.problem, point.step.x
     jacobian = jacobian_at(problem, x) * point.scale
     # Here the equations have two null vectors: one leads along this branch, the other off it.
@@ -213,7 +212,6 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
 
 
 def _check_plain(problem: Shooting) -> None:
-    """**Raises:** `ValueError` unless rigid stops are all that the machine has."""
     if problem.modes[0] or others_of(problem.machine):
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "

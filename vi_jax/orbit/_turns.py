@@ -85,11 +85,9 @@ class _Guard(NamedTuple):
     number: int
 
     def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
-        """The guard in a state."""
         return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
 
     def at(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        """The guard, by the state's vector."""
         return self.value(flight, s, flight.unravel(u))
 
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:

@@ -71,7 +71,6 @@ AT_CODIMENSION_TWO = {
 
 
 def one(kind: str) -> str:
-    """A kind with its article, for messages."""
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 

@@ -107,17 +107,8 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
         )
     section = 0.0 if scene.section_phase is None else scene.section_phase
     dtype = jnp.result_type(float, *numbers)
-    arrays = (jnp.asarray(x, dtype) for x in (*numbers, section))
-    return _compiled_orbits(*arrays, n=count("cycles", cycles, least=1))
-
-
-@compiled
-def _compiled_orbits(zeta, xi, k, d, section, *, n: int) -> ClosedFormOrbits:
-    """As `one_impact_orbits`, compiled.
-
-    **Arguments:** as `one_impact_orbits`.
-    """
-    return one_impact_orbits(zeta, xi, k, d, n, section)
+    *arrays, section = (jnp.asarray(x, dtype) for x in (*numbers, section))
+    return _one_impact_orbits(*arrays, count("cycles", cycles, least=1), section)
 
 
 def one_impact_orbits(
@@ -171,6 +162,9 @@ def one_impact_orbits(
     )
     order = jnp.lexsort((-v, ~exists, ~admissible))
     return jax.tree.map(lambda x: x[order], orbits)
+
+
+_one_impact_orbits = compiled(one_impact_orbits)
 
 
 def _dot(a, b):

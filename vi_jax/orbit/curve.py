@@ -48,7 +48,6 @@ def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
 
 
 def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any]:
-    """Kind, place and extremes of each special point, as variables along `special`."""
     orbits = [point.orbit for point in special]
     # Without any the words are empty ones, whose type files can hold.
     found = {
@@ -66,7 +65,6 @@ def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any
 
 
 def _numbers(found: object) -> dict[str, np.ndarray]:
-    """Numbers by name, of what a function of an orbit returned."""
     named = found if isinstance(found, Mapping) else {"value": found}
     numbers = {str(name): np.asarray(x) for name, x in named.items()}
     for name, x in numbers.items():
@@ -101,7 +99,6 @@ class Curve(InWords, abc.ABC):
 
     @property
     def scale(self) -> np.ndarray:
-        """The size of each unknown."""
         return self.problem.scale
 
     @property
@@ -223,7 +220,6 @@ class Curve(InWords, abc.ABC):
 
     @cached_property
     def _hits(self) -> list[Hits]:
-        """The impacts of each motion."""
         return [hits_of(self.problem, step) for step in self.steps]
 
     @property

@@ -384,7 +384,6 @@ def find_orbit(
 
 
 def _check_guess(machine: AbstractMachine, state: State) -> None:
-    """**Raises:** `ValueError` unless this is a state, or as many of them in rows."""
     check_leaves("guess", state)
     axes = axes_of(machine, state)
     if axes > 1:
@@ -427,7 +426,6 @@ def _judged(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
     multipliers: bool,
 ) -> Orbit:  # fmt: skip
-    """The orbit found from one guess, with all that is said about it."""
     machine, cycles = the_map.machine, the_map.cycles
     guess = _in_later_modes(the_map, jax.lax.stop_gradient(guess))
     moved, start, place = moved_from_impacts(the_map, guess, impact_log)
@@ -513,7 +511,6 @@ def _comes_back(start: State, seen: ObservedArc) -> Flag:
 
 
 def _at_section(guess: State, section: Array, modes: Array | None) -> State:
-    """A state on the section from its numbers, and the machine's own modes there."""
     state = ravel_pytree(bare(guess))[1](section)
     return state if modes is None else HybridState(state, tuple(modes))
 
@@ -521,7 +518,6 @@ def _at_section(guess: State, section: Array, modes: Array | None) -> State:
 def _least_period(
     sections: Float[Array, "cycles states"], error: Array, unit: Array, angles: np.ndarray | None
 ) -> Array:
-    """The fewest cycles after which the sections repeat."""
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
     slack = jnp.maximum(_slack(sections.dtype), 100 * error / unit)

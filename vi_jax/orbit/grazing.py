@@ -5,7 +5,7 @@ machine is simulated at some of these values.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -114,15 +114,9 @@ def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
 
 
 def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
-    """What the local map settles on, at each offset of the parameter."""
     found = _iterated(local, offsets)
     near = found.depth <= local_depths(local, offsets)
     return found._replace(period=np.where(near, found.period, -1))
-
-
-def lanes_of(found: Settled, which: Any) -> Settled:
-    """Some of the lanes, by number or by flag."""
-    return Settled(*(part[which] for part in found))
 
 
 def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
@@ -345,7 +339,6 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
 
 
 def alike(forecast: Settled, machine: Simulated) -> np.ndarray:
-    """Whether forecast and machine settle on the same period, with the same impacts in it."""
     counted = np.isnan(machine.impacts) | (forecast.impacts == machine.impacts)
     return (forecast.period == machine.period) & (counted | (forecast.period <= 0))
 
@@ -378,7 +371,6 @@ class Motions(NamedTuple):
 
 @on_host
 def _position_of(problem: Shooting, states):
-    """The first coordinate in each state."""
     flat = states.reshape(-1, problem.states)
     return jax.vmap(lambda u: problem.machine.position(problem.unravel(u)))(flat).reshape(
         states.shape[:-1]
@@ -401,8 +393,7 @@ def beside_grazing(
     on if it goes far away."""
     sparse, n = offsets[::_SPARSE], len(offsets)
     machine = simulated(graze, np.concatenate([offsets, -sparse]))
-    here, there = (Simulated(*(part[which] for part in machine))
-                   for which in (slice(n), slice(n, None)))  # fmt: skip
+    here, there = (jax.tree.map(lambda a: a[:n], machine), jax.tree.map(lambda a: a[n:], machine))
     same = alike(found, here), alike(settled(graze.map, -sparse), there)
     beyond = Motions(offsets, here.period, here.impacts, positions(graze, offsets, here.places))
     return beyond, same, _far(here, graze.problem.cycles)
@@ -600,7 +591,7 @@ def grazing(
         "grazing", lambda: Interrupted("check of the grazing", unchecked),
         progress=progress, unit="value", total=len(offsets),
     ) as tell:  # fmt: skip
-        some = lanes_of(settles, slice(None, None, ASKED))
+        some = jax.tree.map(lambda a: a[::ASKED], settles)
         beside, same, far = beside_grazing(graze, offsets, some)
         checked, agreement = stretch(np.abs(offsets), *same)
         tell(len(offsets))
@@ -617,7 +608,7 @@ def _within(
     local map may go through other things than the machine does."""
     size = np.abs(found.forecast.offset)
     inside = (size >= checked[0]) & (size <= checked[1])
-    some = lanes_of(settles, inside)
+    some = jax.tree.map(lambda a: a[inside], settles)
     outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[inside], some)
     return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)
 
@@ -674,7 +665,6 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
 
 
 def _called(graze: Graze, number: int) -> str:
-    """What is touched, in words."""
     machine = graze.problem.machine
     if number >= len(stops_of(machine)):
         return Event(number).called(machine)

@@ -334,7 +334,6 @@ def lies_on_a_stop(orbit: Orbit) -> bool:
 
 
 def hits_in_words(orbit: Orbit) -> str:
-    """The impacts of a motion, and how often it rests."""
     words, rests = so_many(int(orbit.impacts), "impact"), int(orbit.rests)
     if rests:
         return f"{words} and {so_many(rests, 'rest')} on a stop"
@@ -390,7 +389,6 @@ class Orbits(InWords, list[Orbit]):
 
 
 def in_one_line(orbit: Orbit) -> str:
-    """A motion in one line."""
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
     stable = STABILITY[orbit.stability].partition(":")[0]

@@ -173,7 +173,6 @@ class _Saddle:
 
 
 def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
-    """One branch of a stable manifold."""
     ahead = side * saddle.stable
     here, grown = saddle.place, 0.0
     step, periods = spacing * _CLOSEST * 4, 1

@@ -67,17 +67,14 @@ class Kick(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of components."""
         return len(self.places)
 
     def rows(self, z: Kicks) -> Any:
-        """The states that kicks lead to."""
         rows = np.broadcast_to(self.start, (*z.shape[:-1], self.start.size)).copy()
         rows[..., self.places] += z / self.weights
         return rows
 
     def allowed(self, z: Kicks) -> Bool[np.ndarray, "..."]:
-        """Whether they stay within the bounds."""
         there = self.rows(z)[..., self.places]
         return np.asarray(((there >= self.low) & (there <= self.high)).all(axis=-1))
 
@@ -311,7 +308,6 @@ def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
 
 
 def _newton(edge: Edge, z: Row) -> tuple[Row, float] | None:
-    """A solution of Lagrange's equations near a kick, or `None`."""
     size, multiplier, last = z.size, None, np.inf
     for _ in range(_STEPS):
         step = _DIFFERENCE * np.linalg.norm(z)
@@ -518,7 +514,6 @@ def minimal_kick(
 
 
 def _smallest(kicks: list[MinimalKick], settling: Settling) -> MinimalKick:
-    """The kick of the least norm, with the others."""
     first, *others = sorted(kicks, key=lambda one: float(one.norm))
     return dataclasses.replace(first, others=tuple(others), lanes=settling.lanes)
 
@@ -557,10 +552,6 @@ def _kick_of(
     weights: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]],
 ) -> Kick:
-    """The kicks that are asked for.
-
-    **Raises:** `ValueError` or `TypeError` that names the argument.
-    """
     numbered = components(settling.state(np.arange(start.size, dtype=start.dtype)))
     places = {name: int(place) for name, place in numbered.items()}
     if isinstance(names, str):
@@ -592,7 +583,6 @@ def _kick_of(
 def _described(
     settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
 ) -> MinimalKick:
-    """A kick, with what simulation says of it."""
     z, residual, is_exact, edge = found
     aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
     verdicts = settling.judge(aside)
@@ -617,6 +607,5 @@ def _described(
 
 
 def _apart(a: MinimalKick, b: MinimalKick) -> float:
-    """How different two kicks are, relative to the norm of one."""
     one, other = (np.array([float(x) for x in kick.kick.values()]) for kick in (a, b))
     return float(np.linalg.norm(one - other) / np.linalg.norm(one))

@@ -89,7 +89,6 @@ class Settling:
         """Told of each start that is judged."""
 
     def starting(self, begin: float) -> "Settling":
-        """The same for starts at another clock."""
         new = copy.copy(self)
         new.begin = begin
         return new
@@ -100,7 +99,6 @@ class Settling:
         return sum(self._judged_so_far)
 
     def state(self, row: object) -> State:
-        """A state from its numbers."""
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
     def near(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -259,12 +257,10 @@ class Settling:
 
 
 def in_row(state: State) -> Row:
-    """The numbers of a state."""
     return np.asarray(in_rows(state, 0))
 
 
 def one_orbit(name: str, orbit: object) -> Orbit:
-    """**Raises:** `ValueError` unless this is one orbit that was found."""
     if not isinstance(orbit, Orbit) or orbit.residual.ndim or not bool(orbit.successful):
         raise ValueError(
             f"Argument `{name}` must be one orbit that was found, but is a batch, a failed search "
