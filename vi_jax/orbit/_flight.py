@@ -16,6 +16,7 @@ from ..flow import TIME, AbstractMethod, Integrals, SmoothMachine, carried, elap
 from ..machine import (
     AbstractEvent,
     AbstractMachine,
+    RigidStop,
     SoftStop,
     events_of,
     guard_of,
@@ -39,11 +40,12 @@ class Event(NamedTuple):
     ends; otherwise empty."""
 
     def called(self, machine: AbstractMachine) -> str:
-        """What messages call it: its name, or its kind and place among the machine's events of
-        that kind."""
+        """What messages call it: its name, or its side, or its kind and place among the machine's
+        events of that kind."""
         event, events = self.of(machine), events_of(machine)
-        if isinstance(event, SoftStop):
-            return event.name or f"{event.side} soft stop"
+        if isinstance(event, RigidStop | SoftStop):
+            soft = "soft " if isinstance(event, SoftStop) else ""
+            return event.name or f"{event.side} {soft}stop"
         place = sum(other.word == event.word for other in events[: self.number])
         return event.name or f"{event.word} {place}"
 

@@ -23,6 +23,7 @@ from ..machine import angles_in, nearest_images
 from ._corrector import Step, advance, located, off_by, on_host, way
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
+from ._surgery import halves_apart
 from .special import Point
 
 # Reasons to end that a curve has of itself: Ctrl-C was pressed, or the corrector has no answer.
@@ -96,6 +97,9 @@ class Table(abc.ABC):
     their order.
     """
 
+    symmetric: bool = False
+    """Whether a motion can become its own image, or cease to be it."""
+
     def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
         self.problem, self.bounds = problem, bounds
         self.closing = Closing(self)
@@ -117,6 +121,10 @@ class Table(abc.ABC):
 
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         return located(self.problem, here, new, test)
+
+    def images(self, step: Step) -> np.ndarray:
+        """How far a motion is from being its own image; empty if it cannot be."""
+        return halves_apart(self.problem, step, mirrored=True) if self.symmetric else np.zeros(0)
 
     def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
         """What happens between two points without ending the curve, in its order."""

@@ -252,8 +252,8 @@ def touched(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """Where the motion grazes its state, ∂h, a, the derivative of h by the parameter, and the
-    gradient of dh/ds."""
+    """Where the motion grazes its state, ∂h, a, the derivative of h by the parameter, the gradient
+    of dh/ds, and the kick of a rigid stop."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
@@ -272,21 +272,18 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
 
         return guard_rates(field, guard, s, problem.unravel(u))
 
-    gradient = jax.grad(lambda u: distance(machine, s, u))(u)
-    fast = jax.grad(lambda u: rates(u).v)(u)
-    return u, gradient, rates(u).a, slope, fast
-
-
-@on_host
-def _struck(problem: Shooting, x, number: int, leg, s, u, push):
-    """How fast the jump of an impact changes along a direction."""
-    machine = problem.at(x)
-
     def jumped(u):
         state = jump_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
         return ravel_pytree(state)[0]
 
-    return jax.jvp(jumped, (u,), (push,))[1]
+    gradient = jax.grad(lambda u: distance(machine, s, u))(u)
+    fast, rate, kick = jax.grad(lambda u: rates(u).v)(u), rates(u).a, None
+    if number < len(stops_of(machine)):
+        push = fast / (fast @ fast)
+        unit = jnp.linalg.norm(gradient * problem.sizes[1:]) / problem.sizes[0]
+        after = jax.jvp(jumped, (u - _SLOW * unit * push,), (push,))[1]
+        kick = -jnp.sqrt(2 * rate) * (after - push)
+    return u, gradient, rate, slope, fast, kick
 
 
 def touch_at(
@@ -294,18 +291,14 @@ def touch_at(
 ) -> Touch:
     """All about one touch; `along`, the derivative of the motion by the parameter."""
     event = events_of(problem.machine)[number]
-    u, gradient, rate, slope, fast = _at_touch(problem, x, along, number, leg, clock)
+    u, gradient, rate, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
         raise ValueError(
             f"Argument `point` must be a grazing at which the motion turns, but the "
             f"distance's second derivative is {float(rate):.3g} there."
         )
-    if number < len(stops_of(problem.machine)):
-        push = fast / (fast @ fast)
-        unit = np.linalg.norm(gradient * np.asarray(problem.sizes)[1:]) / problem.radian
-        near = u - _SLOW * unit * push
-        after = _struck(problem, x, number, leg, clock, near, push)
-        kick = Kick(-np.sqrt(2 * rate) * (after - push), 0.5)
+    if impact is not None:
+        kick = Kick(impact, 0.5)
     elif event.holds_mode:
         kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
     else:

@@ -247,7 +247,7 @@ class MotionTable(Table):
         """The rows of places where the two halves of the period become alike, or images of each
         other: beyond, the same motions come again, observed half a period later or in the
         mirror."""
-        for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self._images)):
+        for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self.images)):
             begin = apart(here)
             if np.linalg.norm(begin) < ROUNDED:
                 continue
@@ -438,10 +438,10 @@ class MotionTable(Table):
 
     def _springs(self, here: Step, at: Step) -> bool:
         """Whether the branch springs there: halves of a period are alike, or images."""
-        apart, images = self._halves(at), self._images(at)
+        apart, images = self._halves(at), self.images(at)
         if apart.size and np.linalg.norm(apart) < ALIKE:
             return True
-        before = np.linalg.norm(self._images(here))
+        before = np.linalg.norm(self.images(here))
         return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
@@ -457,14 +457,8 @@ class MotionTable(Table):
         """How the second half of the period differs from the first; empty if it cannot be alike."""
         return halves_apart(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
 
-    def _images(self, step: Step) -> np.ndarray:
-        """How far the motion is from being its own image; empty if it cannot be."""
-        if not self.symmetric:
-            return np.zeros(0)
-        return halves_apart(self.problem, step, mirrored=True)
-
     def _apart(self, step: Step) -> float:
-        return float(np.linalg.norm(self._images(step)))
+        return float(np.linalg.norm(self.images(step)))
 
 
 def _brief_flight(problem: Shooting, at: Step) -> int | None:

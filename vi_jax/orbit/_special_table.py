@@ -101,7 +101,7 @@ class SpecialTable(Table):
         """How a curve ends that the corrector follows no further: perhaps where the motion becomes
         symmetric."""
         last = steps[-1]
-        if self.symmetric and np.linalg.norm(self._images(last)) < ALIKE:
+        if self.symmetric and np.linalg.norm(self.images(last)) < ALIKE:
             for here in reversed(steps):
                 root = way(self.problem, here, last)
                 if root > MOST * BESIDE:
@@ -159,31 +159,27 @@ class SpecialTable(Table):
     def _mirror(self, here: Step) -> Iterator[Event]:
         """Where the motion becomes symmetric: beyond, the same ones come again in the mirror, and
         what grazed on one side is passed through on the other."""
-        begin = self._images(here) if self.symmetric else np.zeros(0)
+        begin = self.images(here)
         if np.linalg.norm(begin) < ROUNDED:
             return
 
         def ending(at: Step) -> Ending | None:
-            if np.linalg.norm(self._images(at)) >= ALIKE:
+            if np.linalg.norm(self.images(at)) >= ALIKE:
                 return None
             return Ending(self._symmetric(here, way(self.problem, here, at)) or at, SYMMETRY)
 
-        yield Event(lambda step: float(np.dot(begin, self._images(step))), ending)
-
-    def _images(self, step: Step) -> np.ndarray:
-        """How far the motion is from being its own image."""
-        return halves_apart(self.problem, step, mirrored=True)
+        yield Event(lambda step: float(np.dot(begin, self.images(step))), ending)
 
     def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
         """The point about so far ahead at which the motion is symmetric and the curve is crossed by
         that of the symmetric motions; `beyond`, whether this one can be followed further."""
-        begin = self._images(here)
+        begin = self.images(here)
 
         def admits(step: Step, length: float) -> bool:
-            other = np.linalg.norm(self._images(step)) < ALIKE * BESIDE
+            other = np.linalg.norm(self.images(step)) < ALIKE * BESIDE
             return not other and (beyond or length < root)
 
-        alike = lambda step: float(np.dot(begin, self._images(step)))
+        alike = lambda step: float(np.dot(begin, self.images(step)))
         return crossing(self.problem, self.advance, here, root, alike, admits)
 
 

@@ -87,9 +87,6 @@ class _Guard(NamedTuple):
     def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
         return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
 
-    def at(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        return self.value(flight, s, flight.unravel(u))
-
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
         """d/ds of the guard along the flight, or another number of the same sign."""
         return self.rates(flight, flight.smooth, s, u).v
@@ -183,12 +180,14 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
     for number, event in enumerate(events_of(machine)):
         if number < len(stops_of(machine)) or number == section_number(machine):
             continue
-        at = found(_Guard(number))
+        guard = _Guard(number)
+        at = found(guard)
         # A body that friction lets go begins to slide with velocity and acceleration zero.
         away = at.place > begin + _TURNED * path.h
         facing = at.turns & (at.before > 0) & away
         if event.from_below:  # it touches nothing where it has not been below zero
-            value = jax.vmap(partial(_Guard(number).at, flight))(path.places, path.states)
+            along = lambda s, u, guard=guard: guard.value(flight, s, flight.unravel(u))
+            value = jax.vmap(along)(path.places, path.states)
             # Right behind the event itself it is zero, to rounding of either sign.
             below = -_ROUNDED * jnp.max(jnp.abs(value))
             facing = facing & at.happens & (jax.lax.cummin(value) < below)

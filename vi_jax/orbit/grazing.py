@@ -632,7 +632,7 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
     outcome, aperiodic = scenario_of(local, offsets, found)
     single = len(graze.touches) == 1 and first.kick.order == 0.5
     values = np.linalg.eigvals(local.matrix)
-    names = sorted({_called(graze, t.number) for t in graze.touches})
+    names = sorted({Event(touch.number).called(machine) for touch in graze.touches})
     unchecked = Grazing(
         parameter=graze.problem.parameters[0],
         value=float(graze.x[-1]),
@@ -662,14 +662,6 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
         units=stated(machine),
     )  # fmt: skip
     return unchecked, found
-
-
-def _called(graze: Graze, number: int) -> str:
-    machine = graze.problem.machine
-    if number >= len(stops_of(machine)):
-        return Event(number).called(machine)
-    stop = stops_of(machine)[number]
-    return stop.name or f"{stop.side} stop"
 
 
 def _brief_depth(graze: Graze) -> float:
