@@ -5,7 +5,6 @@ from ._continuation import continue_orbit as continue_orbit
 from ._cycle_map import CycleMap as CycleMap
 from ._cycle_map import adopted as adopted
 from ._cycle_map import cycle_map as cycle_map
-from ._follow import check_walk as check_walk
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
 from .curve import Boundary as Boundary
@@ -30,7 +29,6 @@ from .results import distance as distance
 from .results import distinct_among as distinct_among
 from .results import distinct_orbits as distinct_orbits
 from .results import in_one_line as in_one_line
-from .results import trimmed as trimmed
 from .results import unit_of as unit_of
 from .root_finders import AbstractRootFinder as AbstractRootFinder
 from .root_finders import Gradient as Gradient

@@ -454,6 +454,7 @@ class Closing:
         return begin
 
     def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
+        """Motions with their angles at the turns nearest to those of another one."""
         problem, xs = self.table.problem, xs.copy()
         angles = angles_in(problem.machine, problem.like)
         if angles is not None:
@@ -474,14 +475,14 @@ def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
     from its other sections on."""
     if problem.autonomous:
         return []
-    (clock, states), parameters = problem.parts(x), x[-len(problem.parameters) :]
+    clock, states = problem.parts(x)
     if not problem.events:
         sections = zip(*(part[1:] for part in problem.sections(x)), strict=True)
         later = [ravel_pytree(problem.state_at(x, leg, s))[0] for leg, s in sections]
-        return [jnp.concatenate([state, parameters]) for state in later]
+        return [jnp.concatenate([state, x[states.size :]]) for state in later]
     found, period = [], problem.period(x)
     for first in range(1, problem.legs):
         if problem.events[first:] + problem.events[:first] == problem.events:
             later = jnp.concatenate([clock[first:], clock[:first] + period])
-            found.append(problem.pack(later, jnp.roll(states, -first, axis=0), parameters))
+            found.append(problem.pack(later, jnp.roll(states, -first, axis=0), x))
     return found

@@ -82,17 +82,20 @@ def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
 
 
 @on_host
-def _lacks(problem: Shooting, y: Vector, like: Array) -> tuple[Vector, Array]:
-    """What y = (u, p, ω, Re v, Im v) lacks to be an equilibrium u with an eigenvector v to iω, in
-    length and phase like another one; and the derivative of that."""
+def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
+    """What (u, p, ω, Re v, Im v) = y·scale lacks to be an equilibrium u with an eigenvector v to
+    iω, in length and phase like another one, all relative to its size; and the derivative of
+    that."""
     n = problem.states
 
     def missing(y):
-        u, turn, (a, b) = y[:n], y[n + 1], y[n + 2 :].reshape(2, n)
-        field = partial(_rate, problem, problem.at(y[: n + 1]))
+        at, (c, d) = y * scale, y[n + 2 :].reshape(2, n)
+        u, turn, (a, b) = at[:n], at[n + 1], at[n + 2 :].reshape(2, n)
+        field = partial(_rate, problem, problem.at(at[: n + 1]))
         matrix = jax.jacfwd(field)(u)
-        sized = jnp.stack([like[0] @ a + like[1] @ b - 1, like[0] @ b - like[1] @ a])
-        return jnp.concatenate([field(u), matrix @ a + turn * b, matrix @ b - turn * a, sized])
+        rates = jnp.stack([field(u), matrix @ a + turn * b, matrix @ b - turn * a])
+        sized = jnp.stack([like[0] @ c + like[1] @ d - 1, like[0] @ d - like[1] @ c])
+        return jnp.concatenate([(rates / (scale[:n] * scale[n + 1])).ravel(), sized])
 
     return missing(y), jax.jacfwd(missing)(y)
 
@@ -103,25 +106,25 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
     n, turn, matrix = problem.states, 2 * np.pi / guess[0], _linear(problem, guess)[0]
     if not np.isfinite(matrix).all():
         return None
-    values, vectors = np.linalg.eig(matrix)
+    sizes = problem.scale[1 : n + 1]
+    scale = np.concatenate([problem.scale[1:], [turn], sizes, sizes])
+    values, vectors = np.linalg.eig(matrix * sizes / sizes[:, None])
     first = vectors[:, np.argmin(np.abs(values - 1j * turn))]
     like = np.stack([np.real(first), np.imag(first)])
-    y, size = np.concatenate([guess[1:], [turn], like.ravel()]), np.inf
-    scale = np.concatenate([problem.scale[1:], [turn], np.ones(2 * n)])
+    y, size = np.concatenate([guess[1:] / scale[: n + 1], [1.0], like.ravel()]), np.inf
     for _ in range(20):
-        missing, jacobian = _lacks(problem, y, like)
+        missing, jacobian = _lacks(problem, y, scale, like)
         if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):
             return None
-        # The smallest move, where a component is neutral.
-        move = scale * np.linalg.lstsq(jacobian * scale, missing)[0]
-        y = y - move
-        size = np.abs(move / scale).max()
+        move = np.linalg.lstsq(jacobian, missing)[0]  # the smallest, where a component is neutral
+        y, size = y - move, np.abs(move).max()
         if size <= 1e-14:
             break
-    if not size < _ZERO or abs(y[n + 1] - turn) >= _ALIKE * turn:
+    if not size < _ZERO or abs(y[n + 1] - 1) >= _ALIKE:
         return None
-    a, b = y[n + 2 :].reshape(2, n)
-    return np.concatenate([[2 * np.pi / y[n + 1]], y[: n + 1]]), a + 1j * b
+    y = y * scale
+    vector = y[n + 2 : 2 * n + 2] + 1j * y[2 * n + 2 :]
+    return np.append(2 * np.pi / y[n + 1], y[: n + 1]), vector / np.linalg.norm(vector)
 
 
 def _about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:

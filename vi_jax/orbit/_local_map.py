@@ -472,6 +472,7 @@ def _carried(problem: Shooting, x, leg, s0, s1):
 
 @on_host
 def _through(problem: Shooting, x, leg):
+    """The saltation matrix of the event that begins a leg."""
     clock, states = problem.parts(x)
     return problem.saltation(problem.at(x), leg, clock[leg], states[leg])[0]
 

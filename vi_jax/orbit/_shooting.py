@@ -273,16 +273,14 @@ class Shooting(eqx.Module):
             return jnp.asarray(x[0])
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
-    def pack(self, clock: Any, states: Any, parameters: Any, period: Any = None) -> Vector:
-        """The vector of unknowns.
-
-        **Arguments:** clock (legs,) and state (legs, states) at each event, both as in `parts`; the
-        parameters' values; of an autonomous machine the period.
-        """
+    def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Vector:
+        """The vector of unknowns, from `parts` of it, other unknowns that end with the same
+        parameters, and of an autonomous machine the period."""
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = clock.at[0].set(period)
-        return jnp.concatenate([clock, jnp.ravel(states), jnp.ravel(jnp.asarray(parameters))])
+        parameters = jnp.asarray(x)[-len(self.parameters) :]
+        return jnp.concatenate([clock, jnp.ravel(states), parameters])
 
     @property
     def scale(self) -> np.ndarray:

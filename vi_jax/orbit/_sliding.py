@@ -137,14 +137,15 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
         return None
     if mode:
-        force, _ = holding_force(problem, at, leg, number, place)
+        force = holding_force(problem, at, leg, number, place)[0]
         # A surface that is touched from one side holds only what the other side's field drives on.
         return (
             Change(number, place, (mode, 0.0, mode), False)
             if force < _ZERO * _unit(problem, at, held=True)
             else None
         )
-    return Change(number, place, (0.0, _away(problem, at, leg, number, place), 0.0), False)
+    away = holding_force(problem, at, leg, number, place)[2]
+    return Change(number, place, (0.0, away, 0.0), False)
 
 
 def _beginning(problem: Shooting, at: Step) -> Change | None:
@@ -155,7 +156,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
             continue
         before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
         if before:
-            force, rate = holding_force(problem, at, i, event.number, float(clock[i]))
+            force, rate, _ = holding_force(problem, at, i, event.number, float(clock[i]))
             found.append((abs(force), rate, event.number, float(clock[i]), before, after))
     if not found:
         return None
@@ -188,27 +189,20 @@ def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     machine, states = problem.at(x), problem.parts(x)[1]
     # An event's state is that before it; in a leg it is flown to.
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
-    found = holding(problem, machine, leg, number, s, state)
-    return found.x, found.v
+    force, modes = holding(problem, machine, leg, number, s, state), problem.modes_in(leg)
+    contact = problem.flight(machine, leg).contact
+    new = after_event(machine, number, s, state, modes, contact)[1]
+    return force.x, force.v, new[mode_number(machine, number)]
 
 
 def holding_force(
     problem: Shooting, at: Step, leg: int, number: int, s: float
-) -> tuple[float, float]:
-    """How far what drives a switch off its surface exceeds what holds it there, and how fast that
-    grows while it is held."""
+) -> tuple[float, float, float]:
+    """How far what drives a switch off its surface exceeds what holds it there, how fast that grows
+    while it is held, and the mode in which it would leave."""
     begins = bool(s == problem.values(at.x)[0][leg])
-    force, rate = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
-    return float(force), float(rate)
-
-
-def _away(problem: Shooting, at: Step, leg: int, number: int, s: float) -> float:
-    """The mode in which a switch that is just held would leave its surface."""
-    x, machine, modes = jnp.asarray(at.x), problem.at(at.x), problem.modes_in(leg)
-    state = problem.state_at(x, leg, jnp.asarray(s))
-    contact = problem.flight(machine, leg).contact
-    new = after_event(machine, number, jnp.asarray(s), state, modes, contact)[1]
-    return float(new[mode_number(problem.machine, number)])
+    force, rate, mode = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
+    return float(force), float(rate), float(mode)
 
 
 # Events that are closer than this where they vanish are located well enough: a choice.
@@ -272,5 +266,5 @@ def _with_part(
         place, extra = clock[first], states[first][None]
     clock = np.insert(clock, first, [place] * len(extra))
     states = np.insert(states, [first] * len(extra), extra, axis=0)
-    whole = np.asarray(problem.pack(clock, states, step.x[-1:], period))
+    whole = np.asarray(problem.pack(clock, states, step.x, period))
     return at._replace(x=whole, seen=observe(problem, whole))

@@ -100,7 +100,7 @@ def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndar
     if problem.events:
         clock = (clock + turn * np.arange(n)[:, None]).ravel()
         states = np.tile(states, (n, 1))
-    return np.asarray(new.pack(clock, states, x[-len(problem.parameters) :], n * turn))
+    return np.asarray(new.pack(clock, states, x, n * turn))
 
 
 def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
@@ -110,7 +110,6 @@ def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
     Both branches cross there, so that the equations of this one cannot be solved close by. The
     mean of the two halves is a motion of half the period but for a term of second order.
     """
-    count = len(problem.parameters)
     legs, (clock, states, period) = len(problem.events) // 2, problem.values(at.x)
     turn = period / 2
     half = dataclasses.replace(
@@ -123,7 +122,7 @@ def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
         states = 0.5 * (states[:legs] + states[legs:])
     else:
         states = states + 0.5 * halves_apart(problem, at) * problem.half_scale()
-    mean = np.asarray(half.pack(clock, states, at.x[-count:], turn))
+    mean = np.asarray(half.pack(clock, states, at.x, turn))
 
     def doubling(step: Step) -> float:
         return float(np.linalg.det(step.seen.monodromy + np.eye(problem.states)))
@@ -166,8 +165,7 @@ def without_events(
         clock, states = np.zeros(0), state_at(old, x, np.asarray(0), period)[None]
     modes = tuple(old.modes[i] for i in keep) or (old.modes[which[-1]],)
     new = dataclasses.replace(old, events=tuple(old.events[i] for i in keep), modes=modes)
-    count = len(old.parameters)
-    return new, np.asarray(new.pack(clock, states, np.asarray(x)[-count:], period))
+    return new, np.asarray(new.pack(clock, states, x, period))
 
 
 def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
@@ -181,7 +179,7 @@ def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]
             break
     else:
         return old, x
-    legs, count = max(1, len(old.events) // turns), len(old.parameters)
+    legs = max(1, len(old.events) // turns)
     clock, states, period = old.values(x)
     events = tuple(
         e if e.cycle is None else e._replace(cycle=e.cycle % cycles) for e in old.events[:legs]
@@ -190,5 +188,4 @@ def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]
     new = dataclasses.replace(
         old, cycles=cycles, events=events, modes=old.modes[:legs], steps=steps
     )
-    x = np.asarray(x)[-count:]
     return new, np.asarray(new.pack(clock[:legs], states[:legs], x, period / turns))

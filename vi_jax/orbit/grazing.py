@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float, Int
 from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, so_many
 from ..flow import NamedEnumeration, simulate
-from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of, with_leaf
+from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
 from ._corrector import on_host
 from ._flight import Event
 from ._local_map import Graze, LocalMap, graze_at
@@ -292,14 +292,14 @@ class Simulated(NamedTuple):
 
 
 @on_host
-def _lanes(problem, method, name: str, values, states, cycles: int, settle):
+def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
     """Sections and impacts of the last cycles, (lanes, cycles)."""
 
     def one(value, u):
-        machine = with_leaf(problem.machine, name, value)
         run = simulate(
-            machine, problem.unravel(u), cycles, settle=settle, method=method, record="sections"
-        )
+            problem.at(value[None]), problem.unravel(u), cycles, settle=settle,
+            method=problem.method, record="sections",
+        )  # fmt: skip
         rows = in_rows(run.sections)
         return rows[1:], run.impacts, run.successful
 
@@ -312,8 +312,8 @@ def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
     rows, impacts, good = _lanes(
-        problem, problem.method, problem.parameters[0], value + offsets, smooth,
-        problem.cycles * LOOKED, settling(local) * problem.cycles,
+        problem, value + offsets, smooth, problem.cycles * LOOKED,
+        settling(local) * problem.cycles,
     )  # fmt: skip
     last = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
     hits = impacts.reshape(len(rows), LOOKED, problem.cycles).sum(axis=2) - len(problem.impacts)
