@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterable
 from math import cos, pi, sin
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -72,7 +72,7 @@ class ShaftMachine(AbstractMachine):
         state."""
         return type(state) in self.timed_states
 
-    def in_clock(self, clock: str) -> Self:
+    def in_clock(self, clock: str) -> Any:
         """The same machine in the `"phase"` or the `"time"` clock."""
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
