@@ -190,15 +190,19 @@ def flag(name: str, value: object) -> bool:
 
 
 def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
-    """A tuple of what is listed; what it holds is not looked at."""
+    """A tuple of things of this kind."""
     try:
         if isinstance(value, str):
             raise TypeError
-        return tuple(value)
+        found = tuple(value)
     except TypeError:
         raise TypeError(
             f"Argument `{name}` must be a tuple of `{kind.__name__}`s, but got {value!r}."
         ) from None
+    for part in found:
+        if not isinstance(part, kind):
+            raise TypeError(f"Argument `{name}` must hold `{kind.__name__}`s, but holds {part!r}.")
+    return found
 
 
 def tuple_of_names(name: str, value: object) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from ..lanes import horner as horner
 from ..lanes import sincos as sincos
 from .base import AbstractMachine as AbstractMachine
 from .base import has_velocity as has_velocity
-from .base import names_coordinates as names_coordinates
 from .base import renews as renews
 from .clocks import adopt as adopt
 from .clocks import as_logged as as_logged
@@ -75,7 +74,6 @@ from .events import holds_anywhere as holds_anywhere
 from .events import is_autonomous as is_autonomous
 from .events import jump_of as jump_of
 from .events import mode_number as mode_number
-from .events import mode_values as mode_values
 from .events import modes_at_start as modes_at_start
 from .events import modes_of as modes_of
 from .events import own_modes as own_modes
@@ -113,7 +111,6 @@ from .numbers import with_leaves as with_leaves
 from .own import by_default as by_default
 from .own import changed as changed
 from .own import clock_of as clock_of
-from .own import coordinate_on as coordinate_on
 from .own import is_own as is_own
 from .own import others_of as others_of
 from .own import outcomes_of as outcomes_of

@@ -86,13 +86,6 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     return state
 
 
-def way_of(slip: Scalar, state: State, *, roundings: int) -> Scalar:
-    """The sign of a velocity; zero where it is no more than so many roundings of the state."""
-    size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
-    least = stop_gradient(roundings * jnp.finfo(slip.dtype).eps * size)
-    return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
-
-
 class Rubbed(NamedTuple):
     """The state behind an impact with friction, and the impulses of it."""
 
@@ -145,9 +138,8 @@ def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple
 
 
 class Held(NamedTuple):
-    """What holds the bodies that rest: a row for each coordinate that stops limit, in their order,
-    then one for each friction on a stop, then one for each other friction, in the order of the
-    switches."""
+    """What holds the bodies that rest on stops: a row for each coordinate that stops limit, in
+    their order, then one for each friction on a stop."""
 
     coordinates: list[Any]
     """Whose velocity is held; of a friction that along the stop."""
@@ -158,10 +150,6 @@ class Held(NamedTuple):
     rubbing: list[tuple[int, Any, int, Scalar]]
     """For each friction on a stop: its place among the switches, the friction, the row of its stop,
     and the share of the friction's push in the stop's."""
-    first: int
-    """The row of the first friction."""
-    dry: list[tuple[int, Any, Any]]
-    """Of each other friction its place among the switches, itself, and the mass that it acts on."""
     masses: list[Any]
     """What a force of each row acts on; empty without friction on stops."""
 
@@ -195,26 +183,7 @@ def held_by(
         acts = [*acts, here & (modes[i] == 0)]
         rubbing.append((i, friction, at, slips))
     bodies = [coordinates[k] for k in numbers]
-    of_rows = [masses[k] for k in numbers] if frictions else []
-    return Held(bodies, pushes, acts, rubbing, len(limited), [], of_rows)
-
-
-def with_dry_friction(
-    held: Held, machine: Any, s: Scalar, state: State, modes: Sequence[Scalar]
-) -> Held:
-    """The same with a row for each friction that may hold a body wherever it is. It is no part of
-    an impact: its forces are finite.
-
-    **Arguments:** as `held_by`.
-    """
-    for i, friction in enumerate(switches_of(machine)):
-        if friction.is_dry:
-            push, mass = friction.row(machine, s, state)
-            held.coordinates.append(friction.as_velocity(machine, s))
-            held.pushes.append(push)
-            held.acts.append(modes[i] == 0)
-            held.dry.append((i, friction, mass))
-    return held
+    return Held(bodies, pushes, acts, rubbing, [masses[k] for k in numbers if frictions])
 
 
 def held_flow(
@@ -230,20 +199,26 @@ def held_flow(
     **Returns:** the rate, and of each friction, by its place among the switches, the force along
     the surface, that which presses on it (of one on a stop), and the mass that it acts on.
     """
-    held = with_dry_friction(held_by(machine, s, state, modes, contact), machine, s, state, modes)
-    wanted = [-gained(body, state, flow) for body in held.coordinates]
-    rows = len(held.coordinates) - len(held.dry)
-    for row, (_, friction, _) in enumerate(held.dry, start=rows):
-        wanted[row] = -friction.slip_rate(machine, s, state, flow)
-    amounts = forces(shares(held.coordinates, state, held.pushes), held.acts, wanted)
+    bodies, pushes, acts, rubbing, masses = held_by(machine, s, state, modes, contact)
+    wanted = [-gained(body, state, flow) for body in bodies]
+    first, dry = len(bodies), []
+    for i, friction in enumerate(switches_of(machine)):
+        if friction.is_dry:  # no part of an impact: its forces are finite
+            push, mass = friction.row(machine, s, state)
+            dry.append((i, mass))
+            bodies.append(friction.as_velocity(machine, s))
+            pushes.append(push)
+            acts.append(modes[i] == 0)
+            wanted.append(-friction.slip_rate(machine, s, state, flow))
+    amounts = forces(shares(bodies, state, pushes), acts, wanted)
     pace, found = machine.pace(s, state), {}
-    for row, (i, _, mass) in enumerate(held.dry, start=rows):
-        force = amounts[row] * mass
+    for (i, mass), amount in zip(dry, amounts[first:], strict=True):
+        force = amount * mass
         found[i] = force if pace is None else force / pace, None, mass
-    for row, (i, friction, at, _) in enumerate(held.rubbing, start=held.first):
-        sign, mass = stops_of(machine)[friction.rubs_on].sign, held.masses[row]
-        found[i] = amounts[row] * mass, -sign * amounts[at] * held.masses[at], mass
-    return added(flow, amounts, held.pushes), found
+    for row, (i, friction, at, _) in enumerate(rubbing, start=first - len(rubbing)):
+        sign = stops_of(machine)[friction.rubs_on].sign
+        found[i] = amounts[row] * masses[row], -sign * amounts[at] * masses[at], masses[row]
+    return added(flow, amounts, pushes), found
 
 
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
@@ -313,17 +288,14 @@ def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int =
         )
         for m in (1.0, -1.0)
     )
-    rises, falls = (rate_of(switches[i], machine, s, state, x) for x in (up, down))
+    rises, falls = (rate_of(switches[i].function, machine, s, state, x) for x in (up, down))
     apart = falls - rises
     share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
     # Not kept within [0, 1]: a step ends where it leaves that, and sees a smooth field till then.
     return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)
 
 
-def rate_of(switch: Any, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-    """d/ds of a switch's function along a flow.
-
-    **Arguments:** `flow`, d(state)/ds.
-    """
+def rate_of(function: Any, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+    """d/ds of a function of machine, `s` and state along a flow."""
     along = (s, state), (jnp.ones_like(s), flow)
-    return jax.jvp(lambda s, state: switch.function(machine, s, state), *along)[1]
+    return jax.jvp(lambda s, state: function(machine, s, state), *along)[1]

@@ -1,5 +1,9 @@
 """The events of a machine by their numbers: their guards, what happens then; and its modes, in a
-state or beside it."""
+state or beside it.
+
+An argument `number` is that of an event, `modes` are all of the machine, before the event, and
+`contact` is as in `Around`.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -38,10 +42,7 @@ def section_number(machine: Machine) -> int:
 def guard_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalar:
-    """The guard of one of a machine's events, which rises through zero where it happens.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine; `contact` as in `Around`.
-    """
+    """The guard of one of a machine's events, which rises through zero where it happens."""
     event, own, more = event_of(machine, number, modes, contact)
     return event.guard(machine, s, state, *modes[own], **more)
 
@@ -49,38 +50,26 @@ def guard_of(
 def sides_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalars:
-    """Smooth functions of which the greatest is the guard of one of a machine's events.
-
-    **Arguments:** as `guard_of`.
-    """
+    """Smooth functions of which the greatest is the guard of one of a machine's events."""
     event, own, more = event_of(machine, number, modes, contact)
     return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[own], **more)))
 
 
 def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
     """The state after one of a machine's events as a smooth function of that before it (see
-    `AbstractEvent.jump`).
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
+    `AbstractEvent.jump`)."""
     event, own, _ = event_of(machine, number, modes, ())
     return _rubbed(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """Whether one of a machine's events happens where its guard has risen; `None` if always.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
+    """Whether one of a machine's events happens where its guard has risen; `None` if always."""
     event, own, _ = event_of(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
 def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """What the log of events keeps of one of a machine's events.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine.
-    """
+    """What the log of events keeps of one of a machine's events."""
     event, own, _ = event_of(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
@@ -88,11 +77,7 @@ def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Mode
 def after_event(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> tuple[State, Modes]:
-    """State and modes after one of a machine's events.
-
-    **Arguments:** `number`, the event's; `modes`, all of the machine before it; `contact` as in
-    `Around`.
-    """
+    """State and modes after one of a machine's events."""
     event, own, more = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
@@ -104,7 +89,6 @@ def after_event(
 
 
 def _rubbed(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
-    """The state after an impact, with what friction on the stop makes of it."""
     friction = rubbing_on(machine, number)
     if friction is None:
         return after
@@ -162,18 +146,10 @@ def begin_modes(
 
 
 def struck_modes(
-    machine: Machine,
-    s: Scalar,
-    state: State,
-    modes: Modes,
-    own: Sequence[Any] | None = None,
+    machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
     contact: Scalars = (),
-) -> Modes:
-    """The modes after the state has jumped to this one.
-
-    **Arguments:** `modes`, before the jump; `own`, the machine's own after it, which stay as they
-    are if left out; `contact` as in `Around`.
-    """
+) -> Modes:  # fmt: skip
+    """The modes after the state has jumped to this one, the machine's own as they are or `own`."""
     held = []
     together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
@@ -197,10 +173,10 @@ def holds_anywhere(machine: Machine) -> bool:
 def modes_at_start(machine: Machine, s: Scalar, state: State) -> tuple[Any, ...]:
     """The machine's own modes of a motion that begins in `state`."""
     modes = machine.modes
-    return mode_values(modes(s, state) if callable(modes) else declared_modes(machine))
+    return _values(modes(s, state) if callable(modes) else declared_modes(machine))
 
 
-def mode_values(modes: Any) -> tuple[Any, ...]:
+def _values(modes: Any) -> tuple[Any, ...]:
     """Modes as a user gives them, one, several or by name, in a tuple."""
     if isinstance(modes, Mapping):
         return tuple(modes.values())
@@ -208,17 +184,14 @@ def mode_values(modes: Any) -> tuple[Any, ...]:
 
 
 def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
-    """The machine's own modes after an event, of which a user returned all, or a dictionary of
-    those that change.
-
-    **Arguments:** `modes`, all of the machine before the event; `whose`, what returned them, for
-    messages.
+    """The machine's own modes after an event, of which a user's function, `whose`, returned all, or
+    a dictionary of those that change.
 
     **Raises:** `TypeError` for a name that the machine does not declare.
     """
     names = tuple(declared_modes(machine))
     if not isinstance(found, Mapping) or not names:
-        return mode_values(found)
+        return _values(found)
     extra = [name for name in found if name not in names]
     if extra:
         raise TypeError(

@@ -5,6 +5,7 @@ import functools
 import inspect
 import itertools
 from collections.abc import Callable, Mapping
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -26,7 +27,7 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .contacts import added, field_in, forces, gained, held_flow, push_of, shares, way_of
+from .contacts import added, field_in, forces, gained, held_flow, push_of, rate_of, shares
 from .event import AbstractSwitch, Around
 from .own import coordinate_on, stops_of, switches_of
 from .state import with_components
@@ -72,13 +73,14 @@ class Friction(AbstractSwitch):
 
     def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
         """The rate by s at which the slip changes along a flow."""
-        along = (s, state), (jnp.ones_like(s), flow)
-        return jax.jvp(lambda s, x: self.speed_of_slip(machine, s, x), *along)[1]
+        return rate_of(self.speed_of_slip, machine, s, state, flow)
 
     def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The sign of the slip; zero where that is rounding."""
         slip = self.speed_of_slip(machine, s, state)
-        return way_of(slip, state, roundings=self.roundings)
+        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
+        least = stop_gradient(self.roundings * jnp.finfo(slip.dtype).eps * size)
+        return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: the sign of the slip, sticking without any."""
@@ -222,11 +224,7 @@ class DryFriction(Friction):
 
     def as_velocity(self, machine: Machine, s: Scalar) -> Any:
         """The slip in the place of a coordinate's velocity."""
-
-        def velocity(state: State) -> Scalar:
-            return self.speed_of_slip(machine, s, state)
-
-        return _Slip(velocity)
+        return SimpleNamespace(velocity=lambda state: self.speed_of_slip(machine, s, state))
 
     def held(self, machine, s, state, contact, found):
         force, _, mass = found
@@ -338,13 +336,6 @@ class ContactFriction(Friction):
     def push_in(self, machine, s, state, mode):
         """`None`, since the force is solved for together with that of the stop (`held_flow`)."""
         return None
-
-
-class _Slip:
-    """A slip in the place of a coordinate's velocity."""
-
-    def __init__(self, velocity: Callable[[State], Scalar]):
-        self.velocity = velocity
 
 
 def asked(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:

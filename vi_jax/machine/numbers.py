@@ -22,7 +22,8 @@ def leaf_names(tree: object) -> list[str]:
 def by_name(tree: object) -> dict[str, Any]:
     """All numbers of a machine, a state or another pytree by their names, in the order of its
     leaves."""
-    return dict(_named(tree))
+    leaves = ((path, x) for path, x in jtu.tree_leaves_with_path(tree) if eqx.is_array_like(x))
+    return {jtu.keystr(path, simple=True, separator="."): x for path, x in leaves}
 
 
 def components(state: State, lead: int = 0) -> dict[str, Any]:
@@ -45,9 +46,8 @@ def in_rows(states: State, lead: int = 1) -> Array:
 
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
     """The numbers of a state of any kind, in their units; of one with many the first few."""
-    parts = list(components(state).items())
-    words = [f"{name} = {in_unit(plain(x, digits), units, name)}" for name, x in parts]
-    return ", ".join(first_few(words))
+    parts = components(state).items()
+    return ", ".join(first_few([f"{k} = {in_unit(plain(x, digits), units, k)}" for k, x in parts]))
 
 
 def first_few(words: list[str]) -> list[str]:
@@ -149,20 +149,3 @@ def check_again(machine: Machine) -> None:
         check = getattr(part, "__check_init__", None)
         if check is not None:
             check()
-
-
-def _named(tree: object) -> list[tuple[str, Any]]:
-    named = []
-    for path, value in jtu.tree_leaves_with_path(tree):
-        if eqx.is_array_like(value):
-            words = (str(_word(key)) for key in path)
-            named.append((".".join(words), value))
-    return named
-
-
-def _word(key: object) -> Any:
-    """One step of a path through a machine, as text: an attribute, an index or a key."""
-    for kind in ("name", "idx", "key"):
-        if hasattr(key, kind):
-            return getattr(key, kind)
-    return key

@@ -1,5 +1,6 @@
 """Machines whose cycle is a turn of a shaft, in the phase or the time clock; the paper's scene."""
 
+import abc
 import dataclasses
 from collections.abc import Iterable
 from math import cos, pi, sin
@@ -53,24 +54,24 @@ class ShaftMachine(AbstractMachine):
         one_of("clock_name", self.clock_name, ("phase", "time"))
 
     @property
+    @abc.abstractmethod
     def state_type(self) -> type:
         """The class of a state in the phase clock."""
-        raise NotImplementedError
 
     @property
-    def timed_states(self) -> dict[type, type]:
-        """For each class of states that has the speed of the shaft, that of the same states by
-        time, with `phase` as one more component at the end."""
-        raise NotImplementedError
+    @abc.abstractmethod
+    def timed_type(self) -> type | None:
+        """That of the same state by time, with `phase` as one more component at the end; `None`
+        where the speed of the shaft is no part of it."""
 
     def is_timed(self, state: State) -> bool:
         """Whether the angle of the shaft is part of the state."""
-        return type(state) in self.timed_states.values()
+        return type(state) is self.timed_type
 
     def is_paced(self, state: State) -> bool:
         """Whether time is not the independent variable, but passes by the speed of the shaft in the
         state."""
-        return type(state) in self.timed_states
+        return self.timed_type is not None and type(state) is self.state_type
 
     def in_clock(self, clock: str) -> Any:
         """The same machine in the `"phase"` or the `"time"` clock."""
@@ -80,11 +81,10 @@ class ShaftMachine(AbstractMachine):
     def adopt(self, start: State) -> State:
         """A start made for either clock, as this machine's clock needs it."""
         wanted = self.state_type
-        if self.clock_name == "time" and wanted in self.timed_states:
+        if self.clock_name == "time" and self.timed_type is not None:
             if type(start) is wanted:
-                components = vars(start).values()
-                return self.timed_states[wanted](*components, jnp.zeros_like(start.Y))
-            wanted = self.timed_states[wanted]
+                return self.timed_type(*vars(start).values(), jnp.zeros_like(start.Y))
+            wanted = self.timed_type
         _require_state("start", start, wanted)
         return state_of_numbers("start", start)
 
@@ -198,12 +198,6 @@ class Scene(ShaftMachine):
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         instance_of("drive", self.drive, AbstractDrive, "an `IdealDrive` or a `Motor`")
         self.drive.check()
-        for stop in self.stops:
-            if not isinstance(stop, RigidStop):
-                raise TypeError(f"Argument `stops` must hold `RigidStop`s, but holds {stop!r}.")
-        for stop in self.soft_stops:
-            if not isinstance(stop, SoftStop):
-                raise TypeError(f"Argument `soft_stops` must hold `SoftStop`s, but holds {stop!r}.")
         if len(self.stops) > 2 or len({stop.side for stop in self.stops}) != len(self.stops):
             raise ValueError(
                 "Argument `stops` must hold at most one stop on each side, but holds "
@@ -303,15 +297,13 @@ class Scene(ShaftMachine):
 
     @property
     def state_type(self) -> type:
-        """The class of a state in the phase clock."""
+        """That of the drive's states."""
         return self.drive.state
 
     @property
-    def timed_states(self) -> dict[type, type]:
-        """For the drive's class of states, that of its states by time; empty where both are the
-        same."""
-        timed = self.drive.timed_state
-        return {} if timed is None else {self.drive.state: timed}
+    def timed_type(self) -> type | None:
+        """That of the drive's states by time."""
+        return self.drive.timed_state
 
     @property
     def _stops(self) -> tuple[RigidStop, ...]:

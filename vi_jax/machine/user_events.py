@@ -96,7 +96,7 @@ class Switch(AbstractSwitch):
     def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
         """d/ds of the function in the modes +1 and -1."""
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
-        return rate_of(self, machine, s, state, up), rate_of(self, machine, s, state, down)
+        return tuple(rate_of(self.function, machine, s, state, x) for x in (up, down))
 
 
 class Reset(AbstractEvent):

@@ -32,8 +32,6 @@ def _numbered(contacts: object) -> tuple[RigidStop, ...]:
     """Contacts with the numbers of their coordinates; those of one `at` share the first one's."""
     rows, found = [], []
     for stop in tuple_of("contacts", contacts, RigidStop):
-        if not isinstance(stop, RigidStop):
-            raise TypeError(f"Argument `contacts` must hold `RigidStop`s, but holds {stop!r}.")
         if stop.at is not None:
             same = [k for k, row in enumerate(rows) if _same(row, stop.at)]
             if same:

@@ -89,6 +89,8 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         **RotorState.units, "frequency_ratio": "ω", "rate": "ω", "time": "1/ω",
         "energy": "m² r² ω²/M", "power": "m² r² ω³/M",
     }  # fmt: skip
+    state_type: ClassVar = RotorState  # pyright: ignore
+    timed_type: ClassVar = TimedRotorState  # pyright: ignore
     labels: ClassVar = ("Y (m r/M)", "dY/dτ (m r ω/M)")  # pyright: ignore
 
     @property
@@ -152,16 +154,6 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         if self.gap is not None and not self.two_sided:
             return None
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
-
-    @property
-    def state_type(self) -> Any:
-        """Class of a state in the phase clock."""
-        return RotorState
-
-    @property
-    def timed_states(self) -> dict[type, type]:
-        """Class of a state in the time clock, by that in the phase clock."""
-        return {RotorState: TimedRotorState}
 
     def section_speed(self, state: State) -> Any:
         """The momentum of the shaft is its speed where φ = 0."""
