@@ -3,7 +3,11 @@
 from ..lanes import horner as horner
 from ..lanes import sincos as sincos
 from .base import AbstractMachine as AbstractMachine
+from .base import contacts_in as contacts_in
 from .base import has_velocity as has_velocity
+from .base import listed as listed
+from .base import names_on as names_on
+from .base import number_on as number_on
 from .base import renews as renews
 from .clocks import adopt as adopt
 from .clocks import as_logged as as_logged
@@ -118,10 +122,6 @@ from .own import section_in as section_in
 from .own import stops_of as stops_of
 from .own import switches_of as switches_of
 from .parameters import Parameters as Parameters
-from .parts import contacts_in as contacts_in
-from .parts import listed as listed
-from .parts import names_on as names_on
-from .parts import number_on as number_on
 from .scene import Oscillator as Oscillator
 from .scene import Scene as Scene
 from .scene import ShaftMachine as ShaftMachine

@@ -1,39 +1,170 @@
-"""What every verb asks of a machine. A class of your own with these few methods runs like ours."""
+"""What every verb asks of a machine: a class of your own with these few methods runs like ours. And
+its contacts and events, sorted into what a step asks for.
+
+A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, kinds of
+one's own), each with the coordinate that it acts on. A step asks for the stops, for the switches,
+for the other events, and for the coordinates that stops limit, by number.
+"""
 
 import abc
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import partial, wraps
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # JAX 0.9
+    from jax.core import get_opaque_trace_state  # pyright: ignore
+
 from .._checks import fields_with, number, require
-from .._types import Scalar, State
+from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
-from .own import by_default, derived, is_own, says, stops_of, switches_of, with_own_defaults
-from .parts import (
-    MEMORY,
-    contacts_in,
-    coordinates_in,
-    names_on,
-    other_events,
-    stops_in,
-    switches_in,
+from .friction import ContactFriction
+from .own import (
+    by_default,
+    derived,
+    is_own,
+    says,
+    stops_of,
+    switches_of,
+    with_own_defaults,
+    with_static,
 )
 from .shown import Shown
 from .soft import SoftStop
 from .stop import RigidStop, Wall
 from .units import PLAIN, unit_in
+from .user_events import Reset
 
 # What a machine must say, and how.
 _MUST_SAY = {
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
 }
+
+
+def listed(parts: object) -> tuple[Any, ...]:
+    """Contacts or events as a tuple, of which one may be given without."""
+    single = isinstance(parts, AbstractEvent)
+    return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
+
+
+def _once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
+    """A function of a machine that is called once while JAX traces a function. A step asks for the
+    parts of a machine some hundred times, and each of a user's contacts takes a millisecond."""
+
+    @wraps(found)
+    def kept(machine: Machine) -> Any:
+        trace, memory = get_opaque_trace_state(), vars(machine).setdefault(_MEMORY, {})
+        known = memory.get(found)
+        if known is None or known[0] != trace:
+            known = memory[found] = trace, found(machine)
+        return known[1]
+
+    return kept
+
+
+# Where a machine keeps what `_once_a_trace` found; it is no field, and no part of a copy.
+_MEMORY = "_found_in_a_trace"
+
+
+@_once_a_trace
+def contacts_in(machine: Machine) -> tuple[Any, ...]:
+    """The contacts that a machine lists."""
+    return listed(machine.contacts)
+
+
+@_once_a_trace
+def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
+    """The rigid stops among a machine's contacts."""
+    contacts = contacts_in(machine)
+    places = _places(contacts)
+    return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
+
+
+@_once_a_trace
+def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
+    """The soft stops and frictions among a machine's contacts, which act by themselves, and the
+    switches among its events."""
+    contacts, found = contacts_in(machine), []
+    places, at = _places(contacts), 0
+    for x in contacts:
+        if isinstance(x, RigidStop):
+            if x.friction is not None:
+                found.append(with_static(_friction_on(x, at, places), acts=True))
+            at += 1
+        elif isinstance(x, AbstractSwitch):
+            found.append(with_static(_at(x, places) if isinstance(x, SoftStop) else x, acts=True))
+    return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
+
+
+@_once_a_trace
+def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
+    """The events of a machine that are no switches, and the turn that ends its cycles."""
+    found = []
+    for event in listed(machine.events):
+        if not isinstance(event, AbstractSwitch):
+            found += event.one_way() if isinstance(event, Reset) else (event,)
+    counter = counter_of(machine)
+    return (*found, counter.event()) if isinstance(counter, Turn) else tuple(found)
+
+
+def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
+    """The coordinates on which a machine's contacts act, in the order of `_places`."""
+    contacts = contacts_in(machine)
+    stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
+    masses = {x.on: x.mass for x in reversed(stops)}
+    return tuple(machine._coordinate_on(on, masses.get(on)) for on in _places(contacts))
+
+
+def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
+    """The number of each coordinate by what names it: those of rigid stops, of soft ones, then
+    those along which rigid ones rub."""
+    rigid = [x for x in contacts if isinstance(x, RigidStop)]
+    named = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
+    named += [x.along for x in rigid if x.friction is not None]
+    return {on: i for i, on in enumerate(dict.fromkeys(named or [None]))}
+
+
+def number_on(machine: Machine, name: str) -> int | None:
+    """The number of the coordinate that contacts name so, as one or by its position; `None` if no
+    contact acts on it."""
+    for on, k in _places(contacts_in(machine)).items():
+        if on == name or (isinstance(on, tuple) and on[0] == name):
+            return k
+    return None
+
+
+def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
+    """The names in the state of the position and the velocity of a coordinate, by its number;
+    `None` where contacts do not name it by them."""
+    if says(machine, "coordinates"):
+        return None
+    on = next((on for on, k in _places(contacts_in(machine)).items() if k == number), None)
+    return machine._names_on(on)
+
+
+def _at(stop: Any, places: dict[Any, int]) -> Any:
+    """A stop with the number of its coordinate."""
+    if stop.on is None and stop.coordinate:
+        return stop
+    return with_static(stop, coordinate=places[stop.on])
+
+
+def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> ContactFriction:
+    rebound = stop.tangential_restitution
+    return ContactFriction(
+        stop.friction,
+        stop=number,
+        along=places[stop.along],
+        restitution=0.0 if rebound is None else rebound,
+    )
 
 
 def _unlisted(kind: type) -> str | None:
@@ -117,7 +248,7 @@ class AbstractMachine(Shown):
         return super().__new__(cls, *args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: x for name, x in vars(self).items() if name != MEMORY}
+        return {name: x for name, x in vars(self).items() if name != _MEMORY}
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:
@@ -163,7 +294,7 @@ class AbstractMachine(Shown):
             """The coordinates that contacts act on, by number as `RigidStop.coordinate` names them;
             extremes are recorded of the first. By default those that contacts name by `on`, and
             where none does one, the machine's `position`, `velocity` and `placed`."""
-            return coordinates_in(self)
+            return _coordinates_in(self)
 
     def start(self) -> State:
         """The state to begin from where none is given.
@@ -269,20 +400,11 @@ class AbstractMachine(Shown):
         own = {**dict(found), **fields_with(type(self), "unit")}
         return {x: unit for x, unit in own.items() if unit}
 
-    # The parts as a step asks for them (`stops_of` and the others of `parts`). Machines of this
-    # room that sort them in another way have their own.
-
-    @property
-    def _stops(self) -> tuple[RigidStop, ...]:
-        return stops_in(self)
-
-    @property
-    def _switches(self) -> tuple[AbstractSwitch, ...]:
-        return switches_in(self)
-
-    @property
-    def _others(self) -> tuple[AbstractEvent, ...]:
-        return other_events(self)
+    # The parts as a step asks for them (`stops_of` and the others). Machines of this room that sort
+    # them in another way have their own.
+    _stops = property(_stops_in)
+    _switches = property(_switches_in)
+    _others = property(_other_events)
 
     def _section(self, state: State) -> Scalar | None:
         """See `section_in`."""

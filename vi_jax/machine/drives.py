@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from math import pi
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -221,11 +220,6 @@ class AbstractDrive(Shown):
         """How fast the crank turns (unit: ω), without sign."""
         fixed = self.fixed_speed
         return jnp.abs(state.W) if fixed is None else fixed
-
-    def duration(self) -> Float[Array, "..."] | float | None:
-        """How long a turn takes (time τ), 2π/ζ; `None` where the speed is not fixed."""
-        fixed = self.fixed_speed
-        return None if fixed is None else 2 * pi / fixed
 
 
 class IdealDrive(AbstractDrive):

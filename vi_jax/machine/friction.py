@@ -29,7 +29,7 @@ from .._checks import (
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .contacts import added, field_in, forces, gained, held_flow, push_of, rate_of, shares
 from .event import AbstractSwitch, Around
-from .own import coordinate_on, stops_of, switches_of
+from .own import stops_of, switches_of
 from .state import with_components
 
 # Of a set of modes that is looked for, a force may point the wrong way by this share of what
@@ -205,13 +205,13 @@ class DryFriction(Friction):
     def speed_of_slip(self, machine, s, state):
         if self.slip is not None:
             return jnp.asarray(asked(self.slip, machine, s, state))
-        return coordinate_on(machine, self.on, self.mass).velocity(state)
+        return machine._coordinate_on(self.on, self.mass).velocity(state)
 
     def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
         """The change of the state by an impulse that changes the slip by one, and the mass that the
         force acts on."""
         if self.push is None:
-            body = coordinate_on(machine, self.on, self.mass)
+            body = machine._coordinate_on(self.on, self.mass)
             push, mass = push_of(body, state), body.mass_at(s, state)
             if self.slip is None:
                 return push, mass
@@ -254,7 +254,7 @@ class DryFriction(Friction):
     def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
         """The state without slip, which vanishes to rounding."""
         if self.slip is None and self.push is None:
-            body = coordinate_on(machine, self.on, self.mass)
+            body = machine._coordinate_on(self.on, self.mass)
             velocity = body.velocity(state)
             return body.placed(state, body.position(state), jnp.zeros_like(velocity))
         slip, (push, _) = self.speed_of_slip(machine, s, state), self.row(machine, s, state)

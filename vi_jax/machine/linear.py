@@ -1,8 +1,8 @@
 """Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs."""
 
 import abc
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -75,12 +75,8 @@ class LinearMachine(AbstractMachine):
     stiffness: eqx.AbstractVar[Float[Array, "..."]]
     frequency: eqx.AbstractVar[Scalar]
     contacts: eqx.AbstractVar[tuple[RigidStop, ...]]  # pyright: ignore
+    units: ClassVar = {"": "1"}  # pyright: ignore
     _known: _Known | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """None: its numbers are the equation's."""
-        return {"": "1"}
 
     @property
     @abc.abstractmethod

@@ -113,12 +113,3 @@ def outcomes_of(machine: Machine) -> tuple[str, ...]:
     """Return the names of the outcomes with which events and stops of a machine end a motion."""
     events = (*switches_of(machine), *others_of(machine), *stops_of(machine))
     return tuple(dict.fromkeys(x.ends for x in events if x.ends))
-
-
-def coordinate_on(machine: Machine, on: Any, mass: Any = None) -> Any:
-    """Return the coordinate that a contact names by its `on`; of a contact that names none the
-    machine's own.
-
-    **Arguments:** `mass`, which acts there, 1 if it is `None`.
-    """
-    return machine._coordinate_on(on, mass)

@@ -192,6 +192,7 @@ class Scene(ShaftMachine):
     """Compliant stops; their stiffness in units of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi), "room": POSITIVE}
     units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
+    labels: ClassVar = ("Y = y/a", "V = dY/dτ")  # pyright: ignore
 
     def __check_init__(self):
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
@@ -249,13 +250,8 @@ class Scene(ShaftMachine):
     @property
     def period(self) -> Scalar | float:
         """2π/ζ of time τ for an ideal drive; of another a turn of the crank."""
-        duration = self.drive.duration()
-        return 2 * pi if duration is None else duration
-
-    @property
-    def labels(self) -> tuple[str, str]:
-        """Position and velocity in the paper's units, the crank radius a and the frequency ω."""
-        return "Y = y/a", "V = dY/dτ"
+        speed = self.drive.fixed_speed
+        return 2 * pi if speed is None else 2 * pi / speed
 
     def at_section(self, phase: Number) -> "Scene":
         """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
@@ -353,11 +349,6 @@ class Scene(ShaftMachine):
         for stop in self.soft_stops:
             turn = jnp.minimum(turn, stop.longest_step(self, s, state))
         return turn * speed if self.clock_name == "phase" else turn
-
-    @property
-    def scales_known(self) -> bool:
-        """Not with soft stops, whose contacts may be much briefer than a cycle."""
-        return not self.soft_stops
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
         """1/2ξ of a strongly damped body, or what the drive says: the time w0/τ0 in which a motor

@@ -1,5 +1,6 @@
 """A cantilever beam with a stop, by its exact modes."""
 
+import dataclasses
 from functools import cache
 from math import pi
 from typing import Any
@@ -126,7 +127,7 @@ class Beam(LinearMachine):
         if self.gap is None:
             return ()
         first, *other = stops_at(self.gap, self.restitution, two_sided=self.two_sided)
-        return (eqx.tree_at(lambda x: x.at, first, self.shape(self.place), is_leaf=_absent), *other)
+        return dataclasses.replace(first, at=self.shape(self.place)), *other
 
     @property
     def forces(self) -> tuple[None, Float[Array, " modes"], None]:
@@ -152,7 +153,3 @@ class Beam(LinearMachine):
     def deflection(self, state: StructureState, place: Number = 1.0) -> Float[Array, "..."]:
         """w at places along the beam, in [0, 1] of its length: by default of its tip."""
         return self.shape(place) @ state.displacement
-
-
-def _absent(x: object) -> bool:
-    return x is None

@@ -1,5 +1,6 @@
 """A capsule that drives itself along the ground: dry friction, sticking, impacts and drift."""
 
+import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
@@ -113,8 +114,8 @@ class Capsule(ForcedMachine):
 
     def renewed(self, state: CapsuleState) -> CapsuleState:
         """The travel of a cycle is its progress."""
-        x = state
-        return CapsuleState(x.place, x.speed, x.capsule_speed, jnp.zeros_like(x.travel), x.travel)
+        at = state.travel
+        return dataclasses.replace(state, travel=jnp.zeros_like(at), progress=at)
 
     def start(
         self, *, place: Number = 0.0, speed: Number = 0.0, capsule_speed: Number = 0.0

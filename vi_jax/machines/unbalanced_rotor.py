@@ -116,8 +116,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
 
     def field(self, s: Scalar, state: State) -> Any:
         """d(state)/dφ, or d(state)/dτ of a state for the time clock, between impacts."""
-        timed = self.is_timed(state)
-        phase = state.phase if timed else s
+        phase = self._angle(s, state)
         sine, cosine = jnp.sin(phase), jnp.cos(phase)
         W = state.P + self.coupling * state.V * sine
         motor = self.strength * (self.control - W / self.no_load_speed)
@@ -125,14 +124,14 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         # Both equations solved for Y''; the shaft's own is that of its momentum.
         push = (force + sine * motor) / (1 - self.coupling * sine * sine)
         twist = motor - self.coupling * state.V * W * cosine
-        if timed:
+        if self.is_timed(state):
             return TimedRotorState(state.V, push, twist, W)
         pace = _pace(W)
         return RotorState(pace * state.V, pace * push, pace * twist)
 
     def effective_mass(self, s: Scalar, state: State) -> Scalar:
         """1 - ε sin²φ, what an impact acts on, since it jerks the shaft too (unit: M)."""
-        sine = jnp.sin(state.phase if self.is_timed(state) else s)
+        sine = jnp.sin(self._angle(s, state))
         return 1 - self.coupling * sine * sine
 
     @property
@@ -175,9 +174,12 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         pace = self._speed(s, state) if self.clock_name == "phase" else 1.0
         return pace * (1 - self.coupling) / jnp.maximum(rate, 1e-6)
 
+    def _angle(self, s: Scalar, state: State) -> Scalar:
+        return state.phase if self.is_timed(state) else s
+
     def _speed(self, s: Scalar, state: State) -> Scalar:
         """Speed of the rotor without its sign (unit: ω)."""
-        return jnp.abs(self.speed(state.phase if self.is_timed(state) else s, state))
+        return jnp.abs(self.speed(self._angle(s, state), state))
 
     def alive(self, state: State) -> jax.Array | None:
         """In the phase clock a rotor that does not turn forward has a state that is no number."""

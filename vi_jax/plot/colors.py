@@ -102,17 +102,12 @@ def shades(color: str) -> Iterator[str]:
         for part in (0.7, 0.35):
             yield paler(color, part)
         for part in (0.75, 0.5):
-            yield _hex(part * np.array(to_rgb(color)))
+            yield to_hex(tuple(part * np.array(to_rgb(color))))
 
 
 def paler(color: str, part: float | int = 0.45) -> str:
     """Return the colour mixed with white; `part` is the share of the colour, from 0 to 1."""
-    return _hex(part * np.array(to_rgb(color)) + 1 - part)
-
-
-def _hex(rgb: np.ndarray) -> str:
-    red, green, blue = map(float, rgb)
-    return to_hex((red, green, blue))
+    return to_hex(tuple(part * np.array(to_rgb(color)) + 1 - part))
 
 
 def mark_of(kind: str, **style: Any) -> Line2D:
