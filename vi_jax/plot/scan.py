@@ -29,10 +29,8 @@ _OTHERS = {
     **{int(regime): (regime.meaning, color) for regime, color in IRREGULAR.items()},
     _LEAST: ("not computed", look.NOT_COMPUTED),
 }
-# Added to a period, by impacts: none, one in two cycles, more than one in two cycles.
-_NONE, _ONE, _MORE = 100, 200, 300
-# Added to the number of an outcome; the code of a motion that none ended, if no period is known.
-_OUTCOME, _GOES_ON = 1000, 999
+# In the place of the period of a motion that no event ended, if none is known.
+_GOES_ON = len(PERIODS) + 1
 
 # Motions named one by one in the legend; further ones share its last line.
 _NAMED = 12
@@ -71,69 +69,59 @@ def plot_regimes(
         )
     kind = data["period" if "period" in data else "outcome"]
     x, y = _two_axes([str(name) for name in kind.dims], x, y)
-    codes = _codes(data.transpose(y, x, ...))
+    lanes = _lanes(data.transpose(y, x, ...))
     word = _word_of(data) if machine is None else partial(cycles_in_words, machine)
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
-    present = sorted({int(code) for code in codes.flat}, key=_place)
     outcomes = data["outcome"].attrs["flag_meanings"].split()[1:] if "outcome" in data else []
-    names, colors = zip(*(_named(code, word, outcomes) for code in present), strict=True)
-    shown = np.searchsorted(np.sort(present), codes)
-    order = np.argsort(present)
-    _image(ax, across, up, shown, [colors[i] for i in order])
+    kinds, shown = np.unique(lanes.reshape(-1, 3), axis=0, return_inverse=True)
+    entries = [_entry(kind, word, outcomes) for kind in kinds.tolist()]
+    _image(ax, across, up, shown.reshape(lanes.shape[:2]), [color for _, _, color in entries])
     if legend:
-        _legend(ax, list(zip(names, colors, strict=True)))
+        _legend(ax, [entry[1:] for entry in sorted(entries)])
     for name, set_label in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
         set_label(axis_name(name, {name: data[name].attrs.get("units", "")}))
     return ax
 
 
-def _codes(data: xr.Dataset) -> np.ndarray:
-    """The code of each lane: of its regime, or of its outcome."""
+def _lanes(data: xr.Dataset) -> np.ndarray:
+    """Three numbers of each lane: its outcome, its period or regime, and its impacts where they are
+    told apart, 2 for more than one; -1 if there is none."""
     if "period" in data:
-        codes = np.clip(np.asarray(data["period"]).astype(int), _LEAST + 1, len(PERIODS))
-        if "impacts" in data:
-            impacts = np.asarray(data["impacts"], float)
-            free, two = (codes > 0) & (impacts < 0.5), (codes == 2) & (impacts >= 0.5)
-            codes = codes + _NONE * free + np.where(impacts > 1.5, _MORE, _ONE) * two
+        period = np.clip(np.asarray(data["period"]).astype(int), _LEAST + 1, len(PERIODS))
     else:
         failed = np.isin(np.asarray(data["result"]), (0, NOT_COMPUTED), invert=True)
-        codes = np.where(failed, int(REGIMES.failed), _GOES_ON)
+        period = np.where(failed, int(REGIMES.failed), _GOES_ON)
+    lanes = np.stack([np.full_like(period, -1), period, np.full_like(period, -1)], axis=-1)
+    if "period" in data and "impacts" in data:
+        impacts = np.asarray(data["impacts"], float)
+        lanes[(period > 0) & (impacts < 0.5), 2] = 0
+        for number, hits in ((1, impacts >= 0.5), (2, impacts > 1.5)):
+            lanes[(period == 2) & hits, 2] = number
     if "outcome" in data:
         outcome = np.asarray(data["outcome"]).astype(int)
-        codes = np.where(outcome >= 0, _OUTCOME + outcome, codes)
+        lanes[outcome >= 0] = -1
+        lanes[..., 0] = np.maximum(outcome, -1)
     if "result" in data:
-        codes[np.asarray(data["result"]) == NOT_COMPUTED] = _LEAST
-    return codes
+        lanes[np.asarray(data["result"]) == NOT_COMPUTED] = -1, _LEAST, -1
+    return lanes
 
 
-def _place(code: int) -> tuple[int, int]:
-    """Place of a code in the legend: by period, and by impacts within one; then outcomes."""
-    if code <= 0:
-        return 2, list(_OTHERS).index(code)
-    if code >= _GOES_ON:
-        return 1, code
-    return 0, 1000 * (code % 100) + code
-
-
-def _named(code: int, word: Callable[[int], str], outcomes: Sequence[str]) -> tuple[str, str]:
-    """Name and colour of a regime or an outcome."""
-    if code <= 0:
-        return _OTHERS[code]
-    if code == _GOES_ON:
-        return "goes on", IRREGULAR[REGIMES.unsettled]
-    if code >= _OUTCOME:
-        number = code - _OUTCOME
-        return outcomes[number], OUTCOMES[number % len(OUTCOMES)]
-    cycles, most = code % 100, len(PERIODS)
-    name = f"> {word(most - 1)}" if cycles == most else word(cycles)
-    kind, impacts = {
-        0: ("", None),
-        _NONE: (", no impact", 0),
-        _ONE: (", 1 impact", 1),
-        _MORE: (", more impacts", 2),
-    }[code - cycles]
-    return name + kind, color_of(cycles, impacts)
+def _entry(
+    kind: Sequence[int], word: Callable[[int], str], outcomes: Sequence[str]
+) -> tuple[tuple[int, ...], str, str]:
+    """Place in the legend, name and colour of lanes: by period and impacts, then outcomes."""
+    outcome, period, impacts = kind
+    if outcome >= 0:
+        return (1, outcome), outcomes[outcome], OUTCOMES[outcome % len(OUTCOMES)]
+    if period <= 0:
+        return (2, list(_OTHERS).index(period)), *_OTHERS[period]
+    if period == _GOES_ON:
+        return (1, -1), "goes on", IRREGULAR[REGIMES.unsettled]
+    most = len(PERIODS)
+    name = f"> {word(most - 1)}" if period == most else word(period)
+    name += {-1: "", 0: ", no impact", 1: ", 1 impact", 2: ", more impacts"}[impacts]
+    return (0, period, impacts), name, color_of(period, None if impacts < 0 else impacts)
 
 
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
