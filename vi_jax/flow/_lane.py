@@ -18,6 +18,7 @@ from ..machine import (
     clock_of,
     events_of,
     is_autonomous,
+    mode_number,
     others_of,
     own_modes,
     section_in,
@@ -235,13 +236,24 @@ class Plan(eqx.Module):
     stop: Any = None
     """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
-    extents: Scalars | None = None
+    extents: tuple[Any, ...] | None = None
     """Of each coordinate, then of the guard of each of `others`, how small it is, if it is much
-    less than 1; else 1, and of a machine whose numbers are about 1 absent."""
+    less than 1; else 1, and of a machine whose numbers are about 1 absent. Of an event that holds a
+    mode a pair, out of mode 0 and in it, where its guard is another quantity."""
 
     def extent(self, k: int) -> Scalar | float:
-        """A length by which those of coordinate number k are judged, or of place k in `extents`."""
+        """A length by which those of coordinate number k are judged."""
         return 1.0 if self.extents is None else self.extents[k]
+
+    def guard_extent(self, number: int, lane: "Lane") -> Scalar | float:
+        """A size by which the guard of an event that is no stop is judged in the lane's modes."""
+        if self.extents is None:
+            return 1.0
+        found = self.extents[len(self.machine.coordinates) + self.others(lane.state).index(number)]
+        if not events_of(self.machine)[number].holds_mode:
+            return found
+        held = lane.modes[mode_number(self.machine, number)] == 0
+        return jnp.where(held, found[1], found[0])
 
     def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """What rounding leaves of place and velocity of coordinate number k (see `rounding`)."""

@@ -58,7 +58,8 @@ _NO_NUMBERS = (
 
 # A field that differs by more than this at the ends of its cycle has another period; with a period
 # of five digits it differs by less.
-_APART = 1e-4
+# It is compared with its size there, and at this share of a cycle, where few inputs are zero.
+_APART, _INSIDE = 1e-4, 0.29
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
@@ -190,12 +191,12 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
     except Exception:  # the error is raised in words where field and guards are traced
         return
-    cycle, first, last, below = found
+    cycle, first, within, last, below = found
     parts = jtu.tree_leaves_with_path(start) if ticks else []
     if len(first) != len(parts):  # the field returns no state: it is refused where it is traced
         return
-    for (path, _), one, other in zip(parts, first, last, strict=True):
-        if np.max(abs(one - other) / (1e-3 + abs(one) + abs(other))) > _APART:
+    for (path, _), one, inside, other in zip(parts, first, within, last, strict=True):
+        if np.any(abs(one - other) > _APART * np.maximum(abs(inside), abs(one) + abs(other))):
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
@@ -205,13 +206,13 @@ def check_values(machine: AbstractMachine, start: State) -> None:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """The cycle; the field where it begins and where it ends, if `s` `ticks`; which guards are
-    below zero in any state around the start. `zero` is an argument, since what is computed from
-    constants alone is compiled by itself."""
+    """The cycle; the field where it begins, within it and where it ends, if `s` `ticks`; which
+    guards are below zero in any state around the start. `zero` is an argument, since what is
+    computed from constants alone is compiled by itself."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
-    ends = (zero, cycle) if ticks else ()
-    fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in ends] or [(), ()]
+    instants = (zero, _INSIDE * cycle, cycle) if ticks else ()
+    fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in instants] or [()] * 3
     return cycle, *fields, _guards_below(machine, zero, start, modes) if others_of(machine) else ()
 
 

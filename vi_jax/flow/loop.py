@@ -2,11 +2,10 @@
 of steps are judged."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from functools import partial
 from math import pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +19,7 @@ from .. import lanes
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
-    Friction,
+    ContactFriction,
     bare,
     begin_modes,
     events_of,
@@ -86,49 +85,36 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     return stop_gradient(jtu.tree_map(size, sizes, moved))
 
 
-def extents_of(plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State) -> Scalars:
+def extents_of(
+    plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
+) -> tuple[Any, ...]:
     """As `Plan.extents`: of each coordinate, then of the guard of each event that is no stop, how
     small it is, if it is much less than 1; else 1. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
     s, start = stop_gradient((s, start))
-    found = [_small(_spread(body.position, start, sizes)) for body in machine.coordinates]
-    for number in plan.others(start):
-        event = events_of(machine)[number]
-        if isinstance(event, Friction):
-            found.append(_small(_size_of_friction(plan, number, s, start, modes, contact, sizes)))
-            continue
-        if event.holds_mode:  # its guard is another quantity in each mode
-            found.append(jnp.ones_like(s))
-            continue
 
-        def guard(s: Scalar, x: State, number: int = number) -> Scalar:
+    def of_guard(number: int, modes: Scalars, contact: Scalars) -> Scalar:
+        def guard(s: Scalar, x: State) -> Scalar:
             return jnp.asarray(guard_of(machine, number, s, x, modes, contact), s.dtype)
 
-        value, rate = jax.jvp(lambda s, guard=guard: guard(s, start), (s,), (jnp.ones_like(s),))
+        value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
         own = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        spread = _spread(lambda x, guard=guard: guard(s, x), start, sizes)
-        found.append(_small(jnp.maximum(own, spread)))
+        return _small(jnp.maximum(own, _spread(lambda x: guard(s, x), start, sizes)))
+
+    found: list[Any] = [_small(_spread(x.position, start, sizes)) for x in machine.coordinates]
+    for number in plan.others(start):
+        event, rest = events_of(machine)[number], contact
+        if not event.holds_mode:
+            found.append(of_guard(number, modes, rest))
+            continue
+        if contact and isinstance(event, ContactFriction):  # it holds a body that rests
+            k = stops_of(machine)[event.stop].coordinate
+            rest = (*contact[:k], jnp.full_like(s, to_event(event.stop)), *contact[k + 1 :])
+        own = mode_number(machine, number)
+        each = ((*modes[:own], jnp.full_like(s, x), *modes[own + 1 :]) for x in (1.0, 0.0))
+        found.append(tuple(of_guard(number, x, rest) for x in each))
     return stop_gradient(tuple(found))
-
-
-def _size_of_friction(
-    plan: Plan, number: int, s: Scalar, start: State, modes: Scalars, contact: Scalars,
-    sizes: State,
-) -> Scalar:  # fmt: skip
-    """The larger of the slip and of the force that holds a body, where each is a guard of friction;
-    `contact` is of bodies of which none rests."""
-    machine, event = plan.machine, events_of(plan.machine)[number]
-    assert isinstance(event, Friction)
-    own = mode_number(machine, number)
-    held = (*modes[:own], jnp.zeros_like(s), *modes[own + 1 :])
-
-    def force(x: State) -> Scalar:
-        return guard_of(machine, number, s, x, held, contact)
-
-    parts = force, lambda x: event.speed_of_slip(machine, s, x)
-    each = (jnp.maximum(jnp.abs(x(start)), _spread(x, start, sizes)) for x in parts)
-    return functools.reduce(jnp.maximum, each)
 
 
 def _small(size: Scalar) -> Scalar:

@@ -106,7 +106,8 @@ def set_off(
 
         was = stop_gradient(guard_of(machine, number, lane.s, old, modes, contact))
         now, rate = jax.jvp(guard, *stop_gradient(((lane.s, lane.state), along)))
-        slack = float(jnp.finfo(now.dtype).eps) ** 0.5 * (1 + jnp.abs(now))
+        size = plan.guard_extent(number, lane) + jnp.abs(now)
+        slack = float(jnp.finfo(now.dtype).eps) ** 0.5 * size
         moved, own = jnp.abs(now - was) > slack, turns.get(number, jnp.zeros_like(when))
         rises = when & (was < -slack) & (now > slack)
         if number == section_number(machine):
@@ -135,7 +136,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
-            slides = _comes_back(machine, number, its_modes, lane.s, its_state)
+            slides = _comes_back(plan, number, lane._replace(state=its_state, modes=its_modes))
             lane = lane.ended(turns[number], slides, "sliding")
             its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
@@ -176,21 +177,21 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
     return lane.ended(here, jnp.ones_like(here), outcome)
 
 
-def _comes_back(
-    machine: AbstractMachine, i: int, modes: tuple, s: Scalar, state: State
-) -> Flag | None:
+def _comes_back(plan: Plan, i: int, lane: Lane) -> Flag | None:
     """Whether the field behind a switch, event number i, points back at its surface, as that before
     it did: the motion would slide along it. `None` for a kind of switch whose motion cannot."""
+    machine = plan.machine
     if not events_of(machine)[i].may_slide:
         return None
-    smooth = in_modes(machine, modes)
+    smooth = in_modes(machine, lane.modes)
 
     def guard(s: Scalar, state: State) -> Scalar:
-        return guard_of(machine, i, s, state, modes)
+        return guard_of(machine, i, s, state, lane.modes)
 
-    here = stop_gradient(guard_rates(smooth.field, guard, s, state))
-    slack = 1e4 * float(jnp.finfo(s.dtype).eps) * (1 + jnp.abs(here.v))
-    return (jnp.abs(here.x) <= slack) & (here.v > slack)
+    here = stop_gradient(guard_rates(smooth.field, guard, lane.s, lane.state))
+    speed = plan.in_units(here.v)
+    slack = 1e4 * float(jnp.finfo(speed.dtype).eps) * (plan.guard_extent(i, lane) + jnp.abs(speed))
+    return (jnp.abs(here.x) <= slack) & (speed > slack)
 
 
 def _turned_over(
@@ -202,7 +203,7 @@ def _turned_over(
     was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
     now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
     was, now = stop_gradient((was, now))
-    slack = JUMPED * (1 + jnp.abs(now))
+    slack = JUMPED * (plan.guard_extent(number, lane) + jnp.abs(now))
     return when & (was <= slack) & (now > slack)
 
 

@@ -324,7 +324,7 @@ def _jumped(guard: Crossing) -> Crossing:
     """The event, with whether its guard has jumped above zero as the step begins: by more than what
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
-    return guard._replace(above=x > JUMPED * (1 + jnp.abs(x)) + _rounding(guard.scale))
+    return guard._replace(above=x > JUMPED * jnp.abs(x) + _rounding(guard.scale))
 
 
 def _rounding(scale: Scalar) -> Scalar:
@@ -386,7 +386,7 @@ def _others(
         event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
         both = zip(begins[place], arrives[place], strict=True)
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
-        scale = plan.extent(len(machine.coordinates) + place) + plan.in_units(
+        scale = plan.guard_extent(number, lane) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         )
         if event.from_below:
