@@ -36,14 +36,15 @@ def implicit_stages(
     h: Any,
     y0: Vector,
     tolerance: Scalar | float,
+    sizes: Vector | float = 1.0,
 ) -> tuple[list[Vector], Scalar]:
     """The slopes of all stages, and what the last steps of Newton's method still changed, of a step
     of length h from `y0`, flattened.
 
     All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
-    Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to 1 + |y|; where that
-    fails what is left is infinite. Derivatives are those of the solution, by the implicit function
-    theorem.
+    Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to `sizes` + |y|; where
+    that fails what is left is infinite. Derivatives are those of the solution, by the implicit
+    function theorem.
     """
     gamma = float(tableau.a_diagonal[-1])
     still = stop_gradient((s0, y0))
@@ -65,7 +66,7 @@ def implicit_stages(
             def newton(carry):
                 k, _, i = carry
                 change = dot(inverse, lacks(k))
-                return k - change, change_of(h * gamma * change, y0), i + 1
+                return k - change, change_of(h * gamma * change, y0, sizes), i + 1
 
             start = (k, jnp.full_like(h, jnp.inf), jnp.zeros_like(h))
             k, size, _ = jax.lax.while_loop(goes_on, newton, start)
@@ -78,9 +79,9 @@ def implicit_stages(
     return stages, left
 
 
-def change_of(change: Vector, y: Vector) -> Scalar:
-    """The largest component of a change, relative to 1 + |y|; infinite if there is a NaN."""
-    size = jnp.max(jnp.abs(change) / (1 + jnp.abs(y)))
+def change_of(change: Vector, y: Vector, sizes: Vector | float) -> Scalar:
+    """The largest component of a change, relative to `sizes` + |y|; infinite if there is a NaN."""
+    size = jnp.max(jnp.abs(change) / (sizes + jnp.abs(y)))
     return jnp.where(jnp.isfinite(size), size, jnp.inf)
 
 
@@ -132,14 +133,15 @@ class Unrolled(diffrax.AbstractSolver):
     step; its own `root_finder` is not used.
 
     **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
-    `tolerance`, to which stages are solved, relative to 1 + |y| (by default
-    1e-12).
+    `tolerance`, to which stages are solved, relative to `sizes` + |y| (by default 1e-12); `sizes`,
+    a number for each array of y (by default 1).
 
     **Raises:** `TypeError` if `solver` is not one.
     """
 
     solver: Any  # not yet known to be a solver when it is checked below
     tolerance: Any = eqx.field(kw_only=True, default=None)
+    sizes: Any = eqx.field(kw_only=True, default=None)
     term_structure: ClassVar[Any] = diffrax.AbstractTerm
 
     def __check_init__(self):
@@ -213,9 +215,14 @@ class Unrolled(diffrax.AbstractSolver):
         def field(t, y):
             return ravel_pytree(terms.vf(t, unravel(y), args))[0]
 
-        slopes, left = implicit_stages(tableau, field, t0, control, flat, tolerance)
+        sizes = jtu.tree_map(jnp.ones_like, y0)
+        if self.sizes is not None:
+            sizes = jtu.tree_map(lambda one, size: one * size, sizes, self.sizes)
+        each = ravel_pytree(sizes)[0]
+        slopes, left = implicit_stages(tableau, field, t0, control, flat, tolerance, each)
         stages = [unravel(control * k) for k in slopes]
-        error = jtu.tree_map(lambda e: jnp.abs(e) + left, weighted(tableau.b_error, stages))
+        error = weighted(tableau.b_error, stages)
+        error = jtu.tree_map(lambda e, size: jnp.abs(e) + left * size, error, sizes)
         y1 = weighted(tableau.b_sol, stages, y0)
         assert tableau.a_diagonal is not None
         diagonal, places = tableau.a_diagonal[-1], [(0.0, t0, y0)]
@@ -249,6 +256,13 @@ _VISIBLE = 1e-6
 
 def _unrolled(solver: object) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
+
+
+def _within(solver: Unrolled, tolerance: Any, sizes: Any, beside: Integrals) -> Unrolled:
+    """An implicit solver of a state of these sizes, and of what is integrated `beside` it."""
+    if sizes is not None:
+        sizes = sizes, jtu.tree_map(jnp.ones_like, beside)
+    return Unrolled(solver.solver, tolerance=tolerance, sizes=sizes)
 
 
 def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
@@ -342,7 +356,7 @@ class Adaptive(_RungeKutta):
         rtol, atol, floor = self._tolerances(s0)
         solver = self.solver
         if solver.implicit:
-            solver = Unrolled(solver.solver, tolerance=jnp.maximum(0.01 * rtol, floor))
+            solver = _within(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
         new, after, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
         least = jtu.tree_map(lambda x: atol, old)
@@ -468,6 +482,12 @@ class ImplicitSteps(FixedStep):
     end is not a number."""
 
     takes_implicit = True
+    sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
+    """As of `Adaptive`."""
+
+    def with_sizes(self, sizes):
+        """With stages solved to these sizes."""
+        return dataclasses.replace(self, sizes=sizes)
 
     @property
     def follows_fading(self):
@@ -476,7 +496,7 @@ class ImplicitSteps(FixedStep):
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """One Runge–Kutta step, and the stages of the solver; its error is not asked for."""
-        solver = Unrolled(self.solver.solver, tolerance=8 * jnp.finfo(s0.dtype).eps)
+        solver = _within(self.solver, 8 * jnp.finfo(s0.dtype).eps, self.sizes, beside)
         new, beside, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))
         new = jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), new)
