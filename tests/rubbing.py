@@ -1,9 +1,10 @@
-"""A body that dry friction holds and brakes, under a force of any kind, for several files."""
+"""A body that dry friction holds and brakes, and a block on a floor, for several files."""
 
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
@@ -24,3 +25,30 @@ class Rubbing(vi.AbstractMachine):
 
     def field(self, s, x):
         return vi.OscillatorState(x.V, self.force(self, s, x))
+
+
+class Block(vi.Mechanical):
+    """A particle above a floor at y = 0, pulled along it."""
+
+    friction: Any = 0.3
+    restitution: Any = 0.0
+    tangential: Any = 0.0
+    pull: Any = 0.0
+    """Amplitude of a force cos t along the floor."""
+    lift: Any = 0.0
+    """Amplitude of a force sin 2t up."""
+    weight: Any = 1.0
+    q = ("x", "y")
+    cycle = 2 * jnp.pi
+
+    @property
+    def contacts(self):
+        rubs = dict(friction=self.friction, along="x", tangential_restitution=self.tangential)
+        return vi.RigidStop(0.0, self.restitution, "left", on="y", **rubs)
+
+    def mass(self, q):
+        return self.weight, self.weight
+
+    def force(self, t, q, v):
+        up = -1 + self.lift * jnp.sin(2 * t)
+        return dict(x=self.weight * self.pull * jnp.cos(t), y=self.weight * up)

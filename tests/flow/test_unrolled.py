@@ -9,7 +9,6 @@ import pytest
 import vi_jax as vi
 
 SOLVERS = [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Bosh3(), diffrax.Heun()]
-NAMES = [type(solver).__name__ for solver in SOLVERS]
 
 
 def field(t, y, args):
@@ -20,7 +19,7 @@ TERM = diffrax.ODETerm(field)
 START = {"x": jnp.asarray(0.3), "v": jnp.asarray(-0.7)}
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=NAMES)
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda x: type(x).__name__)
 def test_step_is_that_of_diffrax(solver):
     args = 0.1
     hidden = solver.init(TERM, 0.2, 0.5, START, args)
@@ -37,17 +36,14 @@ def test_step_is_that_of_diffrax(solver):
 
 
 def test_serves_diffeqsolve():
-    solver = diffrax.Dopri8()
-
     def solve(solver):
         return diffrax.diffeqsolve(
             TERM, solver, 0.0, 20.0, 0.1, START, args=0.1,
             stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
         ).ys["x"][-1]  # fmt: skip
 
-    assert float(jax.jit(lambda: solve(vi.Unrolled(solver)))()) == pytest.approx(
-        float(solve(solver)), abs=1e-10
-    )
+    mine = float(jax.jit(lambda: solve(vi.Unrolled(diffrax.Dopri8())))())
+    assert mine == pytest.approx(float(solve(diffrax.Dopri8())), abs=1e-10)
 
 
 @pytest.mark.slow
@@ -68,8 +64,5 @@ def test_an_implicit_step_is_that_of_diffrax():
 def test_other_solvers_are_refused(method, solver):
     with pytest.raises(TypeError, match=r"`solver` must be an explicit or diagonally implicit"):
         method(solver)
-
-
-def test_fixed_steps_are_explicit():
     with pytest.raises(TypeError, match=r"`FixedStep` must be an explicit.*Use `Adaptive`"):
         vi.FixedStep(diffrax.Kvaerno5())

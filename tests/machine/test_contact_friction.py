@@ -1,37 +1,12 @@
 """Friction on a stop: in its impacts, and under the force of a body that rests on it."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 
-from rubbing import Rubbing
-
-
-class Block(vi.Mechanical):
-    """A particle above a floor at y = 0, pulled along it."""
-
-    friction: Any = 0.3
-    restitution: Any = 0.0
-    tangential: Any = 0.0
-    pull: Any = 0.0
-    """Amplitude of a force cos t along the floor."""
-    lift: Any = 0.0
-    """Amplitude of a force sin 2t up."""
-    q = ("x", "y")
-    mass = (1.0, 1.0)
-    cycle = 2 * jnp.pi
-
-    @property
-    def contacts(self):
-        rubs = dict(friction=self.friction, along="x", tangential_restitution=self.tangential)
-        return vi.RigidStop(0.0, self.restitution, "left", on="y", **rubs)
-
-    def force(self, t, q, v):
-        return dict(x=self.pull * jnp.cos(t), y=-1 + self.lift * jnp.sin(2 * t))
+from rubbing import Block, Rubbing
 
 
 @pytest.mark.slow
@@ -96,6 +71,15 @@ def test_a_block_bounces_to_rest_while_it_slides():
     # In the last bounces, 8e-6 of the longest step, the body counts as held.
     held = mu * 15 * 8e-6 * 2 * np.pi / 5
     assert lost - held < float(run.impact_energy[0]) <= lost + 1e-9
+
+
+@pytest.mark.slow
+def test_a_grain_rubs_as_a_block_does():
+    def end(weight):
+        block = Block(0.3, 0.4, pull=0.5, lift=0.6, weight=weight)
+        return vi.simulate(block, block.at(y=0.1, v=dict(x=0.5)), 4).last.v.x
+
+    np.testing.assert_allclose(jax.vmap(end)(jnp.array([1e-15, 1e-28])), end(1.0), atol=1e-9)
 
 
 def force(machine, s, z):

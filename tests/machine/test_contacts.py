@@ -9,6 +9,8 @@ import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
 
+from rubbing import Block
+
 
 class Oscillator(vi.AbstractMachine):
     omega: float = 0.9
@@ -30,18 +32,6 @@ class Oscillator(vi.AbstractMachine):
         return vi.State(x=0.0, u=0.0)
 
 
-class Block(vi.Mechanical):
-    """A block that is dropped on a floor and pushed to and fro."""
-
-    q = ("x", "y")
-    mass = (1.0, 1.0)
-    cycle = 2 * jnp.pi
-    contacts = vi.RigidStop(0.0, 0.4, "left", on="y", friction=0.3, along="x")
-
-    def force(self, t, q, v):
-        return dict(x=0.5 * jnp.cos(t), y=-1.0)
-
-
 class Stack(vi.Mechanical):
     """A body on rough ground, with another one on it."""
 
@@ -59,7 +49,7 @@ def numbers(state):
 
 
 def test_friction_on_a_floor_that_a_body_hits():
-    machine = Block()
+    machine = Block(0.3, 0.4, pull=0.5)
     run = vi.simulate(machine, machine.at(y=0.1, v=dict(x=0.5)), 10)
     assert int(run.impacts.sum()) == 13
     np.testing.assert_allclose(numbers(run.last), [0.952123292, 0, 0.121811435, 0], atol=2e-8)
