@@ -168,8 +168,8 @@ def interval(name: str, value: Any) -> tuple[float, float]:
 
 
 def row_of_numbers(values: object) -> np.ndarray | None:
-    """Finite real numbers in one row, one at least, or `None` if `values` is none such. Texts,
-    truth values, dates and complex numbers are no real numbers, even where NumPy takes them."""
+    """Finite real numbers in one row, one at least, or `None` for other values. Texts, truth
+    values, dates and complex numbers are no real numbers, even where NumPy takes them."""
     if isinstance(values, list | tuple) and any(isinstance(x, bool | np.bool_) for x in values):
         return None
     try:
@@ -228,7 +228,7 @@ def short(value: object) -> str:
 
 def state_of_numbers(name: str, state: object) -> Any:
     """`state`, each part of which is a real number or an array of them. **Raises:** `TypeError`
-    that names the part which is none."""
+    that names any other part."""
     for part, value in vars(state).items():
         require_real(name, part, value)
     return state

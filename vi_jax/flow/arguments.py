@@ -204,7 +204,7 @@ def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
 
 def machine_of(machine: Machine) -> AbstractMachine:
     """The machine as every verb takes it, so that other numbers are not another program: each
-    number that is a `float` is an array. **Raises:** `TypeError` if it is none."""
+    number that is a `float` is an array. **Raises:** `TypeError` for anything else."""
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     return jtu.tree_map(strongly_typed, machine)
 

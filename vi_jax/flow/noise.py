@@ -260,7 +260,7 @@ def lane_key(key: UInt32[Array, "2"], number: UInt32[Array, ""]) -> UInt32[Array
 
 
 def words_of(key: Any) -> UInt32[Array, "2"]:
-    """The two words of a key of JAX's. **Raises:** `TypeError` or `ValueError` for what is none."""
+    """The two words of a JAX key. **Raises:** `TypeError` or `ValueError` for anything else."""
     what = "one key of JAX's Threefry generator, as `jax.random.key(0)` makes it"
     if key is None:
         raise TypeError(f"Argument `key` must be {what}, where there is noise.")

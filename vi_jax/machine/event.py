@@ -135,8 +135,8 @@ class AbstractSwitch(AbstractEvent):
     """The number of the stop on which this is friction, also in its impacts (see
     `ContactFriction`)."""
     blends: ClassVar[bool] = False
-    """Whether in mode 0 the field is the mean of those of modes -1 and +1 that stays on the surface
-    where they meet (see `Switch`)."""
+    """Whether the field of mode 0 is a mean of the fields of modes -1 and +1, with which the motion
+    stays on the surface between them (see `Switch`)."""
 
     @abc.abstractmethod
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:

@@ -30,7 +30,7 @@ from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, rates, to_turn
 from ..results import EventKind, code_of_outcome
 from ..smooth import exact, holding, in_modes, limited_of
-from .guards import JUMPED, Crossing, furthest_landing
+from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
 from .impact import is_compound, strike_in_turn, strike_once
 from .settle import settle, stilled
 from .trial import Release, Situation, Trial
@@ -106,8 +106,7 @@ def set_off(
 
         was = stop_gradient(guard_of(machine, number, lane.s, old, modes, contact))
         now, rate = jax.jvp(guard, *stop_gradient(((lane.s, lane.state), along)))
-        size = plan.guard_extent(number, lane) + jnp.abs(now)
-        slack = float(jnp.finfo(now.dtype).eps) ** 0.5 * size
+        slack = guard_rounding(plan.guard_extent(number, lane) + jnp.abs(now))
         moved, own = jnp.abs(now - was) > slack, turns.get(number, jnp.zeros_like(when))
         rises = when & (was < -slack) & (now > slack)
         if number == section_number(machine):
@@ -170,7 +169,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
-    """The lane, its lane ended where an event happened that ends the motion."""
+    """The lane, ended where an event happened that ends the motion."""
     if not event.ends:
         return lane
     outcome = code_of_outcome(outcomes_of(machine).index(event.ends))

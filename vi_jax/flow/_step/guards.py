@@ -324,10 +324,10 @@ def _jumped(guard: Crossing) -> Crossing:
     """The event, with whether its guard has jumped above zero as the step begins: by more than what
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
-    return guard._replace(above=x > JUMPED * jnp.abs(x) + _rounding(guard.scale))
+    return guard._replace(above=x > JUMPED * jnp.abs(x) + guard_rounding(guard.scale))
 
 
-def _rounding(scale: Scalar) -> Scalar:
+def guard_rounding(scale: Scalar) -> Scalar:
     """What a search's step leaves of a guard of this size that is zero."""
     return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
 
@@ -424,7 +424,7 @@ def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple
     """Whether a guard counts that does so only once it has been below zero, and `Lane.below` at the
     step's end. One that begins at zero and falls counts."""
     # On it is also what a search's step left so close to it: a cycle is no shorter.
-    rounding = _rounding(scale)
+    rounding = guard_rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     # Where the motion has begun on it, which is behind it, rounding may be all that falls.

@@ -432,9 +432,9 @@ def flight(
     and ξ.
 
     Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less under
-    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping. What is summed are changes, each
-    of the order of τ: the rounding of a short flight is that of its own length, as it has to be
-    where a body leaves the stop by less than its position rounds.
+    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping. Changes are summed, each of the
+    order of τ. So the rounding of a short flight is small beside its length, also where a body
+    leaves the stop by less than the rounding of its position.
     """
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
     square = (1 - xi * xi) * tau * tau

@@ -36,7 +36,7 @@ def implicit_stages(
     h: Any,
     y0: Vector,
     tolerance: Scalar | float,
-    sizes: Vector | float = 1.0,
+    sizes: Vector,
 ) -> tuple[list[Vector], Scalar]:
     """The slopes of all stages, and what the last steps of Newton's method still changed, of a step
     of length h from `y0`, flattened.
@@ -79,7 +79,7 @@ def implicit_stages(
     return stages, left
 
 
-def change_of(change: Vector, y: Vector, sizes: Vector | float) -> Scalar:
+def change_of(change: Vector, y: Vector, sizes: Vector) -> Scalar:
     """The largest component of a change, relative to `sizes` + |y|; infinite if there is a NaN."""
     size = jnp.max(jnp.abs(change) / (sizes + jnp.abs(y)))
     return jnp.where(jnp.isfinite(size), size, jnp.inf)
@@ -483,7 +483,7 @@ class ImplicitSteps(FixedStep):
 
     takes_implicit = True
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
-    """As of `Adaptive`."""
+    """How large the numbers of the state are, as `with_sizes` sets it."""
 
     def with_sizes(self, sizes):
         """With stages solved to these sizes."""
