@@ -344,7 +344,7 @@ def _check_frictions(machine: AbstractMachine) -> None:
         "along": ("coordinate", len(machine.coordinates)),
     }
     for switch in switches_of(machine):
-        if switch.rubs_on is None:
+        if switch.friction_stop is None:
             continue
         for argument, (what, count) in known.items():
             number = getattr(switch, argument)
@@ -353,7 +353,7 @@ def _check_frictions(machine: AbstractMachine) -> None:
                     f"Argument `{argument}` of a ContactFriction must be the number of a {what} of "
                     f"the {name}, which has {count}, but got {number}."
                 )
-        across = stops_of(machine)[switch.rubs_on].coordinate
+        across = stops_of(machine)[switch.friction_stop].coordinate
         if switch.along == across:  # pyright: ignore[reportAttributeAccessIssue]
             raise ValueError(
                 f"Argument `along` of a ContactFriction must be the number of the coordinate that "

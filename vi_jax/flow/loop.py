@@ -24,12 +24,12 @@ from ..machine import (
     begin_modes,
     events_of,
     guard_of,
+    has_contact_friction,
     holds_anywhere,
     is_in_range,
     mode_number,
     prepared,
     replaced,
-    rubs,
     scales_known,
     stops_of,
     struck_modes,
@@ -161,7 +161,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
-        if rubs(machine) or (stops_of(machine) and holds_anywhere(machine)):
+        if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
@@ -227,14 +227,14 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     `plan.kept + 1`: the first holds the state in which recording begins, and no record. States of a
     machine with modes of its own are `HybridState`s.
     """
-    way = prepared(plan.machine)
-    own = way.machine is plan.machine
+    form = prepared(plan.machine)
+    own = form.machine is plan.machine
     if not own:
         if plan.noise is not None:
-            plan = dataclasses.replace(plan, noise=in_modes_of(way, plan.noise, start))
+            plan = dataclasses.replace(plan, noise=in_modes_of(form, plan.noise, start))
         # What ends a lane early knows the machine's own state only.
-        plan = dataclasses.replace(plan, machine=way.machine, stop=None)
-        start = way.inward(start)
+        plan = dataclasses.replace(plan, machine=form.machine, stop=None)
+        start = form.inward(start)
     zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(plan.machine, s, start, plan.own)
@@ -251,7 +251,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         rows=plan.kept + 1, backend=plan.backend,
     )  # fmt: skip
     if not own:
-        states = replaced(states, jax.vmap(way.outward)(bare(states)))
+        states = replaced(states, jax.vmap(form.outward)(bare(states)))
     return ends, states, records
 
 

@@ -139,7 +139,7 @@ def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> 
     return dataclasses.replace(plan, noise=impulses)
 
 
-def in_modes_of(way: Prepared, noise: Impulses, start: State) -> Impulses:
+def in_modes_of(form: Prepared, noise: Impulses, start: State) -> Impulses:
     """The noise of a machine that is followed in its natural modes: its impulses act on the
     machine's own velocities. `start` is a state of the machine itself."""
     leaves, tree = jtu.tree_flatten(start)
@@ -147,7 +147,7 @@ def in_modes_of(way: Prepared, noise: Impulses, start: State) -> Impulses:
     def matrix(i: int) -> Array:
         """Of what the modes take over from array number i, which they are linear in."""
         put = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
-        return jax.jacfwd(lambda x: jtu.tree_leaves(way.inward(put(x)))[i])(leaves[i])
+        return jax.jacfwd(lambda x: jtu.tree_leaves(form.inward(put(x)))[i])(leaves[i])
 
     modes = [None if x is None else matrix(i) for i, x in enumerate(noise.scales)]
     return dataclasses.replace(noise, modes=tuple(modes))

@@ -19,9 +19,9 @@ from ..machine import (
     AbstractMachine,
     Coordinate,
     field_in,
+    has_contact_friction,
     held_flow,
     holds_anywhere,
-    rubs,
     scales_known,
     shown_modes,
     stops_of,
@@ -68,7 +68,7 @@ class SmoothMachine(eqx.Module):
         if not self.contact and not dry:
             return flow
         limited = limited_of(machine) if self.contact else []
-        several = len(limited) > 1 or rubs(machine)
+        several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
             flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
         for k in () if several else limited:  # without rounding where one body rests

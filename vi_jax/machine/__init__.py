@@ -34,9 +34,9 @@ from .contacts import forces as forces
 from .contacts import held_by as held_by
 from .contacts import held_flow as held_flow
 from .contacts import push_of as push_of
-from .contacts import rubbed as rubbed
 from .contacts import shares as shares
 from .contacts import shown_modes as shown_modes
+from .contacts import with_friction_impulse as with_friction_impulse
 from .coordinates import Coordinate as Coordinate
 from .coordinates import angles_in as angles_in
 from .coordinates import component as component
@@ -72,8 +72,10 @@ from .events import begin_modes as begin_modes
 from .events import begun as begun
 from .events import event_of as event_of
 from .events import events_of as events_of
+from .events import friction_on as friction_on
 from .events import guard_of as guard_of
 from .events import happens_at as happens_at
+from .events import has_contact_friction as has_contact_friction
 from .events import holds_anywhere as holds_anywhere
 from .events import is_autonomous as is_autonomous
 from .events import jump_of as jump_of
@@ -83,8 +85,6 @@ from .events import modes_of as modes_of
 from .events import own_modes as own_modes
 from .events import raveled as raveled
 from .events import replaced as replaced
-from .events import rubbing_on as rubbing_on
-from .events import rubs as rubs
 from .events import section_number as section_number
 from .events import sides_of as sides_of
 from .events import struck_modes as struck_modes

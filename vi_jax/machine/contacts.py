@@ -86,7 +86,7 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     return state
 
 
-class Rubbed(NamedTuple):
+class FrictionImpulse(NamedTuple):
     """The state behind an impact with friction, and the impulses of it."""
 
     state: State
@@ -95,9 +95,9 @@ class Rubbed(NamedTuple):
     dragged: Scalar
 
 
-def rubbed(
+def with_friction_impulse(
     machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
-) -> Rubbed:
+) -> FrictionImpulse:
     """An impact on stop `number` as Coulomb's friction has it: the body sticks, its velocity along
     the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
     most `level` times that of the stop; else it slips against that much.
@@ -127,7 +127,7 @@ def rubbed(
     )
     place, speed = body.position(after), body.velocity(after)
     moved = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
-    return Rubbed(moved, pushed, dragged)
+    return FrictionImpulse(moved, pushed, dragged)
 
 
 def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
@@ -165,16 +165,16 @@ def held_by(
     limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
     stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
-    frictions = [(i, x) for i, x in enumerate(switches) if x.rubs_on is not None]
+    frictions = [(i, x) for i, x in enumerate(switches) if x.friction_stop is not None]
     numbers = [*limited, *(x.along for _, x in frictions)]
     each = {k: push_of(coordinates[k], state) for k in numbers}
     pushes, acts = [each[k] for k in numbers], [contact[k] > 0 for k in limited]
     masses = {k: coordinates[k].mass_at(s, state) for k in numbers} if frictions else {}
     rubbing = []
     for i, friction in frictions:
-        stop = stops[friction.rubs_on]
+        stop = stops[friction.friction_stop]
         at = limited.index(stop.coordinate)
-        here = contact[stop.coordinate] == 1.0 + friction.rubs_on
+        here = contact[stop.coordinate] == 1.0 + friction.friction_stop
         # The stop pushes a body away from it, and friction against the way it slips.
         ratio = masses[stop.coordinate] / masses[friction.along]
         ratio = modes[i] * friction.level * stop.sign * ratio
@@ -216,7 +216,7 @@ def held_flow(
         force = amount * mass
         found[i] = force if pace is None else force / pace, None, mass
     for row, (i, friction, at, _) in enumerate(rubbing, start=first - len(rubbing)):
-        sign = stops_of(machine)[friction.rubs_on].sign
+        sign = stops_of(machine)[friction.friction_stop].sign
         found[i] = amounts[row] * masses[row], -sign * amounts[at] * masses[at], masses[row]
     return added(flow, amounts, pushes), found
 

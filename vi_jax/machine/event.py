@@ -131,7 +131,7 @@ class AbstractSwitch(AbstractEvent):
     may_slide: ClassVar[bool] = True  # the mode is another on either side of the surface
     analytic: ClassVar[bool] = True
     """Whether the force of a mode has a power series up to the event that ends it."""
-    rubs_on: ClassVar[int | None] = None
+    friction_stop: ClassVar[int | None] = None
     """The number of the stop on which this is friction, also in its impacts (see
     `ContactFriction`)."""
     blends: ClassVar[bool] = False

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, Scalars, State, Vector
-from .contacts import rubbed
+from .contacts import with_friction_impulse
 from .event import AbstractEvent, Around, Modes, Section
 from .friction import chosen_together, frictions_in
 from .own import declared_modes, has_own_modes, others_of, stops_of, switches_of
@@ -59,7 +59,7 @@ def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes
     """The state after one of a machine's events as a smooth function of that before it (see
     `AbstractEvent.jump`)."""
     event, own, _ = event_of(machine, number, modes, ())
-    return _rubbed(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
+    return _with_friction(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
@@ -85,26 +85,26 @@ def after_event(
         if event.is_dry and len(frictions_in(machine)) > 1:
             changed, held = settled_modes(changed, s), modes[own.start] == 0
             changed = chosen_together(machine, s, new, changed, contact, (own.start, held))
-    return _rubbed(machine, number, s, state, new), settled_modes(changed, s)
+    return _with_friction(machine, number, s, state, new), settled_modes(changed, s)
 
 
-def _rubbed(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
-    friction = rubbing_on(machine, number)
+def _with_friction(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
+    friction = friction_on(machine, number)
     if friction is None:
         return after
-    return rubbed(machine, number, friction, s, before, after).state
+    return with_friction_impulse(machine, number, friction, s, before, after).state
 
 
-def rubbing_on(machine: Machine, number: int) -> Any:
+def friction_on(machine: Machine, number: int) -> Any:
     """The friction on stop number `number`, or `None`."""
     if number >= len(stops_of(machine)):
         return None
-    return next((x for x in switches_of(machine) if x.rubs_on == number), None)
+    return next((x for x in switches_of(machine) if x.friction_stop == number), None)
 
 
-def rubs(machine: Machine) -> bool:
+def has_contact_friction(machine: Machine) -> bool:
     """Whether there is friction on one of its stops."""
-    return any(x.rubs_on is not None for x in switches_of(machine))
+    return any(x.friction_stop is not None for x in switches_of(machine))
 
 
 def mode_number(machine: Machine, number: int) -> int:
@@ -153,8 +153,8 @@ def struck_modes(
     held = []
     together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
-        if together and (event.is_dry or getattr(event, "rubs_on", None) is not None):
-            held.append(event.way(machine, s, state))  # pyright: ignore
+        if together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
+            held.append(event.slip_sign(machine, s, state))  # pyright: ignore
         elif event.holds_mode:
             _, place, more = event_of(machine, number, modes, contact)
             held.append(event.struck(machine, s, state, *modes[place], **more))

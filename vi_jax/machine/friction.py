@@ -75,7 +75,7 @@ class Friction(AbstractSwitch):
         """The rate by s at which the slip changes along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
-    def way(self, machine: Machine, s: Scalar, state: State) -> Scalar:
+    def slip_sign(self, machine: Machine, s: Scalar, state: State) -> Scalar:
         """The sign of the slip; zero where that is rounding."""
         slip = self.speed_of_slip(machine, s, state)
         size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
@@ -84,12 +84,12 @@ class Friction(AbstractSwitch):
 
     def begin(self, machine, s, state):
         """The mode of a motion that begins: the sign of the slip, sticking without any."""
-        return self.way(machine, s, state)
+        return self.slip_sign(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
         """The mode after an impact or another jump: the way that the body slips, or would begin
         to."""
-        slips = self.way(machine, s, state)
+        slips = self.slip_sign(machine, s, state)
         if not self.is_known(around):
             return slips
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around, True), slips)
@@ -302,7 +302,7 @@ class ContactFriction(Friction):
         count("along", self.along)
 
     @property
-    def rubs_on(self) -> int:  # pyright: ignore
+    def friction_stop(self) -> int:  # pyright: ignore
         """The number of the stop that it is friction on."""
         return self.stop
 
@@ -362,8 +362,8 @@ def chosen_together(
     """
     places = frictions_in(machine)
     switches = switches_of(machine)
-    ways = [switches[i].way(machine, s, state) for i in places]
-    slips = [x != 0 for x in ways]
+    signs = [switches[i].slip_sign(machine, s, state) for i in places]
+    slips = [x != 0 for x in signs]
     if released is not None:  # what sticks has no slip but rounding
         slips = [
             x & (modes[i] != 0) & (i != released[0]) if switches[i].is_dry else x
@@ -375,8 +375,8 @@ def chosen_together(
     def tried(x: tuple[Any, ...]) -> tuple[Any, ...]:
         _, number, _ = x
         new, chosen = list(modes), ordered[number]
-        for k, (i, way, slip) in enumerate(zip(places, ways, slips, strict=True)):
-            new[i] = jnp.where(slip, way, chosen[k])
+        for k, (i, slip_sign, slip) in enumerate(zip(places, signs, slips, strict=True)):
+            new[i] = jnp.where(slip, slip_sign, chosen[k])
         good = _consistent(machine, s, state, tuple(new), contact, places, slips, released)
         return tuple(new), number + 1, jnp.where(good, 1.0, 0.0)
 
@@ -390,7 +390,8 @@ def chosen_together(
 
 def frictions_in(machine: Machine) -> list[int]:
     """The places among a machine's switches of its frictions."""
-    return [i for i, x in enumerate(switches_of(machine)) if x.is_dry or x.rubs_on is not None]
+    switches = enumerate(switches_of(machine))
+    return [i for i, x in switches if x.is_dry or x.friction_stop is not None]
 
 
 def _consistent(

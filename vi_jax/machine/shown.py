@@ -64,10 +64,10 @@ class Summarized(eqx.Module):
 
 def known(tree: object) -> bool:
     """Whether all numbers in a tree are there: none is traced, a placeholder, or given away."""
-    return all(_there(x) for x in jtu.tree_leaves(tree))
+    return all(_is_shown(x) for x in jtu.tree_leaves(tree))
 
 
-def _there(x: object) -> bool:
+def _is_shown(x: object) -> bool:
     # JAX's own placeholder is a bare object; a solver's leaves may be functions and words.
     if isinstance(x, Tracer | jax.ShapeDtypeStruct) or type(x) is object:
         return False

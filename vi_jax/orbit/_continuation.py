@@ -15,7 +15,7 @@ from ._conditions import Special, as_held, exchange_at, is_defective, names_of, 
 from ._corrector import Step, advance, tangent_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
-from ._problem import check_parameter, flown, legs_of, problem_of, sized, steps_of
+from ._problem import check_parameter, cycles_to_fly, legs_of, problem_of, sized, steps_of
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._special_table import Intervals, SpecialTable
@@ -192,7 +192,7 @@ def _widened(
     """The equations with these parameters before their own, and as many steps as flights need
     anywhere in the intervals of all of them."""
     wide = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
-    steps = steps_of(problem.method, wide.corners(ranges), problem.like, flown(problem, x))
+    steps = steps_of(problem.method, wide.corners(ranges), problem.like, cycles_to_fly(problem, x))
     return _scaled(dataclasses.replace(wide, steps=max(problem.steps, steps)), ranges)
 
 

@@ -49,7 +49,7 @@ class Step(NamedTuple):
     """What is observed there, an `Observed` of arrays of the host."""
 
 
-def way(problem: Shooting, here: Step, at: Step) -> float:
+def distance_along(problem: Shooting, here: Step, at: Step) -> float:
     """How far along the first one's tangent the second lies, in scaled unknowns."""
     return float(np.dot(here.tangent, (at.x - here.x) / problem.scale))
 
@@ -192,7 +192,7 @@ class _CloseError(ArithmeticError):
 def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
     """The point between two, along the first one's tangent, at which a test that changes its sign
     between them is zero; `None` if there is none. The second may lie behind the first."""
-    length = way(problem, here, new)
+    length = distance_along(problem, here, new)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []
 
@@ -316,8 +316,8 @@ def crossing(
         return None
     place = zeros[np.argmin(np.abs(zeros))]
 
-    def there(get: Callable[[Step], Any]) -> np.ndarray:
+    def interpolated(get: Callable[[Step], Any]) -> np.ndarray:
         return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
 
-    x, tangent = there(lambda step: step.x), there(lambda step: step.tangent)
+    x, tangent = interpolated(lambda step: step.x), interpolated(lambda step: step.tangent)
     return here._replace(x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(problem, x))

@@ -143,15 +143,15 @@ class Flight(eqx.Module):
         """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps: the state
         then; the time that passed and the integrals of these averages; clock and state before each
         of the steps."""
-        way = prepared(self.machine)
-        if way.machine is not self.machine:
-            inward = way.inward(self.like)
-            inner = Flight(way.machine, self.modes, self.method, inward, self.contact)
+        form = prepared(self.machine)
+        if form.machine is not self.machine:
+            inward = form.inward(self.like)
+            inner = Flight(form.machine, self.modes, self.method, inward, self.contact)
 
             def outward(u: Vector) -> Vector:
-                return ravel_pytree(way.outward(inner.unravel(u)))[0]
+                return ravel_pytree(form.outward(inner.unravel(u)))[0]
 
-            start = ravel_pytree(way.inward(self.unravel(u)))[0]
+            start = ravel_pytree(form.inward(self.unravel(u)))[0]
             u, passed, (clock, states) = inner.fly(s0, s1, start, steps, averages)
             return outward(u), passed, (clock, jax.vmap(outward)(states))
         numbers, rest = eqx.partition(self, eqx.is_array)

@@ -20,7 +20,7 @@ from .._checks import count, given_number
 from .._messages import Interrupted, Tell, at_work, warn
 from .._types import Vector
 from ..machine import angles_in, nearest_images
-from ._corrector import Step, advance, located, off_by, on_host, way
+from ._corrector import Step, advance, distance_along, located, off_by, on_host
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
 from ._surgery import halves_apart
@@ -268,7 +268,7 @@ class _Walk:
                 continue
             # What falls together with the first one is not looked for, nor what comes later.
             first = ending
-            length = (1 - _SHORT) * way(self.table.problem, here, first.last)
+            length = (1 - _SHORT) * distance_along(self.table.problem, here, first.last)
             end = self.table.advance(here.x, here.tangent, length)
             if first.reason == SHORTER or not bool(end.good):
                 return first
@@ -409,21 +409,21 @@ class Closing:
         ]  # fmt: skip
         for begin, tangent, cycle, known in places:
             begin = self._some_cycles_later(begin, cycle, here)
-            if min(self._apart(step, begin) for step in (here, new)) > near:
+            if min(self._distance(step, begin) for step in (here, new)) > near:
                 continue
 
             def before(step: Step, begin=begin, tangent=tangent) -> float:
                 return float(np.dot(tangent, (begin - step.x) / self.table.scale))
 
             def ending(at: Step, begin=begin, tangent=tangent, known=known) -> Ending | None:
-                same = self._apart(at, begin) < _AGAIN
+                same = self._distance(at, begin) < _AGAIN
                 if not same or np.linalg.norm(at.tangent - tangent) >= _ALONG:
                     return None
                 return Ending(at if known is None else known._replace(tangent=at.tangent), CLOSED)
 
             yield Event(before, ending)
 
-    def _apart(self, step: Step, begin: np.ndarray) -> float:
+    def _distance(self, step: Step, begin: np.ndarray) -> float:
         return float(np.linalg.norm((step.x - begin) / self.table.scale))
 
     def _begin_at(self, first: Step) -> None:
@@ -435,7 +435,7 @@ class Closing:
         others = ((other, rate / scale) for other, rate in found)
         self.begins = [
             (first.x, np.asarray(first.tangent)),
-            *(other for other in others if self._apart(first, other[0]) > _AGAIN),
+            *(other for other in others if self._distance(first, other[0]) > _AGAIN),
         ]
 
     def _cycle(self, step: Step) -> float:

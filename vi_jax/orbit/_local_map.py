@@ -96,7 +96,7 @@ def soft_kick(
     orders: list[float] = []
     for _ in range(_TRIES):
         y, deep = greatest(length)
-        measured.append((y, _flown(problem, x, number, leg, clock, deep, length)))
+        measured.append((y, _change_by_contact(problem, x, number, leg, clock, deep, length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
             order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
@@ -137,7 +137,7 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
     return end, guard_of(machine, number, s1, problem.unravel(end), modes)
 
 
-def _flown(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
+def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
     """The state after a contact, less what it would be without; `deep`, the state at the greatest
     depth of the free flight, and how long that would be beyond the surface."""
     from scipy.optimize import brentq  # slow to load
@@ -258,11 +258,11 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
 
-    def there(x):
+    def guard_and_state(x):
         u = ravel_pytree(problem.state_at(x, leg, s))[0]
         return distance(problem.at(x), s, u), u
 
-    (_, slope), u = jax.jvp(lambda x: there(x)[0], (x,), (along,)), there(x)[1]
+    (_, slope), u = jax.jvp(lambda x: guard_and_state(x)[0], (x,), (along,)), guard_and_state(x)[1]
     machine = problem.at(x)
     field = problem.flight(machine, leg).smooth.field
 
@@ -510,7 +510,7 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    def there(x):
+    def guard_and_state(x):
         return ravel_pytree(problem.state_at(x, leg, s))[0]
 
-    return jax.jvp(there, (x,), (along,))
+    return jax.jvp(guard_and_state, (x,), (along,))

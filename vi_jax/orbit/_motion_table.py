@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ._conditions import HeldMultiplier, alone, rates_at
-from ._corrector import BESIDE, Step, advance, crossing, way
+from ._corrector import BESIDE, Step, advance, crossing, distance_along
 from ._flight import LANDS, LEAVES
 from ._flight import Event as MotionEvent
 from ._follow import Ending, Event, Table, bounds_of
@@ -162,7 +162,7 @@ class MotionTable(Table):
         return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
-        return self.advance(here.x, here.tangent, share * way(self.problem, here, last))
+        return self.advance(here.x, here.tangent, share * distance_along(self.problem, here, last))
 
     def _point(self, kind: str, step: Step, *args: Any, **more: Any) -> Point:
         return point_at(self.problem, step, kind, *args, **more)
@@ -203,7 +203,7 @@ class MotionTable(Table):
             yield Event(falls, partial(self._ended, here, impact=i))
         # Of events that are together all along the rounding is left out.
         together = ROUNDING * self.problem.radian
-        off = 0.0 if here.seen.apart > together else together
+        off = 0.0 if here.seen.order_margin > together else together
         for i, event in enumerate(self.problem.landings):
             lost = partial(self._named, REST, detail=RESTS[LANDS], impact=event)
             yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
@@ -212,7 +212,7 @@ class MotionTable(Table):
         anew, reordered = (partial(self._ended, here, other=kind) for kind in (ANEW, REORDERED))
         yield Event(room, partial(self._ended, here))
         yield Event(lambda step: float(step.seen.order), anew)
-        yield Event(lambda step: float(step.seen.apart) + off, reordered)
+        yield Event(lambda step: float(step.seen.order_margin) + off, reordered)
 
     def _ended(
         self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
@@ -228,7 +228,7 @@ class MotionTable(Table):
         if change is not None and change.kind is not None:
             name = MotionEvent(change.number).called(self.problem.machine)
             place = place_in_words(self.problem, at, change.clock)
-            detail = SLIDING[change.kind][change.there].format(name=name, place=place)
+            detail = SLIDING[change.kind][change.exists].format(name=name, place=place)
             return self._named(change.kind, at, detail, impact)
         if other is not None:
             return self._named(GRAZING, at, DETAILS[other])
@@ -292,7 +292,7 @@ class MotionTable(Table):
         """The bifurcations between two points, the extremes and the zeros of what is watched, in
         their order."""
         found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
-        return sorted(found, key=lambda f: way(self.problem, here, f[1]))
+        return sorted(found, key=lambda f: distance_along(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Where a number is larger, or less, than at all points close by, and where one that is
@@ -308,15 +308,15 @@ class MotionTable(Table):
             at = self.where(here, last, lambda step, k=(kind, name): self._numbers(step)[k][1])
             if at is None:
                 continue
-            there, rate = self._numbers(at)[kind, name]
+            value_there, rate = self._numbers(at)[kind, name]
             if kind == WATCHED:
-                real, detail = abs(there) <= _ZERO * steep, f"{name} passes zero"
+                real, detail = abs(value_there) <= _ZERO * steep, f"{name} passes zero"
             else:
                 sense, most = (1, "largest") if begin > 0 else (-1, "least")
                 # Else it has a pole, as a multiplier at a grazing.
-                real = sense * there >= max(sense * value, sense * other) - least
+                real = sense * value_there >= max(sense * value, sense * other) - least
                 corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
-                detail = f"{name} = {there:.10g} is the {most} nearby{corner}"
+                detail = f"{name} = {value_there:.10g} is the {most} nearby{corner}"
             if real:
                 yield self._point(kind, at, detail, quantity=name), at
 
@@ -367,7 +367,7 @@ class MotionTable(Table):
         at = self.where(here, last, lambda step: tests_of(step)[TURNS])
         if at is None:
             return ()
-        root, length = (way(self.problem, here, step) for step in (at, last))
+        root, length = (distance_along(self.problem, here, step) for step in (at, last))
         if not BESIDE < root < length - BESIDE:
             return ()
         sides = [self.advance(here.x, here.tangent, root + x) for x in (-BESIDE, BESIDE)]
@@ -423,7 +423,7 @@ class MotionTable(Table):
         detail = DETAILS[kind]
         if kind == TURNS:
             kind = CROSSING
-        elif kind == CROSSING and self.symmetric and self._apart(at) < ALIKE:
+        elif kind == CROSSING and self.symmetric and self._asymmetry(at) < ALIKE:
             kind, detail = SYMMETRY, DETAILS[SYMMETRY]
         elif kind == CROSSING and held:
             kind, detail = FOLD, DETAILS[HELD_FOLD]
@@ -447,9 +447,9 @@ class MotionTable(Table):
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         def admits(step: Step, length: float) -> bool:
             # So close to where they cross the corrector may find the other branch.
-            return not self.symmetric or (kind == FOLD) != (self._apart(step) < ALIKE * BESIDE)
+            return not self.symmetric or (kind == FOLD) != (self._asymmetry(step) < ALIKE * BESIDE)
 
-        root = way(self.problem, here, at)
+        root = distance_along(self.problem, here, at)
         tested = lambda step: tests_of(step)[kind]
         return crossing(self.problem, self.advance, here, root, tested, admits) or at
 
@@ -457,7 +457,7 @@ class MotionTable(Table):
         """How the second half of the period differs from the first; empty if it cannot be alike."""
         return halves_apart(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
 
-    def _apart(self, step: Step) -> float:
+    def _asymmetry(self, step: Step) -> float:
         return float(np.linalg.norm(self.images(step)))
 
 

@@ -33,6 +33,7 @@ from ..machine import (
     begin_modes,
     check_again,
     events_of,
+    has_contact_friction,
     in_rows,
     is_autonomous,
     leaf,
@@ -41,7 +42,6 @@ from ..machine import (
     phase_at,
     raveled,
     renews,
-    rubs,
     scales_known,
     section_in,
     stops_of,
@@ -99,7 +99,7 @@ def steps_of(
     return max(method.steps_per_cycle, 16, *fewest) * cycles
 
 
-def cycles_flown(
+def longest_leg(
     places: Sequence[float] | np.ndarray, events: Sequence[Event], period: float, cycles: int
 ) -> int:
     """Cycles for which each leg gets steps: those of the longest leg, rounded up, and one more,
@@ -110,9 +110,9 @@ def cycles_flown(
     return min(cycles, ceil(longest / period * cycles) + 1)
 
 
-def flown(problem: Shooting, x: Unknowns) -> int:
+def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
     places, _, period = problem.values(x)
-    return cycles_flown(places, problem.events, period, problem.cycles)
+    return longest_leg(places, problem.events, period, problem.cycles)
 
 
 @compiled
@@ -193,7 +193,7 @@ def problem_of(
     found, autonomous = events_in(orbit), is_autonomous(machine, bare(orbit.state))
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
     places, events = [place for place, _ in found], tuple(event for _, event in found)
-    needed = cycles_flown(places, events, period, cycles)
+    needed = longest_leg(places, events, period, cycles)
     steps = steps_of(carried, corners, bare(orbit.state), needed)
     blank = Shooting(machine, carried, bare(orbit.state), cycles, (), (), steps, (parameter,))
     states, modes = _followed(blank, orbit.state, found, period)
@@ -403,7 +403,7 @@ def legs_of(
     """
     machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
-    if is_autonomous(machine, state) or renews(machine) or rubs(machine):
+    if is_autonomous(machine, state) or renews(machine) or has_contact_friction(machine):
         raise ValueError(
             f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has a section, "
             f"`renewed` or friction on a stop, so that it cannot be followed. {_INSTEAD}"

@@ -69,8 +69,8 @@ class Observed(NamedTuple):
     """Where the force on a body that rests has its least turn; that force is its `room`."""
     order: Scalar
     """1 where each switch goes into the mode that is its next one here, else -1."""
-    apart: Scalar
-    """How far its events are from coming in another order; see `apart`."""
+    order_margin: Scalar
+    """How far its events are from coming in another order; see `order_margin`."""
     duration: Scalar
     """The period in time."""
     averages: dict[str, Scalar]
@@ -100,7 +100,7 @@ class Observed(NamedTuple):
         return max(usual, np.abs(np.asarray(self.approach)).max(initial=0.0))
 
 
-def apart(
+def order_margin(
     machine: AbstractMachine,
     events: tuple[Event, ...],
     modes: tuple[tuple[float, ...], ...],
@@ -373,7 +373,7 @@ class Shooting(eqx.Module):
     def _contact(self, contacts: Sequence[tuple[float, ...]], leg: Leg) -> tuple[Array, ...]:
         return tuple(jnp.asarray(contacts, jnp.result_type(float))[leg])
 
-    def flown(
+    def fly_leg(
         self, machine: AbstractMachine, leg: Leg, begin: Hops, s: Scalar,
         averages: tuple[str, ...] = (),
     ) -> Any:  # fmt: skip
@@ -434,7 +434,7 @@ class Shooting(eqx.Module):
 
         def arrive(leg, s0, s1, u):
             begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
-            end, _, _ = self.flown(machine, leg, begin, s1)
+            end, _, _ = self.fly_leg(machine, leg, begin, s1)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype), begin
             return end, self.guard(machine, leg, s0, u)[None], begin
@@ -459,7 +459,7 @@ class Shooting(eqx.Module):
         def follow(leg, s0, s1, u):
             def end(u):
                 begin = self.hopped(machine, leg, s0, s1, u, averages)
-                end, passed, path = self.flown(machine, leg, begin, s1, averages)
+                end, passed, path = self.fly_leg(machine, leg, begin, s1, averages)
                 return end, (passed, path, begin)
 
             after = self.after(machine, leg, s0, u)
@@ -486,10 +486,10 @@ class Shooting(eqx.Module):
         period = ends[-1] - clock[0]
         last = {i: jax.tree.map(lambda a, i=i: a[i], begin) for i in self.landings}
         escapes = (self._escape(machine, i, last[i], clock, states, period) for i in last)
-        left = (self._left(machine, i, last[i], ends[i]) for i in last)
+        left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
         Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
         nearest, pulled = jnp.argmin(turns.nearest.room), jnp.argmin(turns.pull.room)
-        order_of_events = apart(
+        order_of_events = order_margin(
             machine, self.events, self.modes, self.contacts, clock, ends - clock, before
         )
         integrals = jax.tree.map(jnp.sum, passed)
@@ -504,14 +504,14 @@ class Shooting(eqx.Module):
             nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
             pull=jax.tree.map(lambda x: x[pulled], turns.pull),
             order=jnp.min(order),
-            apart=reduce(jnp.minimum, left, order_of_events),
+            order_margin=reduce(jnp.minimum, left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
             averages=means(integrals, time),
             largest=jnp.max(largest, axis=0),
             escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
 
-    def _left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
+    def _time_left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
         """Time from the end of the chatter that begins with event number i to the next event, if
         that is not its release (of which `_escape` says more)."""
         landing = self.events[i]
@@ -545,7 +545,7 @@ class Shooting(eqx.Module):
         for i, contact in enumerate(self.contacts):
             if any(contact):
                 begin = last(i)
-                path = self.flown(machine, i, begin, ends[i])[2]
+                path = self.fly_leg(machine, i, begin, ends[i])[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
                 pull = pull_of(Path(flight, path[0], path[1], h, not self.events))
                 least = jnp.minimum(least, pull.room)
@@ -613,7 +613,7 @@ class Shooting(eqx.Module):
         s0, s1 = clock[leg], self.ends(clock, self.period(x))[leg]
         u = self.after(machine, leg, s0, states[leg])
         begin = self.hopped(machine, leg, s0, s1, u)
-        end = self.flown(machine, leg, begin, s)[0]
+        end = self.fly_leg(machine, leg, begin, s)[0]
         if self.landings:
             last = self.hopped(machine, leg, s0, s, u)
             within = self.departing(machine, leg).fly(last.s, s, last.u, self.steps)[0]

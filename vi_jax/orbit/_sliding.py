@@ -69,7 +69,7 @@ class Change(NamedTuple):
     clock: float
     modes: tuple[float, float, float]
     """Of the switch, before that part, in it and after it."""
-    there: bool
+    exists: bool
     """Whether the motion has that part, on this side."""
 
     @property
@@ -213,8 +213,8 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
     """The special point at which a part of the motion vanishes, from one that is close to it; the
     same where it is close enough, or no other is found."""
     clock = problem.values(at.x)[0]
-    close = abs(float(at.seen.apart)) < _CLOSE * problem.radian
-    if not change.there or problem.conditions or close:
+    close = abs(float(at.seen.order_margin)) < _CLOSE * problem.radian
+    if not change.exists or problem.conditions or close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
     if first + 1 == problem.legs:  # the part lies across the begin of the period
@@ -239,7 +239,7 @@ def without_part(
     is touched."""
     first = int(np.argmin(np.abs(problem.values(at.x)[0] - change.clock)))
     alike = change.modes[0] == change.modes[2]
-    if not change.there:
+    if not change.exists:
         return problem, np.asarray(at.x), None if alike else first
     both = [first, (first + 1) % problem.legs]
     new, x = without_events(problem, np.asarray(at.x), both if alike else [first])
@@ -260,8 +260,8 @@ def _with_part(
     if alike:
         place, before = float(step.seen.nearest.clock), problem.values(at.x)[0][first]
         place = place + period * np.round((before - place) / period)
-        there = state_at(new, step.x, np.asarray(max(0, first - 1)), place)
-        extra = np.stack([there] * 2)
+        state = state_at(new, step.x, np.asarray(max(0, first - 1)), place)
+        extra = np.stack([state] * 2)
     else:
         place, extra = clock[first], states[first][None]
     clock = np.insert(clock, first, [place] * len(extra))

@@ -32,10 +32,10 @@ from ._corrector import (
     Step,
     advance,
     crossing,
+    distance_along,
     jacobian_at,
     located,
     on_host,
-    way,
 )
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
@@ -103,7 +103,7 @@ class SpecialTable(Table):
         last = steps[-1]
         if self.symmetric and np.linalg.norm(self.images(last)) < ALIKE:
             for here in reversed(steps):
-                root = way(self.problem, here, last)
+                root = distance_along(self.problem, here, last)
                 if root > MOST * BESIDE:
                     at = self._symmetric(here, root, beyond=False)
                     return super().stalled(steps) if at is None else Ending(at, SYMMETRY)
@@ -140,7 +140,7 @@ class SpecialTable(Table):
         """The end at a place at which an impact grazes, where the monodromy matrix has a pole."""
         found = None
         if self.condition.kind not in TOUCHING and at is not here:
-            root = way(self.problem, here, at)
+            root = distance_along(self.problem, here, at)
             found = crossing(self.problem, self.advance, here, root, test)
         if found is None:
             return Ending(at, GRAZING)
@@ -166,7 +166,9 @@ class SpecialTable(Table):
         def ending(at: Step) -> Ending | None:
             if np.linalg.norm(self.images(at)) >= ALIKE:
                 return None
-            return Ending(self._symmetric(here, way(self.problem, here, at)) or at, SYMMETRY)
+            return Ending(
+                self._symmetric(here, distance_along(self.problem, here, at)) or at, SYMMETRY
+            )
 
         yield Event(lambda step: float(np.dot(begin, self.images(step))), ending)
 
@@ -430,4 +432,4 @@ def _zero(
         return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
 
     ahead = partial(advance, problem)
-    return crossing(problem, ahead, here, way(problem, here, at), test, admits)
+    return crossing(problem, ahead, here, distance_along(problem, here, at), test, admits)

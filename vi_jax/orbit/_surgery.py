@@ -142,7 +142,7 @@ def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step
         seen = found.seen
         inside = min(seen.nearest.room, seen.pull.room, *seen.approach) > 0
         together = ROUNDING * problem.radian
-        if bool(found.good) and inside and min(seen.order, seen.apart + together) > 0:
+        if bool(found.good) and inside and min(seen.order, seen.order_margin + together) > 0:
             return found
     return None
 

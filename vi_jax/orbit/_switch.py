@@ -95,7 +95,7 @@ def _crossed(point: Point, distance: float) -> Orbit:
 def _held_otherwise(point: Point, distance: float) -> Orbit:
     """The motion on the other side of a sliding bifurcation."""
     problem, change = point.problem, change_at(point.problem, point.step)
-    if change is not None and change.there and change.modes[0] == change.modes[2]:
+    if change is not None and change.exists and change.modes[0] == change.modes[2]:
         new, start, _ = without_part(problem, point.step, change)
         found = admissible_beside(new, start, distance)
         if found is not None:

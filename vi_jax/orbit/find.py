@@ -440,12 +440,12 @@ def _judged(
     # Back on the section asked for, of which the last one met is the guess's.
     last = seen.states.shape[1] - 1
     sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
-    modes, told = None, sections
+    modes, rows = None, sections
     if seen.modes is not None:
         modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
-        told = jnp.concatenate([sections, modes], axis=1)
+        rows = jnp.concatenate([sections, modes], axis=1)
     unit = jax.lax.stop_gradient(root.unit)
-    least = _least_period(told, error, unit, angles)
+    least = _least_period(rows, error, unit, angles)
     again = _comes_back(start, seen)
     monodromy = jacobians[least - 1] if multipliers else jnp.full_like(jacobians[0], jnp.nan)
     within = jnp.arange(cycles) < least

@@ -168,7 +168,7 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)
         both[1] = settling.near(both[1], both[0])
-        far = np.flatnonzero(~(settling.apart(both[1], both[0]) <= _APART))  # or no number
+        far = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or no number
         end = far[0] if far.size else TRAIL
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -183,7 +183,7 @@ def _met_again(
 ) -> tuple[Row, int] | None:
     """A state near to which the motion comes back, the latest, and after how many cycles."""
     last = trail[-1]
-    back = np.flatnonzero(settling.apart(trail[:-1], last)[::-1][:longest] <= recurs)
+    back = np.flatnonzero(settling.distance_to(trail[:-1], last)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
 
 

@@ -258,7 +258,7 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
     longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
     trail = settling.trail(kick.rows(z)[None], longest * period)[0]
-    apart = settling.apart(trail[1:, None], rows)
+    apart = settling.distance_to(trail[1:, None], rows)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None
@@ -508,7 +508,7 @@ def minimal_kick(
             unit, radius = rays.directions[ray], float(rays.outside[ray])
             found = _exact(settling, kick, unit, radius, angle, longest, seed)
             new = _described(settling, kick, found, longest, cycle, phase)
-            if all(_apart(new, old) > _SAME for old in kicks):
+            if all(_distance(new, old) > _SAME for old in kicks):
                 kicks.append(new)
     return _smallest(kicks, settling)
 
@@ -606,6 +606,6 @@ def _described(
     )
 
 
-def _apart(a: MinimalKick, b: MinimalKick) -> float:
+def _distance(a: MinimalKick, b: MinimalKick) -> float:
     one, other = (np.array([float(x) for x in kick.kick.values()]) for kick in (a, b))
     return float(np.linalg.norm(one - other) / np.linalg.norm(one))

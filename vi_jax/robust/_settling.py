@@ -105,13 +105,13 @@ class Settling:
         """States moved by whole turns of their angles to where they are nearest to others."""
         return nearest_images(self.angles, here, there)
 
-    def apart(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    def distance_to(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
         """How far states lie from others, up to whole turns, see `orbit.distance`."""
         return distance(self.near(here, there), there, self.unit)
 
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
         """How far section states lie from the motion's nearest one."""
-        return self.apart(rows[:, None], self.motion).min(axis=1)
+        return self.distance_to(rows[:, None], self.motion).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
@@ -134,7 +134,7 @@ class Settling:
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
             # What repeats has settled: to go on would cost, and end an equilibrium in noise.
-            moves = (self.apart(there, here) > _STAYS) | (begin > 0)
+            moves = (self.distance_to(there, here) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
             returned = goes_on.copy()
@@ -209,7 +209,7 @@ class Settling:
             return None
         rows = self.starting(0.0).trail(last, 2 * longest)[0]
         for period in range(1, longest + 1):
-            if self.apart(rows[:-period], rows[period:]).max() <= _SAME:
+            if self.distance_to(rows[:-period], rows[period:]).max() <= _SAME:
                 return rows[:period]
         return None
 
@@ -225,7 +225,7 @@ class Settling:
         if not bool(orbit.successful):
             return None
         sections = np.asarray(in_rows(orbit.sections))
-        return orbit if self.apart(row, sections).min() <= near else None
+        return orbit if self.distance_to(row, sections).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """What judges starts so long after a section state of the motion, and the state then.
@@ -235,7 +235,7 @@ class Settling:
         machine, method = self.the_map.machine, self.the_map.method
         if _stands_still(machine, self.state(start)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
-        row = self.motion[self.apart(start, self.motion).argmin()]
+        row = self.motion[self.distance_to(start, self.motion).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
         length = float(jnp.asarray(machine.cycle))
         if autonomous:

@@ -128,7 +128,7 @@ def uncertainty_of(
     margin = int(distances.max())
     exponents, intervals, fractions = [], [], []
     for axis in range(label.ndim):
-        apart = (_apart(label, there, axis, d) for d in distances.tolist())
+        apart = (_labels_differ(label, there, axis, d) for d in distances.tolist())
         sums = [_by_tile(found, there, margin) for found in apart]
         uncertain, starts = np.stack([x for x, _ in sums]), sums[0][1]
         exponent, half = _power(distances, uncertain, starts, confidence)
@@ -157,7 +157,7 @@ def _power(
     return exponent, quantile * float(np.hypot(spread, scatter))
 
 
-def _apart(label: np.ndarray, there: np.ndarray, axis: int, distance: int) -> np.ndarray:
+def _labels_differ(label: np.ndarray, there: np.ndarray, axis: int, distance: int) -> np.ndarray:
     """Which cells have another outcome so many cells away along an axis, up or down."""
     found = np.zeros(label.shape, bool)
     low = (slice(None),) * axis + (slice(None, -distance),)

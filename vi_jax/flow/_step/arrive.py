@@ -266,12 +266,12 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
         return None
     contacts = list(lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
-        (place, before), (there, after) = (
+        (place, before), (moved_to, after) = (
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, lane.state)
         )
-        if not (there is place and after is before):
+        if not (moved_to is place and after is before):
             slack, slow = plan.rounding(k, lane.state)
-            moved = (jnp.abs(there - place) > slack) | (jnp.abs(after - before) > slow)
+            moved = (jnp.abs(moved_to - place) > slack) | (jnp.abs(after - before) > slow)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     return tuple(contacts)
 
@@ -304,35 +304,35 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     """The lane after a step, with its event applied and recorded, and whether the interval is
     complete. If the step is not `taken`, the lane stays what it was."""
     position = plan.machine.position
-    there = lane._replace(
+    arrived = lane._replace(
         s=trial.s, state=trial.state, direction=_along(plan, lane, trial), below=trial.below,
         completed=trial.ends_interval,
     ).recording(integrals=trial.integrals)  # fmt: skip
     # Y where the step ends, and before the state jumps there, where something may move it.
     here = position(trial.state)
     places = (here, here) if others_of(plan.machine) else (here,)
-    way = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
-    at = Situation(plan, lane, trial, taken, way)
+    flow = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
+    at = Situation(plan, lane, trial, taken, flow)
     if trial.crossings:
         leaves = [path.leaves.landed for path in trial.paths if path.leaves is not None]
         met = any_of(taken, [*(c.landed for c in trial.crossings), *leaves])
         # Rare: skipped where no lane of a group has met anything.
-        there, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (there, places))
-    there = there.recording(**_reached(at, places))
-    assert there.completed is not None
-    completed = taken & there.completed
-    there = lane._replace(
-        s=jnp.where(taken, there.s, lane.s),
-        fault=jnp.where(taken, there.fault, lane.fault) if _may_end(plan.machine) else lane.fault,
-        record=there.record._replace(
-            integrals=select(taken, there.record.integrals, lane.record.integrals)
+        arrived, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (arrived, places))
+    arrived = arrived.recording(**_reached(at, places))
+    assert arrived.completed is not None
+    completed = taken & arrived.completed
+    arrived = lane._replace(
+        s=jnp.where(taken, arrived.s, lane.s),
+        fault=jnp.where(taken, arrived.fault, lane.fault) if _may_end(plan.machine) else lane.fault,
+        record=arrived.record._replace(
+            integrals=select(taken, arrived.record.integrals, lane.record.integrals)
         ),
         **{
-            name: select(taken, getattr(there, name), getattr(lane, name))
+            name: select(taken, getattr(arrived, name), getattr(lane, name))
             for name in ("state", "direction", "contact", "modes", "below")
         },
     )
-    return there, completed
+    return arrived, completed
 
 
 def _may_end(machine: AbstractMachine) -> bool:
@@ -366,20 +366,20 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     """The lane after the event that the step landed on, and Y there and before a jump: first the
     last part of the way, then the jump. Another event at the same instant is landed upon by the
     next step, which has no length."""
-    plan, trial, way = at.plan, at.trial, at.way
+    plan, trial, flow = at.plan, at.trial, at.flow
     landed = {c.number: c.landed for c in trial.crossings}
     before = places[1:]
     if landed:
         offset = jnp.zeros_like(lane.s)
         for c in trial.crossings:
             offset = jnp.where(c.landed, _offset(at, c), offset)
-        _, there, passed = way.drifted(offset)
+        _, at_event, passed = flow.drifted(offset)
         met = any_of(at.taken, landed.values())
         integrals = select(met, passed, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
         lane = lane.recording(integrals=integrals)
-        before = tuple(jnp.where(met, plan.machine.position(there), Y) for Y in before)
-        lane = _landed(at, lane, there)
+        before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
+        lane = _landed(at, lane, at_event)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
             lane = _released(at, lane, k, path.leaves)
@@ -390,15 +390,15 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     return (_at_fixed_clock(at, lane) if fixed else lane), places
 
 
-def _landed(at: Situation, lane: Lane, there: State) -> Lane:
-    """The lane after the event that the step landed on, in the state `there`, and all that it sets
-    off."""
+def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
+    """The lane after the event that the step landed on, and all that it sets off; `at_event`, the
+    state before it."""
     plan, machine, trial = at.plan, at.plan.machine, at.trial
     landed = {c.number: c.landed for c in trial.crossings}
     near = _near(at)
     off: dict[int, Flag] = {}
     if stops_of(machine):
-        lane = _impact(at, lane, landed, there)
+        lane = _impact(at, lane, landed, at_event)
         for number, stop in enumerate(stops_of(machine)):
             if stop.ends_cycle:
                 lane = lane.completing(landed[number])
@@ -407,11 +407,11 @@ def _landed(at: Situation, lane: Lane, there: State) -> Lane:
         met = any_of(at.taken, (landed[n] for n in range(len(stops_of(machine)))))
         close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
         # A stop may have changed the modes already.
-        lane, off, _ = set_off(plan, lane, met, (there, at.old.modes), {}, close)
+        lane, off, _ = set_off(plan, lane, met, (at_event, at.old.modes), {}, close)
     due = {}
     for c in trial.crossings:
         if c.coordinate is None:
-            lane = lane._replace(state=select(c.landed, there, lane.state))
+            lane = lane._replace(state=select(c.landed, at_event, lane.state))
             here = c.landed | off[c.number] if c.number in off else c.landed
             if c.number == section_number(machine):
                 # What begins anew with a cycle does so at its end.
@@ -449,19 +449,19 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
     moved = jnp.where(at.trial.ends_interval, bound - stop_gradient(bound), 0.0)
     s = stop_gradient(lane.s) + moved
     moving = lane.s, lane.state, lane.record.integrals
-    way = FlowToEvent(at.plan, smooth, lane.part, moving)
-    _, state, integrals = way.unmoved(s - lane.s)
+    flow = FlowToEvent(at.plan, smooth, lane.part, moving)
+    _, state, integrals = flow.unmoved(s - lane.s)
     return lane._replace(s=s, state=state).recording(integrals=integrals)
 
 
 def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     """The lane with coordinate number k free, where the step ended at its release."""
-    plan, way, contact = at.plan, at.way, lane.contact
+    plan, flow, contact = at.plan, at.flow, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
-    offset = way.met_after(way.force(k), offset)
+    offset = flow.met_after(flow.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
-    _, state, integrals = way.drifted(offset, moving)
+    _, state, integrals = flow.drifted(offset, moving)
     if not exact(plan.machine, state):
         # While they were held their places were kept to the method's error.
         limited = limited_of(plan.machine)
@@ -483,7 +483,7 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
 def _offset(at: Situation, c: Crossing) -> Scalar:
     """How far in s an event is from the step's end, with the derivatives of the time at which it is
     met; 0 in value where the step landed on another."""
-    plan, trial, way = at.plan, at.trial, at.way
+    plan, trial, flow = at.plan, at.trial, at.flow
     # Of a motion so flat that the event's place is known worse than its surface, it is here.
     near = c.landed & (jnp.abs(c.offset) <= plan.in_units(furthest_landing(trial.h)))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
@@ -492,19 +492,19 @@ def _offset(at: Situation, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(at.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # With the derivatives of what is met, which mean nothing where nothing is.
-    met = way.met_after(way.guard(c.number), offset)
+    met = flow.met_after(flow.guard(c.number), offset)
     return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
-def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) -> Lane:
-    """The lane after the rebound from the stops `landed` upon in the state `there`, or at rest on
-    them."""
+def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
+    """The lane after the rebound from the stops `landed` upon, or at rest on them; `at_event`, the
+    state before the impact."""
     plan, machine, before = at.plan, at.plan.machine, at.old
     landed = {number: landed[number] for number in range(len(stops_of(machine)))}
     strike = strike_in_turn if is_compound(machine) else strike_once
-    lane, blows = strike(plan, at.taken, lane, landed, there)
+    lane, blows = strike(plan, at.taken, lane, landed, at_event)
     met = any_of(at.taken, landed.values())
-    lane = settle(at, lane, there, met, blows)
+    lane = settle(at, lane, at_event, met, blows)
     direction = list(lane.direction)
     for k, body in enumerate(machine.coordinates):
         if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
@@ -519,7 +519,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     modes, contact = lane.modes, lane.contact or ()
     if modes and not is_compound(machine):
         for number, here in landed.items():
-            given = machine, lane.s, there, lane.state, modes
+            given = machine, lane.s, at_event, lane.state, modes
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # What friction has to hold depends on who rests now.
@@ -529,7 +529,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], there: State) ->
     if lane.contact is None or len(blows) == 1:
         return lane
     # What rests on other stops may be let go of by it. A stop may have changed the modes already.
-    return release_pulled(plan, lane, at.taken, met, (there, before.modes), before.contact)
+    return release_pulled(plan, lane, at.taken, met, (at_event, before.modes), before.contact)
 
 
 def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
@@ -541,7 +541,7 @@ def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
         return {"y_max": y_max, "y_min": y_min, "clearance": clearance}
-    tops = [_top(trial, k, at.way) for k in range(len(trial.paths))]
+    tops = [_top(trial, k, at.flow) for k in range(len(trial.paths))]
     reached = jnp.where(trial.paths[0].at_turn, tops[0], places[0])
     if clearance is not None:
         for stop in stops_of(plan.machine):
@@ -555,11 +555,11 @@ def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
     return {"y_max": y_max, "y_min": y_min, "clearance": clearance}
 
 
-def _top(trial: Trial, k: int, way: FlowToEvent) -> Scalar:
+def _top(trial: Trial, k: int, flow: FlowToEvent) -> Scalar:
     """The position of coordinate number k at the turning point that the step was aimed at; else
     where the step ends."""
     path = trial.paths[k]
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)
     height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
-    return way.height_of_turn(k, height, path.at_turn, to_turn(end))
+    return flow.height_of_turn(k, height, path.at_turn, to_turn(end))

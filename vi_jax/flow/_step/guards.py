@@ -97,7 +97,7 @@ def guards_error(
     return functools.reduce(jnp.maximum, known) if known else None
 
 
-def apart(stages: list[Stage]) -> list[Stage]:
+def separated(stages: list[Stage]) -> list[Stage]:
     """Return those stages within a step that are apart from each other."""
     found: list[Stage] = []
     for stage in sorted(stages, key=lambda x: x.share):
@@ -201,9 +201,9 @@ def may_be_above(
     """
     (x0, v0), (x1, v1) = begin, end
     seen = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
-    apart = 0.5 * jnp.abs(seen[1:] - seen[:-1])
-    within = jnp.any(seen[1:-1] + jnp.maximum(apart[1:], apart[:-1]) > zero)
-    return within | (v0 > 0) & (x0 + apart[0] > zero) | (v1 < 0) & (x1 + apart[-1] > zero)
+    separated = 0.5 * jnp.abs(seen[1:] - seen[:-1])
+    within = jnp.any(seen[1:-1] + jnp.maximum(separated[1:], separated[:-1]) > zero)
+    return within | (v0 > 0) & (x0 + separated[0] > zero) | (v1 < 0) & (x1 + separated[-1] > zero)
 
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:

@@ -64,14 +64,14 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     taken = pin_flag(active & trial.good & ~aim, lane.s)
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
-    there, completed = arrive(plan, lane, trial, taken)
+    arrived, completed = arrive(plan, lane, trial, taken)
     if section_in(plan.machine, lane.state) is not None:
-        completed = completed | taken & _stands_on_section(plan, lane, there)
+        completed = completed | taken & _stands_on_section(plan, lane, arrived)
     reached = completed = pin_flag(completed, lane.s)
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)
-    new = _onward(plan, there, reached, completed, done)._replace(
+    new = _onward(plan, arrived, reached, completed, done)._replace(
         length=length,
         attempt=jnp.where(aim, goal, _next_attempt(plan, lane, trial, taken, length)),
         target=jnp.where(aim, target, FREE),
@@ -86,7 +86,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     for condition, reason in _faults(plan, lane, trial, taken, rejected, new):
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, reason, fault)
-    return new._replace(fault=fault), completed, there.record
+    return new._replace(fault=fault), completed, arrived.record
 
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
@@ -101,33 +101,33 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
     return jnp.where(short, jnp.minimum(stop_gradient(trial.h), length), length)
 
 
-def _stands_on_section(plan: Plan, lane: Lane, there: Lane) -> Flag:
+def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     """Whether a motion has died out, to rounding, in an equilibrium that lies on the machine's
     section: a step changes nothing, and it is twice as long on its way as a cycle is expected to
     take. It would meet the section by accident of rounding only, or never."""
-    old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, there.state))
-    slack = 8 * float(jnp.finfo(there.s.dtype).eps)
-    cycle, size = plan.machine.cycle, jnp.ones_like(there.s)
+    old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, arrived.state))
+    slack = 8 * float(jnp.finfo(arrived.s.dtype).eps)
+    cycle, size = plan.machine.cycle, jnp.ones_like(arrived.s)
     # One that is aimed at something may be so short that nothing has time to change.
-    still = (there.s >= 2 * cycle) & (there.s - lane.s >= _LONG * cycle)
+    still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
     for before, after in zip(old, new, strict=True):
         still = still & jnp.all(jnp.abs(after - before) <= slack * (1 + jnp.abs(before)))
         size = size + jnp.max(jnp.abs(after))
-    guard = jnp.asarray(section_in(plan.machine, stop_gradient(there.state)))
+    guard = jnp.asarray(section_in(plan.machine, stop_gradient(arrived.state)))
     return still & (jnp.abs(guard) <= slack * size)
 
 
-def _onward(plan: Plan, there: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
+def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
     """The lane as its next interval begins, where one was `completed`; and as its next cycle
     begins, where that was the cycle's last. The step `reached` the end of a piece of its cycle."""
-    turned, part, state = reached, there.part, there.state
+    turned, part, state = reached, arrived.part, arrived.state
     if plan.instants > 1:
         part = part + jnp.where(reached, 1.0, 0.0)
         turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
     if not plan.ticks(state):
         state = select(turned, rewound(plan.machine, state), state)
-    lane = there._replace(s=jnp.where(turned, 0.0, there.s), state=state)
+    lane = arrived._replace(s=jnp.where(turned, 0.0, arrived.s), state=state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
         lane = after_jump(plan, lane._replace(state=renewed), turned, state)

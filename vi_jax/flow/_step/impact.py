@@ -13,12 +13,12 @@ from ...machine import (
     Coordinate,
     RigidStop,
     forces,
+    friction_on,
+    has_contact_friction,
     push_of,
-    rubbed,
-    rubbing_on,
-    rubs,
     shares,
     stops_of,
+    with_friction_impulse,
 )
 from .._lane import Lane, Plan, select, to_event, written
 from ..results import EventKind
@@ -42,7 +42,7 @@ class Blow(NamedTuple):
 
 def is_compound(machine: AbstractMachine) -> bool:
     """Whether several velocities change in an impact, across stops or along them; static."""
-    return len(limited_of(machine)) > 1 or rubs(machine)
+    return len(limited_of(machine)) > 1 or has_contact_friction(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -56,11 +56,11 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 
 
 def recorded(
-    plan: Plan, lane: Lane, there: State, hit: Flag, number: int, approach: Scalar
+    plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar
 ) -> Lane:
     """The lane with an impact counted and logged, if a stop is `hit` by a step that is taken, in
-    the state `there`."""
-    clock, record = plan.clock(lane.s, there), lane.record
+    the state `at_event`."""
+    clock, record = plan.clock(lane.s, at_event), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
@@ -72,27 +72,27 @@ def recorded(
 
 
 def strike_once(
-    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, Blow]]:
     """The lane after an impact, and what it was to the coordinate, by its number, where stops limit
     one coordinate and nothing rubs. By the stops' numbers, `landed` is whether the step landed on
-    it, in the state `there`."""
+    it, in the state `at_event`."""
     machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
-    velocity = body.velocity(there)
+    velocity = body.velocity(at_event)
     for number, met in landed.items():
         stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound, share = stop.rebound_and_share(approach)
         lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")
-        state = select(met, body.placed(there, stop.place, rebound), lane.state)
-        lane = recorded(plan, lane._replace(state=state), there, taken & met, number, approach)
+        state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
+        lane = recorded(plan, lane._replace(state=state), at_event, taken & met, number, approach)
         energy = lane.record.impact_energy
         if energy is not None:
             lost = stop.loss(approach, share)
             if not (isinstance(body.mass, float) and body.mass == 1.0):
-                lost = body.mass_at(lane.s, there) * lost
+                lost = body.mass_at(lane.s, at_event) * lost
             lane = lane.recording(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
@@ -137,7 +137,7 @@ class _Instant(NamedTuple):
     s: Scalar
     met: Flag
     """Whether any stop is landed upon."""
-    there: State
+    at_event: State
     """The state before."""
     bodies: dict[int, Coordinate]
     """The coordinates that stops limit, by their numbers, as all that follows but stops."""
@@ -160,7 +160,7 @@ class _Instant(NamedTuple):
 
 
 def strike_in_turn(
-    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, Blow]]:
     """As `strike_once`, where stops limit several coordinates, or something rubs.
 
@@ -170,7 +170,7 @@ def strike_in_turn(
     without an end (several balls without restitution) goes to its limit: the contacts that are
     still being struck come to rest against each other.
     """
-    instant = _instant(plan, taken, lane, landed, there)
+    instant = _instant(plan, taken, lane, landed, at_event)
     zero = jnp.zeros_like(lane.s)
     nothing = dict.fromkeys(instant.bodies, zero)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
@@ -178,7 +178,7 @@ def strike_in_turn(
     for number, stop in enumerate(stops_of(plan.machine)):
         k = stop.coordinate
         touched[k] = jnp.where(landed[number], to_event(number), touched[k])
-    lane = lane._replace(state=select(instant.met, there, lane.state))
+    lane = lane._replace(state=select(instant.met, at_event, lane.state))
     begin = _Round(lane, touched, nothing, zero, jnp.where(instant.met, 1.0, zero), zero)
     end = jax.lax.while_loop(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
@@ -195,28 +195,28 @@ def strike_in_turn(
 
 
 def _instant(
-    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], there: State
+    plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> _Instant:
     """What is known of an instant before its impacts."""
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
     each = list(bodies.values())
-    gains = shares(each, there, [push_of(body, there) for body in each])
+    gains = shares(each, at_event, [push_of(body, at_event) for body in each])
     met = jnp.zeros_like(taken)
     coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
         k, here = stop.coordinate, landed[number]
         met, coupled[k] = met | here, coupled[k] | here
-        depth = stop_gradient(stop.beyond(bodies[k].position(there)))
+        depth = stop_gradient(stop.beyond(bodies[k].position(at_event)))
         size = plan.extent(k) + jnp.abs(stop_gradient(stop.gap))
         closed = here | (jnp.abs(depth) <= 256 * float(jnp.finfo(depth.dtype).eps) * size)
         if lane.contact is not None:
             closed = closed | (lane.contact[k] == to_event(number))
         touches[number] = closed
     coupled = _coupled(plan, gains, touches, coupled)
-    before = {k: body.velocity(there) for k, body in bodies.items()}
-    slow = {k: plan.rounding(k, there)[1] for k in bodies}
+    before = {k: body.velocity(at_event) for k, body in bodies.items()}
+    slow = {k: plan.rounding(k, at_event)[1] for k in bodies}
     return _Instant(
-        plan, taken, lane.s, met, there, bodies, before, gains, landed, touches, coupled, slow
+        plan, taken, lane.s, met, at_event, bodies, before, gains, landed, touches, coupled, slow
     )
 
 
@@ -271,7 +271,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         stop, k = stops[number], stops[number].coordinate
         speed = jnp.maximum(closing[number], 0.0)
         lane = lane.ended(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
-        lane = recorded(plan, lane, instant.there, instant.taken & hit, number, speed)
+        lane = recorded(plan, lane, instant.at_event, instant.taken & hit, number, speed)
         if stop.modes is not None:
             given = plan.machine, lane.s, state, new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
@@ -288,7 +288,7 @@ def _each_by_itself(
     """Whether contacts that close equally fast are struck one after the other all the same, in
     their order: with friction, where one would have to pull, and where laws that differ would gain
     energy together."""
-    if rubs(instant.plan.machine):
+    if has_contact_friction(instant.plan.machine):
         return jnp.ones((), bool)
     on = dict.fromkeys(velocities, jnp.zeros((), bool))
     wanted = {k: jnp.zeros_like(V) for k, V in velocities.items()}
@@ -303,7 +303,7 @@ def _each_by_itself(
     gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
     for k, body in instant.bodies.items():
         amount, V, change = amounts[k], velocities[k], wanted[k]
-        work = body.mass_at(instant.s, instant.there) * amount * (V + 0.5 * change)
+        work = body.mass_at(instant.s, instant.at_event) * amount * (V + 0.5 * change)
         gained, size_of = gained + work, size_of + jnp.abs(work)
         pulls = pulls | (amount * signs[k] > _EQUAL * jnp.abs(change))
     return stop_gradient(pulls | (gained > _EQUAL * size_of))
@@ -336,10 +336,10 @@ def _pushed_state(
         )  # fmt: skip
     pushed = []
     for number, hit in hits.items():
-        friction = rubbing_on(machine, number)
+        friction = friction_on(machine, number)
         if friction is not None:
             k = stops[number].coordinate
-            rough = rubbed(machine, number, friction, instant.s, state, new)
+            rough = with_friction_impulse(machine, number, friction, instant.s, state, new)
             new = select(hit, rough.state, new)
             amounts[k] = jnp.where(hit, rough.pushed, amounts[k])
             along = machine.coordinates[friction.along]

@@ -12,7 +12,16 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import added, forces, held_by, holds_anywhere, push_of, rubs, shares, struck_modes
+from ...machine import (
+    added,
+    forces,
+    has_contact_friction,
+    held_by,
+    holds_anywhere,
+    push_of,
+    shares,
+    struck_modes,
+)
 from .._lane import Lane, Plan, any_of, in_place, select
 from ..drift import FlowToEvent
 from ..events import force_rate, rates
@@ -30,9 +39,9 @@ _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 _CLOSED = 1e-9
 
 
-def settle(at: Situation, lane: Lane, there: State, met: Flag, blows: dict[int, Blow]) -> Lane:
+def settle(at: Situation, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Lane:
     """The lane at rest on those stops whose impacts were the last ones; `lane` is behind the
-    impacts, `there` the state before them, `met` whether there were any."""
+    impacts, `at_event` the state before them, `met` whether there were any."""
     if lane.contact is None:
         return lane
     if len(blows) == 1:
@@ -41,12 +50,12 @@ def settle(at: Situation, lane: Lane, there: State, met: Flag, blows: dict[int, 
         path, alone = at.trial.paths[k], at.trial.alone[k]
         speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
         growth = None if path.surge is None else path.surge[1]
-        known = k, blow, speed, lane._replace(state=there), growth
+        known = k, blow, speed, lane._replace(state=at_event), growth
         ends, left = _ends(at.plan, alone, *known)
         rests = {k: pin_flag((blow.struck > 0) & ends, lane.s)}
         waits = {k: left}
     else:
-        lane = lane._replace(contact=_broken(at.plan, lane, there, met, blows))
+        lane = lane._replace(contact=_broken(at.plan, lane, at_event, met, blows))
         rests, waits = _together(at.plan, lane, blows)
     return _held(at.plan, at.taken, lane, rests, blows, waits)
 
@@ -65,7 +74,7 @@ def _held(
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
         contact = in_place(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
     walls, modes = {k: blow.struck for k, blow in blows.items()}, lane.modes
-    if rubs(plan.machine):
+    if has_contact_friction(plan.machine):
         # Which way a body slips is known behind its impact.
         modes = struck_modes(plan.machine, s, state, modes, contact=contact)
         slowed, rubbed_away = _without_rebounds(plan, s, state, modes, rests, walls)
@@ -76,8 +85,8 @@ def _held(
         if holds_anywhere(plan.machine):
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
     resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
-    way = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
-    later, still, passed = way.drifted(pin(wait))
+    flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
+    later, still, passed = flow.drifted(pin(wait))
     if len(rests) > 1:  # another body may come upon this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}
@@ -199,15 +208,15 @@ def _before_it_presses(
     return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
 
 
-def _broken(plan: Plan, lane: Lane, there: State, met: Flag, blows: dict[int, Blow]) -> Scalars:
+def _broken(plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Scalars:
     """`Lane.contact` without those contacts that were struck or pulled apart by the impacts;
-    `there` is the state before them."""
+    `at_event` is the state before them."""
     assert lane.contact is not None
     contact = list(lane.contact)
     for k, blow in blows.items():
         body = plan.machine.coordinates[k]
-        V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, there))
-        _, slow = plan.rounding(k, there)
+        V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, at_event))
+        _, slow = plan.rounding(k, at_event)
         apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slow))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)

@@ -19,12 +19,12 @@ from .guards import (
     Crossing,
     Side,
     Within,
-    apart,
     crossings,
     guards_error,
     landing_tolerance,
     leniency,
     looks_within,
+    separated,
     turn_tolerance,
     within,
 )
@@ -148,7 +148,7 @@ class Situation(NamedTuple):
     trial: Trial
     taken: Flag
     """Whether the step is taken."""
-    way: FlowToEvent
+    flow: FlowToEvent
     """The motion from the step's end on."""
 
 
@@ -185,7 +185,7 @@ def attempt(
     elif looks:
         there = lane.s, s1, lane.state
         new, beside, error, stages = method.step_with_stages(smooth, *there, beside)
-        stages = stages if method.adaptive else apart(stages)
+        stages = stages if method.adaptive else separated(stages)
     else:
         new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
     if lane.contact is not None and not method.holds(machine):

@@ -348,17 +348,17 @@ def _linear(
     """The flight of a linear machine, in its modes or to be taken there; as `ExactFlight.step`."""
     machine, h = smooth.machine, s1 - s0
     if isinstance(machine, LinearMachine):
-        way = machine.prepared_modes()
+        form = machine.prepared_modes()
     else:
-        way = Prepared(machine, lambda x: x, lambda x: x)
-    begin = way.inward(state)
+        form = Prepared(machine, lambda x: x, lambda x: x)
+    begin = form.inward(state)
 
     def along(share: float) -> State:
-        return way.outward(modal_flight(way.machine, smooth.contact, s0, share * h, begin))
+        return form.outward(modal_flight(form.machine, smooth.contact, s0, share * h, begin))
 
     if beside:
         beside = _integrated(smooth, s0, s1, state, along, beside)
-    new = way.outward(modal_flight(way.machine, smooth.contact, s0, h, begin))
+    new = form.outward(modal_flight(form.machine, smooth.contact, s0, h, begin))
     return new, beside, jnp.zeros_like(s0)
 
 
