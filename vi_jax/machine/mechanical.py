@@ -7,6 +7,7 @@ equations are M v' + h = f for the applied forces f, where h_i = Σ_k v_k (∂M/
 """
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from math import pi
@@ -58,6 +59,8 @@ class Mechanical(AbstractMachine):
 
     q: ClassVar[tuple[str, ...]]
     mass: ClassVar[Any]
+    # The components of a state that has no `v`, by the coordinates whose velocities they are.
+    _velocity_names: ClassVar[Mapping[str, str]] = {}
 
     @abc.abstractmethod
     def force(self, *args: Any, **kwargs: Any) -> Any:
@@ -120,7 +123,7 @@ class Mechanical(AbstractMachine):
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """The rate of the state: velocities, and accelerations by Lagrange's equations."""
-        q, v, names = self.places(state), state.v, self.free_names
+        q, v, names = self.places(state), self.velocities(state), self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
         applied = like(free, self.force(t, q, v, *modes), whose)
@@ -132,7 +135,20 @@ class Mechanical(AbstractMachine):
         rates = dict(zip(names, solved(self.masses(q), left), strict=True))
         if len(names) < len(self.q_names):
             rates |= self._guided(t, q, v)
-        return Named(**vars(v), v=Named(**{name: rates[name] for name in self.q_names}))
+        zero, v_rates = jax.tree.map(jnp.zeros_like, state), {x: rates[x] for x in self.q_names}
+        return self._in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
+
+    def _by_s(self, s: Scalar, state: State, *rates: Named) -> Sequence[Named]:
+        """Rates by `s`, which need not be time."""
+        pace = self.pace(s, state)
+        if pace is None:
+            return rates
+        if type(self).prescribed is not Mechanical.prescribed:
+            raise ValueError(
+                f"`pace` of a {type(self).__name__} must be left out, since it has `prescribed`. "
+                "Write the motion of a wall as a function of time."
+            )
+        return jax.tree.map(lambda x: pace * x, rates)
 
     def _guided(self, t: Scalar, q: Named, v: Named) -> dict[str, Any]:
         """The accelerations of prescribed coordinates. What errors of steps leave fades: else it
@@ -153,6 +169,19 @@ class Mechanical(AbstractMachine):
     def places(self, state: State) -> Named:
         """The coordinates in a state, without velocities."""
         return Named(**{name: getattr(state, name) for name in self.q_names})
+
+    def velocities(self, state: State) -> Named:
+        """The velocities in a state, by the names of their coordinates."""
+        names = self._velocity_names
+        return Named(**{q: getattr(state, v) for q, v in names.items()}) if names else state.v
+
+    def _in_state(self, state: Any, q: Named, v: Named) -> Any:
+        """The state with these places and velocities."""
+        if isinstance(state, Named):
+            return state.replace(**vars(q), v=v)
+        return dataclasses.replace(
+            state, **vars(q), **{self._velocity_names[name]: x for name, x in vars(v).items()}
+        )
 
     def masses(self, q: Named) -> Matrix:
         """The mass matrix in these coordinates, as rows of numbers."""
@@ -215,7 +244,7 @@ class Mechanical(AbstractMachine):
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
         name = _named(self, on)
-        return None if name is None else (name, f"v.{name}")
+        return None if name is None else (name, self._velocity_names.get(name, f"v.{name}"))
 
 
 def _named(machine: Mechanical, on: Any) -> str | None:
@@ -240,9 +269,10 @@ def _place(machine: Mechanical, on: Any, state: State) -> Any:
 
 def _speed(machine: Mechanical, on: Any, state: State) -> Any:
     name = _named(machine, on)
+    v = machine.velocities(state)
     if name is not None:
-        return component(name, state.v)
-    return jax.jvp(on, (machine.places(state),), (machine.places(state.v),))[1]
+        return component(name, v)
+    return jax.jvp(on, (machine.places(state),), (v,))[1]
 
 
 def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
@@ -292,8 +322,9 @@ def _pushed(machine: Mechanical, on: Any, state: State) -> Named:
     push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
     if name in push:
         push[name] = 1.0
-    v = {x: jnp.full_like(y, push[x]) for x, y in vars(state.v).items()}
-    return Named(**{x: jnp.zeros_like(y) for x, y in vars(q).items()}, v=Named(**v))
+    v = Named(**{x: jnp.full_like(y, push[x]) for x, y in vars(q).items()})
+    zero = jax.tree.map(jnp.zeros_like, state)
+    return machine._in_state(zero, machine.places(zero), v)
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
@@ -301,12 +332,11 @@ def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named
     coordinate by its name alone is put where it is to be."""
     name, q = _named(machine, on), machine.places(state)
     q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
-    push, _ = _push(machine, on, q)
-    gained = V - _speed(machine, on, Named(**vars(q), v=state.v))
-    v = _moved(state.v, push, gained)
+    push, v = _push(machine, on, q)[0], machine.velocities(state)
+    v = _moved(v, push, V - _speed(machine, on, machine._in_state(state, q, v)))
     if name is not None:
         v = _with(v, name, V)
-    return Named(**vars(q), v=v)
+    return machine._in_state(state, q, v)
 
 
 def _with(x: Named, name: str, value: Any) -> Named:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
 from .._types import Number, Scalar, State
-from ..machine import Coordinate, DryFriction, RigidStop, Shown
-from ._base import ForcedMachine, number_field, relative_to
+from ..machine import DryFriction, Mechanical, RigidStop, Shown
+from ._base import ForcedMachine, number_field
 
 
 class CapsuleState(Shown):
@@ -32,7 +32,7 @@ class CapsuleState(Shown):
     """How far the capsule moved in the cycle before (unit: F/k)."""
 
 
-class Capsule(ForcedMachine):
+class Capsule(ForcedMachine, Mechanical):
     """A mass m on a spring k in a capsule of mass M, driven against a rigid stop of the capsule.
     The capsule slides on the ground with friction, and its impacts move it forward.
 
@@ -59,6 +59,8 @@ class Capsule(ForcedMachine):
     restitution: Any = number_field("restitution", 0.6, SHARE)
     friction: Any = number_field("friction", 1.0, NOT_NEGATIVE, "F")
     static_ratio: Any = number_field("static_ratio", 1.0, Range(1.0))
+    q: ClassVar = ("place", "travel")
+    _velocity_names: ClassVar = {"place": "speed", "travel": "capsule_speed"}
     quantity_units: ClassVar = {
         **CapsuleState.units, "rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k",
         "power": "F²/√(k m)",
@@ -69,48 +71,27 @@ class Capsule(ForcedMachine):
     )
 
     @property
-    def contacts(self) -> tuple[RigidStop, DryFriction]:
-        """The stop in the capsule, on the right of the mass, and the ground under the capsule, of
-        which a force moves the capsule against the mass as well."""
-        faster = 1 / self.mass_ratio
-        return (
-            RigidStop(self.gap, self.restitution),
-            DryFriction(
-                self.friction,
-                static_ratio=self.static_ratio,
-                slip=lambda x: x.capsule_speed,
-                push={"capsule_speed": faster, "speed": -faster},
-            ),
-        )
+    def mass(self) -> list[list[Any]]:  # pyright: ignore
+        """Of the mass as seen from the capsule, and of both together (unit: m)."""
+        return [[1.0, 1.0], [1.0, 1 + self.mass_ratio]]
+
+    def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
+        """The drive, and the spring and the dashpot between the mass and the capsule."""
+        drive = self.amplitude * jnp.cos(t)
+        return {"place": drive - q.place - 2 * self.damping_ratio * v.place, "travel": drive}
 
     @property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The mass as seen from the capsule; impacts act on the reduced mass (unit: m)."""
-        both = 1 + self.mass_ratio
-        return (relative_to("capsule_speed", lambda x: x / both, self.mass_ratio / both),)
+    def contacts(self) -> tuple[RigidStop, DryFriction]:
+        """The stop in the capsule, on the right of the mass, and the ground under the capsule."""
+        return (
+            RigidStop(self.gap, self.restitution, on="place"),
+            DryFriction(self.friction, static_ratio=self.static_ratio, on="travel"),
+        )
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
-
-    def field(self, s: Scalar, state: CapsuleState) -> CapsuleState:
-        """d(state)/d(ωt) between impacts, but for friction."""
-        pull = self.pull(state)
-        capsule = pull / self.mass_ratio
-        relative = self.amplitude * jnp.cos(s) - pull - capsule
-        pace = 1 / self.frequency
-        return CapsuleState(
-            place=pace * state.speed,
-            speed=pace * relative,
-            capsule_speed=pace * capsule,
-            travel=pace * state.capsule_speed,
-            progress=jnp.zeros_like(s),
-        )
-
-    def pull(self, state: CapsuleState) -> Scalar:
-        """Force of spring and dashpot on the capsule (unit: F)."""
-        return state.place + 2 * self.damping_ratio * state.speed
 
     def renewed(self, state: CapsuleState) -> CapsuleState:
         """The travel of a cycle is its progress."""
