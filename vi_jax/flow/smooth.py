@@ -13,15 +13,18 @@ from jax.core import Tracer
 from jax.extend.core import Jaxpr
 from jax.lax import stop_gradient
 
-from .._types import Scalar, Scalars, State
+from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called, walked
 from ..machine import (
     AbstractMachine,
     Coordinate,
+    added,
     field_in,
+    gained,
     has_contact_friction,
     held_flow,
     holds_anywhere,
+    push_of,
     scales_known,
     shown_modes,
     stops_of,
@@ -72,8 +75,7 @@ class SmoothMachine(eqx.Module):
         if several or dry:
             flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
         for k in () if several else limited:  # without rounding where one body rests
-            still, rests = _held_still(machine.coordinates[k], state, flow), self.contact[k] > 0
-            flow = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), still, flow)
+            flow = _held_still(machine.coordinates[k], state, flow, self.contact[k] > 0)
         return flow
 
 
@@ -83,13 +85,18 @@ def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
     return smooth.held_field(s, state)
 
 
-def _held_still(coordinate: Coordinate, state: State, flow: State) -> State:
-    """The rate of a state along `flow` while this coordinate keeps its place and velocity: the
-    derivative of `placed`, which need not be linear."""
+def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
+    """The rate of a state along `flow` while this coordinate keeps its place and velocity, if it
+    `rests`: without what its force takes, or the derivative of `placed`, which need not be
+    linear."""
+    if coordinate.push is not None:
+        taken = jnp.where(rests, -gained(coordinate, state, flow), 0.0)
+        return added(flow, (taken,), (push_of(coordinate, state),))
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     zero = jnp.zeros_like(place)
     along = (state, place, velocity), (flow, zero, jnp.zeros_like(velocity))
-    return jax.jvp(coordinate.placed, *along)[1]
+    still = jax.jvp(coordinate.placed, *along)[1]
+    return jtu.tree_map(lambda a, b: jnp.where(rests, a, b), still, flow)
 
 
 def in_modes(machine: AbstractMachine, modes: Scalars) -> SmoothMachine:

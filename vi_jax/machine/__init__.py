@@ -31,6 +31,7 @@ from .contacts import added as added
 from .contacts import check_takes as check_takes
 from .contacts import field_in as field_in
 from .contacts import forces as forces
+from .contacts import gained as gained
 from .contacts import held_by as held_by
 from .contacts import held_flow as held_flow
 from .contacts import push_of as push_of

@@ -9,6 +9,7 @@ for the other events, and for the coordinates that stops limit, by number.
 import abc
 from collections.abc import Callable, Mapping
 from functools import partial, wraps
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -120,7 +121,8 @@ def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
     contacts = contacts_in(machine)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
-    return tuple(machine._coordinate_on(on, masses.get(on)) for on in _places(contacts))
+    each = {k: on for on, k in reversed(_places(contacts).items())}
+    return tuple(machine._coordinate_on(each[k], masses.get(each[k])) for k in sorted(each))
 
 
 def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
@@ -129,7 +131,19 @@ def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
     rigid = [x for x in contacts if isinstance(x, RigidStop)]
     named = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
     named += [x.along for x in rigid if x.friction is not None]
-    return {on: i for i, on in enumerate(dict.fromkeys(named or [None]))}
+    numbers: dict[Any, int] = {}
+    return {on: numbers.setdefault(_known_as(on), len(numbers)) for on in named or [None]}
+
+
+def _known_as(on: Any) -> Any:
+    """What names a coordinate, or of a gap what it computes: the same one is often written for both
+    sides, and two coordinates cost twice as much as one."""
+    if not isinstance(on, FunctionType):
+        return on
+    code, cells = on.__code__, on.__closure__ or ()
+    parts = code.co_code, repr(code.co_consts), code.co_names, code.co_varnames, code.co_freevars
+    given = (*(x.cell_contents for x in cells), *(on.__defaults__ or ()))
+    return *parts, id(on.__globals__), repr(on.__kwdefaults__), tuple(map(id, given))
 
 
 def number_on(machine: Machine, name: str) -> int | None:

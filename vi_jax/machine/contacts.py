@@ -8,11 +8,13 @@ of several contacts become what they are to be, is a linear system as large as t
 
 import inspect
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Flag, Machine, Scalar, Scalars, State
@@ -71,8 +73,8 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
     for i in range(n):
         pivot = rows[i][i]
         found = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
-        by = jnp.where(found, pivot, 1.0)
-        rows[i] = [jnp.where(found, x / by, 0.0) for x in rows[i]]
+        inverse = jnp.where(found, 1 / jnp.where(found, pivot, 1.0), 0.0)
+        rows[i] = [x * inverse for x in rows[i]]
         for j in range(n):
             if j != i:
                 rows[j] = [a - rows[j][i] * b for a, b in zip(rows[j], rows[i], strict=True)]
@@ -81,8 +83,13 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
 
 def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
     """A tree to which each change is added, multiplied by its amount."""
+
+    def one(amount: Scalar, a: Any, b: Any) -> Any:
+        nothing = isinstance(b, np.ndarray) and not b.any()  # as places in a push
+        return a if nothing else a + amount * b
+
     for amount, change in zip(amounts, changes, strict=True):
-        state = jtu.tree_map(lambda a, b, amount=amount: a + amount * b, state, change)
+        state = jtu.tree_map(partial(one, amount), state, change)
     return state
 
 

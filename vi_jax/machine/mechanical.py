@@ -131,7 +131,8 @@ class Mechanical(AbstractMachine):
             by_name = ", ".join(f"{name}=..." for name in names)
             raise TypeError(f"{whose} must return forces by name, `dict({by_name})`.")
         applied = vars(applied)
-        left = [f - h for f, h in zip(applied.values(), self._inertial(q, v), strict=True)]
+        both = zip(applied.values(), self._inertial(q, v), strict=True)
+        left = [_less(f, 1.0, h) for f, h in both]
         rates = dict(zip(names, solved(self.masses(q), left), strict=True))
         if len(names) < len(self.q_names):
             rates |= self._guided(t, q, v)
@@ -322,9 +323,10 @@ def _pushed(machine: Mechanical, on: Any, state: State) -> Named:
     push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
     if name in push:
         push[name] = 1.0
-    v = Named(**{x: jnp.full_like(y, push[x]) for x, y in vars(q).items()})
-    zero = jax.tree.map(jnp.zeros_like, state)
-    return machine._in_state(zero, machine.places(zero), v)
+    zero = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
+    q = machine.places(zero)
+    v = {x: y if _is_zero(push[x]) else jnp.full_like(y, push[x]) for x, y in vars(q).items()}
+    return machine._in_state(zero, q, Named(**v))
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
@@ -389,24 +391,28 @@ def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
 
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
     """M⁻¹ right, of a symmetric matrix that is positive: elimination without pivots, which leaves
-    out what is known to be zero."""
-    n, rows = len(right), [[*row, x] for row, x in zip(M, right, strict=True)]
+    out what is known to be zero. A pivot is inverted, since that of constant masses is one number
+    for all stages of a step."""
+    n, rows, inverses = len(right), [[*row, x] for row, x in zip(M, right, strict=True)], []
     for i in range(n):
+        inverses.append(1 / rows[i][i])
         for k in range(i + 1, n):
             if _is_zero(rows[k][i]):
                 continue
-            ratio = rows[k][i] / rows[i][i]
-            rows[k] = [
-                a if _is_zero(b) else a - ratio * b for a, b in zip(rows[k], rows[i], strict=True)
-            ]
+            ratio = rows[k][i] * inverses[i]
+            rows[k] = [_less(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
     found: list[Any] = [0.0] * n
     for i in reversed(range(n)):
         value = rows[i][n]
         for j in range(i + 1, n):
-            if not _is_zero(rows[i][j]) and not _is_zero(found[j]):
-                value = value - rows[i][j] * found[j]
-        found[i] = 0.0 if _is_zero(value) else value / rows[i][i]
+            value = _less(value, rows[i][j], found[j])
+        found[i] = 0.0 if _is_zero(value) else value * inverses[i]
     return found
+
+
+def _less(x: Any, factor: Any, y: Any) -> Any:
+    """x - factor·y, without what is known to be zero."""
+    return x if _is_zero(factor) or _is_zero(y) else x - factor * y
 
 
 def moving(function: Callable[[Named], Any], q: Named) -> dict[Any, frozenset[str]]:
