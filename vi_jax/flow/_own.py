@@ -357,7 +357,7 @@ def _check_frictions(machine: AbstractMachine) -> None:
         if switch.along == across:  # pyright: ignore[reportAttributeAccessIssue]
             raise ValueError(
                 f"Argument `along` of a ContactFriction must be the number of the coordinate that "
-                f"slips along the stop, but got {across}, which stop {switch.rubs_on} of the "
+                f"slips along the stop, but got {across}, which stop {switch.friction_stop} of the "
                 f"{name} limits."
             )
 

@@ -98,6 +98,7 @@ from .linear import LinearMachine as LinearMachine
 from .linear import Prepared as Prepared
 from .linear import StructureState as StructureState
 from .mechanical import Mechanical as Mechanical
+from .mechanical import solved as solved
 from .modal import ModalMachine as ModalMachine
 from .modal import Modes as Modes
 from .numbers import by_name as by_name

@@ -56,7 +56,7 @@ def listed(parts: object) -> tuple[Any, ...]:
     return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
 
 
-def _once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
+def once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
     """A function of a machine that is called once while JAX traces a function. A step asks for the
     parts of a machine some hundred times, and each of a user's contacts takes a millisecond."""
 
@@ -71,17 +71,17 @@ def _once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
     return kept
 
 
-# Where a machine keeps what `_once_a_trace` found; it is no field, and no part of a copy.
+# Where a machine keeps what `once_a_trace` found; it is no field, and no part of a copy.
 _MEMORY = "_found_in_a_trace"
 
 
-@_once_a_trace
+@once_a_trace
 def contacts_in(machine: Machine) -> tuple[Any, ...]:
     """The contacts that a machine lists."""
     return listed(machine.contacts)
 
 
-@_once_a_trace
+@once_a_trace
 def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
     """The rigid stops among a machine's contacts."""
     contacts = contacts_in(machine)
@@ -89,7 +89,7 @@ def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
     return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
 
 
-@_once_a_trace
+@once_a_trace
 def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     """The soft stops and frictions among a machine's contacts, which act by themselves, and the
     switches among its events."""
@@ -105,7 +105,7 @@ def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
 
 
-@_once_a_trace
+@once_a_trace
 def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
     """The events of a machine that are no switches, and the turn that ends its cycles."""
     found = []

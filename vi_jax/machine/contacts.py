@@ -39,7 +39,7 @@ def push_of(coordinate: Any, state: State) -> State:
 
 def gained(coordinate: Any, state: State, change: State) -> Scalar:
     """By how much a coordinate's velocity changes as the state does."""
-    return jax.jvp(coordinate.velocity, (state,), (change,))[1]
+    return jnp.asarray(jax.jvp(coordinate.velocity, (state,), (change,))[1])
 
 
 def shares(coordinates: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
@@ -85,8 +85,10 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     """A tree to which each change is added, multiplied by its amount."""
 
     def one(amount: Scalar, a: Any, b: Any) -> Any:
-        nothing = isinstance(b, np.ndarray) and not b.any()  # as places in a push
-        return a if nothing else a + amount * b
+        known = isinstance(b, np.ndarray)  # in a push: its places, and its own velocity
+        if known and not b.any():
+            return a
+        return a + (amount if known and (b == 1).all() else amount * b)
 
     for amount, change in zip(amounts, changes, strict=True):
         state = jtu.tree_map(partial(one, amount), state, change)

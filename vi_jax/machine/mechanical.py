@@ -20,7 +20,7 @@ import numpy as np
 from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
-from .base import AbstractMachine
+from .base import AbstractMachine, once_a_trace
 from .coordinates import Coordinate, component
 from .numbers import split_place
 from .state import State as Named
@@ -67,6 +67,10 @@ class Mechanical(AbstractMachine):
         """`force(t, q, v)`: the applied force on each coordinate, by name. Discrete modes of the
         machine are further arguments."""
 
+    def _applied(self, t: Scalar, q: Named, v: Named, *modes: Scalar) -> Any:
+        """`force`, also of a machine that has a number of this name."""
+        return self.force(t, q, v, *modes)
+
     def prescribed(self, t: Scalar) -> dict[str, Any]:
         """The places of coordinates whose motion is given, as functions of time."""
         return {}
@@ -88,7 +92,7 @@ class Mechanical(AbstractMachine):
             at, rate = at | given[0], rate | given[1]
         return Named(**at, v=Named(**rate))
 
-    def start(self) -> Named:
+    def start(self) -> Any:
         """At rest with all coordinates zero."""
         return self.at()
 
@@ -126,11 +130,13 @@ class Mechanical(AbstractMachine):
         q, v, names = self.places(state), self.velocities(state), self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
-        applied = like(free, self.force(t, q, v, *modes), whose)
+        given = self._applied(t, q, v, *modes)
+        applied = like(free, given, whose)
         if not isinstance(applied, Named):
             by_name = ", ".join(f"{name}=..." for name in names)
             raise TypeError(f"{whose} must return forces by name, `dict({by_name})`.")
-        applied = vars(applied)
+        known = {x: f for x, f in given.items() if _is_zero(f)} if isinstance(given, dict) else {}
+        applied = vars(applied) | known
         both = zip(applied.values(), self._inertial(q, v), strict=True)
         left = [_less(f, 1.0, h) for f, h in both]
         rates = dict(zip(names, solved(self.masses(q), left), strict=True))
@@ -173,8 +179,9 @@ class Mechanical(AbstractMachine):
 
     def velocities(self, state: State) -> Named:
         """The velocities in a state, by the names of their coordinates."""
-        names = self._velocity_names
-        return Named(**{q: getattr(state, v) for q, v in names.items()}) if names else state.v
+        if not self._velocity_names:
+            return state.v
+        return Named(**{q: getattr(state, self._velocity_names[q]) for q in self.q_names})
 
     def _in_state(self, state: Any, q: Named, v: Named) -> Any:
         """The state with these places and velocities."""
@@ -186,7 +193,7 @@ class Mechanical(AbstractMachine):
 
     def masses(self, q: Named) -> Matrix:
         """The mass matrix in these coordinates, as rows of numbers."""
-        given = getattr(self, "mass", None)
+        given = _mass_of(self)
         if given is None:
             raise TypeError(
                 f"A {type(self).__name__} must have `mass`: one for each of its coordinates, in "
@@ -246,6 +253,11 @@ class Mechanical(AbstractMachine):
     def _names_on(self, on: Any) -> tuple[str, str] | None:
         name = _named(self, on)
         return None if name is None else (name, self._velocity_names.get(name, f"v.{name}"))
+
+
+@once_a_trace
+def _mass_of(machine: Any) -> Any:
+    return getattr(machine, "mass", None)
 
 
 def _named(machine: Mechanical, on: Any) -> str | None:
@@ -318,18 +330,19 @@ def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
     return _push(machine, on, machine.places(state))[1]
 
 
-def _pushed(machine: Mechanical, on: Any, state: State) -> Named:
+def _pushed(machine: Mechanical, on: Any, state: State) -> Any:
     q, name = machine.places(state), _named(machine, on)
     push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
     if name in push:
         push[name] = 1.0
     zero = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
     q = machine.places(zero)
-    v = {x: y if _is_zero(push[x]) else jnp.full_like(y, push[x]) for x, y in vars(q).items()}
+    v = {x: (jnp if isinstance(push[x], jax.Array) else np).full_like(y, push[x])
+         for x, y in vars(q).items()}  # fmt: skip
     return machine._in_state(zero, q, Named(**v))
 
 
-def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Named:
+def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
     """A gap's place and velocity changed by as little as can be, in the measure of the masses; a
     coordinate by its name alone is put where it is to be."""
     name, q = _named(machine, on), machine.places(state)
@@ -351,9 +364,9 @@ def _moved(x: Named, push: list[Any], amount: Any) -> Named:
     return Named(**{name: y if _is_zero(p) else y + p * amount for (name, y), p in both})
 
 
-def _is_zero(x: Any) -> bool:
-    """Whether a number is known to be zero while a program is traced."""
-    return isinstance(x, int | float) and x == 0
+def _is_zero(x: Any, zero: float = 0.0) -> bool:
+    """Whether a number is known to be zero, or another number, while a program is traced."""
+    return isinstance(x, int | float) and x == zero
 
 
 def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> Matrix:
@@ -406,13 +419,17 @@ def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
         value = rows[i][n]
         for j in range(i + 1, n):
             value = _less(value, rows[i][j], found[j])
-        found[i] = 0.0 if _is_zero(value) else value * inverses[i]
+        found[i] = 0.0 if _is_zero(value) else _times(inverses[i], value)
     return found
 
 
 def _less(x: Any, factor: Any, y: Any) -> Any:
     """x - factor·y, without what is known to be zero."""
-    return x if _is_zero(factor) or _is_zero(y) else x - factor * y
+    return x if _is_zero(factor) or _is_zero(y) else x - _times(factor, y)
+
+
+def _times(factor: Any, y: Any) -> Any:
+    return y if _is_zero(factor, 1.0) else factor * y
 
 
 def moving(function: Callable[[Named], Any], q: Named) -> dict[Any, frozenset[str]]:

@@ -1,7 +1,6 @@
 """What the ready machines share: their fields, pairs of stops, and kinds of drive."""
 
-import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import pi
 from typing import Any, ClassVar
 
@@ -9,7 +8,7 @@ import equinox as eqx
 
 from .._checks import REAL, Range, optional_real, real, require_ranges
 from .._types import Scalar, State
-from ..machine import AbstractMachine, Coordinate, RigidStop, stops_of
+from ..machine import AbstractMachine, RigidStop, stops_of
 
 
 def number_field(name: str, default: float | None, allowed: Range = REAL, unit: str = "") -> Any:
@@ -26,17 +25,6 @@ def stops_at(
     """Equal stops at this distance from zero: on the right, and if two-sided then on the left."""
     sides = ("right", "left") if two_sided else ("right",)
     return tuple(RigidStop(gap, restitution, side, **others) for side in sides)
-
-
-def relative_to(other: str, gained: Callable[[Scalar], Scalar], mass: Scalar) -> Coordinate:
-    """The `place` and `speed` of a body as seen from another one, of which `other` is the speed.
-    That speed is `gained` from what an impact takes from the first; `mass`, the reduced one."""
-
-    def placed(x: Any, Y: Scalar, V: Scalar) -> Any:
-        there = getattr(x, other) + gained(x.speed - V)
-        return dataclasses.replace(x, place=Y, speed=V, **{other: there})
-
-    return Coordinate(lambda x: x.place, lambda x: x.speed, placed, mass)
 
 
 class ReadyMachine(AbstractMachine):

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
 from .._types import Number, Scalar, State
-from ..machine import Coordinate, RigidStop, Shown
-from ._base import PhaseMachine, number_field, relative_to, stops_at
+from ..machine import Mechanical, RigidStop, Shown
+from ._base import PhaseMachine, number_field, stops_at
 
 
 class PairState(Shown):
@@ -34,7 +34,7 @@ class FreePairState(PairState):
     """Speed of the box (unit: a ω)."""
 
 
-class ImpactPair(PhaseMachine):
+class ImpactPair(PhaseMachine, Mechanical):
     """A ball between the walls of a box.
 
     The box moves as a sin ωt; or, if `mass_ratio` is given, it is itself a body on a spring and a
@@ -62,22 +62,32 @@ class ImpactPair(PhaseMachine):
     mass_ratio: Any = number_field("mass_ratio", None, NOT_NEGATIVE)
     damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
     frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
-    force: Any = number_field("force", 0.5, REAL, "M a ω²")
+    force: Any = number_field("force", 0.5, REAL, "M a ω²")  # pyright: ignore
+    _velocity_names: ClassVar = {"place": "speed", "box": "box_speed"}
     labels: ClassVar = ("place in the box (a)", "speed in the box (a ω)")  # pyright: ignore
+
+    @property
+    def q(self) -> tuple[str, ...]:  # pyright: ignore
+        """The ball as seen from the box; and the box, if it is free."""
+        return ("place",) if self.mass_ratio is None else ("place", "box")
+
+    @property
+    def mass(self) -> Any:  # pyright: ignore
+        """Of the ball, the unit of mass; if the box is free, that is the unit."""
+        ball = self.mass_ratio
+        return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
+
+    def _applied(self, t: Scalar, q: Any, v: Any, *modes: Scalar) -> dict[str, Any]:
+        """Nothing acts on the ball, but in a box whose motion is given it is seen from there."""
+        if self.mass_ratio is None:
+            return {"place": jnp.sin(t)}
+        pull = -self.frequency * (self.frequency * q.box + 2 * self.damping_ratio * v.box)
+        return {"place": 0.0, "box": pull + self.force * jnp.sin(t)}
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
         """Both walls, the right one first."""
-        return stops_at(self.half_gap, self.restitution, on=("place", "speed"))
-
-    @property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The place of the ball. Impacts act on its mass, the unit of mass; in a free box on the
-        reduced mass, in units of the box's mass."""
-        if self.mass_ratio is None:
-            return super().coordinates
-        reduced = self.mass_ratio / (1 + self.mass_ratio)
-        return (relative_to("box_speed", lambda x: reduced * x, reduced),)
+        return stops_at(self.half_gap, self.restitution, on="place")
 
     @property
     def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
@@ -85,15 +95,6 @@ class ImpactPair(PhaseMachine):
         mass = "m" if self.mass_ratio is None else "M"
         rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
         return {**FreePairState.units, **rates}
-
-    def field(self, s: Scalar, state: State) -> Any:
-        """d(state)/ds between impacts: a ball on which nothing acts, seen from the box."""
-        if self.mass_ratio is None:
-            return PairState(state.speed, jnp.sin(s))
-        omega, xi = self.frequency, self.damping_ratio
-        pull = -omega * (omega * state.box + 2 * xi * state.box_speed)
-        box = pull + self.force * jnp.sin(s)
-        return FreePairState(state.speed, -box, state.box_speed, box)
 
     def start(
         self,

@@ -1,10 +1,6 @@
 """The woodpecker toy: a bird on a spring that pecks its way down a pole, jamming and slipping."""
 
-import dataclasses
-from collections.abc import Sequence
-from functools import reduce
 from math import pi
-from operator import add
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,7 +9,16 @@ import numpy as np
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete, number
 from .._types import Number, Scalar, State
-from ..machine import ContactFriction, Coordinate, RigidStop, Shown, counter_of, rising
+from ..machine import (
+    ContactFriction,
+    Coordinate,
+    Mechanical,
+    RigidStop,
+    Shown,
+    counter_of,
+    rising,
+    solved,
+)
 from ._base import ReadyMachine, number_field
 
 WOOD, SLEEVE, BIRD, BEAK = "#c9a36b", "#6f6f6f", "#4c5b66", "#e0b83f"
@@ -44,7 +49,7 @@ class WoodpeckerState(Shown):
     """How far the sleeve came down in the cycle before (m)."""
 
 
-class Woodpecker(ReadyMachine):
+class Woodpecker(ReadyMachine, Mechanical):
     """A sleeve with some play on a pole, and a bird on a spring at it that pecks the pole.
 
     The sleeve tilts until its edge jams on the pole by friction; the bird swings on, lifts the edge
@@ -96,6 +101,10 @@ class Woodpecker(ReadyMachine):
     sleeve_radius: Any = number_field("sleeve_radius", 0.0031, POSITIVE, "m")
     pole_radius: Any = number_field("pole_radius", 0.0025, POSITIVE, "m")
     section_angle: Any = number_field("section_angle", -0.2788, REAL, "rad")
+    q: ClassVar = ("height", "sleeve_angle", "bird_angle")
+    _velocity_names: ClassVar = {
+        "height": "speed", "sleeve_angle": "sleeve_rate", "bird_angle": "bird_rate",
+    }  # fmt: skip
     quantity_units: ClassVar = {
         **WoodpeckerState.units, **dict.fromkeys(("play", "reach", "gap"), "m"), "phase": "s",
         "rate": "1/s", "time": "s", "energy": "J", "power": "W",
@@ -141,32 +150,34 @@ class Woodpecker(ReadyMachine):
     def coordinates(self) -> tuple[Coordinate, ...]:
         """How far the beak and the sleeve's upper edge have come towards the pole, and along it how
         high an edge of the sleeve and the beak are: all in metres, so that all forces are in N."""
-        inertia, beak = self._inertia(), self.bird_arm - self.beak_arm
-        return tuple(
-            by_levers(row, inertia)
-            for row in (
-                (None, None, self.beak_height),
-                (None, self.sleeve_height, None),
-                (1, self.sleeve_radius, None),
-                (1, self.sleeve_arm, beak),
-            )
+        beak = self.bird_arm - self.beak_arm
+        gaps = (
+            lambda q: self.beak_height * q.bird_angle,
+            lambda q: self.sleeve_height * q.sleeve_angle,
+            lambda q: q.height + self.sleeve_radius * q.sleeve_angle,
+            lambda q: q.height + self.sleeve_arm * q.sleeve_angle + beak * q.bird_angle,
         )
+        return tuple(self._coordinate_on(gap) for gap in gaps)
 
-    def _inertia(self) -> tuple[Any, ...]:
-        """What forces are divided by, and the bird's levers over that, and what these add up to.
-        The matrix of masses is a diagonal one and m_S times the product of the levers with
-        themselves; its inverse is that of Sherman and Morrison."""
-        levers = 1, self.sleeve_arm, self.bird_arm
+    @property
+    def mass(self) -> list[list[Any]]:  # pyright: ignore
+        """The matrix of the kinetic energy, where the bird hangs on both arms."""
+        sleeve, bird = self.sleeve_arm, self.bird_arm
         own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
-        by = tuple(a / m for a, m in zip(levers, own, strict=True))
-        return own, by, 1 / self.bird_mass + dot(levers, by)
+        hanging = [
+            [self.bird_mass * a * b for b in (1.0, sleeve, bird)] for a in (1.0, sleeve, bird)
+        ]
+        return [[x + (i == j) * own[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
 
-    def field(self, s: Scalar, state: WoodpeckerState) -> WoodpeckerState:
-        """Free fall under the spring's moment, by time. The contacts add the pole's forces."""
-        moment = self.stiffness * (state.sleeve_angle - state.bird_angle)
-        y, sleeve, bird = (moment * x for x in response((None, -1, 1), self._inertia()))
-        rates = state.speed, state.sleeve_rate, state.bird_rate
-        return WoodpeckerState(*rates, y - self.gravity, sleeve, bird, jnp.zeros_like(s))
+    def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
+        """Weights, and the spring's moment. The contacts add the pole's forces."""
+        moment = self.stiffness * (q.sleeve_angle - q.bird_angle)
+        weight = self.bird_mass * self.gravity
+        return {
+            "height": -self.sleeve_mass * self.gravity - weight,
+            "sleeve_angle": -moment - weight * self.sleeve_arm,
+            "bird_angle": moment - weight * self.bird_arm,
+        }
 
     def _usual(self) -> Scalar:
         """The period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
@@ -177,7 +188,7 @@ class Woodpecker(ReadyMachine):
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """A fifth of the period of the sleeve and the bird in free fall, which swing against each
         other."""
-        _, sleeve, bird = response((None, -1, 1), self._inertia())
+        _, sleeve, bird = solved(self.mass, (0.0, -1.0, 1.0))
         return 0.4 * pi / jnp.sqrt(self.stiffness * (bird - sleeve))
 
     cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
@@ -256,60 +267,3 @@ def _turned(points: Any, angle: float) -> np.ndarray:
 def _oval(long: float, wide: float) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 60)
     return np.stack([long * np.cos(turn), wide * np.sin(turn)], -1)
-
-
-Row = tuple[Any, Any, Any]
-"""By how much y, φM and φS each enter: a number, or `None` where one does not."""
-
-Inertia = tuple[Sequence[Any], Sequence[Any], Any]
-"""The diagonal D of a matrix of masses D + m a aᵀ; D⁻¹a; and 1/m + aᵀD⁻¹a."""
-
-
-def dot(row: Sequence[Any], values: Sequence[Any]) -> Any:
-    """The sum of these values times the numbers of a row, where 1 and -1 are no work."""
-    terms = [
-        (x if a > 0 else -x) if isinstance(a, int) else a * x
-        for a, x in zip(row, values, strict=True)
-        if a is not None
-    ]
-    return reduce(add, terms)
-
-
-def response(row: Row, inertia: Inertia) -> list[Any]:
-    """The accelerations of y, φM and φS by a force of one along a row: the inverse of Sherman and
-    Morrison, D⁻¹ - D⁻¹a aᵀD⁻¹/(1/m + aᵀD⁻¹a), times that row."""
-    own, by, total = inertia
-    common = dot(row, by) / total
-    return [
-        -x * common if a is None else a / m - x * common
-        for a, m, x in zip(row, own, by, strict=True)
-    ]
-
-
-def by_levers(row: Row, inertia: Inertia) -> Coordinate:
-    """The sum of y, φM and φS times the numbers of a row. One of an angle alone is set, to the last
-    bit; one with y is placed by the height."""
-    gained = response(row, inertia)
-    mobility = dot(row, gained)
-
-    def position(x: Any) -> Scalar:
-        return dot(row, (x.height, x.sleeve_angle, x.bird_angle))
-
-    def velocity(x: Any) -> Scalar:
-        return dot(row, (x.speed, x.sleeve_rate, x.bird_rate))
-
-    def placed(x: Any, Y: Scalar, V: Scalar) -> Any:
-        impulse = (V - velocity(x)) / mobility
-        if row[0] is not None:
-            place = {"height": x.height + Y - position(x)}
-        elif row[1] is not None:
-            place = {"sleeve_angle": Y / row[1]}
-        else:
-            place = {"bird_angle": Y / row[2]}
-        rates = {
-            name: getattr(x, name) + impulse * a
-            for name, a in zip(("speed", "sleeve_rate", "bird_rate"), gained, strict=True)
-        }
-        return dataclasses.replace(x, **place, **rates)
-
-    return Coordinate(position, velocity, placed, 1 / mobility)
