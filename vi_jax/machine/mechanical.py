@@ -7,7 +7,6 @@ equations are M v' + h = f for the applied forces f, where h_i = Σ_k v_k (∂M/
 """
 
 import abc
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from math import pi
@@ -23,6 +22,7 @@ from ..lanes import dependent_results
 from .base import AbstractMachine, once_a_trace
 from .coordinates import Coordinate, component
 from .numbers import split_place
+from .own import with_static
 from .state import State as Named
 from .state import like
 
@@ -187,9 +187,8 @@ class Mechanical(AbstractMachine):
         """The state with these places and velocities."""
         if isinstance(state, Named):
             return state.replace(**vars(q), v=v)
-        return dataclasses.replace(
-            state, **vars(q), **{self._velocity_names[name]: x for name, x in vars(v).items()}
-        )
+        speeds = {self._velocity_names[name]: x for name, x in vars(v).items()}
+        return with_static(state, **vars(q), **speeds)
 
     def masses(self, q: Named) -> Matrix:
         """The mass matrix in these coordinates, as rows of numbers."""

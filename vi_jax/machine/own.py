@@ -63,8 +63,8 @@ def says(part: object, name: str) -> bool:
 
 
 def with_static(part: Any, **values: Any) -> Any:
-    """A copy of a part with other values in fields that are not numbers. Its own `__init__` may
-    take other arguments."""
+    """A copy of a part or a state with other values in some fields. Its own `__init__` may take
+    other arguments."""
     new = copy.copy(part)
     for name, value in values.items():
         object.__setattr__(new, name, value)

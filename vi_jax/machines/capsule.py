@@ -72,7 +72,7 @@ class Capsule(ForcedMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        """Of the mass as seen from the capsule, and of both together (unit: m)."""
+        """The mass matrix of the mass, as seen from the capsule, and of both together (unit: m)."""
         return [[1.0, 1.0], [1.0, 1 + self.mass_ratio]]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:

@@ -73,12 +73,12 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def mass(self) -> Any:  # pyright: ignore
-        """Of the ball, the unit of mass; if the box is free, that is the unit."""
+        """The mass of the ball, or the mass matrix of the ball and a free box (unit: that of the box)."""
         ball = self.mass_ratio
         return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
 
     def _applied(self, t: Scalar, q: Any, v: Any, *modes: Scalar) -> dict[str, Any]:
-        """Nothing acts on the ball, but in a box whose motion is given it is seen from there."""
+        """The forces on the ball, as seen from a box whose motion is given, and on a free box."""
         if self.mass_ratio is None:
             return {"place": jnp.sin(t)}
         pull = -self.frequency * (self.frequency * q.box + 2 * self.damping_ratio * v.box)

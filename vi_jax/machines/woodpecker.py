@@ -161,7 +161,7 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        """The matrix of the kinetic energy, where the bird hangs on both arms."""
+        """The mass matrix: the bird hangs on both arms."""
         sleeve, bird = self.sleeve_arm, self.bird_arm
         own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
         hanging = [
@@ -170,7 +170,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         return [[x + (i == j) * own[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """Weights, and the spring's moment. The contacts add the pole's forces."""
+        """The weights, and the moment of the spring. The contacts add the forces of the pole."""
         moment = self.stiffness * (q.sleeve_angle - q.bird_angle)
         weight = self.bird_mass * self.gravity
         return {
