@@ -250,7 +250,7 @@ def test_an_orbit_on_a_table_whose_motion_is_prescribed():
     np.testing.assert_allclose(found[:2], other, atol=1e-7)
     np.testing.assert_allclose(other.prod(), 0.5**2, rtol=1e-7)
     # Errors in the place of the table fade so, by definition.
-    np.testing.assert_allclose(found[2:], np.exp(-4 * np.pi), rtol=1e-2)
+    np.testing.assert_allclose(found[2:], np.exp(-2 * np.pi), rtol=1e-2)
 
 
 class Pendulums(vi.Mechanical):

@@ -73,7 +73,7 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def mass(self) -> Any:  # pyright: ignore
-        """The mass of the ball, or the mass matrix of the ball and a free box (unit: that of the box)."""
+        """The mass of the ball, or the mass matrix of the ball and a free box."""
         ball = self.mass_ratio
         return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
 
