@@ -52,14 +52,15 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     - `half_gap` λ: half the box's length less the ball's (unit: a), positive.
     - `restitution` e in [0, 1].
-    - `mass_ratio`: the ball's mass over the box's; without it the motion of the box is given.
+    - `mass_ratio`: the ball's mass over the box's, positive; without it the motion of the box is
+      given.
     - `damping_ratio` ξ, `frequency` Ω (of the box on its spring, unit: ω; 0 leaves out the spring)
       and `force` F (unit: M a ω²), of a box that is free.
     """
 
     half_gap: Any = number_field("half_gap", 1.6, POSITIVE, "a")
     restitution: Any = number_field("restitution", 0.5, SHARE)
-    mass_ratio: Any = number_field("mass_ratio", None, NOT_NEGATIVE)
+    mass_ratio: Any = number_field("mass_ratio", None, POSITIVE)
     damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
     frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
     force: Any = number_field("force", 0.5, REAL, "M a ω²")  # pyright: ignore
