@@ -368,6 +368,20 @@ def test_masses_of_an_array_that_depend_on_it():
     np.testing.assert_allclose(other.v.a, [one.v.x, one.v.y], rtol=1e-14)
 
 
+def test_a_gap_written_twice_is_one_coordinate():
+    class Between(Pair):
+        share: float = 0.5
+
+        def wall(self, side, place):
+            return vi.RigidStop(1.0, 0.5, side, on=lambda q: q.left - self.share * q.right - place)
+
+        contacts = property(
+            lambda self: (self.wall("left", 0.0), self.wall("right", 0.0), self.wall("right", 1.0))
+        )
+
+    assert [x.coordinate for x in Between()._stops] == [0, 0, 1]
+
+
 def test_wrong_masses_and_names_are_told():
     class Wrong(Pair):
         mass = (1.0, 2.0, 3.0)

@@ -1,5 +1,5 @@
-"""Ready machines beside the same machines by their masses and forces: the momentum and the energy
-of an impact follow from the masses."""
+"""Ready machines beside the same machines by their masses and forces, in other coordinates: the
+momentum and the energy of an impact follow from the masses."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -17,10 +17,6 @@ class Masses(vi.Mechanical):
     """The machine with the numbers of the ready machine `of`."""
 
     of: Any
-
-    def own(self, x):
-        """The numbers of the ready machine's sections that are compared."""
-        return jax.tree.leaves(x)
 
     def walls(self, gap, on):
         sides = ("right", "left")
@@ -97,41 +93,6 @@ class Spring(Masses):
         return z.x, z.v.x
 
 
-class Capsule(Masses):
-    q: ClassVar = ("mass_", "capsule")
-
-    @property
-    def cycle(self):
-        return 2 * np.pi / self.of.frequency
-
-    @property
-    def mass(self):
-        return 1.0, self.of.mass_ratio
-
-    def force(self, t, q, v):
-        pull = q.mass_ - q.capsule + 2 * self.of.damping_ratio * (v.mass_ - v.capsule)
-        drive = self.of.amplitude * jnp.cos(self.of.frequency * t)
-        return dict(mass_=drive - pull, capsule=pull)
-
-    @property
-    def contacts(self):
-        n = self.of
-        return (
-            vi.RigidStop(n.gap, n.restitution, on=lambda q: q.mass_ - q.capsule),
-            vi.DryFriction(n.friction, static_ratio=n.static_ratio, on="capsule"),
-        )
-
-    def begun(self, x):
-        v = dict(mass_=x.speed + x.capsule_speed, capsule=x.capsule_speed)
-        return self.at(mass_=x.place, v=v)
-
-    def seen(self, z):
-        return z.mass_ - z.capsule, z.v.mass_ - z.v.capsule, z.v.capsule, z.capsule
-
-    def own(self, x):
-        return x.place, x.speed, x.capsule_speed, jnp.cumsum(x.progress)
-
-
 class Rotor(Masses):
     """The inertia of the shaft is 1/ε."""
 
@@ -175,12 +136,6 @@ CASES = {
          "stiffness": (-0.5, 1), "cubic": (0, 1), "gap": (0.5, 1)},
         {"Y": (-0.5, 0.5), "V": (-1, 1)},
     ),
-    "capsule": (
-        M.Capsule(), Capsule,
-        {**HITS, "amplitude": (0.3, 3), "frequency": (0.4, 2), "damping_ratio": (0, 0.2),
-         "mass_ratio": (1, 8), "gap": (0.2, 1.2), "friction": (0.1, 1.5), "static_ratio": (1, 1.4)},
-        {"place": (-0.2, 0.2), "speed": (-0.2, 0.2)},
-    ),
     "rotor": (
         M.UnbalancedRotor(gap=1.0, two_sided=True), Rotor,
         {**HITS, "strength": (0.05, 1), "control": (0.6, 1.8), "no_load_speed": (0.8, 1.2),
@@ -204,7 +159,7 @@ def test_a_machine_is_that_of_its_masses(name):
             vi.simulate(x, at, CYCLES, method=vi.Adaptive(rtol=1e-12))
             for x, at in ((machine, start), (other, other.begun(start)))
         ]
-        ours = jnp.stack(other.own(runs[0].sections)), jnp.stack(other.seen(runs[1].sections))
+        ours = jnp.stack(jax.tree.leaves(runs[0].sections)), jnp.stack(other.seen(runs[1].sections))
         return ours, [x.impact_energy for x in runs], [x.impacts for x in runs], runs
 
     states, energies, impacts, runs = vi.jit(jax.vmap(both))(*drawn)
