@@ -17,7 +17,7 @@ def test_a_mass_pressed_on_the_stop_pushes_the_capsule():
         amplitude=a, friction=level, gap=0.1, frequency=w, mass_ratio=gamma, damping_ratio=0.0
     )
     fine = vi.Adaptive(rtol=1e-10)
-    start = capsule.start(place=0.1)  # it sets off at once, at ωt = 0
+    start = capsule.at(place=0.1)  # it sets off at once, at ωt = 0
     run = vi.simulate(capsule, start, 1, samples=100, method=fine)
     at = np.arange(12) * 2 * np.pi / 100  # it slows down, and stops at the earliest here
     speed = (a * np.sin(at) - level * at) / (w * (1 + gamma))

@@ -75,7 +75,7 @@ class Mechanical(AbstractMachine):
         """The places of coordinates whose motion is given, as functions of time."""
         return {}
 
-    def at(self, v: Any = None, **places: Any) -> Named:
+    def at(self, v: Any = None, **places: Any) -> Any:
         """A state: each coordinate's place, and in `v` each velocity by name; 0 if not given, and
         of those that are prescribed as at t = 0."""
         names = self.free_names
@@ -90,6 +90,8 @@ class Mechanical(AbstractMachine):
         if len(names) < len(zeros):
             given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
             at, rate = at | given[0], rate | given[1]
+        if self._velocity_names:
+            return self._in_state(self.start(), Named(**at), Named(**rate))
         return Named(**at, v=Named(**rate))
 
     def start(self) -> Any:
@@ -127,7 +129,7 @@ class Mechanical(AbstractMachine):
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """The rate of the state: velocities, and accelerations by Lagrange's equations."""
-        q, v, names = self.places(state), self.velocities(state), self.free_names
+        q, v, names = self.places(state), self._velocities(state), self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
         given = self._applied(t, q, v, *modes)
@@ -177,7 +179,7 @@ class Mechanical(AbstractMachine):
         """The coordinates in a state, without velocities."""
         return Named(**{name: getattr(state, name) for name in self.q_names})
 
-    def velocities(self, state: State) -> Named:
+    def _velocities(self, state: State) -> Named:
         """The velocities in a state, by the names of their coordinates."""
         if not self._velocity_names:
             return state.v
@@ -281,7 +283,7 @@ def _place(machine: Mechanical, on: Any, state: State) -> Any:
 
 def _speed(machine: Mechanical, on: Any, state: State) -> Any:
     name = _named(machine, on)
-    v = machine.velocities(state)
+    v = machine._velocities(state)
     if name is not None:
         return component(name, v)
     return jax.jvp(on, (machine.places(state),), (v,))[1]
@@ -346,7 +348,7 @@ def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
     coordinate by its name alone is put where it is to be."""
     name, q = _named(machine, on), machine.places(state)
     q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
-    push, v = _push(machine, on, q)[0], machine.velocities(state)
+    push, v = _push(machine, on, q)[0], machine._velocities(state)
     v = _moved(v, push, V - _speed(machine, on, machine._in_state(state, q, v)))
     if name is not None:
         v = _with(v, name, V)
