@@ -1,8 +1,8 @@
 """Elementary functions without a hardware instruction, as code on whole vectors.
 
 Each is written for double precision, and single precision goes by way of it. Errors are at most 2
-units in the last place, those of `cbrt` 4 (`tests/lanes/test_library.py`). Subnormal results may be zero: the threads
-that run lanes take such numbers for zero.
+units in the last place, of `cbrt` 4 (`tests/lanes/test_library.py`). Subnormal results may be zero:
+the threads that run lanes take such numbers for zero.
 """
 
 from collections.abc import Callable, Sequence
