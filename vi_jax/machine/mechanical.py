@@ -206,41 +206,20 @@ class Mechanical(AbstractMachine):
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """h, what the applied forces are diminished by; 0 where the masses are constant."""
         names = self.free_names
-        speeds, n = [getattr(v, name) for name in names], len(names)
-        h: list[Any] = [0.0] * n
-        if not callable(getattr(self, "mass", None)):
-            return h
-        if any(self.q_shapes.values()):
-            return self._inertial_of_arrays(q, v)
-        turns = moving(self.masses, q)
-        for name in self.q_names:
-            if not any(name in where for where in turns.values()):
-                continue
-            slopes = _slope(self.masses, q, name)
-            moves = [
-                sum(slopes[i][j] * speeds[j] for j in range(n) if name in turns.get((i, j), ()))
-                for i in range(n)
-            ]
-            h = [x + getattr(v, name) * y for x, y in zip(h, moves, strict=True)]
-            if name in names:
-                k = names.index(name)
-                h[k] = h[k] - 0.5 * sum(x * y for x, y in zip(speeds, moves, strict=True))
-        return h
-
-    def _inertial_of_arrays(self, q: Named, v: Named) -> list[Any]:
-        """The same of masses that are one for each coordinate, some of which are arrays."""
+        speeds = [getattr(v, name) for name in names]
+        if not callable(_mass_of(self)):
+            return [0.0 for _ in names]
 
         def momenta(q: Named) -> list[Any]:
-            M = self.masses(q)
-            return [M[i][i] * getattr(v, name) for i, name in enumerate(self.free_names)]
+            rows = (zip(row, speeds, strict=True) for row in self.masses(q))
+            return [sum(_times(m, x) for m, x in row if not _is_zero(m)) for row in rows]
 
         def twice_energy(q: Named) -> Any:
-            both = zip(momenta(q), self.free_names, strict=True)
-            return sum(jnp.sum(p * getattr(v, name)) for p, name in both)
+            return _dot(momenta(q), speeds)
 
         _, moves = jax.jvp(momenta, (q,), (v,))
-        pulls = jax.grad(twice_energy)(q)
-        return [x - 0.5 * getattr(pulls, k) for x, k in zip(moves, self.free_names, strict=True)]
+        pulls = [_slope(twice_energy, q, name) for name in names]
+        return [x - 0.5 * y for x, y in zip(moves, pulls, strict=True)]
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         return Coordinate(
@@ -296,17 +275,21 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
         base, place = split_place(name)
         one = jnp.zeros_like(getattr(q, base)).at[place].set(1.0) if place else 1.0
         return [one if x == base else 0.0 for x in names]
-    by = moving(on, q).get((), frozenset())
-    return [_slope(on, q, name) if name in by else 0.0 for name in names]
+    gap = jax.make_jaxpr(on)(q).jaxpr
+    acts = [any(dependent_results(gap, [x == y for y in names], smooth=False)) for x in names]
+    return [_slope(on, q, x) if y else 0.0 for x, y in zip(names, acts, strict=True)]
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
     """The derivative of a function of the coordinates with respect to one of them."""
     here = getattr(q, name)
+
+    def of_one(x: Any) -> Any:
+        return function(q.replace(**{name: x}))
+
     if jnp.ndim(here):
-        return jax.grad(lambda x: function(q.replace(**{name: x})))(here)
-    one = {x: jnp.full_like(y, float(x == name)) for x, y in vars(q).items()}
-    return jax.jvp(function, (q,), (Named(**one),))[1]
+        return jax.grad(of_one)(here)
+    return jax.jvp(of_one, (here,), (jnp.ones_like(here),))[1]
 
 
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
@@ -316,8 +299,7 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
     slopes = dict(zip(machine.q_names, _slopes(machine, on, q), strict=True))
     slopes = [slopes[name] for name in names]
     push = solved(machine.masses(q), slopes)
-    gain = sum(jnp.sum(x * y) if jnp.ndim(x) else x * y
-               for x, y in zip(slopes, push, strict=True) if not _is_zero(x))  # fmt: skip
+    gain = _dot(slopes, push)
     if _is_zero(gain):
         raise ValueError(
             f"A contact of a {type(machine).__name__} is `on` no coordinate that it could move. "
@@ -429,25 +411,11 @@ def _less(x: Any, factor: Any, y: Any) -> Any:
     return x if _is_zero(factor) or _is_zero(y) else x - _times(factor, y)
 
 
+def _dot(xs: Sequence[Any], ys: Sequence[Any]) -> Any:
+    """The sum of the products of numbers and of arrays, without what is known to be zero."""
+    both = zip(xs, ys, strict=True)
+    return sum(jnp.sum(x * y) if jnp.ndim(x) else x * y for x, y in both if not _is_zero(x))
+
+
 def _times(factor: Any, y: Any) -> Any:
     return y if _is_zero(factor, 1.0) else factor * y
-
-
-def moving(function: Callable[[Named], Any], q: Named) -> dict[Any, frozenset[str]]:
-    """By which coordinates each number that a function returns changes, by its place in what it
-    returns; found while a program is traced."""
-    leaves = {}
-    names = list(vars(q))
-    jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(q)
-    places = [
-        tuple(getattr(key, "idx", key) for key in path)
-        for path, _ in jax.tree_util.tree_leaves_with_path(shape)
-    ]
-    for name in names:
-        moves = [x == name for x in names]
-        for place, changes in zip(
-            places, dependent_results(jaxpr.jaxpr, moves, smooth=False), strict=True
-        ):
-            if changes:
-                leaves[place] = leaves.get(place, frozenset()) | {name}
-    return leaves
