@@ -23,6 +23,8 @@ from .arguments import shape_of as shape_of
 from .events import Rates as Rates
 from .events import force_rate as force_rate
 from .events import guard_rates as guard_rates
+from .loop import row_sizes as row_sizes
+from .loop import sizes_on_host as sizes_on_host
 from .methods import AbstractMethod as AbstractMethod
 from .methods import Adaptive as Adaptive
 from .methods import ExactFlight as ExactFlight

@@ -236,6 +236,8 @@ class Plan(eqx.Module):
     stop: Any = None
     """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
 
+    sizes: State | None = None
+    """Of each number of the state how small it is (see `loop.sizes_of`)."""
     extents: tuple[Any, ...] | None = None
     """Of each coordinate, then of the guard of each of `others`, how small it is, if it is much
     less than 1; else 1, and of a machine whose numbers are about 1 absent. Of an event that holds a

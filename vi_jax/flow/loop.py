@@ -2,7 +2,6 @@
 of steps are judged."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from math import pi
 from typing import Any, NamedTuple
@@ -16,7 +15,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes
-from .._types import Flag, Scalar, Scalars, State
+from .._programs import compiled
+from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
     ContactFriction,
@@ -26,11 +26,14 @@ from ..machine import (
     guard_of,
     has_contact_friction,
     holds_anywhere,
+    in_rows,
     is_in_range,
     mode_number,
+    modes_of,
     prepared,
     replaced,
     scales_known,
+    size_of,
     stops_of,
     struck_modes,
 )
@@ -58,6 +61,42 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     """
     if scales_known(machine):
         return None
+    return stop_gradient(jtu.tree_map(_small, _known_sizes(machine, s, start, modes)))
+
+
+def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
+    """Return the size of each number of a state, in the order of `in_rows`: about how large it is
+    along a motion; 1 if nothing is known of it, or for a machine whose numbers are about 1 by
+    definition. States are compared relative to these sizes.
+
+    **Arguments:** `start`, where the motion begins; `rows`, other states of it, (..., states).
+    """
+    state = bare(start)
+    row = stop_gradient(in_rows(state, 0))
+    if scales_known(machine):
+        return jnp.ones_like(row)
+    zero = jnp.zeros((), row.dtype)
+    known = _known_sizes(machine, zero, state, begin_modes(machine, zero, state, modes_of(start)))
+    sizes = in_rows(jtu.tree_map(lambda x, y: jnp.broadcast_to(x, jnp.shape(y)), known, state), 0)
+    if rows is not None:
+        rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
+        sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
+    return stop_gradient(jnp.where(sizes > 0, sizes, 1.0))
+
+
+@compiled
+def _compiled_sizes(machine: AbstractMachine, start: State, rows: Array) -> Vector:
+    return row_sizes(machine, start, rows)
+
+
+def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> np.ndarray:
+    """`row_sizes`, host-side."""
+    largest = np.abs(rows.reshape(-1, rows.shape[-1])).max(axis=0)
+    return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
+
+
+def _known_sizes(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State:
+    """`sizes_of`, large ones too, and 0 where nothing is known."""
     holding = [x for x in events_of(machine) if x.holds_mode]
     # While something sticks or slides along a surface, its rate tells nothing of its size.
     sticks = [getattr(x, "blends", False) or x.is_dry for x in holding] + [False] * len(modes)
@@ -80,9 +119,9 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
     def size(x: Scalar, change: Scalar) -> Scalar:
         x, change = jnp.max(x), unit * jnp.max(jnp.abs(change))
-        return _small(jnp.where(x > _GROWS * change, x, change))
+        return jnp.where(x > _GROWS * change, x, change)
 
-    return stop_gradient(jtu.tree_map(size, sizes, moved))
+    return jtu.tree_map(size, sizes, moved)
 
 
 def extents_of(
@@ -100,9 +139,9 @@ def extents_of(
 
         value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
         own = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        return _small(jnp.maximum(own, _spread(lambda x: guard(s, x), start, sizes)))
+        return _small(jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes)))
 
-    found: list[Any] = [_small(_spread(x.position, start, sizes)) for x in machine.coordinates]
+    found: list[Any] = [_small(size_of(x.position, start, sizes)) for x in machine.coordinates]
     for number in plan.others(start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
@@ -117,16 +156,9 @@ def extents_of(
     return stop_gradient(tuple(found))
 
 
-def _small(size: Scalar) -> Scalar:
+def _small(size: Array) -> Array:
     """A size, but 1 if it is not small, or unknown."""
     return jnp.where((size > 0) & (size < _SMALL), size, 1.0)
-
-
-def _spread(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
-    """The size of what a function of the state adds up where its numbers have these sizes."""
-    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
-    each = jtu.tree_map(lambda slope, size: jnp.sum(jnp.abs(slope)) * size, slopes, sizes)
-    return sum(jtu.tree_leaves(each), start=jnp.zeros(()))
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -244,7 +276,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     sizes = sizes_of(plan.machine, s, start, modes)
     if sizes is not None:
         extents = extents_of(plan, s, start, modes, sizes)
-        plan = dataclasses.replace(plan, method=plan.method.with_sizes(sizes), extents=extents)
+        method = plan.method.with_sizes(sizes)
+        plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),

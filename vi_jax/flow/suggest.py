@@ -12,14 +12,16 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._checks import count, one_of, require
 from .._messages import warning_once
 from .._types import Scalar, State
-from ..machine import AbstractMachine, adopt
+from ..machine import AbstractMachine, adopt, bare, in_rows, size_of
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
+from .loop import row_sizes
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
@@ -86,7 +88,7 @@ def suggest_method(
     **Arguments:**
 
     - `machine`: the machine; its parameters may not be traced.
-    - `error`: the largest error allowed, relative to 1 + |x|, for 95 of 100 lanes.
+    - `error`: the largest error allowed, relative to the size of each number, for 95 of 100 lanes.
     - `quantity`: the quantity of which the error is meant: `"state"` (on the last section),
       `"extremes"` (in each cycle), `"impacts"` (phase and speed of the first 32 in each cycle; a
       missed one is an infinite error) or `"derivative"` (of the last section state by the first
@@ -124,7 +126,7 @@ def suggest_method(
         truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
     else:  # at most half as long as the shortest steps that are tried
         truth = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
-    bench.truth = bench.result(truth)
+    bench.follow(truth)
     failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
     if failed:
         raise ValueError(
@@ -197,18 +199,22 @@ class _Bench:
     """The run that methods are compared on, of lanes that differ in their first velocity."""
 
     truth: np.ndarray
+    sizes: np.ndarray
 
     def __init__(
         self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
+        state = bare(start)
+        sizes = ravel_pytree(state)[1](row_sizes(machine, start))
         # Nothing but the velocity is free of stops.
-        self.nudges = jnp.linspace(-0.1, 0.1, lanes) if lanes > 1 else jnp.zeros(1)
+        self.speed = size_of(machine.coordinates[0].velocity, state, sizes)
+        self.nudges = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
-    def lane(self, method: AbstractMethod, nudge: Scalar) -> Array:
-        """What is compared, as one vector, of the lane whose first velocity differs by `nudge`; its
-        first number is infinite if the lane failed."""
+    def lane(self, method: AbstractMethod, nudge: Scalar) -> tuple[Array, Array]:
+        """What is compared of the lane whose first velocity differs by `nudge`, as one vector, and
+        the size of each of its numbers; the first one is infinite if the lane failed."""
         machine = self.machine
 
         def looked_at(nudge):
@@ -218,21 +224,28 @@ class _Bench:
             # As users run it: with nothing but sections recorded the steps are others.
             log = 32 if self.quantity == "impacts" else 0
             run = simulate(machine, start, self.cycles, method=method, impact_log=log)
-            found: Any = run.last
             if self.quantity == "extremes":
-                found = run.y_min, run.y_max
+                assert run.y_min is not None and run.y_max is not None
+                found = jnp.stack([run.y_min, run.y_max])
+                sizes = jnp.full_like(found, jnp.max(jnp.abs(found)))
             elif self.quantity == "impacts":
                 assert run.impact_log is not None
-                found = run.impact_log.phase, run.impact_log.speed
-            return found, run.successful
+                found = jnp.stack([run.impact_log.phase, run.impact_log.speed])
+                most = jnp.stack([jnp.asarray(machine.cycle), jnp.nanmax(found[1], initial=0.0)])
+                sizes = jnp.broadcast_to(most[:, None, None], found.shape)
+            else:
+                found = in_rows(bare(run.last), 0)
+                sizes = row_sizes(machine, start, in_rows(bare(run.sections)))
+            return found, (sizes, run.successful)
 
         if self.quantity == "derivative":
-            found, good = jax.jacfwd(looked_at, has_aux=True)(nudge)
+            found, (sizes, good) = jax.jacfwd(looked_at, has_aux=True)(nudge)
+            sizes = sizes / self.speed
         else:
-            found, good = looked_at(nudge)
+            found, (sizes, good) = looked_at(nudge)
         # The first number tells a failed lane; NaN elsewhere is where there was no impact.
         ended = jnp.where(good, jnp.zeros_like(nudge), jnp.inf)
-        return jnp.concatenate([ended[None], *map(jnp.ravel, jtu.tree_leaves(found))])
+        return jnp.append(ended, found), jnp.append(jnp.ones_like(nudge), sizes)
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:
         """All lanes under a method; other tolerances are no other program."""
@@ -248,14 +261,15 @@ class _Bench:
         run = self.compiled[key]
         return lambda: jax.block_until_ready(run(numbers, self.nudges))
 
-    def result(self, method: AbstractMethod) -> np.ndarray:
-        """What is looked at, of all lanes."""
-        return np.asarray(self.program(method)())
+    def follow(self, truth: AbstractMethod) -> None:
+        """Compare with this method from now on."""
+        self.truth, sizes = map(np.asarray, self.program(truth)())
+        self.sizes = np.where(sizes > 0, sizes, 1.0).max(axis=0)
 
     def tried(self, method: AbstractMethod, name: str) -> Tried:
         """A method with its error."""
-        found, truth = self.result(method), self.truth
-        apart = np.abs(found - truth) / (1 + np.abs(truth))
+        found, truth = np.asarray(self.program(method)()[0]), self.truth
+        apart = np.abs(found - truth) / (self.sizes + np.abs(truth))
         apart = np.where(np.isnan(found) & np.isnan(truth), 0.0, apart)
         worst = np.where(np.isfinite(apart), apart, np.inf).max(axis=1)
         return Tried(method, name, float(np.quantile(worst, 0.95, method="higher")), np.nan)

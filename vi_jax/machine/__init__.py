@@ -111,6 +111,7 @@ from .numbers import in_rows as in_rows
 from .numbers import leaf as leaf
 from .numbers import leaf_names as leaf_names
 from .numbers import plain as plain
+from .numbers import size_of as size_of
 from .numbers import state_in_words as state_in_words
 from .numbers import with_leaf as with_leaf
 from .numbers import with_leaves as with_leaves

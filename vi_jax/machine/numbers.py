@@ -1,16 +1,17 @@
 """Numbers of a machine by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Machine, State
+from .._types import Machine, Scalar, State
 from .units import in_unit
 
 
@@ -42,6 +43,13 @@ def in_rows(states: State, lead: int = 1) -> Array:
     numbers, in the order of `ravel_pytree`."""
     leaves = [jnp.asarray(x) for x in jtu.tree_leaves(states)]
     return jnp.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
+
+
+def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
+    """The size of what a function of the state adds up where its numbers have these sizes."""
+    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
+    each = jtu.tree_map(lambda slope, size: jnp.sum(jnp.abs(slope) * size), slopes, sizes)
+    return sum(jtu.tree_leaves(each), start=jnp.zeros(()))
 
 
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:

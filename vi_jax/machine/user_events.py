@@ -1,10 +1,12 @@
 """Events that a user writes by functions: switches by a sign, and resets of the state."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
 from .._checks import one_of
@@ -12,6 +14,7 @@ from .._types import Machine, Scalar, Scalars, State
 from .contacts import called, field_in, rate_of, shown_modes
 from .event import AbstractEvent, AbstractSwitch, Around
 from .events import modes_after, struck_modes
+from .numbers import size_of
 from .own import with_static
 from .state import changed
 
@@ -63,8 +66,11 @@ class Switch(AbstractSwitch):
         if around is None:
             return side
         up, down = stop_gradient(self._rates(machine, s, state, around))
-        rounding = 64 * float(jnp.finfo(up.dtype).eps) * (1 + jnp.abs(up) + jnp.abs(down))
-        here = jnp.abs(stop_gradient(self.function(machine, s, state))) <= rounding
+        function = partial(self.function, machine, s)
+        size = size_of(function, state, jtu.tree_map(jnp.abs, state))
+        size = size + jnp.asarray(machine.cycle) / (2 * jnp.pi) * (jnp.abs(up) + jnp.abs(down))
+        rounding = 64 * float(jnp.finfo(up.dtype).eps) * size
+        here = jnp.abs(stop_gradient(function(state))) <= stop_gradient(rounding)
         return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):

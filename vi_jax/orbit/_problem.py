@@ -25,6 +25,7 @@ from ..flow import (
     chosen,
     simulate,
     simulate_pool,
+    sizes_on_host,
 )
 from ..machine import (
     AbstractMachine,
@@ -44,6 +45,7 @@ from ..machine import (
     renews,
     scales_known,
     section_in,
+    size_of,
     stops_of,
     switches_of,
     with_leaf,
@@ -52,7 +54,7 @@ from ..machine import (
 from ._corrector import off_by
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from ._shooting import Shooting, Unknowns
-from .results import Orbit, unit_of
+from .results import Orbit
 
 
 def has_fixed_steps(method: AbstractMethod) -> bool:
@@ -479,9 +481,11 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
     """Of each coordinate, 1 + i if it is on stop number i without landing or leaving, else 0."""
     contact, stops = [0.0] * len(machine.coordinates), stops_of(machine)
     moves = {stops[event.number].coordinate for event in events if event.use}
-    unit = float(unit_of(ravel_pytree(state)[0]))
+    row, unravel = ravel_pytree(state)
+    sizes = unravel(jnp.asarray(sizes_on_host(machine, state, np.asarray(row))))
     for i, stop in enumerate(stops):
-        place = machine.coordinates[stop.coordinate].position(state)
+        position = machine.coordinates[stop.coordinate].position
+        place, unit = position(state), float(size_of(position, state, sizes))
         on = abs(float(stop.beyond(place))) < _ON * (unit + abs(float(place)))
         if on and stop.coordinate not in moves:
             contact[stop.coordinate] = 1.0 + i

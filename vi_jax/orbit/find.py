@@ -7,7 +7,7 @@ where the next one begins; p are the numbers of the machine.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,16 @@ from .._checks import concrete, count, flag
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, State, Vector
-from ..flow import MethodLike, Run, check_leaves, in_modes, means, shape_of, simulate
+from ..flow import (
+    MethodLike,
+    Run,
+    check_leaves,
+    in_modes,
+    means,
+    row_sizes,
+    shape_of,
+    simulate,
+)
 from ..machine import (
     AbstractMachine,
     HybridState,
@@ -57,9 +66,10 @@ def _missing(
 
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
     """Where a root finder comes to from a guess, the first arc's start; the others begin where the
-    motion from there is then. The `x` found are the starts of the arcs, in rows; all numbers are
-    floats."""
+    motion from there is then. The `x` found are the starts of the arcs, in rows; what is said of
+    the search is relative to the sizes of their numbers. All are floats."""
     x, unravel = raveled(guess)
+    sizes = row_sizes(arc.machine, guess)
     arcs = x[None]
     if root_finder.arcs > 1:
         run = simulate(
@@ -67,7 +77,10 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         )
         sections = in_rows(run.sections)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
-    found = find_root(root_finder, lambda arcs: _missing(arc, arcs, unravel), arcs)
+    found = find_root(
+        root_finder, lambda z: _missing(arc, z * sizes, unravel) / sizes, arcs / sizes
+    )
+    found = found._replace(x=found.x * sizes)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`
 
 
@@ -77,6 +90,15 @@ def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arra
     arcs, states, _ = jacobians.shape
     following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
     return block_diag(*jacobians) - following.astype(jacobians.dtype)
+
+
+def _start_change(
+    jacobians: Float[Array, "arcs states states"], missing: Vector, sizes: Vector
+) -> Vector:
+    """The smallest change of the arcs' starts that changes F by `missing`, relative to sizes."""
+    sizes = jnp.tile(sizes, len(jacobians))
+    matrix = shooting_matrix(jacobians) * sizes / sizes[:, None]
+    return sizes * smallest_solution(matrix, missing / sizes)
 
 
 # Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
@@ -244,7 +266,8 @@ def _(primals, tangents):
     slopes = jax.vmap(lambda x: jax.jacfwd(observed)(jnp.append(numbers, x)))(root.x)
     ends, along = slopes.states[:, -1, -1], ravel_pytree(tangents[0])[0]
     rate = (ends[..., :count] @ along).ravel()
-    move = -smallest_solution(shooting_matrix(ends[..., count:]), rate).reshape(root.x.shape)
+    move = -_start_change(ends[..., count:], rate, row_sizes(arc.machine, unravel(root.x[0])))
+    move = move.reshape(root.x.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
     move = move * jnp.where(root.converged > 0, 1.0, jnp.nan)
@@ -267,16 +290,18 @@ def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Arra
 
 
 def error_of(
-    angles: np.ndarray | None, seen: ObservedArc, x: Float[Array, "arcs states"]
+    angles: np.ndarray | None, seen: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
 ) -> tuple[Scalar, Flag]:
-    """The largest component of Newton's next step from the arcs' starts `x`, and whether the motion
-    drifts: most of what it lacks to be periodic is what no other start would change."""
+    """The largest component of Newton's next step from the arcs' starts `x`, relative to `sizes`,
+    and whether the motion drifts: most of what it lacks to be periodic is what no other start would
+    change."""
     after = jnp.roll(x, -1, axis=0)
-    missing = nearest_images(angles, seen.states[:, -1, -1], after) - after
-    missing, ahead = missing.ravel(), shooting_matrix(seen.jacobians[:, -1])
-    step = smallest_solution(ahead, missing)
-    drifts = jnp.linalg.norm(missing - ahead @ step) > _DRIFTS * jnp.linalg.norm(missing)
-    return jnp.max(jnp.abs(step)), drifts
+    missing = (nearest_images(angles, seen.states[:, -1, -1], after) - after).ravel()
+    step = _start_change(seen.jacobians[:, -1], missing, sizes)
+    left = missing - shooting_matrix(seen.jacobians[:, -1]) @ step
+    sizes = jnp.tile(sizes, len(x))
+    drifts = jnp.linalg.norm(left / sizes) > _DRIFTS * jnp.linalg.norm(missing / sizes)
+    return jnp.max(jnp.abs(step / sizes)), drifts
 
 
 def in_order(
@@ -434,7 +459,8 @@ def _judged(
     x = root.x
     jacobians = by_the_first_state(seen.jacobians)
     angles = angles_in(machine, bare(guess))
-    error, drifts = error_of(angles, seen, x)
+    sizes = row_sizes(machine, start, in_rows(bare(seen.states), 3))
+    error, drifts = error_of(angles, seen, x, sizes)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
     # Back on the section asked for, of which the last one met is the guess's.
@@ -445,7 +471,8 @@ def _judged(
         modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
         rows = jnp.concatenate([sections, modes], axis=1)
     unit = jax.lax.stop_gradient(root.unit)
-    least = _least_period(rows, error, unit, angles)
+    scale = unit * (sizes if modes is None else jnp.append(sizes, jnp.ones(modes.shape[1])))
+    least = _least_period(rows, error / unit, scale, angles)
     again = _comes_back(start, seen)
     monodromy = jacobians[least - 1] if multipliers else jnp.full_like(jacobians[0], jnp.nan)
     within = jnp.arange(cycles) < least
@@ -455,12 +482,16 @@ def _judged(
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
     state = _at_section(guess, sections[0], None if modes is None else modes[0])
-    still = _stands_still(machine, state, duration, unit)
+    still = stands_still(machine, state, duration, unit * sizes)
     close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
     found = (root.converged > 0) & again & ~still & close
+    y_min = jnp.min(jnp.where(within, seen.y_min, jnp.inf))
+    y_max = jnp.max(jnp.where(within, seen.y_max, -jnp.inf))
+    # As fast as a harmonic motion of this extent, once in a cycle, and a turn that is as sharp.
+    fast = jnp.pi * (y_max - y_min) * least / duration
+    slow = fast * jnp.sqrt(4 * jnp.maximum(clearance, 0) / (y_max - y_min))
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
-    slow = jnp.sqrt(2 * unit * jnp.maximum(clearance, 0))
-    near = jnp.minimum(slowest, slow) < _SLOW * unit
+    near = jnp.minimum(slowest, slow) < _SLOW * fast
     return Orbit(
         machine=machine,
         method=the_map.method,
@@ -474,8 +505,8 @@ def _judged(
         impact_stop=listed.stop.astype(jnp.int32),
         impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
         rests=jnp.sum(jnp.where(within, seen.rests, 0.0)).astype(jnp.int32),
-        y_min=jnp.min(jnp.where(within, seen.y_min, jnp.inf)),
-        y_max=jnp.max(jnp.where(within, seen.y_max, -jnp.inf)),
+        y_min=y_min,
+        y_max=y_max,
         clearance=clearance,
         monodromy=monodromy,
         multipliers=multipliers_of(monodromy),
@@ -516,11 +547,11 @@ def _at_section(guess: State, section: Array, modes: Array | None) -> State:
 
 
 def _least_period(
-    sections: Float[Array, "cycles states"], error: Array, unit: Array, angles: np.ndarray | None
+    sections: Float[Array, "cycles states"], error: Array, unit: Vector, angles: np.ndarray | None
 ) -> Array:
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
-    slack = jnp.maximum(_slack(sections.dtype), 100 * error / unit)
+    slack = jnp.maximum(_slack(sections.dtype), 100 * error)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
             later = nearest_images(angles, jnp.roll(sections, -m, axis=0), sections)
@@ -529,9 +560,9 @@ def _least_period(
     return least
 
 
-def _stands_still(machine: AbstractMachine, state: State, duration: Array, unit: Array) -> Flag:
+def stands_still(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
     """Whether an autonomous machine stands still in a state, at an equilibrium: as fast as it
-    leaves the section it would get nowhere in its period."""
+    leaves the section it would get nowhere in its period, relative to `unit` + |state|."""
     own, state = modes_of(state), bare(state)
     if not is_autonomous(machine, state):
         return jnp.zeros((), bool)

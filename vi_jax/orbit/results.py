@@ -24,6 +24,7 @@ from ..flow import (
     present,
     quantities_on,
     simulate,
+    sizes_on_host,
     states,
     tidy,
 )
@@ -129,9 +130,10 @@ class Orbit(Summarized):
     multipliers: Complex[Array, "... states"]
     """Floquet multipliers over the period, the largest modulus first."""
     residual: Float[Array, "..."]
-    """Largest component of P(x) - x, the difference of the state after one period."""
+    """Largest component of P(x) - x, the difference of the state after one period, relative to the
+    size of each number (1 for a `Scene`)."""
     error: Float[Array, "..."]
-    """Estimated error of `state`: largest component of Newton's next step."""
+    """Estimated error of `state`, as relative: largest component of Newton's next step."""
     iterations: Int[Array, "..."]
     """Steps of the search."""
     history: Float[Array, "... max_steps"]
@@ -365,18 +367,11 @@ def trimmed(orbit: Orbit) -> Orbit:
     return dataclasses.replace(orbit, **cut, sections=sections)
 
 
-def unit_of(states: Any) -> Any:
-    """Return what counts as 1 where states of a motion are compared: the largest of their
-    components, but at most 1; and 1 if all are zero."""
-    size = abs(states).max()
-    return (size + (size == 0)).clip(None, 1)
-
-
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:
     """Return how far states lie from others, relative to `unit` + |state| of the latter.
 
     Of the components, the last axis, that counts which differs most. Everywhere in the package this
-    number says whether two states, or two motions, are the same; `unit` is that of `unit_of`.
+    number says whether two states, or two motions, are the same; `unit` are their `row_sizes`.
     """
     return (abs(here - there) / (unit + abs(there))).max(axis=-1)
 
@@ -407,8 +402,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     are left out. Host-side: not to be traced.
 
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
-    their sections agree to `tolerance` (relative to the size of the motion: u + |state|, u the
-    largest component, at most 1).
+    their sections agree to `tolerance`, relative to the size of each number
+    of the state.
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
     each on the section on which it was first found; and for each of them the number of searches
@@ -425,7 +420,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     """The different motions in several batches of searches, whose periods asked for may differ; and
     how many searches of each batch found each, (motions, batches). See `distinct_orbits`."""
     chosen: list[Orbit] = []
-    paths: list[np.ndarray] = []
+    paths: list[tuple[np.ndarray, np.ndarray]] = []
     counts: list[np.ndarray] = []
     for which, orbits in enumerate(batches):
         shape = orbits.residual.shape
@@ -442,23 +437,24 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
             path = sections[i, : cycles[i]]
             j = _known(paths, path, tolerance, angles)
             if j == len(paths):
-                paths.append(path)
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
+                paths.append((path, sizes_on_host(chosen[j].machine, chosen[j].state, path)))
                 counts.append(np.zeros(len(batches), int))
             counts[j][which] += 1
-    order = sorted(range(len(chosen)), key=lambda j: (len(paths[j]), float(chosen[j].y_min)))
+    order = sorted(range(len(chosen)), key=lambda j: (len(paths[j][0]), float(chosen[j].y_min)))
     table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
     return Orbits(chosen[j] for j in order), table
 
 
 def _known(
-    paths: list[np.ndarray], path: np.ndarray, tolerance: float, angles: np.ndarray | None
-) -> int:
-    """Which of the known motions one is, by its sections from whichever of them on; else how many
-    there are."""
-    for j, other in enumerate(paths):
+    paths: list[tuple[np.ndarray, np.ndarray]], path: np.ndarray, tolerance: float,
+    angles: np.ndarray | None,
+) -> int:  # fmt: skip
+    """Which of the known motions one is, by its sections from any of them on; else how many there
+    are. `paths` holds the sections of each, and the sizes of their numbers."""
+    for j, (other, sizes) in enumerate(paths):
         if len(other) == len(path):
             here = nearest_images(angles, path[0], other)
-            if distance(here, other, unit_of(other)).min() <= tolerance:
+            if distance(here, other, sizes).min() <= tolerance:
                 return j
     return len(paths)

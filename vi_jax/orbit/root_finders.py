@@ -93,8 +93,8 @@ class Newton(AbstractRootFinder):
 
     **Arguments:**
 
-    - `tolerance`: largest residual component of a found orbit, relative to the largest component of
-      its state where that is below 1; by default 1e-10 in double and 1e-4 in single precision. The
+    - `tolerance`: largest residual component of a found orbit, relative to the sizes of the numbers
+      of its state; by default 1e-10 in double and 1e-4 in single precision. The
       search continues below it as long as the residual decreases.
     - `max_steps`: steps after which it gives up; static.
     - `arcs`: 1 for single shooting. With more, the period is cut into that many arcs, whose

@@ -95,10 +95,8 @@ def _is_angle(branch: Branch, name: str) -> bool:
 
 def _moving(found: Branch | Sweep) -> str:
     """The extreme that varies: the other one may be a stop's place. The least if neither does."""
-    low, high = (
-        np.ptp(x) > 1e-9 * (1 + np.abs(x).max())
-        for x in (np.asarray(found.y_min), np.asarray(found.y_max))
-    )
+    extremes = np.asarray(found.y_min), np.asarray(found.y_max)
+    low, high = (np.ptp(x) > 1e-9 * np.abs(extremes).max() for x in extremes)
     return "y_max" if high and not low else "y_min"
 
 

@@ -229,7 +229,7 @@ def _ahead(
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """One branch of an unstable manifold, with rows of NaN at jumps."""
-    begin = side * _BEGIN * saddle.map.unit * saddle.unstable
+    begin = side * _BEGIN / np.linalg.norm(saddle.unstable / saddle.map.unit) * saddle.unstable
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
         periods += 1

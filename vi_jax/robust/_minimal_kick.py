@@ -152,7 +152,7 @@ def first_exits(
     rays = spread(directions, kick.size, seed)
     reach = largest
     if reach is None:
-        sizes = settling.unit + np.abs(kick.start[list(kick.places)])
+        sizes = (settling.unit + np.abs(kick.start))[list(kick.places)]
         reach = float(np.max(kick.weights * sizes)) / 4
     found = exits(settling, kick, rays, 0.0, reach, points)
     for _ in range(_DOUBLINGS if largest is None else 0):

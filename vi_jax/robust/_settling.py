@@ -16,14 +16,20 @@ from .._checks import count, given_number
 from .._messages import Tell, silent
 from .._programs import compiled
 from .._types import State
-from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool
+from ..flow import (
+    RESULTS,
+    MethodLike,
+    Run,
+    RunOptions,
+    simulate,
+    simulate_pool,
+    sizes_on_host,
+)
 from ..machine import (
     AbstractMachine,
     angles_in,
     bare,
-    begin_modes,
     begun,
-    field_in,
     in_rows,
     is_autonomous,
     modes_of,
@@ -37,7 +43,7 @@ from ..orbit import (
     cycle_map,
     distance,
     find_orbit,
-    unit_of,
+    stands_still,
 )
 
 Row = Float[np.ndarray, " _"]
@@ -56,9 +62,8 @@ _LANES = 1024
 # All relative to the motion's size (see `orbit.distance`). A motion whose sections change by less
 # than the first is where it will stay, or nearer to an unstable one than starts are told apart;
 # section states a period apart are the same within the second; an orbit that is found from a state
-# is its motion if it lies as near as the third; the last is an equilibrium's rate of change.
-# Choices.
-_STAYS, _SAME, _NEAR, _STILL = 1e-11, 1e-5, 1e-3, 1e-8
+# is its motion if it lies as near as the third. Choices.
+_STAYS, _SAME, _NEAR = 1e-11, 1e-5, 1e-3
 
 # Sections of a motion that are recorded at once. A choice: longer ones are put together.
 TRAIL = 16
@@ -79,8 +84,8 @@ class Settling:
     def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
         self.the_map, self.like, self.motion = the_map, like, motion
         self.settle, self.tolerance = settle, tolerance
-        self.unit = float(unit_of(motion))
-        """What counts as 1 in all comparisons of states."""
+        self.unit = sizes_on_host(the_map.machine, like, motion)
+        """What counts as 1 in all comparisons of states, for each of their numbers."""
         self.angles = angles_in(the_map.machine, like)
         self.begin = 0.0
         """How long after the section starts are, by the clock of a machine with a drive."""
@@ -233,7 +238,7 @@ class Settling:
         **Raises:** `ValueError` for an equilibrium, and for a phase beyond the cycle.
         """
         machine, method = self.the_map.machine, self.the_map.method
-        if _stands_still(machine, self.state(start)):
+        if bool(stands_still(machine, self.state(start), machine.cycle, self.unit)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
         row = self.motion[self.distance_to(start, self.motion).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
@@ -300,7 +305,7 @@ def settling_on(
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
-    if _stands_still(the_map.machine, like):
+    if bool(stands_still(machine, like, the_map.machine.cycle, settling.unit)):
         return settling, start
     rows = settling.settled_rows(start, longest)
     if rows is None:
@@ -309,16 +314,6 @@ def settling_on(
             f"does not within {settle} cycles. See `settle` and `longest`."
         )
     return Settling(the_map, like, rows, settle, tolerance), start
-
-
-def _stands_still(machine: AbstractMachine, state: State) -> bool:
-    """Whether a state is an equilibrium of a machine without a drive, which meets no section."""
-    if not is_autonomous(machine, state):
-        return False
-    here = in_row(state)
-    s = jnp.zeros((), here.dtype)
-    rate = in_row(field_in(machine, s, state, begin_modes(machine, s, state)))
-    return bool(np.all(np.abs(rate) <= _STILL * (unit_of(here) + np.abs(here))))
 
 
 def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:

@@ -23,6 +23,7 @@ from ..flow import (
     chosen,
     machine_of,
     simulate,
+    sizes_on_host,
     tidy,
 )
 from ..machine import (
@@ -54,7 +55,7 @@ from ._geometry import (
 )
 from ._scan import LanesFailed, ScanInterrupted, scan
 from .grid import START, axes_of
-from .measures import CODES, REGIMES, Regime, Sections, flags, size_of
+from .measures import CODES, REGIMES, Regime, Sections, flags
 from .program import check_leaf_name, start_with
 
 _BEYOND = REASON_NAMES.index("bad_start")
@@ -307,7 +308,7 @@ def basins(
     - `settle`: drive cycles before the motion is judged.
     - `longest`, `tolerance`: as in `Regime`.
     - `apart`: section states farther apart than this belong to different motions; relative to
-      1 + |state|, or as in `Regime` if the motions are small.
+      the size of each number, as in `Regime`.
     - `method`, `start`, `progress`, and further options: as for `scan` (`store` to interrupt and
       resume).
 
@@ -350,9 +351,14 @@ def _sorted_out(
         run = simulate(machine, here, longest, method=method)
         return np.asarray(in_rows(run.sections))[1 : cycles + 1]
 
-    starts = [data[name].values for name in data.coords if str(name).startswith(START)]
-    size = partial(size_of, machine, begin, starts)
-    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), size)
+    def sizes(states: np.ndarray) -> np.ndarray:
+        largest = {name: float(np.abs(x).max()) for name, x in zip(names, states.T, strict=True)}
+        for name in names:
+            if START + name in data.coords:
+                largest[name] = max(largest[name], float(np.abs(data[START + name]).max()))
+        return sizes_on_host(machine, begin, np.array([*largest.values()]))
+
+    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), sizes)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
     for number, motion in enumerate(motions):
@@ -480,14 +486,14 @@ def _labelled(
     apart: float,
     followed: Callable[[np.ndarray, int], np.ndarray],
     angles: np.ndarray | None,
-    size: Callable[[np.ndarray], Any],
+    sizes: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """A label for each lane, and the section states (period, components) of each motion, that of
     the most lanes first.
 
     **Arguments:** `names` of a state's components; how far states of one motion may be `apart`;
     `followed`, which gives the section states of a motion from one of them and its period; `angles`
-    among the components; the `size` of motions that have these states.
+    among the components; the `sizes` of motions that have these states (`row_sizes`).
     """
     period = np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
@@ -496,7 +502,7 @@ def _labelled(
     if not settled.size:
         return label, []
     # Lanes on one motion fall into few cells; what is found for one of them holds for all.
-    unit = float(size(states[settled]))
+    unit = sizes(states[settled])
     cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)

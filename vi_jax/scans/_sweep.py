@@ -54,8 +54,8 @@ from ..machine import (
 from .grid import LANE, LaneNoise, lane_noise_of
 from .measures import CODES, REGIMES, Regime, Usual, flags
 
-# A jump is so many times the change at the values beside it, and this part of 1 + |number|:
-# choices.
+# A jump is so many times the change at the values beside it, and this part of the largest
+# position, or of ζ: choices.
 _JUMP, _NOTED = 3.0, 0.01
 
 # What is a number at each value of every sweep.
@@ -179,7 +179,8 @@ class Sweep(Summarized):
             steps = np.abs(np.diff(x))
             beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
             usual = np.maximum(beside[:-2], beside[2:])
-            scale = 1 + np.maximum(np.abs(x[1:]), np.abs(x[:-1]))
+            most = np.abs(x) if name == "ζ" else np.maximum(np.abs(self.y_min), np.abs(self.y_max))
+            scale = np.maximum(most[1:], most[:-1])
             far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
             far &= (period[1:] > 0) | (period[:-1] > 0)
             for i in np.flatnonzero(far) + 1:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from .._checks import count, require
 from .._types import Flag, Scalar, State
-from ..flow import AbstractMethod, Run
+from ..flow import AbstractMethod, Run, row_sizes
 from ..machine import (
     AbstractMachine,
     angles_in,
@@ -26,9 +26,7 @@ from ..machine import (
     frequency_ratio,
     in_rows,
     nearest_images,
-    scales_known,
 )
-from ..orbit import unit_of
 from ._lyapunov import lyapunov
 
 Number = Scalar | float
@@ -40,10 +38,6 @@ _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 # The least that sections are held to: so many times what they wander by, and so many roundings.
 # Choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
-
-
-# Motions are small if no number of their states is as large: as the errors of steps are judged.
-_SMALL = 1e-2
 
 
 class REGIMES(IntEnum):
@@ -72,15 +66,6 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
-def size_of(machine: AbstractMachine, *states: Any) -> Scalar | float:
-    """Return what counts as 1 where states of a motion are compared: the largest number in these
-    states if it is small, else 1; 1 for a machine whose numbers are about 1 by definition."""
-    if scales_known(machine):
-        return 1.0
-    size = unit_of(jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(states)]))
-    return jnp.where(size < _SMALL, size, 1.0)
-
-
 def least_period(
     sections: State,
     impacts: Int[Array, " cycles"],
@@ -88,7 +73,7 @@ def least_period(
     longest: int,
     tolerance: Number | None = None,
     wander: Number = 0.0,
-    size: Number = 1.0,
+    sizes: Any = 1.0,
     angles: np.ndarray | None = None,
 ) -> Int[Array, ""]:
     """The fewest drive cycles after which a motion repeats, its impacts too, or
@@ -101,7 +86,7 @@ def least_period(
     come in each cycle: beside a grazing these tell apart what sections hardly do.
 
     **Arguments:** `sections`, more than `longest` of them; the `impacts` of the cycle that ends at
-    each; `tolerance`, relative to `size` (`size_of`) + |state|, by default 1e-6 or, if that is
+    each; `tolerance`, relative to `sizes` (`row_sizes`) + |state|, by default 1e-6 or, if that is
     more, ten times what they `wander` by under their method; which of their numbers are `angles`.
     """
     states = in_rows(sections).T
@@ -111,7 +96,7 @@ def least_period(
     count = states.shape[1] - longest
     last = rows[:, longest:]
     angles = None if angles is None else np.append(angles, False)
-    scale = size + jnp.abs(last[:-1])
+    scale = jnp.asarray(sizes)[..., None] + jnp.abs(last[:-1])
 
     def compared(_, p):
         before = jax.lax.dynamic_slice_in_dim(rows, longest - p, count, axis=1)
@@ -346,15 +331,14 @@ class Regime(AbstractMeasure):
     """`period` in drive cycles and `impacts` in a period; motions without a period by kind.
 
     A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`
-    (relative to 1 + |state|; by default 1e-6, or ten tolerances of a method that sizes its steps by
-    one) with as many impacts in each cycle; see `least_period` for one that still spirals in. If
-    all numbers of start and sections are below 0.01, the largest of them takes the place of the 1
-    (a machine in SI units). Other motions are observed for another `observed` cycles. Unless its
-    greatest Lyapunov exponent exceeds `threshold` there (in the machine's own unit of rates), a
-    motion is unsettled or quasi-periodic. If it does, the motion is continued for `lasting` cycles
-    and observed once more: it is chaotic if its exponent exceeds `threshold` again, else
-    transiently chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers that
-    stand for these in `period`.
+    (relative to the size of each number of the state, which is 1 for the paper's scenes; by default
+    1e-6, or ten tolerances of a method that sizes its steps by one) with as many impacts in each
+    cycle; see `least_period` for one that still spirals in. Other motions are observed for another
+    `observed` cycles. Unless its greatest Lyapunov exponent exceeds `threshold` there (in the
+    machine's own unit of rates), a motion is unsettled or quasi-periodic. If it does, the motion is
+    continued for `lasting` cycles and observed once more: it is chaotic if its exponent exceeds
+    `threshold` again, else transiently chaotic: it has settled meanwhile, or is about to. `REGIMES`
+    has the numbers that stand for these in `period`.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
     later. A longer `lasting` makes this rarer and chaotic lanes more expensive; 0 leaves the second
@@ -407,10 +391,12 @@ class Regime(AbstractMeasure):
     def __call__(self, machine, run):
         """Period and impacts of one lane; whether it is chaotic is left to `refine`."""
         sections = jtu.tree_map(lambda x: x[1:], run.sections)
-        angles = angles_in(machine, jtu.tree_map(lambda x: x[0], run.sections))
+        first = jtu.tree_map(lambda x: x[0], run.sections)
+        begin = self.start if jtu.tree_leaves(self.start) else first
         period = least_period(
             sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
-            wander=self.wander, size=size_of(machine, self.start, sections), angles=angles,
+            wander=self.wander, sizes=row_sizes(machine, begin, in_rows(sections)),
+            angles=angles_in(machine, first),
         )  # fmt: skip
         return {
             "period": jnp.where(run.successful, period, REGIMES.failed).astype(jnp.int16),

@@ -106,15 +106,17 @@ def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     section: a step changes nothing, and it is twice as long on its way as a cycle is expected to
     take. It would meet the section by accident of rounding only, or never."""
     old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, arrived.state))
-    slack = 8 * float(jnp.finfo(arrived.s.dtype).eps)
-    cycle, size = plan.machine.cycle, jnp.ones_like(arrived.s)
+    sizes = [1.0] * len(old) if plan.sizes is None else jtu.tree_leaves(plan.sizes)
+    slack, cycle = 8 * float(jnp.finfo(arrived.s.dtype).eps), plan.machine.cycle
+    share = jnp.ones_like(arrived.s)
     # One that is aimed at something may be so short that nothing has time to change.
     still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
-    for before, after in zip(old, new, strict=True):
-        still = still & jnp.all(jnp.abs(after - before) <= slack * (1 + jnp.abs(before)))
-        size = size + jnp.max(jnp.abs(after))
+    for before, after, size in zip(old, new, sizes, strict=True):
+        still = still & jnp.all(jnp.abs(after - before) <= slack * (size + jnp.abs(before)))
+        share = share + jnp.max(jnp.abs(after)) / size
     guard = jnp.asarray(section_in(plan.machine, stop_gradient(arrived.state)))
-    return still & (jnp.abs(guard) <= slack * size)
+    extent = plan.guard_extent(section_number(plan.machine), lane)
+    return still & (jnp.abs(guard) <= slack * share * extent)
 
 
 def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
