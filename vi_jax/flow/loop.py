@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
@@ -20,6 +21,7 @@ from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
     ContactFriction,
+    angles_in,
     bare,
     begin_modes,
     events_of,
@@ -61,27 +63,31 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     """
     if scales_known(machine):
         return None
-    return stop_gradient(jtu.tree_map(_small, _known_sizes(machine, s, start, modes)))
+    known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
+    return stop_gradient(jtu.tree_map(_small, known))
 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
     """Return the size of each number of a state, in the order of `in_rows`: about how large it is
-    along a motion; 1 if nothing is known of it, or for a machine whose numbers are about 1 by
-    definition. States are compared relative to these sizes.
+    along a motion; 1 for an angle, if nothing is known of it, or for a machine whose numbers are
+    about 1 by definition. States are compared relative to these sizes.
 
     **Arguments:** `start`, where the motion begins; `rows`, other states of it, (..., states).
     """
     state = bare(start)
-    row = stop_gradient(in_rows(state, 0))
+    row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
         return jnp.ones_like(row)
-    zero = jnp.zeros((), row.dtype)
-    known = _known_sizes(machine, zero, state, begin_modes(machine, zero, state, modes_of(start)))
+    zero, angles = jnp.zeros((), row.dtype), angles_in(machine, state)
+    angles = jnp.zeros(row.shape, bool) if angles is None else angles
+    modes = begin_modes(machine, zero, state, modes_of(start))
+    values = unravel(jnp.where(angles, 1.0, jnp.abs(row)))
+    known = _known_sizes(machine, zero, state, modes, values)
     sizes = in_rows(jtu.tree_map(lambda x, y: jnp.broadcast_to(x, jnp.shape(y)), known, state), 0)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
-    return stop_gradient(jnp.where(sizes > 0, sizes, 1.0))
+    return stop_gradient(jnp.where(angles | (sizes <= 0), 1.0, sizes))
 
 
 @compiled
@@ -95,8 +101,10 @@ def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> n
     return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
 
 
-def _known_sizes(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State:
-    """`sizes_of`, large ones too, and 0 where nothing is known."""
+def _known_sizes(
+    machine: AbstractMachine, s: Scalar, start: State, modes: Scalars, values: State
+) -> State:
+    """`sizes_of`, large ones too, and 0 where nothing is known; `values`, the moduli in `start`."""
     holding = [x for x in events_of(machine) if x.holds_mode]
     # While something sticks or slides along a surface, its rate tells nothing of its size.
     sticks = [getattr(x, "blends", False) or x.is_dry for x in holding] + [False] * len(modes)
@@ -108,7 +116,7 @@ def _known_sizes(machine: AbstractMachine, s: Scalar, start: State, modes: Scala
     instants = s + jnp.asarray(machine.cycle) * np.arange(_INSTANTS) / _INSTANTS
     rates = jax.vmap(smooth.field, (0, None))(instants, start)
     sizes = jtu.tree_map(
-        lambda x, v: jnp.maximum(jnp.abs(x), unit * jnp.max(jnp.abs(v), axis=0)), start, rates
+        lambda x, v: jnp.maximum(x, unit * jnp.max(jnp.abs(v), axis=0)), values, rates
     )
     # Factors that differ keep what acts on a difference from cancelling.
     leaves, tree = jtu.tree_flatten(sizes)
