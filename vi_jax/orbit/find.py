@@ -266,7 +266,7 @@ def _(primals, tangents):
     slopes = jax.vmap(lambda x: jax.jacfwd(observed)(jnp.append(numbers, x)))(root.x)
     ends, along = slopes.states[:, -1, -1], ravel_pytree(tangents[0])[0]
     rate = (ends[..., :count] @ along).ravel()
-    move = -_start_change(ends[..., count:], rate, row_sizes(arc.machine, unravel(root.x[0])))
+    move = -_start_change(ends[..., count:], rate, row_sizes(arc.machine, guess))
     move = move.reshape(root.x.shape)
     # Where there is no orbit there is no derivative of one.
     # A product, since the transpose of a choice would be zero.
@@ -376,7 +376,7 @@ def find_orbit(
     found none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess
     that cannot be simulated. If a component is neutral (a multiplier is exactly 1), such as the
     position of a body that slides freely, the orbits are a family. The search then returns the one
-    nearest to the guess, with derivatives across the family.
+    nearest to the guess, relative to the size of each number, with derivatives across the family.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
     """
