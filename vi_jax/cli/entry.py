@@ -56,7 +56,6 @@ def read(path: str) -> dict[str, Any]:
 
 
 def _run_file(options: argparse.Namespace) -> int:
-    """Do what the file asks of the verb."""
     verb, store = options.command, None
     try:
         tables = read(options.file)
@@ -80,8 +79,7 @@ def _run_file(options: argparse.Namespace) -> int:
     return 0 if found.good else 1
 
 
-def _explore(options: argparse.Namespace) -> int:
-    """Serve the page of a machine: that of the command, or the paper's scene."""
+def _serve_page(options: argparse.Namespace) -> int:
     if not 0 <= options.port <= 65535:
         return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
     if problem := missing():
@@ -123,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     verb.add_argument(
         "--no-browser", dest="browser", action="store_false", help="do not open a browser"
     )
-    verb.set_defaults(run=_explore)
+    verb.set_defaults(run=_serve_page)
     for name, what in VERBS.items():
         verb = commands.add_parser(
             name,

@@ -104,7 +104,7 @@ def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
     own = {key: values.pop(key) for key in what.own if key in values}
     with errors_in(place), warnings.catch_warnings(record=True) as caught:
         found = what.work(thing, values, **own)
-        lines = [*before, *found.lines, *_write(found, **files)]
+        lines = [*before, *found.lines, *_write_files(found, **files)]
     return found._replace(lines=lines + sorted({f"  warning: {x.message}" for x in caught}))
 
 
@@ -117,8 +117,7 @@ def _check_path(path: Any, endings: tuple[str, ...], place: str) -> None:
         raise InputError(f"{place} cannot be written: {path}: {reason}")
 
 
-def _write(found: Found, output: str | None = None, picture: str | None = None) -> list[str]:
-    """Write the files that are asked for; the lines that name them."""
+def _write_files(found: Found, output: str | None = None, picture: str | None = None) -> list[str]:
     lines = []
     if output is not None and found.table is not None:
         data = found.table()
@@ -258,15 +257,14 @@ def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     axes = ", ".join(f"{name} ({data[name].size})" for name in data.coords)
     lines = [f"Scan of {data['result'].size:,} motions over {axes}"]
     if "period" in data:
-        lines += _regimes(data, machine)
+        lines += _count_periods(data, machine)
     if options.get("store") is not None:
         lines.append(f'  store: xarray.open_zarr("{options["store"]}")')
     draw = lambda figure: plot.plot_regimes(data, ax=figure.subplots())
     return Found([*lines, str(data)], lambda: data, draw, bool((data["result"] == 0).any()))
 
 
-def _regimes(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
-    """How many motions there are of each period, in the machine's words."""
+def _count_periods(data: xr.Dataset, machine: AbstractMachine) -> list[str]:
     period = np.asarray(data["period"]).astype(int)[np.asarray(data["result"]) == 0]
     kinds, counts = np.unique(period, return_counts=True)
     lines = []

@@ -93,7 +93,9 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             f"{whose} must return the components of its state, {in_short(state)}, but returned "
             f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
         )
-    _traced(f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state)
+    _output_shapes(
+        f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state
+    )
 
 
 def rows_of(machine: AbstractMachine) -> str:
@@ -141,8 +143,7 @@ def in_words_of(whose: str) -> Iterator[None]:
         ) from error
 
 
-def _traced(whose: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """The shapes that a function of a machine returns; errors as `in_words_of`."""
+def _output_shapes(whose: str, function: Callable[..., Any], *arguments: Any) -> Any:
     with in_words_of(whose):
         return eqx.filter_eval_shape(function, *arguments)
 
@@ -155,7 +156,7 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             continue
         whose = f"The restitution law of stop {i} of a {type(machine).__name__}"
         try:
-            got = _traced(whose, stop.rebound, speed)
+            got = _output_shapes(whose, stop.rebound, speed)
         except TypeError as error:
             if str(error).startswith(whose):
                 raise
@@ -217,7 +218,6 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
 
 
 def _guards_below(machine: AbstractMachine, zero: Scalar, start: State, modes: Scalars) -> Array:
-    """Which guards of the machine's events are below zero in some state around the start."""
     first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
     random = np.random.default_rng(0)
     far = np.resize(_FAR, _TRIED)
@@ -370,17 +370,16 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
         _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
         whose = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
-        _check_state(whose, state, _traced(whose, coordinate.placed, state, place, velocity))
+        _check_state(whose, state, _output_shapes(whose, coordinate.placed, state, place, velocity))
     first = len(stops_of(machine))
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))
 
 
 def _check_mass(whose: str, coordinate: Coordinate, s: Scalar, state: State) -> None:
-    """**Raises:** `TypeError` unless a mass is one number, or a function that returns one."""
     mass = coordinate.mass
     if callable(mass):
-        mass = _traced(whose, lambda: jnp.asarray(coordinate.mass_at(s, state)))
+        mass = _output_shapes(whose, lambda: jnp.asarray(coordinate.mass_at(s, state)))
     kind = getattr(mass, "dtype", None) or jnp.result_type(type(mass))
     if jnp.shape(mass) or not jnp.issubdtype(kind, jnp.number):
         raise TypeError(
@@ -400,22 +399,22 @@ def _check_event(
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates)
     _, own, more = event_of(machine, number, modes, contact)
     around = machine, s, state, *modes[own]
-    guard = _traced(f"`guard` of {whose}", lambda: event.guard(*around, **more))
+    guard = _output_shapes(f"`guard` of {whose}", lambda: event.guard(*around, **more))
     if getattr(guard, "shape", None) != () or not jnp.issubdtype(guard.dtype, jnp.floating):
         raise TypeError(
             f"`guard` of {whose} must return one floating-point number, but returned "
             f"{in_short(guard)}."
         )
-    when = _traced(f"`when` of {whose}", lambda: event.happens(*around))
+    when = _output_shapes(f"`when` of {whose}", lambda: event.happens(*around))
     if when is not None and (jnp.shape(when) or not jnp.issubdtype(when.dtype, bool)):
         raise TypeError(
             f"`when` of {whose} must return a flag, but returned {in_short(when)}. Compare it with "
             "a number: `state.V > 0`."
         )
     if isinstance(event, Reset):  # its modes are asked for in the state after it
-        new = _traced(f"`reset` of {whose}", lambda: event.jump(machine, s, state, *modes))
+        new = _output_shapes(f"`reset` of {whose}", lambda: event.jump(machine, s, state, *modes))
         _check_state(f"The state after {whose}", state, new)
-    found = _traced(f"`after` of {whose}", lambda: event.after(*around, **more))
+    found = _output_shapes(f"`after` of {whose}", lambda: event.after(*around, **more))
     if type(found) is not tuple or len(found) != 2:
         raise TypeError(
             f"`after` of {whose} must return the state and the modes afterwards, but returned "
@@ -432,8 +431,6 @@ def _check_event(
 
 
 def _check_state(whose: str, state: State, found: Any) -> None:
-    """**Raises:** `TypeError` for what is no state like the one given."""
-
     def kind(x: Any) -> Any:
         floats = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         return jnp.shape(x), floats

@@ -257,7 +257,6 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
 
 
 def _quantities(plan: Plan, points: State) -> dict[str, Array]:
-    """The machine's functions of its state at the points recorded."""
     machine = plan.machine
     if not has_quantities(machine):
         return {}

@@ -46,9 +46,7 @@ def _along(function: Callable, at: tuple, moves: tuple[bool, ...], slopes: list)
     return jax.jvp(of_moving, [x for x, m in zip(leaves, moves, strict=True) if m], slopes)
 
 
-def _written_out(tangents: Any) -> Any:
-    """Tangents with their zeros as numbers."""
-
+def _with_zeros(tangents: Any) -> Any:
     def number(x: Any) -> Any:
         aval: Any = getattr(x, "aval", None)
         return jnp.zeros(aval.shape, aval.dtype) if isinstance(x, SymbolicZero) else x
@@ -73,7 +71,7 @@ def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) 
 def _carried_jvp(carried, rate, primals, tangents):
     offset, moving, fixed, rest = primals
     there = carried(rate, offset, moving, fixed, rest)
-    slope = _written_out(tangents[1])
+    slope = _with_zeros(tangents[1])
     moves, numbers = _numbers(tangents[2])
     if any(moves) or any(_numbers(tangents[1])[0]):
         # What the derivative by the beginning becomes: it is carried along by the same flow.
@@ -201,7 +199,7 @@ class FlowToEvent:
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
         """`height`, of coordinate number k, with its derivatives; see `drift.height_of_turn`."""
-        place = self._pure(self._place(k))
+        place = self._pure(self._position_of(k))
         return height_of_turn(self._pure_rate, place, height, turns, offset, *self._given())
 
     def guard(self, number: int) -> Callable:
@@ -217,9 +215,7 @@ class FlowToEvent:
 
         return event
 
-    def _place(self, k: int) -> Callable:
-        """The position of coordinate number k, as a function of where the motion is."""
-
+    def _position_of(self, k: int) -> Callable:
         def coordinate(moving, fixed, rest):
             smooth, _ = self._whole(fixed, rest)
             return smooth.machine.coordinates[k].position(moving[1])

@@ -164,7 +164,6 @@ def rounding(
 
 
 def _rounding(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
-    """The rounding of a number that is computed from those of a state."""
     state = stop_gradient(state)
     slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
     terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)

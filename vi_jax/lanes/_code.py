@@ -27,7 +27,7 @@ def llvm() -> Any:
     binding.initialize_native_asmprinter()
     try:
         # A first compilation, so that programs can take the other backend if this one fails.
-        _engine(binding, object_code(binding, "define void @kernel() { ret void }", None))
+        _engine_with(binding, object_code(binding, "define void @kernel() { ret void }", None))
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from None
     return binding
@@ -35,7 +35,7 @@ def llvm() -> Any:
 
 def engine_of(text: str) -> Any:
     """The machine code of a text, in memory as long as what is returned."""
-    return _engine(llvm(), object_code(llvm(), text, None))
+    return _engine_with(llvm(), object_code(llvm(), text, None))
 
 
 def compile_in_background(text: str, cpu: str | None) -> Future:
@@ -68,7 +68,7 @@ def _load_or_compile(
         code = object_code(binding, text, cpu, level)
         if store is not None:
             _write(store / name, code)
-    engine = _engine(binding, code)
+    engine = _engine_with(binding, code)
     return engine, engine.get_function_address("kernel")
 
 
@@ -108,8 +108,7 @@ def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> byt
     return machine.emit_object(module)
 
 
-def _engine(binding: Any, code: bytes) -> Any:
-    """An engine that holds object code."""
+def _engine_with(binding: Any, code: bytes) -> Any:
     machine = binding.Target.from_default_triple().create_target_machine()
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
     engine.add_object_file(binding.ObjectFileRef.from_data(code))

@@ -224,7 +224,7 @@ def _scan(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> 
     order = range(length)[::-1] if params["reverse"] else range(length)
     kept: dict[int, list[Any]] = {}
     for i in order:
-        row = [_row(t, x, i) for x in rows]
+        row = [_row_of(t, x, i) for x in rows]
         out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
         carry, kept[i] = [_opaque(t, x) for x in out[:m]], [settled(t, x) for x in out[m:]]
     columns = []
@@ -236,8 +236,7 @@ def _scan(write: Write, t: Text, params: dict, args: list[Any], mask: Value) -> 
     return [*carry, *columns]
 
 
-def _row(t: Text, x: Array, i: Index) -> Array:
-    """Row number i of an array."""
+def _row_of(t: Text, x: Array, i: Index) -> Array:
     return held(t, Formula(x.shape[1:], x.kind, lambda j: x.at(t, (i, *j)), cheap=True))
 
 
@@ -252,7 +251,7 @@ def _counted_loop(write: Write, t: Text, params: dict, args: list[Any], mask: Va
     def turn(i: Index, values: list[Value]) -> list[Value]:
         carry = _unflat(t, first, values)
         place = plus(t, length - 1, times(t, i, -1)) if params["reverse"] else i
-        row = [_row(t, x, place) for x in rows]
+        row = [_row_of(t, x, place) for x in rows]
         out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
         for column, x in zip(columns, out[m:], strict=True):
             steps = column.strides[1:]

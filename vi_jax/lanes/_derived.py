@@ -110,8 +110,7 @@ def _is_float(x) -> bool:
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def _arg(extreme: Callable, x, *, axes, index_dtype, **_):
-    """The first place of an extreme along an axis."""
+def _first_extreme(extreme: Callable, x, *, axes, index_dtype, **_):
     (axis,) = axes
     n = x.shape[axis]
     places = lax.broadcasted_iota(index_dtype, x.shape, axis)
@@ -121,7 +120,6 @@ def _arg(extreme: Callable, x, *, axes, index_dtype, **_):
 
 
 def _tile(x, *, reps):
-    """An array so many times along each axis."""
     wide = jnp.broadcast_to(
         x.reshape([n for m in x.shape for n in (1, m)]),
         [n for r, m in zip(reps, x.shape, strict=True) for n in (r, m)],
@@ -135,8 +133,8 @@ DERIVED: dict[str, Callable[..., Any]] = {
     "cholesky": _cholesky,
     "sort": _sort,
     "tile": _tile,
-    "argmin": functools.partial(_arg, jnp.min),
-    "argmax": functools.partial(_arg, jnp.max),
+    "argmin": functools.partial(_first_extreme, jnp.min),
+    "argmax": functools.partial(_first_extreme, jnp.max),
 }
 """Functions of a primitive's arguments and parameters that give its results."""
 

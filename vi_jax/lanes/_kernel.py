@@ -214,7 +214,7 @@ class _Writer:
         number = t.raw(f"call i{t.width} @llvm.ctpop.i{t.width}(i{t.width} {flags})")
         number = t.raw(f"zext i{t.width} {number} to i64")
         first = t.raw(f"atomicrmw add ptr %next, i64 {number} monotonic")
-        rank = self._rank(free)
+        rank = self._flags_before(free)
         following = t.binary("add", splat(t, first, "i64"), rank)
         total = splat(t, "%lanes", "i64")
         new = t.both(free, t.binary("icmp slt", following, total, "i1"))
@@ -222,8 +222,7 @@ class _Writer:
         t.fork(t.any(new), "begin", "ready")
         return old._replace(lane=lane), new
 
-    def _rank(self, flag: Value) -> Value:
-        """How many flags hold before each slot."""
+    def _flags_before(self, flag: Value) -> Value:
         t = self.t
         ones = t.cast("zext", flag, "i64")
         # Shifted sums: 1, 2, 4, … slots.
@@ -242,7 +241,7 @@ class _Writer:
         t = self.t
         t.open("begin")
         n = len(self.inputs)
-        read = [self._read(i, x, old.lane, new) for i, x in enumerate(old.arrays[:n])]
+        read = [self._read_input(i, x, old.lane, new) for i, x in enumerate(old.arrays[:n])]
         carry, going, complete, row = self._run(self.program.begin, read, new)
         complete = t.both(new, complete)
         self._store_row(old.lane, complete, t.zero("i64"), row)
@@ -258,8 +257,7 @@ class _Writer:
         t.close()
         return _Group(arrays, old.lane, rows, active), end
 
-    def _read(self, i: int, old: Array, lane: Value, new: Value) -> Array:
-        """Input number i of the lanes in the slots `new`."""
+    def _read_input(self, i: int, old: Array, lane: Value, new: Value) -> Array:
         t, base = self.t, self.t.binary("mul", lane, self.strides[i])
         read = gathering(t, self.inputs[i], base, self.program.in_avals[i], new)
         if isinstance(old, Registers):

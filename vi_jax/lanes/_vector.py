@@ -36,7 +36,7 @@ class Unsupported(Exception):
 def check(jaxpr: Jaxpr) -> None:
     """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form;
     `TypeError` for a function that has no forward derivative."""
-    needed = _needed(jaxpr)
+    needed = _needed_equations(jaxpr)
     for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in needed for v in e.outvars)):
         dtype = getattr(var.aval, "dtype", None)
         try:
@@ -91,7 +91,7 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     **Returns:** its results, likewise.
     """
     jaxpr, env = inner(closed), {}
-    needed = _needed(jaxpr)
+    needed = _needed_equations(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
     def read(atom: object) -> Array:
@@ -108,7 +108,7 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
-        put(eqn.outvars, _equation(t, eqn, [read(a) for a in eqn.invars], mask))
+        put(eqn.outvars, _write_equation(t, eqn, [read(a) for a in eqn.invars], mask))
         for var in last.get(number, ()):  # so that its memory serves again
             env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
@@ -128,8 +128,7 @@ def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, li
     return uses, last
 
 
-def _needed(jaxpr: Jaxpr) -> list[Any]:
-    """The equations that the results depend on, in their order."""
+def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     wanted = {a for a in jaxpr.outvars if not isinstance(a, Literal)}
     kept = []
     for eqn in reversed(jaxpr.eqns):
@@ -139,8 +138,7 @@ def _needed(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
-    """The values of an equation's results, by the rule of its primitive."""
+def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
     name, params = eqn.primitive.name, eqn.params
     if (body := called(eqn)) is not None:
         return write(t, body, args, mask)
@@ -201,7 +199,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
         # Whether it is stored before it is used must not decide how it is rounded.
         return t.opaque(found) if len(avals) == 1 else found
 
-    values = [_one_number(x) for x in args]
+    values = [_only_number(x) for x in args]
     if all(v is not None for v in values):
         found = rule(t, params, dtypes, *values)
         return [uniform(shape, v) for v in (found if len(avals) > 1 else (found,))]
@@ -223,8 +221,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
     return list(outs)
 
 
-def _one_number(x: Array) -> Value | None:
-    """The number of an array that has only one."""
+def _only_number(x: Array) -> Value | None:
     if isinstance(x, Registers):
         return x.item() if x.size == 1 else None
     return x.value if isinstance(x, Formula) else None

@@ -150,14 +150,14 @@ def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
             raise KeyboardInterrupt
         return _answer(frame)
     except KeyboardInterrupt:
-        _abandon(frame)
+        _end_threads(frame)
         in_main = threading.current_thread() is threading.main_thread()
         # One that was dropped is raised by the call under way, when it gets XLA's error.
         if in_main and interrupt_raises() and not interrupt_dropped():
             out.signal = signal.SIGINT
         return _error(frame, INTERRUPTED, _CANCELLED)
     except BaseException as error:
-        _abandon(frame)
+        _end_threads(frame)
         return _error(frame, f"{type(error).__name__}: {error}", _INTERNAL)
 
 
@@ -182,8 +182,7 @@ def _is_as_known(frame: _Frame) -> bool:
     return frame.struct_size >= ctypes.sizeof(_Frame) and sizes == (size, size)
 
 
-def _abandon(frame: _Frame) -> None:
-    """End this call's threads, if it has any."""
+def _end_threads(frame: _Frame) -> None:
     work = _running.get(ctypes.addressof(frame))
     if work is not None:
         work.stop_and_wait()

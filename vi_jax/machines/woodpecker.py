@@ -226,10 +226,10 @@ class Woodpecker(ReadyMachine, Mechanical):
         pole, arm = float(self.pole_radius), float(self.bird_arm)
         beak = float(self.bird_arm - self.beak_arm), float(self.beak_height)
         middle, tilt = np.array([0.0, float(state.height)]), float(state.sleeve_angle)
-        hang = middle + _turned((float(self.sleeve_arm), 0.0), tilt)
+        hang = middle + _rotated((float(self.sleeve_arm), 0.0), tilt)
 
         def filled(about: Any, points: Any, angle: float, color: str) -> None:
-            shape = about + _turned(points, angle)
+            shape = about + _rotated(points, angle)
             pen.ax.fill(*shape.T, facecolor=color, edgecolor="0.15", lw=1.2, joinstyle="round")
 
         # The pole is as long as the motion, with rings a centimetre apart that show the way down.
@@ -240,7 +240,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         for side in (-1, 1):  # the two walls of the sleeve, cut open
             x = side * inside * np.array([1.0, 1.0, 1.28, 1.28])
             filled(middle, np.stack([x, half * np.array([-1, 1, 1, -1])], -1), tilt, SLEEVE)
-        pen.spring(tuple(middle + _turned((1.28 * inside, 0.0), tilt)), tuple(hang))
+        pen.spring(tuple(middle + _rotated((1.28 * inside, 0.0), tilt)), tuple(hang))
         # The tip of its beak and its centre of mass are the machine's.
         lean, centre = float(state.bird_angle), np.array([arm, 0.0])
         head = np.array([0.5 * (beak[0] + arm), beak[1]])
@@ -248,9 +248,9 @@ class Woodpecker(ReadyMachine, Mechanical):
         along = float(np.arctan2(*(head - centre)[::-1]))
         thick = np.array([0.0, 0.1 * long])
         filled(hang, [beak, head + thick, head - thick], lean, BEAK)
-        filled(hang, centre + _turned(_oval(0.8 * long, 0.33 * long), along), lean, BIRD)
+        filled(hang, centre + _rotated(_oval(0.8 * long, 0.33 * long), along), lean, BIRD)
         filled(hang, head + _oval(0.23 * long, 0.23 * long), lean, BIRD)
-        pen.line(tuple(hang), tuple(hang + _turned(centre, lean)), lw=3.0)
+        pen.line(tuple(hang), tuple(hang + _rotated(centre, lean)), lw=3.0)
         left, up, right = -2.6 * inside, float(middle[1]), float(hang[0]) + 1.6 * arm
         pen.label(left, up, "sleeve, $\\varphi_M$", ha="right")
         pen.label(left, up + 1.2 * beak[1], "pole, $\\mu$", ha="right")
@@ -258,8 +258,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         pen.label(1.3 * inside, up - 1.7 * arm, "spring, $c$", ha="left")
 
 
-def _turned(points: Any, angle: float) -> np.ndarray:
-    """Points turned counterclockwise about the origin."""
+def _rotated(points: Any, angle: float) -> np.ndarray:
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.asarray(points, float) @ np.array([[cosine, sine], [-sine, cosine]])
 

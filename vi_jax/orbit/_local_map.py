@@ -64,7 +64,7 @@ def soft_kick(
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The field, and what it is more beyond the surface."""
-        before, after = _jump_of_field(problem, x, number, leg, clock, u)
+        before, after = _fields_beside_surface(problem, x, number, leg, clock, u)
         return before, after - before
 
     def greatest(length: float) -> tuple[float, np.ndarray]:
@@ -111,17 +111,15 @@ def soft_kick(
     return Kick(second + (second - first) / 3, order)
 
 
-def _modes(problem: Shooting, machine, number, leg, s, u):
-    """The machine's modes before and after the switch."""
+def _modes_beside_switch(problem: Shooting, machine, number, leg, s, u):
     before = problem.modes_in(leg)
     return before, after_event(machine, number, s, problem.unravel(u), before)[1]
 
 
 @on_host
-def _jump_of_field(problem: Shooting, x, number: int, leg, s, u):
-    """The field on either side of the surface."""
+def _fields_beside_surface(problem: Shooting, x, number: int, leg, s, u):
     machine = problem.at(x)
-    modes = _modes(problem, machine, number, leg, s, u)
+    modes = _modes_beside_switch(problem, machine, number, leg, s, u)
     flights = [Flight(machine, m, problem.method, problem.like) for m in modes]
     state = problem.unravel(u)
     return jnp.stack([ravel_pytree(flight.smooth.field(s, state))[0] for flight in flights])
@@ -132,7 +130,7 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
     """The state at `s1` and the guard there, in contact or apart."""
     machine = problem.at(x)
     # A body that just comes in: which mode that is, no rounding is to decide.
-    modes = _modes(problem, machine, number, leg, s0, u)[int(touching)]
+    modes = _modes_beside_switch(problem, machine, number, leg, s0, u)[int(touching)]
     end = Flight(machine, modes, problem.method, problem.like).fly(s0, s1, u, _STEPS)[0]
     return end, guard_of(machine, number, s1, problem.unravel(end), modes)
 

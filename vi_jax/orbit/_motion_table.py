@@ -410,7 +410,7 @@ class MotionTable(Table):
         held = bool(self.problem.conditions)
         if kind in (FOLD, TURNS) and not held and not _turns_back(here, at, last, self.scale):
             return []  # rounding: the tangent is ill-defined close to where branches cross
-        if kind in (FOLD, TURNS, CROSSING) and self._shrinks(here, at, last):
+        if kind in (FOLD, TURNS, CROSSING) and self._shrinks_to_rest(here, at, last):
             return []  # it has a multiplier 1 to rounding
         if kind in (FOLD, TURNS, CROSSING) and self._springs(here, at):
             return []  # both are zero there
@@ -429,8 +429,7 @@ class MotionTable(Table):
             kind, detail = FOLD, DETAILS[HELD_FOLD]
         return [(self._point(kind, at, detail), at)]
 
-    def _shrinks(self, here: Step, at: Step, last: Step) -> bool:
-        """Whether an autonomous motion is about to shrink to rest."""
+    def _shrinks_to_rest(self, here: Step, at: Step, last: Step) -> bool:
         if not self.problem.autonomous:
             return False
         size, *beside = (size_of(self.problem, step.x) for step in (at, here, last))

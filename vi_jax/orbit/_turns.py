@@ -149,11 +149,10 @@ def turns_of(path: Path) -> Turns:
     bodies, rooms = turning(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return Turns(low, high, _nearest(dict(enumerate(rooms)), path.h), pull_of(path))
+    return Turns(low, high, _least_room(dict(enumerate(rooms)), path.h), pull_of(path))
 
 
-def _nearest(rooms: dict[int, _Room], h: Scalar) -> Nearest:
-    """The least of the rooms of events, by their numbers."""
+def _least_room(rooms: dict[int, _Room], h: Scalar) -> Nearest:
     least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
     for number, (room, clock) in rooms.items():
         i = jnp.argmin(room)
@@ -196,7 +195,6 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
 
 
 def _turns_in(path: Path, watched: _Guard) -> _Found:
-    """The turning points of one function along a flight."""
     flight, places, states, h, closed = path
     # The end of the last step is the next event: its velocity is that of a further step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
@@ -216,7 +214,7 @@ def pull_of(path: Path) -> Nearest:
         rests = flight.contact[stop.coordinate] == 1.0 + number
         force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
         forces[number] = _Room(force, at.place)
-    return _nearest(forces, path.h)
+    return _least_room(forces, path.h)
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:

@@ -182,8 +182,7 @@ class Curve(InWords, abc.ABC):
         """Period in drive cycles."""
         return self.problem.cycles
 
-    def _about(self) -> dict[str, Any]:
-        """What else is in `attrs` of the dataset."""
+    def _more_attributes(self) -> dict[str, Any]:
         return {}
 
     @property
@@ -347,7 +346,9 @@ class Curve(InWords, abc.ABC):
         }
         data |= special_table(self.special, self.names)
         about = {"parameter": self.names[0], "period_in_cycles": self.cycles}
-        found = xr.Dataset(data, attrs={**about, "ends": list(self.ends), **self._about()})
+        found = xr.Dataset(
+            data, attrs={**about, "ends": list(self.ends), **self._more_attributes()}
+        )
         own = {name: name for name in (*self.averages, *self.names)}
         own |= {f"special_{name}": name for name in self.names}
         own |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
@@ -379,7 +380,6 @@ class Branch(Curve):
         return self.names[0]
 
     def _freed_in_words(self) -> list[str]:
-        """What was freed and what is held instead, if anything is."""
         if not self.free:
             return []
         units = units_of(self.problem.machine)
@@ -445,7 +445,7 @@ class Boundary(Curve):
         """The columns of any curve; for Neimark–Sacker points also the `angle`."""
         return (*super().column_names, *(("angle",) if self.kind == TORUS else ()))
 
-    def _about(self) -> dict[str, Any]:
+    def _more_attributes(self) -> dict[str, Any]:
         return {"kind": self.kind}
 
     def __str__(self) -> str:

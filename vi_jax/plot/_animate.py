@@ -202,7 +202,6 @@ class MotionAnimation(animation.FuncAnimation):
         return (box.x0 - wide, box.x1 + wide), (box.y0 - tall, box.y1 + tall)
 
     def _repr_html_(self) -> str:
-        """The animation as HTML with controls, for notebooks."""
         return self.to_jshtml(fps=self.fps)
 
     def save(self, filename: str | Path, writer: Any = None, **options: Any) -> None:  # pyright: ignore

@@ -137,7 +137,6 @@ def _draw_machine(ax: Axes, found: Grazing, machine: Motions) -> None:
 
 
 def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The last sections of each lane as points."""
     up = position[:, -_DRAWN:]
     return np.repeat(offset, up.shape[1]), up.ravel()
 

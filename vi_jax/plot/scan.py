@@ -197,7 +197,6 @@ def _start_name(machine: AbstractMachine, name: str) -> str:
 
 
 def _basin_colors(found: Basins) -> list[str]:
-    """Colours of the labels, the least first."""
     irregular = [IRREGULAR[regime] for regime in sorted(REGIMES)]
     kinds: dict[str, Iterator[str]] = {}
     colors = {}
@@ -237,8 +236,8 @@ def _image(ax: Axes, across: np.ndarray, up: np.ndarray, shades: Any, colors: li
     """
     columns, rows = np.argsort(across), np.argsort(up)
     ax.pcolormesh(
-        _edges(across[columns]),
-        _edges(up[rows]),
+        _cell_edges(across[columns]),
+        _cell_edges(up[rows]),
         shades[np.ix_(rows, columns)],
         cmap=ListedColormap([to_rgb(c) for c in colors]),
         vmin=-0.5,
@@ -247,8 +246,7 @@ def _image(ax: Axes, across: np.ndarray, up: np.ndarray, shades: Any, colors: li
     )
 
 
-def _edges(row: np.ndarray) -> np.ndarray:
-    """Edges of the cells around rising points, halfway between them."""
+def _cell_edges(row: np.ndarray) -> np.ndarray:
     if row.size == 1:
         return row[0] + 0.5 * np.array([-1.0, 1.0])
     middle = 0.5 * (row[1:] + row[:-1])

@@ -56,14 +56,13 @@ class Pen:
         """
         width = self.size if width is None else width
         height = width if height is None else height
-        self._fill(Rectangle, (x - width / 2, y - height / 2), width, height, color=color)
+        self._draw_shape(Rectangle, (x - width / 2, y - height / 2), width, height, color=color)
 
     def ball(self, x: float, y: float, radius: float, *, color: str = BLUE) -> None:
         """A ball with its middle at (x, y)."""
-        self._fill(Circle, (x, y), radius, color=color)
+        self._draw_shape(Circle, (x, y), radius, color=color)
 
-    def _fill(self, shape: Any, *place: Any, color: str) -> None:
-        """A shape with a pale inside and an edge."""
+    def _draw_shape(self, shape: Any, *place: Any, color: str) -> None:
         for fill, alpha in ((color, 0.28), ("none", 1.0)):
             self.ax.add_patch(shape(*place, facecolor=fill, edgecolor=color, alpha=alpha, lw=1.6))
 

@@ -394,13 +394,16 @@ def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> lis
         for side, edge, out in (("low", row[0] - half, -half), ("high", row[-1] + half, half)):
             middle = {other: 0.5 * (x[0] + x[-1]) for other, x in rows.items()}
             inside, beyond = ({**middle, name: edge + x * out} for x in (-1e-3, 1e-3))
-            if _can_be(machine, begin, inside) and not _can_be(machine, begin, beyond):
+            if _is_possible_start(machine, begin, inside) and not _is_possible_start(
+                machine, begin, beyond
+            ):
                 found.append(f"{name} {side}")
     return found
 
 
-def _can_be(machine: AbstractMachine, begin: object, values: Mapping[str, float]) -> bool:
-    """Whether a start with these parts can be simulated."""
+def _is_possible_start(
+    machine: AbstractMachine, begin: object, values: Mapping[str, float]
+) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

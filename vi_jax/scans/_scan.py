@@ -334,7 +334,6 @@ def _how_to_go_on(kept: MemoryStore) -> str:
 
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
-    """A program of a block of lanes, compiled for so many devices."""
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
@@ -462,14 +461,13 @@ def scan(
     blocks = in_blocks(program, grid, place, paired, store, lanes)
     data = computed(program, blocks, place, store, progress)
     if verify:
-        better = make(dataclasses.replace(options, method=_better(program)))
+        better = make(dataclasses.replace(options, method=_finer_method(program)))
         data.attrs |= _verified(data, blocks, verify, better, place, store)
     _warn_of_failures(data)
     return data
 
 
-def _better(program: ScanProgram) -> AbstractMethod:
-    """Return a method to verify the program's by, of steps at most half as long."""
+def _finer_method(program: ScanProgram) -> AbstractMethod:
     best, mine = preset(program.machine, "reference"), program.method
     if type(best) is type(mine) and best.steps_per_cycle <= mine.steps_per_cycle:
         return mine.tighter()

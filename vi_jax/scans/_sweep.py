@@ -137,7 +137,7 @@ class Sweep(Summarized):
                 f"{good} of {self.values.size} successful"
             )
         values, lines = np.asarray(self.values), []
-        kinds, jumps = self._kinds(), self._jumps()
+        kinds, jumps = self._motions_in_words(), self._jumps()
         for i, value in enumerate(values):
             same = bool(i) and kinds[i] == kinds[i - 1]
             if same and not jumps[i]:
@@ -150,8 +150,7 @@ class Sweep(Summarized):
             lines = [*lines[:12], f"  {len(lines) - 12} further changes"]
         return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *lines])
 
-    def _kinds(self) -> list[str]:
-        """The motion at each value in words: its period and its impacts."""
+    def _motions_in_words(self) -> list[str]:
         names: dict[int, str] = {
             REGIMES.unsettled: "no period",
             REGIMES.failed: REGIMES.failed.meaning,

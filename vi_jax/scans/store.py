@@ -139,7 +139,7 @@ class ZarrStore(MemoryStore):
                     f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
                     f"cannot be read: {error}."
                 ) from None
-            _compare(self.path, dict(group.attrs), description, new=new)
+            _refuse_another_scan(self.path, dict(group.attrs), description, new=new)
             self.arrays = {name: group[name] for name in (*self.variables, *self.blocks.axes)}
         begun, now = group.attrs.get(_RELEASE), installed_version()
         if begun is not None and begun != now:
@@ -171,7 +171,7 @@ class ZarrStore(MemoryStore):
         return found
 
     def _is_done(self, where: Where) -> bool:
-        chunks = {name: self._chunk(name, where) for name in self.variables}
+        chunks = {name: self._chunk_file(name, where) for name in self.variables}
         if not (self.path / chunks["result"]).exists():
             return False
         lost = [
@@ -182,8 +182,7 @@ class ZarrStore(MemoryStore):
         self.lost += lost
         return not lost
 
-    def _chunk(self, name: str, where: Where) -> str:
-        """The file of a block's numbers."""
+    def _chunk_file(self, name: str, where: Where) -> str:
         corner = [part.start // n for part, n in zip(where, self.blocks.block, strict=True)]
         corner += [0] * len(self.variables[name].sizes)
         return "/".join([name, "c", *map(str, corner)])
@@ -272,10 +271,9 @@ def check_writable(path: str | Path) -> None:
         )
 
 
-def _compare(
+def _refuse_another_scan(
     path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any], *, new: bool
 ) -> None:
-    """Refuse to mix two scans in one store."""
     there = attributes.get("scan")
     if there is None:
         raise ValueError(

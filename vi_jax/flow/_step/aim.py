@@ -58,7 +58,7 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     seen = rises & (bound > 0) & (place > brief) & (h - place > brief)
     dips = (begin.x <= 0) & (end.x < 0) & (begin.v < 0) & (end.v < 0) & (begin.a > 0)
     least = -begin.v / jnp.where(dips, begin.a, 1.0)
-    dips = dips & (least < 0.5 * h) & _is_long(plan, h)
+    dips = dips & (least < 0.5 * h) & _may_be_shortened(plan, h)
     return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
@@ -126,11 +126,10 @@ def _crest(
     above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
-    return (above | (first < 1)) & _is_long(plan, h), place * h
+    return (above | (first < 1)) & _may_be_shortened(plan, h), place * h
 
 
-def _is_long(plan: Plan, h: Scalar) -> Flag:
-    """Whether a step is long enough to be shortened."""
+def _may_be_shortened(plan: Plan, h: Scalar) -> Flag:
     return h > plan.in_units(_SHORTEST if h.dtype == jnp.float64 else _SHORTEST_SINGLE)
 
 
@@ -280,7 +279,7 @@ def first_event(
         facing = tuple(-lane.direction[k] * c for c in slope(paths[k]))
         # The motion turned within the step. Unless it went through a stop before, that comes
         # first: what lies beyond the turn is met from there.
-        turned, place = turned & ~_through_a_stop(plan, lane, guards, k), -1.0
+        turned, place = turned & ~_ran_into_stop(plan, lane, guards, k), -1.0
         if len(courses) > 1:  # of their turns that matter the earliest comes first
             theta, known = _root(facing, corrections)
             turned, place = that_matter(k, turned, theta, known), theta - 2
@@ -314,8 +313,7 @@ def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | Non
     return target, curve, at_once
 
 
-def _through_a_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Flag:
-    """Whether coordinate number k, as it went when the step began, ran into a stop."""
+def _ran_into_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Flag:
     through = jnp.zeros_like(lane.s, bool)
     for guard, over, _ in guards:
         if guard.coordinate == k:

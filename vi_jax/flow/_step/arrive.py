@@ -249,7 +249,7 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
     # A switch leaves velocities as they are; but of a state without them it changes the rate.
     when = jumps if has_velocity(plan.machine, lane.state) else happens
     if others_of(plan.machine) or when is happens:
-        lane = lane._replace(direction=_directions(plan, lane, when, old))
+        lane = lane._replace(direction=_directions_after_event(plan, lane, when, old))
     return lane
 
 
@@ -257,7 +257,7 @@ def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
     """The lane with the directions of all coordinates, and the stops rested on, `when` its state
     was put in place of an `old` one."""
     lane = lane._replace(contact=contacts_after_jump(plan, lane, when, old))
-    return lane._replace(direction=_directions(plan, lane, when, old))
+    return lane._replace(direction=_directions_after_event(plan, lane, when, old))
 
 
 def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
@@ -276,8 +276,7 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
     return tuple(contacts)
 
 
-def _directions(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
-    """The directions of all coordinates behind an event, in the modes that the lane has then."""
+def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
     found, new = list(lane.direction), lane.state
     smooth = holding(plan.machine, lane.modes, lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
@@ -305,8 +304,8 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     complete. If the step is not `taken`, the lane stays what it was."""
     position = plan.machine.position
     arrived = lane._replace(
-        s=trial.s, state=trial.state, direction=_along(plan, lane, trial), below=trial.below,
-        completed=trial.ends_interval,
+        s=trial.s, state=trial.state, direction=_directions_at_end(plan, lane, trial),
+        below=trial.below, completed=trial.ends_interval,
     ).recording(integrals=trial.integrals)  # fmt: skip
     # Y where the step ends, and before the state jumps there, where something may move it.
     here = position(trial.state)
@@ -336,7 +335,6 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
 
 
 def _may_end(machine: AbstractMachine) -> bool:
-    """Whether an event may end a lane; static."""
     laws = any(not stop.is_one_number for stop in stops_of(machine))
     slides = any(event.may_slide for event in events_of(machine))
     several = bool(stops_of(machine)) and (len(machine.coordinates) > 1 or bool(others_of(machine)))
@@ -344,8 +342,7 @@ def _may_end(machine: AbstractMachine) -> bool:
     return laws or slides or several or chain or bool(outcomes_of(machine))
 
 
-def _along(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
-    """The directions of all coordinates where a step ends, before its event."""
+def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
     direction = []
     for k, along in enumerate(lane.direction):
         if trial.paths:

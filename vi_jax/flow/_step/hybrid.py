@@ -194,7 +194,7 @@ def _faults(
     ends = [
         (impacts > plan.max_impacts, code("chatter")),
         (((new.aims >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
-        (new.aims >= _LOST, _lost(plan, lane, new.target)),
+        (new.aims >= _LOST, _reason_for_giving_up(plan, lane, new.target)),
         (new.steps >= plan.max_steps, code("max_steps")),
         (new.spent >= _STUCK, code("max_steps")),
     ]
@@ -209,8 +209,7 @@ def _faults(
     return [(gone & ~numeric, broken), (gone, tiny), *ends]
 
 
-def _lost(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
-    """The reason of a lane that has aimed too often, by what it aimed at."""
+def _reason_for_giving_up(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     machine, reason = plan.machine, code("unresolved")
     if plan.motion or stops_of(machine):
         reason = jnp.where(target < FREE, code("turn_unresolved"), reason)

@@ -170,7 +170,7 @@ def strike_in_turn(
     without an end (several balls without restitution) goes to its limit: the contacts that are
     still being struck come to rest against each other.
     """
-    instant = _instant(plan, taken, lane, landed, at_event)
+    instant = _before_impacts(plan, taken, lane, landed, at_event)
     zero = jnp.zeros_like(lane.s)
     nothing = dict.fromkeys(instant.bodies, zero)
     # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
@@ -194,10 +194,9 @@ def strike_in_turn(
     return lane, blows
 
 
-def _instant(
+def _before_impacts(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> _Instant:
-    """What is known of an instant before its impacts."""
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
     each = list(bodies.values())
     gains = shares(each, at_event, [push_of(body, at_event) for body in each])

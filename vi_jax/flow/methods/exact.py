@@ -75,7 +75,7 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     is but one mode. A mode matters if its free motion moves a contact by more than rounding: others
     cannot make or hide an event. Those that have faded away so cost no steps."""
     q, p = state.displacement, state.velocity
-    place, rate = (0.0, 0.0) if machine.steady is None else _steady(machine, s)
+    place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
     pace = machine.pace_of
     moves = jnp.abs(q - place) + jnp.abs(p - rate) * machine.slowness
     fastest, least = machine.frequency, _MATTERS * jnp.finfo(pace.dtype).eps
@@ -94,7 +94,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     does not reach."""
     machine, s, state = stop_gradient((machine, s, state))  # a length has no derivative
     q, p = state.displacement, state.velocity
-    place, rate = (0.0, 0.0) if machine.steady is None else _steady(machine, s)
+    place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
     y, v = q - place, p - rate
     sway = machine.swing_time * (v + 0.5 * machine.damping * y)
     free = jnp.sqrt(y * y + sway * sway)
@@ -120,8 +120,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     return jnp.where(machine.plain * machine.fades > 0, length / _WIDER, 0.0)
 
 
-def _steady(machine: ModalMachine, s: Scalar) -> tuple[Any, Any]:
-    """The steady response at s, and its rate."""
+def _steady_response(machine: ModalMachine, s: Scalar) -> tuple[Any, Any]:
     assert machine.steady is not None
     constant, cosine, sine = machine.steady
     omega = machine.frequency
@@ -138,9 +137,9 @@ def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -
     if machine.steady is None:
         y, v, place, rate = q, p, 0.0, 0.0
     else:
-        place, rate = _steady(machine, s)
+        place, rate = _steady_response(machine, s)
         y, v = q - place, p - rate
-        place, rate = _steady(machine, s + h)
+        place, rate = _steady_response(machine, s + h)
     mean = half * odd
     new = place + (even + mean) * y + odd * v
     return new, rate + (even - mean) * v - machine.stiffness * odd * y

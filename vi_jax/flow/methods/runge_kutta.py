@@ -199,7 +199,7 @@ class Unrolled(diffrax.AbstractSolver):
         if not tableau.ssal or y1 is None:
             y1 = reached(tableau.b_sol)
         error = terms.prod(weighted(tableau.b_error, slopes), control)
-        return y1, error, slopes, _with_weights(tableau, places)
+        return y1, error, slopes, _with_error_weights(tableau, places)
 
     def error(self, slopes: list[Any], control: Any) -> Any:
         """The error of a step from the slopes of its stages and its length."""
@@ -229,11 +229,10 @@ class Unrolled(diffrax.AbstractSolver):
         for n, (a, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True), start=2):
             there = weighted(np.append(a, diagonal), stages[:n], y0)
             places.append((float(c), t0 + float(c) * (t1 - t0), there))
-        return y1, error, [unravel(k) for k in slopes], _with_weights(tableau, places)
+        return y1, error, [unravel(k) for k in slopes], _with_error_weights(tableau, places)
 
 
-def _with_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
-    """The stages with their weights in the error."""
+def _with_error_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
     return [(*x, float(b)) for x, b in zip(places, tableau.b_error, strict=True)]
 
 

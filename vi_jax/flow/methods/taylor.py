@@ -389,8 +389,7 @@ def along(function: Callable[[State], Scalar], treedef: object, series: list[Ser
     return Along([flow.next(n)[0] for n in range(len(series[0]))])
 
 
-def _at(series: Series, h: Scalar) -> Coefficient:
-    """The sum of a series, by Horner's rule."""
+def _sum_series(series: Series, h: Scalar) -> Coefficient:
     total = None
     for c in reversed(series):
         if total is not None:
@@ -427,7 +426,7 @@ class Along(NamedTuple):
         def rates(place: Callable[[Series], Coefficient]) -> Rates:
             return Rates(*(zero if (x := place(c)) is None else x for c in each))
 
-        return rates(lambda c: c[0]), rates(lambda c: _at(c, h))
+        return rates(lambda c: c[0]), rates(lambda c: _sum_series(c, h))
 
     def over(self, h: Scalar, factor: int = 1, offset: Scalar | None = None) -> Scalars:
         """Coefficients of factor·x - offset in θ, which goes from 0 to 1 along such a step."""
@@ -529,7 +528,7 @@ class Expansion(NamedTuple):
 
     def at(self, h: Scalar) -> tuple[State, Integrals]:
         """State, and what is integrated beside it, a length h away."""
-        return jtu.tree_unflatten(self.treedef, [_at(x, h) for x in self.series])
+        return jtu.tree_unflatten(self.treedef, [_sum_series(x, h) for x in self.series])
 
     def of(self, function: Callable[[State], Any]) -> Along:
         """A scalar function of the state along it, a constant for differentiation."""

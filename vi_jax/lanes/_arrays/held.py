@@ -152,15 +152,14 @@ def table(t: Text, array: object, kind: str) -> Array:
     word = stored_kind(kind)
     if all(x.tobytes() == numbers[0].tobytes() for x in numbers):
         return uniform(array.shape, t.constant(numbers[0], kind))
-    body = ", ".join(f"{word} {_word(x, kind)}" for x in numbers)
+    body = ", ".join(f"{word} {_llvm_number(x, kind)}" for x in numbers)
     content = f"private unnamed_addr constant [{numbers.size} x {word}] [{body}], align 64"
     name = f"@table{hashlib.blake2b(content.encode(), digest_size=8).hexdigest()}"
     t.declared[name] = f"{name} = {content}"
     return Strided(array.shape, kind, Table(name), contiguous(array.shape))
 
 
-def _word(number: Any, kind: str) -> str:
-    """A number in LLVM's words."""
+def _llvm_number(number: Any, kind: str) -> str:
     if is_float(kind):
         return "0x" + struct.pack(">d", float(number)).hex().upper()
     return str(int(number))

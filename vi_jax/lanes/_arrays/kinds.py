@@ -155,7 +155,6 @@ class Pieces(Array):
 
 
 def _clamped(t: Text, place: Index, last: int) -> Value:
-    """A place moved to between 0 and the last."""
     wide, zero, end = in_lanes(t, place), t.zero("i64"), t.constant(last, "i64")
     wide = t.select(t.binary("icmp slt", wide, zero, "i1"), zero, wide)
     return t.select(t.binary("icmp sgt", wide, end, "i1"), end, wide)
