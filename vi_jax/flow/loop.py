@@ -74,7 +74,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
 
     **Arguments:** `start`, where the motion begins; `rows`, other states of it, (..., states).
     """
-    state = bare(start)
+    state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), bare(start))  # integers too
     row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
         return jnp.ones_like(row)
