@@ -276,7 +276,7 @@ def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pre
             os.kill(os.getpid(), signal.SIGINT)
         return compute(*args, **options)
 
-    for name in ("_joined", "_write"):
+    for name in ("_joined", "_write_files"):
         after = getattr(verbs, name)
         press = lambda *args, after=after, **options: (
             os.kill(os.getpid(), signal.SIGINT), after(*args, **options)
