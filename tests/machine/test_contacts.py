@@ -148,9 +148,11 @@ def test_contacts_that_are_wrong_are_told(contacts, message):
         vi.simulate(machine)
 
 
-def test_a_plain_number_of_a_subclass_is_its_default():
+def test_a_subclass_replaces_a_number():
     wider = type("Wider", (Oscillator,), {"gap": 3.0})
     assert jax.tree.leaves((wider(), wider(gap=2.0))) == [0.9, 3.0, 0.7, 0.9, 2.0, 0.7]
+    tuned = type("Tuned", (Oscillator,), {"gap": property(lambda self: 2 * self.omega)})
+    assert jax.tree.leaves(tuned()) == [0.9, 0.7] and tuned(omega=0.5).gap == 1.0
 
 
 def test_a_state_is_a_pytree_of_names():

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from .._types import Machine, Scalar, State
 
@@ -30,16 +30,19 @@ def changed(part: object, base: type, names: Iterable[str]) -> str | None:
 
 
 def with_own_defaults(kind: type) -> None:
-    """Take a plain value of a class as the default of the field that its parent has by this name.
-    A dataclass would silently keep the parent's, since the class gives it no type."""
+    """Let a class replace fields of its parent without a type, which a dataclass ignores: a plain
+    value becomes the field's default, and a property takes the place of the field."""
     fields = getattr(kind, "__dataclass_fields__", {})
-    plain = [x for x, value in vars(kind).items() if x in fields and not hasattr(value, "__get__")]
-    types = inspect.get_annotations(kind) if plain else {}
-    for name in set(plain).difference(types):
-        field = copy.copy(fields[name])
-        field.default, field.default_factory = vars(kind)[name], dataclasses.MISSING
-        setattr(kind, name, field)
-        kind.__annotations__ = types = {**types, name: field.type}
+    types = dict(inspect.get_annotations(kind))
+    for name in [x for x in vars(kind) if x in fields and x not in types]:
+        value, field = vars(kind)[name], copy.copy(fields[name])
+        if isinstance(value, property):
+            types[name] = ClassVar[Any]
+        elif not hasattr(value, "__get__"):
+            field.default, field.default_factory = value, dataclasses.MISSING
+            setattr(kind, name, field)
+            types[name] = field.type
+    kind.__annotations__ = types
 
 
 class derived:
