@@ -32,7 +32,6 @@ def test_unstable_orbit_has_the_rates_of_its_multipliers():
     found = vi.lyapunov(scene, start, 60, settle=0)
     rates = np.sort(np.log(np.abs(closed.multipliers[0])) * 0.9 / (2 * np.pi))[::-1]
     np.testing.assert_allclose(found.exponents, rates, atol=1e-4)
-    assert float(found.exponents[0]) > 0.01
 
 
 def test_the_greatest_alone_is_the_greatest_of_all():
@@ -41,11 +40,17 @@ def test_the_greatest_alone_is_the_greatest_of_all():
     scene = ideal(zeta=0.7, k=0.8, xi=0.003)
     alone = vi.lyapunov(scene, scene.start(), cycles, number=1)
     whole = vi.lyapunov(scene, scene.start(), cycles)
-    for name in ("exponents", "per_cycle"):
-        one, all_of_them = (getattr(x, name) for x in (alone, whole))
-        np.testing.assert_allclose(one, all_of_them[:1], rtol=1e-9)
+    np.testing.assert_allclose(alone.exponents, whole.exponents[:1], rtol=1e-9)
+    np.testing.assert_allclose(alone.per_cycle, whole.per_cycle[:1], rtol=1e-9)
     np.testing.assert_allclose(alone.spread, whole.spread, rtol=1e-9)
     np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
+
+
+def test_of_two_bodies_apart_the_slow_one_has_the_greatest():
+    damping, stiffness = np.diag([4.0, 2.0]), np.diag([1.0, 0.04])
+    row = vi.machines.Structure(mass=[1, 1], damping=damping, stiffness=stiffness, frequency=1.0)
+    found = vi.lyapunov(row, row.start(displacement=[1.0, 1.0]), number=1)
+    np.testing.assert_allclose(found.exponents, np.sqrt(0.96) - 1, atol=1e-9)
 
 
 def test_a_long_cycle_leaves_next_to_nothing():
@@ -100,6 +105,8 @@ def test_failed_runs_and_bad_arguments():
         vi.lyapunov(scene, scene.start(), number=3)
     with pytest.raises(ValueError, match="`cycles` must be at least 8"):
         vi.lyapunov(scene, scene.start(), 2)
+    with pytest.raises(ValueError, match="both a section and a `renewed`"):
+        vi.lyapunov(Wheel(), Wheel().start(), cycles=16)
 
 
 @pytest.mark.slow
@@ -123,9 +130,3 @@ def test_one_rest_is_enough():
     mean, halves = _weighted(jnp.asarray(rates), jnp.asarray(duration))
     np.testing.assert_allclose(mean, [-0.1, -np.inf])
     np.testing.assert_allclose(halves, [-0.1, -0.1])
-
-
-def test_what_is_renewed_on_its_section_is_not_observed_at_intervals():
-    wheel = Wheel()
-    with pytest.raises(ValueError, match="both a section and a `renewed`"):
-        vi.lyapunov(wheel, wheel.start(), cycles=16)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
@@ -123,6 +124,10 @@ class Lyapunov(Summarized):
 # even, as the windows of `_window` are.
 _AT_ONCE = 512
 
+# What is left of a direction is rounding below so many roundings of its length: a choice, some
+# times what the projections leave.
+_ROUNDING = 16
+
 
 @warning_once
 def lyapunov(
@@ -226,7 +231,10 @@ def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
     )
     x = raveled(before.last)[0]
     modes = modes_of(before.last)
-    return (x, modes), jnp.eye(x.size, number, dtype=x.dtype), before.result
+    # In no special position: directions of single components would stay what they are where one
+    # component does not move the others, and miss the greatest exponent.
+    frame = np.linalg.qr(np.random.default_rng(0).normal(size=(x.size, x.size)))[0][:, :number]
+    return (x, modes), jnp.asarray(frame, x.dtype), before.result
 
 
 @compiled
@@ -330,13 +338,16 @@ def _orthogonal(
     """The frame made orthonormal (Gram and Schmidt, twice), and the lengths that it had left."""
     columns, sizes = [], []
     for column in frame.T:
+        before = _length(column)
         for _ in range(2):
             for other in columns:
                 column = column - jnp.dot(other, column) * other
         size = _length(column)
-        # Nothing is left of a direction that is forgotten at once, as where the body rests.
-        columns.append(column / jnp.where(size > 0, size, 1.0))
-        sizes.append(size)
+        # Nothing but rounding is left of a direction that is forgotten at once, as where the body
+        # rests.
+        lost = size <= _ROUNDING * jnp.finfo(size.dtype).eps * before
+        columns.append(jnp.where(lost, 0.0, column / jnp.where(lost, 1.0, size)))
+        sizes.append(jnp.where(lost, 0.0, size))
     return jnp.stack(columns, axis=1), jnp.stack(sizes)
 
 
