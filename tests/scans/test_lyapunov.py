@@ -46,13 +46,6 @@ def test_the_greatest_alone_is_the_greatest_of_all():
     np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
 
 
-def test_of_two_bodies_apart_the_slow_one_has_the_greatest():
-    damping, stiffness = np.diag([4.0, 2.0]), np.diag([1.0, 0.04])
-    row = vi.machines.Structure(mass=[1, 1], damping=damping, stiffness=stiffness, frequency=1.0)
-    found = vi.lyapunov(row, row.start(displacement=[1.0, 1.0]), number=1)
-    np.testing.assert_allclose(found.exponents, np.sqrt(0.96) - 1, atol=1e-9)
-
-
 def test_a_long_cycle_leaves_next_to_nothing():
     """Of a direction after one cycle e^-283, whose square is no number."""
     scene = ideal(zeta=0.02, xi=0.9, gap=None)
@@ -128,5 +121,20 @@ def test_one_rest_is_enough():
     rates, duration = np.full((400, 2), -0.1), np.ones(400)
     rates[-1, 1] = -np.inf
     mean, halves = _weighted(jnp.asarray(rates), jnp.asarray(duration))
-    np.testing.assert_allclose(mean, [-0.1, -np.inf])
-    np.testing.assert_allclose(halves, [-0.1, -0.1])
+    np.testing.assert_allclose([*mean, *halves], [-0.1, -np.inf, -0.1, -0.1])
+
+
+@pytest.mark.slow
+def test_a_body_at_rest_leaves_the_exponent_of_another():
+    def greatest(damping, number):
+        row = vi.machines.Structure(
+            mass=[1, 1], damping=jnp.diag(jnp.stack([2.0, damping])), frequency=1.0,
+            stiffness=np.diag([1.0, 0.01]), contacts=(vi.RigidStop(-0.5, 0.5, at=[1, 0]),),
+        )  # fmt: skip
+        start = row.start(displacement=[-0.5, 1.0])
+        return vi.lyapunov(row, start, 100, number=number).exponents[0]
+
+    root = np.sqrt(0.3**2 - 0.04)
+    for number in (1, None):
+        found = jax.value_and_grad(greatest)(0.3, number)
+        np.testing.assert_allclose(found, ((root - 0.3) / 2, (0.3 / root - 1) / 2), rtol=1e-6)

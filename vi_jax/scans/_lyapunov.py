@@ -281,7 +281,9 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         )(frame)
         frame, sizes = _orthogonal(grown[-1])
         alone = frame.shape[1] == 1
-        rates = _growth(grown[..., 0])[:, None] if alone else jnp.log(sizes)[None]
+        none = sizes == 0  # whose logarithm has no derivative, not even times zero
+        logarithms = jnp.where(none, -jnp.inf, jnp.log(jnp.where(none, 1.0, sizes)))
+        rates = _growth(grown[..., 0])[:, None] if alone else logarithms[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
         return ((new[-1], modes), frame, result), (rates, duration, integrals)
 
@@ -321,7 +323,9 @@ def _length(vector: Float[Array, " states"]) -> Scalar:
     """Its norm, of numbers whose squares are too small or too large for one too."""
     largest = jnp.max(jnp.abs(vector))
     unit = jnp.where((largest > 0) & (largest < jnp.inf), largest, 1.0)
-    return unit * jnp.linalg.norm(vector / unit)
+    # Of nothing the norm has no derivative, not even times zero.
+    norm = jnp.linalg.norm(jnp.where(largest == 0, 1.0, vector / unit))
+    return jnp.where(largest == 0, 0.0, unit * norm)
 
 
 def _growth(ways: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
