@@ -239,8 +239,8 @@ class Plan(eqx.Module):
     sizes: State | None = None
     """Of each number of the state how small it is (see `loop.sizes_of`)."""
     extents: tuple[Any, ...] | None = None
-    """Of each coordinate, then of the guard of each of `others`, how small it is, if it is much
-    less than 1; else 1, and of a machine whose numbers are about 1 absent. Of an event that holds a
+    """Of each coordinate, then of the guard of each of `others`, how small it is, if it is less
+    than 1; else 1, and of a machine whose numbers are about 1 absent. Of an event that holds a
     mode a pair, out of mode 0 and in it, where its guard is another quantity."""
 
     def extent(self, k: int) -> Scalar | float:

@@ -47,14 +47,13 @@ from .noise import in_modes_of
 from .results import code
 from .smooth import in_modes
 
-# A number of the state is small if it is below this; others are judged as if they were 1. One that
-# is this share of what the others make of it has still to grow. In so many instants of a cycle the
-# rates are asked for. Choices.
-_SMALL, _GROWS, _INSTANTS = 1e-2, 1e-3, 7
+# A number of the state that is this share of what the others make of it has still to grow. In so
+# many instants of a cycle the rates are asked for. Choices.
+_GROWS, _INSTANTS = 1e-3, 7
 
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """About how large each number of the state will be, if that is much less than 1; else 1. `None`
+    """About how large each number of the state will be, if that is less than 1; else 1. `None`
     of a machine whose numbers are about 1 by definition.
 
     It is the value in the start, or what the rates there make of it in the 2π-th part of a cycle,
@@ -136,7 +135,7 @@ def extents_of(
     plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
 ) -> tuple[Any, ...]:
     """As `Plan.extents`: of each coordinate, then of the guard of each event that is no stop, how
-    small it is, if it is much less than 1; else 1. `sizes` are from `sizes_of`."""
+    small it is, if it is less than 1; else 1. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
     s, start = stop_gradient((s, start))
@@ -165,8 +164,8 @@ def extents_of(
 
 
 def _small(size: Array) -> Array:
-    """A size, but 1 if it is not small, or unknown."""
-    return jnp.where((size > 0) & (size < _SMALL), size, 1.0)
+    """A size; 1 if it is larger, since a motion may become smaller than it begins, or unknown."""
+    return jnp.where((size > 0) & (size < 1), size, 1.0)
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:

@@ -308,8 +308,8 @@ class Adaptive(_RungeKutta):
 
     **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol` and
     `atol`, tolerances relative to each state component and absolute; `atol` defaults to `rtol`,
-    reduced in proportion for components that are smaller than 0.01 at the start (a machine in SI
-    units); `steps_per_cycle`, the fewest steps in a cycle (at least 5, the default).
+    reduced in proportion for components that are smaller than 1; `steps_per_cycle`, the fewest
+    steps in a cycle (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
     `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
