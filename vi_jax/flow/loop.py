@@ -57,8 +57,8 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     of a machine whose numbers are about 1 by definition.
 
     It is the value in the start, or what the rates there make of it in the 2π-th part of a cycle,
-    or what the other numbers make of it. The numbers of an array have one size. Nothing is known of
-    a number that is zero and that nothing moves yet.
+    or what the other numbers make of it. Nothing is known of a number that is zero and that nothing
+    moves yet.
     """
     if scales_known(machine):
         return None
@@ -81,8 +81,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     angles = jnp.zeros(row.shape, bool) if angles is None else angles
     modes = begin_modes(machine, zero, state, modes_of(start))
     values = unravel(jnp.where(angles, 1.0, jnp.abs(row)))
-    known = _known_sizes(machine, zero, state, modes, values)
-    sizes = in_rows(jtu.tree_map(lambda x, y: jnp.broadcast_to(x, jnp.shape(y)), known, state), 0)
+    sizes = in_rows(_known_sizes(machine, zero, state, modes, values), 0)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
@@ -125,7 +124,7 @@ def _known_sizes(
     moved = jax.jvp(lambda x: smooth.field(s, x), (start,), (along,))[1]
 
     def size(x: Scalar, change: Scalar) -> Scalar:
-        x, change = jnp.max(x), unit * jnp.max(jnp.abs(change))
+        change = unit * jnp.abs(change)
         return jnp.where(x > _GROWS * change, x, change)
 
     return jtu.tree_map(size, sizes, moved)

@@ -388,7 +388,7 @@ class Adaptive(_RungeKutta):
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
         atol = atol if isinstance(size, float) else atol * size
         if self.sizes is not None:
-            atol = atol * functools.reduce(jnp.maximum, jtu.tree_leaves(self.sizes))
+            atol = atol * functools.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(self.sizes)))
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):
