@@ -185,12 +185,13 @@ class Orbit(Summarized):
     def admissible(self) -> Bool[Array, "..."]:
         """Whether the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
+        size = jnp.maximum(jnp.abs(self.y_min), jnp.abs(self.y_max))
         inside = self.clearance >= 0
         for stop in stops_of(self.machine):
             if stop.coordinate:
                 continue  # the extremes are those of the first coordinate
             reach = self.y_max if stop.sign > 0 else -self.y_min
-            inside = inside & (reach <= stop.gap + slack * (1 + jnp.abs(stop.gap)))
+            inside = inside & (reach <= stop.gap + slack * (size + jnp.abs(stop.gap)))
         return self.successful & inside & (self.slowest_impact > 0)
 
     def trajectory(

@@ -73,11 +73,11 @@ class AbstractMethod(eqx.Module):
     @property
     def wander(self) -> Any:
         """How far the states of a periodic motion may differ from one period to the next, relative
-        to 1 + |state|; 0 if only by rounding, since the steps are the same in each period."""
+        to the size of each number; 0 if only by rounding, since the steps are the same in each period."""
         return 0.0
 
     def with_sizes(self, sizes: State) -> "AbstractMethod":
-        """The method for a motion of numbers about so large, one for each array of the state."""
+        """The method for a motion whose numbers are about so large."""
         return self
 
     def holds(self, machine: AbstractMachine) -> bool:
