@@ -73,7 +73,7 @@ class AbstractMethod(eqx.Module):
     @property
     def wander(self) -> Any:
         """How far the states of a periodic motion may differ from one period to the next, relative
-        to the size of each number; 0 if only by rounding, since the steps are the same in each period."""
+        to the size of each number; 0 if only by rounding, since each period has the same steps."""
         return 0.0
 
     def with_sizes(self, sizes: State) -> "AbstractMethod":
