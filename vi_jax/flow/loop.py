@@ -51,6 +51,10 @@ from .smooth import in_modes
 # many instants of a cycle the rates are asked for. Choices.
 _GROWS, _INSTANTS = 1e-3, 7
 
+# A motion whose numbers are smaller is at rest in the origin, but for the rounding of numbers about
+# 1. A choice.
+_REST = 1e-15
+
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
     """About how large each number of the state will be, if that is less than 1; else 1. `None`
@@ -68,7 +72,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
     """Return the size of each number of a state, in the order of `in_rows`: about how large it is
-    along a motion; 1 for an angle, if nothing is known of it, or for a machine whose numbers are
+    along a motion; 1 for an angle, if it is zero to rounding, or for a machine whose numbers are
     about 1 by definition. States are compared relative to these sizes.
 
     **Arguments:** `start`, where the motion begins; `rows`, other states of it, (..., states).
@@ -85,7 +89,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
-    return stop_gradient(jnp.where(angles | (sizes <= 0), 1.0, sizes))
+    return stop_gradient(jnp.where(angles | ~(sizes > _REST), 1.0, sizes))
 
 
 @compiled
