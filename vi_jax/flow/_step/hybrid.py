@@ -45,8 +45,9 @@ _LOST, _MANY = 64.0, 16.0
 # Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
 _STUCK = 65536.0
 
-# Of a cycle, a step that is long enough to tell by it whether anything moves. A choice.
-_LONG = 1e-3
+# Of a cycle, a step that is long enough to tell by it whether anything moves: a choice, below the
+# step by which a motion gets away from an event that it does not meet.
+_LONG = 5e-4
 
 
 def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
