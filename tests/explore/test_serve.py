@@ -32,11 +32,6 @@ def test_without_marimo_it_says_what_to_install(monkeypatch, capsys):
     assert extras["optional-dependencies"]["explore"] == [serve.NEEDED]
 
 
-def test_a_port_that_is_none(capsys):
-    assert cli.main(["explore", "--port", "70000"]) == 2
-    assert "port must be 0-65535" in capsys.readouterr().err
-
-
 OWN = "import vi_jax as vi\n\nmake = vi.machines.Duffing\n"
 
 
@@ -68,25 +63,15 @@ def test_what_is_no_machine_is_said_before_anything_starts(
     assert (subject.controls["gap"].low, subject.controls["gap"].high) == (0.5, 3.0)
 
 
-def test_a_port_that_is_taken(monkeypatch, capsys):
+def test_a_port_that_is_none_or_taken(monkeypatch, capsys):
+    assert cli.main(["explore", "--port", "70000"]) == 2
+    assert "port must be 0-65535" in capsys.readouterr().err
     pytest.importorskip("marimo")
     monkeypatch.setattr(Subject, "compile", lambda self, tell: pytest.fail("work began"))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert cli.main(["explore", "--no-browser", "--port", str(port)]) == 1
     assert f"port {port}" in capsys.readouterr().err
-
-
-def test_answers_do_not_wait_for_acknowledgements(monkeypatch):
-    pytest.importorskip("marimo")
-    option, found = (socket.IPPROTO_TCP, socket.TCP_NODELAY), []
-    run = lambda server, sockets: found.append(sockets[0].getsockopt(*option))
-    monkeypatch.setattr("uvicorn.Server.run", run)  # connections inherit the option
-    monkeypatch.setattr(Subject, "compile", lambda self, tell: None)
-    monkeypatch.setattr(serve, "SERVED", [])
-    monkeypatch.setattr(os, "_exit", lambda code: None)
-    serve.serve("127.0.0.1", 0, ("it", Subject(vi.machines.Duffing())), browser=False, tell=str)
-    assert found and found[0]
 
 
 @pytest.fixture(scope="module")

@@ -48,6 +48,20 @@ def test_a_motion_says_that_it_rests(orbit):
     assert int(held.rests) == 0 and "0 impacts and rest on a stop, stable" in str(held)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("q", [("y", "x"), ("x", "y")])
+def test_rests_beside_another_body(q):
+    """Newton's method leaves the resting body a velocity of 1e-28, which was one more impact."""
+    base = dict(
+        q=q, mass=(1.0, 1.0), cycle=2 * np.pi, contacts=vi.RigidStop(0, 0.5, "left", on="y")
+    )
+    force = lambda _, t, q, v: {"y": -1 + 1.5 * jnp.sin(t), "x": jnp.cos(t) - 0.3 * (q.x + v.x)}
+    machine = type("Beside", (vi.Mechanical,), base | {"force": force})()
+    last = vi.simulate(machine, machine.at(y=0.2), 1, settle=60).last
+    orbit = vi.find_orbit(machine, last.replace(y=last.y + 1e-3), throw=True)
+    assert (int(orbit.impacts), int(orbit.rests)) == (19, 1)
+
+
 def rate(zeta, clock, y, v):
     """d(y, v)/ds of the body in flight, from the section on."""
     scene = scene_at(zeta)

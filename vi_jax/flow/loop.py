@@ -234,8 +234,10 @@ def _rests_on(
     plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float, slow: Scalar | float
 ) -> Scalar:
     """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
-    be by a force that grows; its place is known to within `slack`, its velocity to `slow`."""
-    contact = jnp.zeros_like(here.x)
+    be by a force that grows; its place is known to within `slack`, its velocity to `slow`, and
+    both to the rounding of a search that ends there."""
+    contact, least = jnp.zeros_like(here.x), 4 * jnp.finfo(here.x.dtype).eps * plan.extent(k)
+    slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
     for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
             pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
