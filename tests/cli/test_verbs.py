@@ -320,7 +320,3 @@ def test_ready_files(path, monkeypatch):
     (verb,) = verbs.VERBS.keys() & tables.keys()
     assert f"vi-jax {verb} experiments/{path.name}" in path.read_text("utf-8")
     assert tables[verb].keys() <= {*verbs.VERBS[verb].keys()} and machine.start() is not None
-
-
-def test_there_are_ready_files():
-    assert {"regimes", "basins", "frequency_response"} <= {path.stem for path in READY}

@@ -1,5 +1,7 @@
 """Dry friction with sticking: Den Hartog's closed form, a belt's, SciPy, energy, derivatives."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -251,3 +253,33 @@ def test_sticking_and_slipping_where_friction_falls_with_the_speed():
     np.testing.assert_allclose(
         run.duration[1:], run.duration[-1], atol=1e-9
     )  # it forgets its start
+
+
+class Shaken(vi.AbstractMachine):
+    """A body on a surface that moves with a speed of time, and the component w."""
+
+    surface: Any = eqx.field(static=True)
+    cycle: Any = 1.0
+
+    @property
+    def contacts(self):
+        return vi.DryFriction(0.1, on="v", mass=1.0, slip=lambda t, z: z.v - self.surface(t, z.w))
+
+    def field(self, t, z):
+        return {"x": z.v, "v": 0.0 * z.v, "w": 0.0}
+
+    def renewed(self, z):
+        return z.replace(w=-z.w)
+
+
+def test_surfaces_whose_speed_jumps():
+    """The body was carried along at once, in silence. Friction is 0.1, and never holds it."""
+    start = vi.State(x=0.0, v=0.0, w=1.0)
+    run = vi.simulate(Shaken(lambda t, w: w), start, 3, samples=2)
+    assert run.samples.state.v == pytest.approx(np.array([0, 1, 2, 1, 0, 1, 2]) / 20, abs=1e-15)
+    run = vi.simulate(Shaken(lambda t, w: 2 * t - 1), start, 2)
+    assert float(run.sections.v[1]) == pytest.approx(0.1 - 2 / 21, abs=1e-12)  # back to t = 10/21
+    with pytest.raises(ValueError, match=r"jumps by 2 at t = 0\.5\. Let it jump where"):
+        vi.simulate(Shaken(lambda t, w: jnp.where(t < 0.5, 1.0, -1.0)), start, 1)
+    with pytest.warns(UserWarning, match="within a thousandth of a cycle, at t = 0.5,"):
+        vi.simulate(Shaken(lambda t, w: jnp.tanh(1e4 * (t - 0.5))), start, 1)

@@ -9,19 +9,6 @@ pytestmark = pytest.mark.slow
 SIZES = (1.0, 1e-6)
 
 
-def test_orbits_are_as_exact():
-    """One whose first steps are short: it was left off at 4e-6 of its size."""
-    found = []
-    for size in SIZES:
-        wells = vi.machines.Duffing(
-            amplitude=0.2 * size, damping=0.15, stiffness=-1.0, cubic=1 / size**2, gap=100.0 * size
-        )
-        orbit = vi.find_orbit(wells, wells.start(Y=size, V=0.2 * size), 1, throw=True)
-        assert bool(orbit.stable) and float(orbit.error) < 1e-9  # relative to each number
-        found.append([float(orbit.state.Y) / size, float(orbit.state.V) / size])
-    np.testing.assert_allclose(found[1], found[0], atol=1e-10)
-
-
 def test_all_orbits_are_told_apart():
     """Those of one period were one motion."""
     found = []

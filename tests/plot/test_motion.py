@@ -110,21 +110,6 @@ def test_pictures_say_the_units_that_a_machine_states_and_show_its_soft_stop():
     assert any(np.allclose(x, [face, face]) for x in drawn)
 
 
-def test_phase_portrait_marks_sections(scene, run):
-    ax = plot_phase_portrait(run, scene, ax=_axes())
-    _, dots, _ = ax.lines
-    np.testing.assert_array_equal(dots.get_xdata(), np.asarray(run.sections.Y))
-    np.testing.assert_array_equal(dots.get_ydata(), np.asarray(run.sections.V))
-
-
-def test_new_axes_by_default(run):
-    import matplotlib.pyplot as plt
-
-    ax = plot_history(run)
-    assert ax.figure in map(plt.figure, plt.get_fignums())
-    plt.close(ax.figure)
-
-
 def test_errors_name_the_argument(scene, run):
     with pytest.raises(ValueError, match="`motion` must have samples"):
         plot_history(dataclasses.replace(run, samples=None))

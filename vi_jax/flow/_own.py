@@ -183,6 +183,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or any(isinstance(x, Tracer) for x in leaves):
         return
+    _check_slips(machine, start)
     try:
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         if not (ticks or others_of(machine)):
@@ -203,6 +204,59 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
         _warn_of_guard(kind, int(i), event.name or type(event).__name__)
+
+
+# A slip is evaluated at so many instants of a cycle, and where it changes most so often between two
+# of them. One that still changes by this share of that jumps; one that changes by so much of its
+# range between two instants is steep. Choices.
+_SLIPS, _HALVES, _STILL, _STEEP = 1024, 40, 0.5, 0.05
+
+
+def _check_slips(machine: AbstractMachine, start: State) -> None:
+    """Warn once of friction on a surface whose speed changes so fast that steps may be too long.
+
+    **Raises:** `ValueError` if it jumps within a cycle.
+    """
+    for number, friction in enumerate(switches_of(machine)):
+        if not friction.is_dry or getattr(friction, "slip", None) is None:
+            continue
+        try:
+            with jax.ensure_compile_time_eval():
+                times, extent, steps = jtu.tree_map(np.asarray, _steepest(machine, number, start))
+        except Exception:  # the error is raised in words where the friction is traced
+            return
+        if steps[0] > 0 and steps[1] > _STILL * steps[0]:
+            raise ValueError(
+                f"The `slip` of a DryFriction of a {type(machine).__name__} must be continuous in "
+                f"time, but it jumps by {steps[1]:.6g} at t = {times:.6g}. Let it jump where a "
+                "cycle begins, or make the surface's speed a component of the state, which a "
+                "`Reset` changes."
+            )
+        limits = AbstractMachine.step_limit, Mechanical.step_limit
+        if steps[0] > _STEEP * extent and type(machine).step_limit in limits:
+            _warn_of_slip(type(machine), float(times))
+
+
+@eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
+def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
+    """Where within a cycle a slip changes most, the range of its values, and how much it changes
+    there between two of many instants, and between two that are far closer."""
+    friction: Any = switches_of(machine)[number]
+    slip = lambda s: jnp.asarray(friction.speed_of_slip(machine, s, start), float)
+    s = jnp.asarray(machine.cycle, float) * (np.arange(_SLIPS) / _SLIPS)
+    values = jax.vmap(slip)(s)
+    steps = jnp.abs(jnp.diff(values))
+    place = jnp.argmax(steps)
+
+    def halve(_: Any, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        first = jnp.abs(slip(middle) - slip(low)) > jnp.abs(slip(high) - slip(middle))
+        return jnp.where(first, low, middle), jnp.where(first, middle, high)
+
+    low, high = jax.lax.fori_loop(0, _HALVES, halve, (s[place], s[place + 1]))
+    extent = jnp.max(values) - jnp.min(values)
+    return high, extent, (steps[place], jnp.abs(slip(high) - slip(low)))
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
@@ -248,6 +302,15 @@ def _warn_of_period(kind: type, name: str, cycle: float) -> None:
         f"The `field` of a {kind.__name__} is not the same at `s` = 0 and at `s` = `cycle` = "
         f"{cycle:.6g}: the rate of its {name} differs. `s` restarts from 0 in each cycle, so "
         "`cycle` must be a period of the field, unless the field is meant to jump there."
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_of_slip(kind: type, time: float) -> None:
+    warn(
+        f"The `slip` of a DryFriction of a {kind.__name__} changes within a thousandth of a cycle, "
+        f"at t = {time:.6g}, and steps may be too long for that. Give the machine a `step_limit`, "
+        "or let the surface's speed jump by a `Reset`."
     )
 
 

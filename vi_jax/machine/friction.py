@@ -167,7 +167,7 @@ class DryFriction(Friction):
       function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
     - `mass`: of that body, 1 by default; a `Mechanical` knows it.
     - `slip(z)` or `slip(t, z)`: the velocity relative to a surface that moves, such as
-      `slip=lambda z: z.u - belt`.
+      `slip=lambda z: z.u - belt`. It may jump where a cycle begins, not within one.
     - `push`: instead of `on` and `mass`, the change of the rate of each component by a unit of
       force, by name, if the friction acts on several.
     - `load(z)`, `load(t, z)` or `load(machine, t, z)`: what the level is multiplied by, not

@@ -45,6 +45,10 @@ _LOST, _MANY = 64.0, 16.0
 # Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
 _STUCK = 65536.0
 
+# A slip jumps where it changes by this share of itself: a choice. If it is zero to rounding, the
+# modes behind a jump are those before it.
+_JUMPS = 1e-6
+
 # Of a cycle, a step that is long enough to tell by it whether anything moves: a choice, below the
 # step by which a motion gets away from an event that it does not meet.
 _LONG = 5e-4
@@ -135,10 +139,26 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
     if renewed is not state:
         lane = after_jump(plan, lane._replace(state=renewed), turned, state)
         lane = lane._replace(state=select(turned, renewed, state))
+    lane = _strike_frictions(plan, arrived, lane, turned)
     if plan.noise is not None:
         lane = after_impulse(plan, lane, reached, completed)
     record = select(completed, plan.fresh(lane.state), lane.record)
     return lane._replace(part=part, record=record)
+
+
+def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
+    """The lane with the modes behind a jump of a slip as a cycle begins: by `renewed`, or as the
+    clock of a surface that moves begins anew."""
+    machine, renewed = plan.machine, new.state is not old.state
+    frictions = [x for x in switches_of(machine) if x.is_dry and (renewed or x.slip is not None)]
+    if not frictions:
+        return new
+    jumps = jnp.zeros((), bool)
+    for friction in frictions:
+        before, after = (friction.speed_of_slip(machine, x.s, x.state) for x in (old, new))
+        jumps = jumps | (jnp.abs(after - before) > _JUMPS * (jnp.abs(after) + jnp.abs(before)))
+    struck = struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
+    return new._replace(modes=select(turned & stop_gradient(jumps), struck, new.modes))
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
