@@ -252,8 +252,8 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     if moved > _SAME:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
-            f"{max(moved, float(start.size)):.2g}): branches cross there, or it is no orbit of "
-            "this machine."
+            f"{max(moved, float(start.size)):.2g}): branches cross there, its section lies on an "
+            "impact or another event, or it is no orbit of this machine."
         )
     return start
 
