@@ -23,6 +23,7 @@ from ..machine import (
     AbstractMachine,
     AbstractSwitch,
     Coordinate,
+    DryFriction,
     LinearMachine,
     Mechanical,
     Reset,
@@ -218,23 +219,23 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
     **Raises:** `ValueError` if it jumps within a cycle.
     """
     for number, friction in enumerate(switches_of(machine)):
-        if not friction.is_dry or getattr(friction, "slip", None) is None:
+        if not isinstance(friction, DryFriction) or not friction.slip_takes_time:
             continue
         try:
             with jax.ensure_compile_time_eval():
-                times, extent, steps = jtu.tree_map(np.asarray, _steepest(machine, number, start))
+                time, extent, coarse, fine = map(np.asarray, _steepest(machine, number, start))
         except Exception:  # the error is raised in words where the friction is traced
             return
-        if steps[0] > 0 and steps[1] > _STILL * steps[0]:
+        if coarse > 0 and fine > _STILL * coarse:
             raise ValueError(
                 f"The `slip` of a DryFriction of a {type(machine).__name__} must be continuous in "
-                f"time, but it jumps by {steps[1]:.6g} at t = {times:.6g}. Let it jump where a "
+                f"time, but it jumps by {fine:.6g} at t = {time:.6g}. Let it jump where a "
                 "cycle begins, or make the surface's speed a component of the state, which a "
                 "`Reset` changes."
             )
         limits = AbstractMachine.step_limit, Mechanical.step_limit
-        if steps[0] > _STEEP * extent and type(machine).step_limit in limits:
-            _warn_of_slip(type(machine), float(times))
+        if coarse > _STEEP * extent and type(machine).step_limit in limits:
+            _warn_of_slip(type(machine), float(time))
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
@@ -256,7 +257,7 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
     low, high = jax.lax.fori_loop(0, _HALVES, halve, (s[place], s[place + 1]))
     extent = jnp.max(values) - jnp.min(values)
-    return high, extent, (steps[place], jnp.abs(slip(high) - slip(low)))
+    return high, extent, steps[place], jnp.abs(slip(high) - slip(low))
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore

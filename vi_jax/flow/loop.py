@@ -92,13 +92,12 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     return stop_gradient(jnp.where(angles | ~(sizes > _REST), 1.0, sizes))
 
 
-@compiled
-def _compiled_sizes(machine: AbstractMachine, start: State, rows: Array) -> Vector:
-    return row_sizes(machine, start, rows)
+_compiled_sizes = compiled(row_sizes)
 
 
 def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> np.ndarray:
-    """`row_sizes`, host-side."""
+    """Return `row_sizes` as an array of the host, by a program that is compiled once for any number
+    of `rows`."""
     largest = np.abs(rows.reshape(-1, rows.shape[-1])).max(axis=0)
     return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
 

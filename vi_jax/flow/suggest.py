@@ -21,7 +21,7 @@ from .._types import Scalar, State
 from ..machine import AbstractMachine, adopt, bare, in_rows, size_of
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
-from .loop import row_sizes
+from .loop import row_sizes, sizes_on_host
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
@@ -205,10 +205,10 @@ class _Bench:
         self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
-        state = bare(start)
-        sizes = ravel_pytree(state)[1](row_sizes(machine, start))
+        row, unravel = ravel_pytree(bare(start))
+        sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(row))))
         # Nothing but the velocity is free of stops.
-        self.speed = size_of(machine.coordinates[0].velocity, state, sizes)
+        self.speed = size_of(machine.coordinates[0].velocity, bare(start), sizes)
         self.nudges = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 

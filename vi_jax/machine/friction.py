@@ -222,6 +222,11 @@ class DryFriction(Friction):
         gain = gained(self.as_velocity(machine, s), state, push)
         return jtu.tree_map(lambda x: x / gain, push), 1 / gain
 
+    @property
+    def slip_takes_time(self) -> bool:
+        """Whether the surface may move by the clock; static."""
+        return self.slip is not None and _argument_count(self.slip) > 1
+
     def as_velocity(self, machine: Machine, s: Scalar) -> Any:
         """The slip in the place of a coordinate's velocity."""
         return SimpleNamespace(velocity=lambda state: self.speed_of_slip(machine, s, state))
@@ -340,12 +345,16 @@ class ContactFriction(Friction):
 
 def asked(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:
     """What a function of the state, of time and state, or of machine, time and state says."""
+    return function(*(machine, s, state)[3 - _argument_count(function) :])
+
+
+def _argument_count(function: Callable[..., Any]) -> int:
     try:
         known = inspect.signature(function).parameters.values()
         many = sum(x.default is x.empty and x.kind < x.VAR_POSITIONAL for x in known)
     except (TypeError, ValueError):  # of a function that is not Python's
         many = 1
-    return function(*(machine, s, state)[3 - min(max(many, 1), 3) :])
+    return min(max(many, 1), 3)
 
 
 def chosen_together(

@@ -191,7 +191,7 @@ class _CloseError(ArithmeticError):
 
 def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
     """The point between two, along the first one's tangent, at which a test that changes its sign
-    between them is zero; `None` if there is none. The second may lie behind the first."""
+    between them is zero; `None` if there is none. `new` may lie on either side of `here`."""
     length = distance_along(problem, here, new)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []

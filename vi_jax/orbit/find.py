@@ -66,8 +66,8 @@ def _missing(
 
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
     """Where a root finder comes to from a guess, the first arc's start; the others begin where the
-    motion from there is then. The `x` found are the starts of the arcs, in rows; what is said of
-    the search is relative to the sizes of their numbers. All are floats."""
+    motion from there is then. The `x` found are the starts of the arcs, in rows. The residual is
+    relative to the sizes of their numbers. All numbers are floats."""
     x, unravel = raveled(guess)
     sizes = row_sizes(arc.machine, guess)
     arcs = x[None]

@@ -305,7 +305,7 @@ def settling_on(
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
-    if bool(stands_still(machine, like, the_map.machine.cycle, settling.unit)):
+    if bool(stands_still(the_map.machine, like, the_map.machine.cycle, settling.unit)):
         return settling, start
     rows = settling.settled_rows(start, longest)
     if rows is None:

@@ -352,11 +352,9 @@ def _sorted_out(
         return np.asarray(in_rows(run.sections))[1 : cycles + 1]
 
     def sizes(states: np.ndarray) -> np.ndarray:
-        largest = {name: float(np.abs(x).max()) for name, x in zip(names, states.T, strict=True)}
-        for name in names:
-            if START + name in data.coords:
-                largest[name] = max(largest[name], float(np.abs(data[START + name]).max()))
-        return sizes_on_host(machine, begin, np.array([*largest.values()]))
+        places = [START + name for name in names]
+        starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in places]
+        return sizes_on_host(machine, begin, np.vstack([states, starts]))
 
     label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), sizes)
     impacts = np.asarray(data["impacts"]).ravel()
@@ -394,16 +392,12 @@ def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> lis
         for side, edge, out in (("low", row[0] - half, -half), ("high", row[-1] + half, half)):
             middle = {other: 0.5 * (x[0] + x[-1]) for other, x in rows.items()}
             inside, beyond = ({**middle, name: edge + x * out} for x in (-1e-3, 1e-3))
-            if _is_possible_start(machine, begin, inside) and not _is_possible_start(
-                machine, begin, beyond
-            ):
+            if _may_start(machine, begin, inside) and not _may_start(machine, begin, beyond):
                 found.append(f"{name} {side}")
     return found
 
 
-def _is_possible_start(
-    machine: AbstractMachine, begin: object, values: Mapping[str, float]
-) -> bool:
+def _may_start(machine: AbstractMachine, begin: object, values: Mapping[str, float]) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

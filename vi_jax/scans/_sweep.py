@@ -169,7 +169,7 @@ class Sweep(Summarized):
             f"max {name}": (self.y_max, unit_of(units, "position")),
             "ζ": (self.frequency_ratio, unit_of(units, "frequency_ratio")),
         }
-        period = np.asarray(self.period)
+        period, reach = np.asarray(self.period), np.maximum(abs(self.y_min), abs(self.y_max))
         found: list[list[str]] = [[] for _ in period]
         for name, (x, unit) in numbers.items():
             if x is None:
@@ -178,7 +178,7 @@ class Sweep(Summarized):
             steps = np.abs(np.diff(x))
             beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
             usual = np.maximum(beside[:-2], beside[2:])
-            most = np.abs(x) if name == "ζ" else np.maximum(np.abs(self.y_min), np.abs(self.y_max))
+            most = np.abs(x) if name == "ζ" else np.asarray(reach)
             scale = np.maximum(most[1:], most[:-1])
             far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
             far &= (period[1:] > 0) | (period[:-1] > 0)

@@ -201,9 +201,9 @@ def may_be_above(
     """
     (x0, v0), (x1, v1) = begin, end
     seen = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
-    separated = 0.5 * jnp.abs(seen[1:] - seen[:-1])
-    within = jnp.any(seen[1:-1] + jnp.maximum(separated[1:], separated[:-1]) > zero)
-    return within | (v0 > 0) & (x0 + separated[0] > zero) | (v1 < 0) & (x1 + separated[-1] > zero)
+    halves = 0.5 * jnp.abs(seen[1:] - seen[:-1])
+    within = jnp.any(seen[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero)
+    return within | (v0 > 0) & (x0 + halves[0] > zero) | (v1 < 0) & (x1 + halves[-1] > zero)
 
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:

@@ -13,13 +13,15 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 they are those at a fixed reading of the clock, so that the steps to come carry none of the clock's.
 """
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
 
-from ..._types import Flag, Scalar
+from ..._types import Flag, Scalar, Scalars
 from ...lanes import pin_flag
 from ...machine import (
+    DryFriction,
     SoftStop,
     is_alive,
     others_of,
@@ -150,15 +152,20 @@ def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
     """The lane with the modes behind a jump of a slip as a cycle begins: by `renewed`, or as the
     clock of a surface that moves begins anew."""
     machine, renewed = plan.machine, new.state is not old.state
-    frictions = [x for x in switches_of(machine) if x.is_dry and (renewed or x.slip is not None)]
-    if not frictions:
+    dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]
+    if not any(renewed or x.slip_takes_time for x in dry):
         return new
     jumps = jnp.zeros((), bool)
-    for friction in frictions:
+    for friction in dry:
         before, after = (friction.speed_of_slip(machine, x.s, x.state) for x in (old, new))
         jumps = jumps | (jnp.abs(after - before) > _JUMPS * (jnp.abs(after) + jnp.abs(before)))
-    struck = struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
-    return new._replace(modes=select(turned & stop_gradient(jumps), struck, new.modes))
+    jumps = pin_flag(turned & stop_gradient(jumps), new.s)
+
+    def struck(new: Lane) -> Scalars:
+        return struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
+
+    # Rare: skipped where no lane of a group has such a jump.
+    return new._replace(modes=jax.lax.cond(jumps, struck, lambda new: new.modes, new))
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
