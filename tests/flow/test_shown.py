@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine.numbers import by_name
-from vi_jax.machine.shown import known
-from vi_jax.machine.units import unit_of
+from vi_jax.machine.numbers import by_name, known, unit_of
 
 M = vi.machines
 MACHINES = [

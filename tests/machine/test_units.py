@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.machine.numbers import leaf_names
-from vi_jax.machine.units import unit_of
+from vi_jax.machine.numbers import leaf_names, unit_of
 
 M = vi.machines
 

@@ -26,7 +26,9 @@ from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Passing, Turn, at_intervals, counter_of
 from .event import AbstractEvent, AbstractSwitch
+from .events import Reset
 from .friction import ContactFriction
+from .numbers import PLAIN, Shown, unit_in
 from .own import (
     by_default,
     derived,
@@ -37,11 +39,7 @@ from .own import (
     with_own_defaults,
     with_static,
 )
-from .shown import Shown
-from .soft import SoftStop
-from .stop import RigidStop, Wall
-from .units import PLAIN, unit_in
-from .user_events import Reset
+from .stop import RigidStop, SoftStop, Wall
 
 # What a machine must say, and how.
 _MUST_SAY = {

@@ -14,8 +14,8 @@ from .._checks import concrete
 from .._types import Scalar, State
 from .coordinates import component, has_component, with_component
 from .event import AbstractEvent
+from .events import Reset
 from .own import with_static
-from .user_events import Reset
 
 
 class Counter:

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, number, real, require, require_ranges
 from .._types import Scalar, State
 from ..lanes import sincos
+from .numbers import Shown
 from .own import by_default, is_own
-from .shown import Shown
 
 # The units of the paper's scene, by names of quantities, of components of a state and of numbers.
 UNITS: Mapping[str, str] = MappingProxyType({

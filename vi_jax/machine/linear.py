@@ -1,21 +1,321 @@
-"""Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs."""
+"""Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs.
+
+A run follows them in their natural modes, in which a step costs O(n) and is a closed form. With
+M = L Lᵀ and L⁻¹ K L⁻ᵀ = U κ Uᵀ the modes are the columns of L⁻ᵀ U: x = σ⁻¹ L⁻ᵀ U q makes of
+M x'' + C x' + K x = f the equations q'' + c q' + κ q = σ² Tᵀ f, T = σ⁻¹ L⁻ᵀ U, one for each mode
+but for what is left off the diagonal of c. One length σ makes the largest number of all shapes 1.
+"""
 
 import abc
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from .._checks import concrete, number
-from .._types import Number, Scalar, State
+from .._types import Flag, Number, Scalar, Scalars, State
 from .base import AbstractMachine, Coordinate
-from .modal import Modes, along, harmonic, modal, solved, times, without_row
+from .numbers import Shown
 from .own import changed
-from .shown import Shown
 from .stop import RigidStop
+
+Numbers = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+
+# Off the diagonal of the damping, what is below so many roundings of its largest number is that of
+# the modes: damping in proportion to mass and stiffness leaves 6 with 40 modes, the more the more
+# masses differ.
+_UNCOUPLED = 500
+# A mode whose κ is below this many roundings of the largest one is a motion as a rigid body, of
+# κ = 0: a choice, by the error of the eigenvalues.
+_RIGID = 16
+# Closer to a resonance than this, |κ - ω² + iωc| over κ + ω², the steady response and the free one
+# cancel in more than three digits.
+_RESONANT = 1e-3
+# Likewise for a constant force, κ over ω².
+_LOOSE = 1e-3
+
+
+class Coupling(NamedTuple):
+    """Parts of stiffness and damping that couple one mode with another."""
+
+    stiffness: Matrix
+    """Zero, but for its derivatives."""
+    damping: Matrix
+    on: Scalar
+    """1 where there is any, or derivatives by it are asked for; else 0."""
+
+
+class ModalMachine(AbstractMachine):
+    """A linear machine in its modes. Its state is a `StructureState` of modal numbers."""
+
+    stops: tuple[RigidStop, ...]  # pyright: ignore
+    frequency: Scalar
+    stiffness: Numbers
+    """κ of each mode, per unit of its mass."""
+    damping: Numbers
+    """Diagonal of the damping c, per unit of mass."""
+    pace_of: Numbers
+    """√|κ|, how fast each mode is."""
+    slowness: Numbers
+    """Its inverse; 1 of a rigid body's motion."""
+    swing: Numbers
+    """√(κ - c²/4), at which a mode oscillates; 1 if it does not. A constant for derivatives."""
+    swing_time: Numbers
+    """Its inverse."""
+    oscillates: Scalar
+    """1 if all modes do, else 0."""
+    fades: Scalar
+    """1 if all modes oscillate and none grows, else 0."""
+    fastest: Scalar
+    """A bound of how fast anything changes."""
+    coupling: Coupling | None
+    forces: tuple[Numbers | None, Numbers | None, Numbers | None]
+    """Constant, cosine and sine, per unit of mass."""
+    steady: tuple[Numbers, Numbers, Numbers] | None
+    """The steady response: constant, cosine and sine; `None` without forces."""
+    plain: Scalar
+    """1 where free flight is the closed form: modes uncoupled, none in resonance; else 0."""
+    rows: tuple[Numbers, ...]
+    """Of each coordinate, by how much of each mode it consists."""
+    pushes: tuple[Numbers, ...]
+    """How velocities change as the coordinate's changes by one."""
+    masses: Scalars
+
+    @property
+    def cycle(self) -> Scalar:
+        """The period 2π/ω of the force."""
+        return 2 * jnp.pi / self.frequency
+
+    @property
+    def _stops(self) -> tuple[RigidStop, ...]:
+        return self.stops
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The machine's coordinates, read from the modes instead of the displacements."""
+        return tuple(along(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
+
+    def force(self, s: Scalar) -> Numbers:
+        """The forces on the modes, per unit of mass."""
+        return harmonic(self.forces, self.frequency * s, self.stiffness)
+
+    def coupled(self, q: Numbers, p: Numbers) -> Numbers:
+        """What modes do to each other."""
+        if self.coupling is None:
+            return jnp.zeros_like(q)
+        found = self.coupling
+        return jax.lax.cond(
+            found.on > 0,
+            lambda q, p: found.stiffness @ q + found.damping @ p,
+            lambda q, p: jnp.zeros_like(q),
+            q, p,
+        )  # fmt: skip
+
+    def field(self, s: Scalar, state: State) -> Any:
+        """d(state)/ds between impacts."""
+        q, p = state.displacement, state.velocity
+        pull = self.force(s) - self.stiffness * q - self.damping * p - self.coupled(q, p)
+        return type(state)(p, pull)
+
+    def step_limit(self, s: Scalar, state: State) -> Scalar:
+        """A fifth of the shortest period, of the modes or the force."""
+        # A fifth is a choice, as for soft stops (`SoftStop.longest_step`).
+        return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.pace_of), self.frequency)
+
+    def relaxation(self, s: Scalar, state: State) -> Scalar:
+        """The shortest time constant with which a mode fades."""
+        tiny = 1e-6 / self.cycle
+        return 1 / jnp.maximum(jnp.max(jnp.abs(self.damping)), tiny)
+
+
+def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
+    """The coordinate c·x of a state.
+
+    **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`, 1/(cᵀM⁻¹c).
+    """
+
+    def placed(state: State, Y: Scalar, V: Scalar) -> Any:
+        x, v = state.displacement, state.velocity
+        return type(state)(x + push * (Y - jnp.dot(row, x)), v + push * (V - jnp.dot(row, v)))
+
+    return Coordinate(
+        lambda state: jnp.dot(row, state.displacement),
+        lambda state: jnp.dot(row, state.velocity),
+        placed,
+        mass,
+    )
+
+
+def harmonic(parts: Any, angle: Scalar, like: Numbers) -> Numbers:
+    """A constant, and multiples of the angle's cosine and sine; any of them may be `None`."""
+    total = jnp.zeros_like(like)
+    steady, cosine, sine = parts
+    total = total if steady is None else total + steady
+    total = total if cosine is None else total + cosine * jnp.cos(angle)
+    return total if sine is None else total + sine * jnp.sin(angle)
+
+
+def times(matrix: Any, x: Numbers) -> Numbers:
+    """A matrix, or the diagonal of one, times a vector."""
+    return matrix * x if matrix.ndim == 1 else matrix @ x
+
+
+def solved(matrix: Any, x: Numbers) -> Numbers:
+    """A matrix, or the diagonal of one, into a vector."""
+    return x / matrix if matrix.ndim == 1 else jnp.linalg.solve(matrix, x)
+
+
+class Modes(NamedTuple):
+    """A linear machine in its modes, and the way there and back."""
+
+    machine: ModalMachine
+    into: Callable[[Numbers], Numbers]
+    """Modal numbers of displacements, or of velocities."""
+    out_of: Callable[[Numbers], Numbers]
+
+
+class _Basis(NamedTuple):
+    """Modes, and the equation in them."""
+
+    shapes: Matrix | None
+    """Their shapes in columns; `None` where the machine's coordinates are its modes."""
+    into: Matrix | None
+    inverse: Numbers
+    """What forces on modes are multiplied by."""
+    stiffness: Numbers
+    damping: Numbers
+    coupling: Coupling | None
+    fastest: Scalar
+
+
+def modal(machine: Any) -> Modes:
+    """A linear machine in its modes (see the top of this file)."""
+    loss = machine.damping
+    both = machine.mass, jnp.zeros(machine.size) if loss is None else loss, machine.stiffness
+    found = _as_it_is(*both) if all(x.ndim == 1 for x in both) else _diagonalized(*both)
+    omega = machine.frequency
+
+    def onto(f: Any) -> Any:  # a force, or a row, as it acts on the modes
+        return f if f is None or found.shapes is None else f @ found.shapes
+
+    acting = [None if f is None else found.inverse * onto(f) for f in machine.forces]
+    forces = acting[0], acting[1], acting[2]
+    steady, resonant = _steady(forces, found, omega)
+    plain = ~resonant
+    if found.coupling is not None:
+        plain = plain & (found.coupling.on == 0)
+    rows = tuple(onto(c) for c in machine.rows)
+    mobile = [found.inverse * c for c in rows]
+    masses = tuple(1 / jnp.dot(c, m) for c, m in zip(rows, mobile, strict=True))
+    kappa, c = stop_gradient((found.stiffness, found.damping))
+    pace, square = jnp.sqrt(jnp.abs(kappa)), kappa - 0.25 * c * c
+    swing = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    made = ModalMachine(
+        stops=tuple(without_row(stop) for stop in machine.contacts),
+        frequency=omega,
+        stiffness=found.stiffness,
+        damping=found.damping,
+        pace_of=pace,
+        slowness=1 / jnp.where(pace > 0, pace, 1.0),
+        swing=swing,
+        swing_time=1 / swing,
+        oscillates=jnp.where(jnp.all(square > 0), 1.0, 0.0).astype(pace.dtype),
+        fades=jnp.where(jnp.all((square > 0) & (c >= 0)), 1.0, 0.0).astype(pace.dtype),
+        fastest=stop_gradient(jnp.maximum(found.fastest, omega)),
+        coupling=found.coupling,
+        forces=forces,
+        steady=steady,
+        plain=jnp.where(plain, 1.0, 0.0).astype(pace.dtype),
+        rows=rows,
+        pushes=tuple(m * one for m, one in zip(mobile, masses, strict=True)),
+        masses=masses,
+    )
+    shapes, into = found.shapes, found.into
+    return Modes(
+        made,
+        lambda x: x if into is None else into @ x,
+        lambda q: q if shapes is None else shapes @ q,
+    )
+
+
+def without_row(stop: RigidStop) -> RigidStop:
+    """The same stop without its `at`."""
+    return stop if stop.at is None else eqx.tree_at(lambda x: x.at, stop, None)
+
+
+def _as_it_is(mass: Numbers, damping: Numbers, stiffness: Numbers) -> _Basis:
+    """Of a machine whose matrices are diagonal: its coordinates are its modes."""
+    kappa, c = stiffness / mass, damping / mass
+    fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.max(jnp.abs(c))
+    return _Basis(None, None, 1 / mass, kappa, c, None, fastest)
+
+
+def _diagonalized(mass: Any, damping: Any, stiffness: Any) -> _Basis:
+    """The modes of mass and stiffness, with all that couples them."""
+    M, C, K = (jnp.diag(x) if x.ndim == 1 else x for x in (mass, damping, stiffness))
+    n, eps = M.shape[0], jnp.finfo(M.dtype).eps
+    L = jnp.linalg.cholesky(M)
+    inverse = solve_triangular(L, jnp.eye(n, dtype=M.dtype), lower=True)
+    own, seen = inverse @ K @ inverse.T, inverse @ C @ inverse.T
+    U = stop_gradient(jnp.linalg.eigh(stop_gradient(0.5 * (own + own.T)))[1])
+    own, seen = U.T @ own @ U, U.T @ seen @ U
+    kappa, c = jnp.diag(own), jnp.diag(seen)
+    rigid = jnp.abs(kappa) <= _RIGID * n * eps * jnp.max(jnp.abs(kappa))
+    kappa = kappa - stop_gradient(jnp.where(rigid, kappa, 0.0))
+    aside = own - jnp.diag(jnp.diag(own))
+    rest = seen - jnp.diag(c)
+    most = jnp.max(jnp.abs(stop_gradient(seen)))
+    mixed = jnp.max(jnp.abs(stop_gradient(rest))) > _UNCOUPLED * eps * most
+    rest = rest - jnp.where(mixed, 0.0, stop_gradient(rest))
+    on = jnp.maximum(jnp.where(mixed, 1.0, 0.0), _asked(M, C, K))
+    fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.sqrt(jnp.sum(stop_gradient(seen) ** 2))
+    shapes = inverse.T @ U
+    scale = stop_gradient(jnp.max(jnp.abs(shapes)))
+    coupling = Coupling(aside - stop_gradient(aside), rest, on.astype(M.dtype))
+    square = jnp.full((n,), scale * scale, M.dtype)
+    return _Basis(shapes / scale, scale * (U.T @ L.T), square, kappa, c, coupling, fastest)
+
+
+@jax.custom_jvp
+def _asked(*matrices: Any) -> Scalar:
+    """1 where derivatives by a machine's matrices are asked for, else 0: the modes are coupled
+    then, by zeros that have derivatives."""
+    return jnp.zeros((), matrices[0].dtype)
+
+
+@_asked.defjvp
+def _(matrices, _):
+    one = jnp.ones((), matrices[0].dtype)
+    return one, jnp.zeros_like(one)
+
+
+def _steady(forces: Any, found: _Basis, omega: Scalar) -> tuple[Any, Flag]:
+    """The steady response to constant, cosine and sine, and whether a mode is so close to resonance
+    that it would cancel against the free motion; zero in such a mode."""
+    if all(f is None for f in forces):
+        return None, jnp.zeros((), bool)
+    kappa, c = found.stiffness, found.damping
+    zero = jnp.zeros_like(kappa)
+    constant, cosine, sine = (zero if f is None else f for f in forces)
+    loose = stop_gradient(jnp.abs(kappa) <= _LOOSE * omega**2)
+    detune, drag = kappa - omega**2, omega * c
+    square = detune**2 + drag**2
+    size = _RESONANT * (jnp.abs(kappa) + omega**2)
+    near = stop_gradient(square <= size**2)
+    scale = jnp.where(near, 0.0, 1 / jnp.where(near, 1.0, square))
+    steady = (
+        jnp.where(loose, 0.0, constant / jnp.where(loose, 1.0, kappa)),
+        scale * (cosine * detune - sine * drag),
+        scale * (sine * detune + cosine * drag),
+    )
+    shaken = near & ((cosine != 0) | (sine != 0))
+    return steady, jnp.any(shaken | (loose & (constant != 0)))
 
 
 class StructureState(Shown):

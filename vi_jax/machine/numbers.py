@@ -1,7 +1,11 @@
-"""Numbers of a machine by name: `"drive.frequency_ratio"`, `"stops.0.gap"`, …"""
+"""Numbers of a machine by name, `"drive.frequency_ratio"` or `"stops.0.gap"`, their units, and how
+they are shown, as text and as a table."""
 
+import dataclasses
 import difflib
-from collections.abc import Callable, Mapping
+import html
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -9,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._types import Machine, Scalar, State
-from .units import in_unit
 
 
 def leaf_names(tree: object) -> list[str]:
@@ -157,3 +161,241 @@ def check_again(machine: Machine) -> None:
         check = getattr(part, "__check_init__", None)
         if check is not None:
             check()
+
+
+NONE: Mapping[str, str] = MappingProxyType({})
+
+Stated = tuple[tuple[str, str], ...]
+"""What a machine states, as pairs of names and units: it can be compared, and so be static."""
+
+
+PLAIN = "position", "velocity"
+"""What a machine calls them that has no other words."""
+
+
+def unit_of(units: Mapping[str, str], name: str) -> str:
+    """The unit of a quantity, of a number by its last word too; "" where none is stated."""
+    last = name.split(".")[-1].split("[")[0]
+    for key in (name, "" if name.startswith("v.") else last, ""):  # `v.x` has another one than `x`
+        if key in units:
+            return units[key]
+    return ""
+
+
+def units_of(machine: Machine) -> dict[str, str]:
+    """The units that a machine states. Those of position and velocity are by default those of the
+    numbers in the state that they are."""
+    units = dict(machine.units)
+    for quantity, name in zip(PLAIN, machine.labels, strict=True):
+        if name in units:
+            units.setdefault(quantity, units[name])
+    return units
+
+
+def stated(machine: Machine) -> Stated:
+    """The units of a machine."""
+    return tuple(units_of(machine).items())
+
+
+def attributes(unit: str) -> dict[str, str]:
+    """The attribute of a variable in this unit; none where it is not known."""
+    return {"units": unit} if unit else {}
+
+
+def in_unit(text: str, units: Mapping[str, str], name: str) -> str:
+    """A number of this name with its unit, if it has one."""
+    return with_unit(text, unit_of(units, name))
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number with its unit, if it has one."""
+    return text if unit in ("", "1") else f"{text} {unit}"
+
+
+QUANTITIES = {
+    "y_min": "position", "y_max": "position", "clearance": "position",
+    "impact_speed": "velocity", "log_speed": "velocity", "frequency_ratio": "frequency_ratio",
+    "exponents": "rate", "spread": "rate", "impact_energy": "energy", "duration": "time",
+    "log_phase": "phase", "impact_phase": "phase", "event_phase": "phase",
+    "fastest_impact": "velocity", "slowest_impact": "velocity",
+}  # fmt: skip
+"""What the arrays of results are of."""
+
+_PREFIXES = ("error_section_", "section_", "sample_", "error_", "start.")
+
+
+def quantity_of(name: str) -> str | None:
+    """What a variable of a data set is of: a quantity, a component of a state, or neither."""
+    for prefix in _PREFIXES:
+        if name.startswith(prefix):
+            inner = name.removeprefix(prefix)
+            return QUANTITIES.get(inner, inner)
+    return QUANTITIES.get(name)
+
+
+def with_units(data: Any, units: Mapping[str, str], named: Mapping[str, str] = NONE) -> Any:
+    """A data set whose variables say in which units they are; `named` are numbers of a machine by
+    other names than their own."""
+    for name in data.variables:
+        quantity = named.get(name) or quantity_of(str(name))
+        if quantity is not None:
+            data[name].attrs |= attributes(unit_of(units, quantity))
+    return data
+
+
+def in_brackets(words: str, unit: str) -> str:
+    """The name of an axis with its unit, if it has one."""
+    return words if unit in ("", "1") else f"{words} ({unit})"
+
+
+def unit_in(label: str) -> str:
+    """The unit at the end of a label such as "height (g/ω²)"."""
+    return label.partition(" (")[2].removesuffix(")")
+
+
+def name_in(label: str) -> str:
+    """The name at the beginning of a label such as "height (g/ω²)" or "Y = y/a"."""
+    return label.partition(" (")[0].partition(" = ")[0]
+
+
+# Longer texts go over several lines; of longer arrays only the range is shown.
+_WIDTH, _LISTED = 88, 6
+
+
+class Shown(eqx.Module):
+    """A module that shows its numbers, in the units that its `units` state, if it has any."""
+
+    def __new__(cls, *args: Any, **kwargs: Any):
+        fields = {field.name for field in dataclasses.fields(cls)}
+        for name in kwargs:
+            if name not in fields and isinstance(getattr(cls, name, None), int | float):
+                raise TypeError(
+                    f"`{cls.__name__}` has no argument `{name}`: a number is declared with its "
+                    f"type in the class, `{name}: float = {getattr(cls, name)!r}`."
+                )
+        return super().__new__(cls)
+
+    def __repr__(self) -> str:
+        return in_words(self, getattr(self, "units", NONE)) if known(self) else super().__repr__()
+
+    def _repr_html_(self) -> str:
+        if not known(self):
+            return f"<pre>{html.escape(repr(self))}</pre>"
+        units = getattr(self, "units", NONE)
+        rows = [
+            (name, number_in_words(x), unit_of(units, name)) for name, x in by_name(self).items()
+        ]
+        return table(type(self).__name__, rows)
+
+
+class Summarized(eqx.Module):
+    """A result that says what it holds."""
+
+    def summary(self) -> str:
+        """In words: a line, and further ones "name: value" that are indented."""
+        raise NotImplementedError
+
+    def drawn(self) -> Any:
+        """A row of numbers to draw beside it, or `None`."""
+        return None
+
+    def __repr__(self) -> str:
+        return self.summary() if known(self) else super().__repr__()
+
+    def _repr_html_(self) -> str:
+        return summary_table(repr(self), self.drawn() if known(self) else None)
+
+
+def known(tree: object) -> bool:
+    """Whether all numbers in a tree are there: none is traced, a placeholder, or given away."""
+    return all(_is_shown(x) for x in jtu.tree_leaves(tree))
+
+
+def _is_shown(x: object) -> bool:
+    # JAX's own placeholder is a bare object; a solver's leaves may be functions and words.
+    if isinstance(x, Tracer | jax.ShapeDtypeStruct) or type(x) is object:
+        return False
+    return not (isinstance(x, jax.Array) and x.is_deleted())
+
+
+def in_words(x: object, units: Mapping[str, str] = NONE, name: str = "", indent: int = 0) -> str:
+    """A module, a state or a number, as it would be written, each number with its unit."""
+    if eqx.is_array_like(x) and not isinstance(x, bool):
+        return number_in_words(x, unit_of(units, name) if name else "")
+    opened, parts, closed = _parts(x)
+    parts = [
+        (f"{key}=" if key else "") + in_words(part, units, key or name, indent + 2)
+        for key, part in parts
+    ]
+    text = opened + ", ".join(parts) + closed
+    if "\n" not in text and indent + len(text) <= _WIDTH:
+        return text
+    margin, end = "\n" + " " * (indent + 2), "\n" + " " * indent
+    return opened + "".join(f"{margin}{part}," for part in parts) + end + closed.lstrip(",")
+
+
+def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
+    """How the text of something begins, what is in it, by name, and how the text ends."""
+    name = f"{type(x).__name__}("
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        values = [(f.name, getattr(x, f.name, None)) for f in dataclasses.fields(x) if f.repr]
+        left_out = (type(None), tuple, str)  # what is not there, and what is empty
+        there = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
+        return name, there, ")"
+    if isinstance(x, tuple) and hasattr(x, "_fields"):
+        return name, list(zip(x._fields, x, strict=True)), ")"  # pyright: ignore
+    if name == "State(":
+        return name, list(vars(x).items()), ")"
+    if isinstance(x, Mapping):
+        return "{", [(str(key), part) for key, part in x.items()], "}"
+    if isinstance(x, tuple | list):
+        left, right = "[]" if isinstance(x, list) else "()"
+        return left, [("", part) for part in x], "," * (right == ")" and len(x) == 1) + right
+    return getattr(x, "__qualname__", None) or repr(x), [], ""
+
+
+def number_in_words(x: object, unit: str = "") -> str:
+    """A number with its unit; of several, if they are many, their range and their shape."""
+    x = np.asarray(x)
+    if not x.ndim:
+        return with_unit(f"{x + 0.0:.9g}" if x.dtype.kind == "f" else str(x), unit)
+    if x.ndim == 1 and x.size <= _LISTED:
+        return with_unit(f"[{', '.join(map(number_in_words, x))}]", unit)
+    shape = " × ".join(map(str, x.shape))
+    if not x.size or x.dtype.kind not in "fiu" or np.isnan(x).all():
+        return f"{x.dtype} ({shape})"
+    low, high = (number_in_words(f(x)) for f in (np.nanmin, np.nanmax))
+    return f"{with_unit(f'{low} … {high}', unit)} ({shape})"
+
+
+def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
+    """Cells in HTML under a title."""
+    cells = "".join(
+        f"<tr>{''.join(f'<td style=text-align:left>{html.escape(x)}</td>' for x in row)}</tr>"
+        for row in rows
+    )
+    caption = f"<caption style=text-align:left>{html.escape(title)}</caption>"
+    return f"<table>{caption}{cells}</table>{after}"
+
+
+def summary_table(text: str, row: object = None) -> str:
+    """A result in words as a table: its lines "name: value", the first one above."""
+    first, *lines = text.splitlines()
+    after = "" if row is None else sparkline(row)
+    rows = (line.strip().rpartition(": ") if ": " not in line else line.strip().partition(": ")
+            for line in lines)  # fmt: skip
+    return table(first, (row[::2] for row in rows), after)
+
+
+def sparkline(row: object, width: int = 240, height: int = 40) -> str:
+    """A row of numbers as a small curve; nothing where fewer than two of them are finite."""
+    y = np.asarray(row, float).ravel()
+    good = np.isfinite(y)
+    if good.sum() < 2:
+        return ""
+    low, span = y[good].min(), np.ptp(y[good]) or 1.0
+    across = 2 + (width - 4) * np.arange(y.size) / (y.size - 1)
+    up = height - 2 - (height - 4) * (y - low) / span
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across[good], up[good], strict=True))
+    line = f'<polyline points="{points}" fill="none" stroke="currentColor"/>'
+    return f'<svg width="{width}" height="{height}">{line}</svg>'

@@ -7,8 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .numbers import split_place
-from .shown import in_words, known, number_in_words, table
+from .numbers import in_words, known, number_in_words, split_place, table
 
 
 class State:

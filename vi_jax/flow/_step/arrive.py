@@ -31,8 +31,7 @@ from ..events import Rates, guard_rates, rates, to_turn
 from ..results import EventKind, code_of_outcome
 from ..smooth import exact, holding, in_modes, limited_of
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
-from .impact import is_compound, strike_in_turn, strike_once
-from .settle import settle, stilled
+from .impact import is_compound, settle, stilled, strike_in_turn, strike_once
 from .trial import Release, Situation, Trial
 
 # Events of one instant that set each other off for ever happen so often each, by choice, before the
