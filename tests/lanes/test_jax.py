@@ -9,7 +9,7 @@ from jax.extend.core import Primitive, primitives
 from jax.interpreters import mlir, partial_eval
 from vi_jax import _programs, lanes
 from vi_jax.lanes import _primitive
-from vi_jax.lanes._arrays import STRUCTURAL
+from vi_jax.lanes._array_rules import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
 
 # Primitives of this package, and some that JAX has in no public module, or not in all its versions.

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 from jax.extend.core import Jaxpr, Literal
 
+from ._array_rules import STRUCTURAL, any_in
 from ._arrays import (
     MOST_IN_REGISTERS,
-    STRUCTURAL,
     Array,
     Formula,
     Index,
@@ -16,7 +16,6 @@ from ._arrays import (
     Registers,
     Strided,
     addressable,
-    any_in,
     counted,
     fill,
     held,

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ._arrays import MOST_IN_REGISTERS, Array, Registers, any_in, held, mapped, splat
+from ._array_rules import any_in
+from ._arrays import MOST_IN_REGISTERS, Array, Registers, held, mapped, splat
 from ._group import (
     Frame,
     add_all,

@@ -5,14 +5,12 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ._array_rules import PLACED, STRUCTURAL, chosen
 from ._arrays import (
     MOST_IN_REGISTERS,
-    PLACED,
-    STRUCTURAL,
     Array,
     Formula,
     Registers,
-    chosen,
     held,
     joined,
     over,
@@ -156,15 +154,11 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
         dtypes = [a.aval.dtype for a in eqn.invars]
         return _elementwise(t, name, params, dtypes, args, avals)
     if name in PLACED:
-        dtypes = [a.aval.dtype for a in eqn.invars[_PLACES.get(name, 1) :]]
+        dtypes = [a.aval.dtype for a in eqn.invars]
         out = PLACED[name](t, params, avals, dtypes, *args)
     else:
         out = STRUCTURAL[name](t, params, avals, *args)
     return [held(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
-
-
-_PLACES = {"dynamic_update_slice": 2}
-"""Where the places begin among the arguments of a primitive of `PLACED`."""
 
 
 def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:

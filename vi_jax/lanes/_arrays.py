@@ -1,22 +1,158 @@
-"""The kinds of arrays: in registers, a formula, pieces of others, or regular places in memory."""
+"""Arrays within a lane: in registers, in memory, or known by a formula.
 
-from collections.abc import Callable, Sequence
+An array of at most `MOST_IN_REGISTERS` numbers is held in registers. What is done with a larger one
+number by number stays a formula until it is needed, so that neighbouring operations become one loop
+and nothing is computed that is not asked for.
+"""
+
+import hashlib
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from .._text import Block, Text, Value
-from .index import (
-    NO_CUTS,
-    Cuts,
-    Index,
-    in_lanes,
-    place_of,
-    plus,
-    range_of,
-    splat,
-)
+from ._text import Block, Text, Value, is_float
+
+# --- places within an array: known while the code is written, the same for all lanes, or each
+# lane's own
+
+Index = int | str | Value
+"""A number; the name of a scalar `i64`, the same for all lanes; or an `i64` of each lane."""
+
+
+def splat(t: Text, scalar: str, kind: str) -> Value:
+    """A scalar of the kernel in every lane of the group."""
+    v = t.vector(kind)
+    one = t.raw(f"insertelement {v} poison, {kind} {scalar}, i32 0")
+    mask = f"<{t.width} x i32> zeroinitializer"
+    return Value(t.raw(f"shufflevector {v} {one}, {v} poison, {mask}"), kind)
+
+
+def in_lanes(t: Text, place: Index) -> Value:
+    """A place as an `i64` of each lane."""
+    if isinstance(place, Value):
+        return place
+    return t.constant(place, "i64") if isinstance(place, int) else splat(t, place, "i64")
+
+
+def plus(t: Text, a: Index, b: Index) -> Index:
+    """The sum of two places."""
+    if isinstance(a, int) and isinstance(b, int):
+        return a + b
+    if a == 0 or b == 0:
+        return b if a == 0 else a
+    if isinstance(a, Value) or isinstance(b, Value):
+        return t.binary("add", in_lanes(t, a), in_lanes(t, b))
+    found = t.once(f"add i64 {a}, {b}")
+    name, number = (b, a) if isinstance(a, int) else (a, b)
+    if isinstance(number, int) and name in t.ranges:
+        low, high = t.ranges[name]
+        t.ranges[found] = low + number, high + number
+    return found
+
+
+def times(t: Text, a: Index, number: int) -> Index:
+    """A place times a number."""
+    if isinstance(a, int):
+        return a * number
+    if number in (0, 1):
+        return a if number else 0
+    if isinstance(a, Value):
+        return t.binary("mul", a, t.constant(number, "i64"))
+    return t.once(f"mul i64 {a}, {number}")
+
+
+def place_of(t: Text, index: Sequence[Index], strides: Sequence[int], offset: Index = 0) -> Index:
+    """The place of an element among an array's numbers."""
+    total = offset
+    for i, stride in zip(index, strides, strict=True):
+        total = plus(t, total, times(t, i, stride))
+    return total
+
+
+def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
+    """The strides of an array whose numbers lie in order, the last axis fastest."""
+    return tuple(int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape)))
+
+
+def counted(
+    t: Text,
+    number: int,
+    turn: Callable[[Index, list[Value]], list[Value]],
+    first: list[Value],
+) -> list[Value]:
+    """A loop of a known number of turns, with a scalar counter.
+
+    **Arguments:** the text; the number; what a turn does with its number and what the turn before
+    gave; what the first one is given.
+
+    **Returns:** what the last turn gave.
+    """
+    if number < 2:
+        return turn(0, first) if number else first
+    inside, after = t.label(), t.label()
+    before = t.block
+    t.line(f"br label %{inside}")
+    t.open(inside)
+    place = len(t.lines)
+    carry = [Value(t.fresh(), a.kind) for a in first]
+    count, following = t.fresh(), t.fresh()
+    t.ranges[count] = 0, number - 1
+    new = turn(count, carry)
+    end = t.block
+    t.line(f"{following} = add i64 {count}, 1")
+    more = t.raw(f"icmp slt i64 {following}, {number}")
+    t.join(carry, (first, before), (new, end), at=place)
+    t.lines.insert(place, f"  {count} = phi i64 [ 0, %{before} ], [ {following}, %{end} ]")
+    t.fork(more, inside, after)
+    t.close()
+    t.follow(after)
+    return new
+
+
+Cuts = Mapping[int, frozenset[int]]
+"""Of some axes, the places at which an array's numbers begin to be known in another way."""
+
+NO_CUTS: Cuts = MappingProxyType({})
+
+
+def over(
+    t: Text,
+    shape: Sequence[int],
+    body: Callable[[tuple[Index, ...]], None],
+    cuts: Cuts = NO_CUTS,
+) -> None:
+    """Loops over all elements of an array of this shape, a loop for each part between `cuts`."""
+
+    def nest(index: tuple[Index, ...]) -> None:
+        axis = len(index)
+        if axis == len(shape):
+            body(index)
+            return
+        bounds = sorted({0, shape[axis], *cuts.get(axis, ())})
+        for begin, end in pairwise(bounds):
+
+            def turn(i: Index, _: list[Value], begin: int = begin) -> list[Value]:
+                nest((*index, plus(t, i, begin)))
+                return []
+
+            counted(t, end - begin, turn, [])
+
+    nest(())
+
+
+def range_of(t: Text, i: Index, size: int) -> tuple[int, int]:
+    """The least and the greatest number that a place along an axis of this size can be."""
+    if isinstance(i, int):
+        return i, i
+    return t.ranges.get(i, (0, size - 1)) if isinstance(i, str) else (0, size - 1)
+
+
+# --- the kinds of arrays
 
 # Arrays of more numbers than this live in memory. A choice: the registers of AVX-512 are 32.
 MOST_IN_REGISTERS = 16
@@ -301,3 +437,152 @@ def scattered(t: Text, pointer: str, place: Value, value: Value, mask: Value | N
     t.declared[name] = f"declare void {name}({v}, {p}, i32, {flags})"
     call = f"{v} {value.text}, {p} {where}, i32 {_BYTES[value.kind]}, {flags} {mask.text}"
     t.store(f"call void {name}({call})")
+
+
+# --- arrays computed, stored, chosen, replaced
+
+
+def addressable(t: Text, x: Array) -> Array:
+    """An array that can be asked for numbers at places known only at run time."""
+    if not isinstance(x, Registers):
+        return x
+    return uniform(x.shape, x.item()) if x.size == 1 else stored(t, x)
+
+
+def held(t: Text, x: Array) -> Any:
+    """An array as a kernel holds one of its size."""
+    if isinstance(x, Registers) or x.size > MOST_IN_REGISTERS:
+        return x
+    return Registers.of(x.shape, x.kind, lambda i: x.at(t, i))
+
+
+def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | None = None) -> Any:
+    """A function of numbers, number by number, of arrays of one shape.
+
+    **Arguments:** `kind`, the type of its result, if another than that of the first array.
+    """
+    first, kind = arrays[0], kind or arrays[0].kind
+    if not first.shape:
+        return Registers.one(function(*(x.at(t, ()) for x in arrays)))
+    if all(isinstance(x, Registers) for x in arrays):
+        numbers = zip(*(x.values.flat for x in arrays), strict=True)  # pyright: ignore
+        out: Any = np.empty(first.shape, object)
+        out.flat = [function(*each) for each in numbers]
+        return Registers(out, kind)
+    number = lambda i: function(*(x.at(t, i) for x in arrays))
+    return Formula(first.shape, kind, number, cuts=joined(*(x.cuts for x in arrays)))
+
+
+def over_all(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> None:
+    """All elements of an array: one after the other if it is in registers, else in loops."""
+    if isinstance(x, Registers):
+        for i in np.ndindex(x.shape):
+            body(i)
+    else:
+        over(t, x.shape, body, x.cuts)
+
+
+def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
+    """An array in memory whose numbers are still to be stored."""
+    numbers = int(np.prod(shape, dtype=int))
+    source = Memory(t.arena.take(max(1, numbers)))
+    return Strided(tuple(shape), kind, source, contiguous(shape))
+
+
+def fill(
+    t: Text, out: Strided, x: Array, *, offset: Index = 0, strides: Sequence[int] | None = None
+) -> None:
+    """Store the numbers of an array in room for them, by default in order.
+
+    **Arguments:** the text; the room; the array; the place of its first number, and the places from
+    one number to the next along each axis.
+    """
+    steps = contiguous(x.shape) if strides is None else strides
+    memory = out.source
+    assert isinstance(memory, Memory)
+    over_all(t, x, lambda i: memory.store(t, place_of(t, i, steps, offset), x.at(t, i)))
+
+
+def stored(t: Text, x: Array) -> Strided:
+    """A copy of an array in memory."""
+    out = room(t, x.shape, x.kind)
+    fill(t, out, x)
+    return out
+
+
+def settled(t: Text, x: Array) -> Array:
+    """An array whose numbers are computed: what is a formula is stored."""
+    return x if is_cheap(x) else stored(t, x)
+
+
+def in_one(t: Text, x: Array) -> Array:
+    """An array that is asked for at places of which no more is known than that they are in it."""
+    return stored(t, x) if x.cuts else settled(t, x)
+
+
+def is_cheap(x: Array) -> bool:
+    """Whether the numbers of an array need not be stored to be asked for again."""
+    if isinstance(x, Pieces):
+        return all(map(is_cheap, x.parts))
+    return not isinstance(x, Formula) or x.cheap
+
+
+def store_at(t: Text, x: Strided, index: Sequence[Index], value: Value) -> None:
+    """Store one number of an array in memory."""
+    memory = x.source
+    assert isinstance(memory, Memory)
+    memory.store(t, place_of(t, index, x.strides, x.offset), value)
+
+
+def selected(t: Text, mask: Value, a: Array, b: Array) -> Any:
+    """The first array where `mask` holds, else the second."""
+    return mapped(t, lambda x, y: t.select(mask, x, y), a, b)
+
+
+def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | None = None) -> None:
+    """Store large arrays over those that they replace, where `mask` holds. The new ones may depend
+    on any of the old ones; arrays in registers are left out."""
+    pairs = [
+        (a, b) for a, b in zip(old, new, strict=True) if isinstance(a, Strided) and not same(a, b)
+    ]
+    blocks = [a.source.block for a, _ in pairs if isinstance(a.source, Memory)]
+
+    def apart(x: Array) -> Array:
+        free = isinstance(x, Strided) and not (
+            isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
+        )
+        return x if free else stored(t, x)
+
+    for a, b in [(a, apart(b)) for a, b in pairs]:
+        fill(t, a, b if mask is None else selected(t, mask, b, a))
+
+
+def same(a: Array, b: Array) -> bool:
+    """Whether two large arrays are the same numbers of the same memory."""
+    if a is b:
+        return True
+    if not (isinstance(a, Strided) and isinstance(b, Strided)):
+        return False
+    mine = isinstance(a.source, Memory) and isinstance(b.source, Memory)
+    alike = a.source.block is b.source.block if mine else a.source == b.source  # pyright: ignore[reportAttributeAccessIssue]
+    return alike and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
+
+
+def table(t: Text, array: object, kind: str) -> Array:
+    """A large array known while the code is written, as constants in the module's text."""
+    array = np.asarray(array)
+    numbers = array.reshape(-1)
+    word = stored_kind(kind)
+    if all(x.tobytes() == numbers[0].tobytes() for x in numbers):
+        return uniform(array.shape, t.constant(numbers[0], kind))
+    body = ", ".join(f"{word} {_llvm_number(x, kind)}" for x in numbers)
+    content = f"private unnamed_addr constant [{numbers.size} x {word}] [{body}], align 64"
+    name = f"@table{hashlib.blake2b(content.encode(), digest_size=8).hexdigest()}"
+    t.declared[name] = f"{name} = {content}"
+    return Strided(array.shape, kind, Table(name), contiguous(array.shape))
+
+
+def _llvm_number(number: Any, kind: str) -> str:
+    if is_float(kind):
+        return "0x" + struct.pack(">d", float(number)).hex().upper()
+    return str(int(number))

@@ -1,0 +1,706 @@
+"""Rules of primitives that take whole arrays: numbers moved, asked for at places from the data,
+added up, multiplied.
+
+The rules return arrays of any kind. The caller puts few numbers into registers (`held`), which
+costs nothing: what moves them is done while the code is written.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ._arrays import (
+    MOST_IN_REGISTERS,
+    Array,
+    Formula,
+    Index,
+    Pieces,
+    Registers,
+    Strided,
+    addressable,
+    contiguous,
+    counted,
+    fill,
+    held,
+    in_lanes,
+    in_one,
+    is_cheap,
+    joined,
+    mapped,
+    over,
+    over_all,
+    place_of,
+    plus,
+    room,
+    same,
+    selected,
+    settled,
+    store_at,
+    stored,
+    times,
+    uniform,
+)
+from ._operations import (
+    ELEMENTWISE,
+    Rule,
+    add,
+    compare,
+    convert,
+    is_unsigned,
+    kind_of,
+    mul,
+    register,
+    weighted,
+)
+from ._text import Text, Value
+
+STRUCTURAL: dict[str, Rule] = {}
+"""Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the
+shapes and types of its results; an `Array` for each argument. They return an `Array`, or some."""
+
+PLACED: dict[str, Rule] = {}
+"""Rules that have the types of the arguments too, which say whether places are signed: with the
+arguments `t`, `p`, `avals`, `d`, and the arrays."""
+
+structural = partial(register, STRUCTURAL)
+placed = partial(register, PLACED)
+
+
+# --- the same numbers at other places
+
+
+class _Along(NamedTuple):
+    """Where the numbers of an array lie along one of its axes, by their places in another shape."""
+
+    axis: int | None
+    """The axis of the new shape that goes along it; `None` if none does."""
+    by: int = 1
+    begin: int = 0
+
+    def place(self, t: Text, index: Sequence[Index]) -> Index:
+        if self.axis is None:
+            return self.begin
+        return plus(t, times(t, index[self.axis], self.by), self.begin)
+
+
+def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_Along]) -> Array:
+    """An array that shows the numbers of another one.
+
+    **Arguments:** the text; the array; the new shape; how it goes along each axis of the array.
+    """
+    cuts: dict[int, set[int]] = {}
+    if any(along[a].by != 1 for a in x.cuts):
+        x = stored(t, x)
+    for a, places in x.cuts.items():
+        if (axis := along[a].axis) is not None:
+            cuts.setdefault(axis, set()).update(n - along[a].begin for n in places)
+    if isinstance(x, Formula) and x.value is not None:
+        return uniform(shape, x.value)
+    if isinstance(x, Strided):
+        steps, offset = [0] * len(shape), 0
+        for stride, way in zip(x.strides, along, strict=True):
+            offset += stride * way.begin
+            if way.axis is not None:
+                steps[way.axis] += stride * way.by
+        return x.viewed(shape, steps, offset)
+    known = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
+    number = lambda i: x.at(t, tuple(way.place(t, i) for way in along))
+    return Formula(tuple(shape), x.kind, number, is_cheap(x), cuts=known)
+
+
+@structural("reshape", "squeeze", "expand_dims")
+def _(t, p, avals, x):
+    return reshaped(t, x, avals[0].shape)
+
+
+def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
+    """The numbers of an array in another shape, in the same order."""
+    if isinstance(x, Registers):
+        return Registers(x.values.reshape(shape), x.kind)
+    mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
+    if [x.shape[i] for i in mine] == [shape[i] for i in other]:
+        axes = dict(zip(mine, other, strict=True))
+        return _moved(t, x, shape, [_Along(axes.get(a)) for a in range(x.ndim)])
+    if not isinstance(x, Strided) or [x.strides[i] for i in mine] != [
+        contiguous(x.shape)[i] for i in mine
+    ]:
+        x = stored(t, x)
+    return x.viewed(shape, contiguous(shape))
+
+
+@structural("transpose")
+def _(t, p, avals, x):
+    return transposed(t, x, p["permutation"])
+
+
+def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
+    """An array with its axes in another order."""
+    order = list(order)
+    along = [_Along(order.index(a)) for a in range(x.ndim)]
+    return _moved(t, x, [x.shape[a] for a in order], along)
+
+
+@structural("rev")
+def _(t, p, avals, x):
+    turned = p["dimensions"]
+    along = [_Along(a, -1, n - 1) if a in turned else _Along(a) for a, n in enumerate(x.shape)]
+    return _moved(t, x, x.shape, along)
+
+
+@structural("slice")
+def _(t, p, avals, x):
+    # JAX's transposes have NumPy's integers.
+    ways = zip(p["strides"] or [1] * x.ndim, p["start_indices"], strict=True)
+    along = [_Along(a, int(by), int(begin)) for a, (by, begin) in enumerate(ways)]
+    return _moved(t, x, avals[0].shape, along)
+
+
+def part_along(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
+    """The part of an array between two places of an axis."""
+    shape = [end - begin if a == axis else n for a, n in enumerate(x.shape)]
+    return _moved(t, x, shape, [_Along(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
+
+
+@structural("split")
+def _(t, p, avals, x):
+    x, axis = settled(t, x), p["axis"]
+    ends = np.cumsum([0, *(aval.shape[axis] for aval in avals)]).tolist()
+    return tuple(part_along(t, x, axis, begin, end) for begin, end in pairwise(ends))
+
+
+@structural("unstack")
+def _(t, p, avals, x):
+    x, axis, shape = settled(t, x), p["axis"], avals[0].shape
+    return tuple(reshaped(t, part_along(t, x, axis, i, i + 1), shape) for i in range(len(avals)))
+
+
+@structural("empty2")
+def _(t, p, avals):
+    return uniform(avals[0].shape, t.zero(kind_of(avals[0].dtype)))
+
+
+@structural("broadcast_in_dim")
+def _(t, p, avals, x, *sizes):
+    shape, where = tuple(p["shape"]), p["broadcast_dimensions"]
+    size = int(np.prod(shape, dtype=int))
+    if size > MOST_IN_REGISTERS:
+        x = addressable(t, x)
+    if x.size < size:  # else nothing would be computed twice
+        x = settled(t, x)
+    pairs = zip(where, x.shape, strict=True)
+    return _moved(t, x, shape, [_Along(a if n != 1 else None) for a, n in pairs])
+
+
+def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
+    """The first array where a flag holds, else the second, where they differ in a few places only,
+    as in a state of which one number was changed; else `None`."""
+    cuts = joined(a.cuts, b.cuts)
+    if len(cuts) != 1:
+        return None
+    ((axis, places),) = cuts.items()
+    parts = []
+    for begin, end in pairwise(sorted({0, a.shape[axis], *places})):
+        x, y = (_piece(t, z, axis, begin, end) for z in (a, b))
+        part = x if same(x, y) else held(t, selected(t, flag, x, y))
+        parts.append(part)
+    return Pieces(a.shape, a.kind, axis, tuple(parts))
+
+
+def _piece(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
+    """What lies between two places of an axis; the numbers that it was put together from, if it
+    was."""
+    first = 0
+    for part in x.parts if isinstance(x, Pieces) and x.axis == axis else ():
+        size = part.shape[axis]
+        if first <= begin and end <= first + size:
+            return _piece(t, part, axis, begin - first, end - first)
+        first += size
+    return part_along(t, addressable(t, x), axis, begin, end)
+
+
+# --- arrays put together
+
+
+@structural("concatenate")
+def _(t, p, avals, *xs):
+    parts = tuple(x for x in xs if x.size)
+    return Pieces(avals[0].shape, kind_of(avals[0].dtype), p["dimension"], parts)
+
+
+@structural("stack")
+def _(t, p, avals, *xs):
+    axis, aval = p["axis"], avals[0]
+    shape = (*aval.shape[:axis], 1, *aval.shape[axis + 1 :])
+    parts = [reshaped(t, x, shape) for x in xs]
+    return Pieces(aval.shape, kind_of(aval.dtype), axis, tuple(parts))
+
+
+@structural("pad")
+def _(t, p, avals, x, value):
+    number = value.at(t, ())
+    if any(inside for _, _, inside in p["padding_config"]):
+        x = _spread(t, p["padding_config"], x, number)
+    for axis, (low, high, _) in enumerate(p["padding_config"]):
+        low, high = int(low), int(high)
+        before, after = (
+            uniform([max(0, n) if a == axis else m for a, m in enumerate(x.shape)], number)
+            for n in (low, high)
+        )
+        size = max(0, low) + x.shape[axis] + max(0, high)
+        shape = tuple(size if a == axis else m for a, m in enumerate(x.shape))
+        x = Pieces(shape, value.kind, axis, tuple(y for y in (before, x, after) if y.size))
+        if min(low, high) < 0:  # that much is cut off
+            x = part_along(t, x, axis, max(0, -low), size + min(0, high))
+    return x
+
+
+def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: Value) -> Array:
+    """An array with so many other numbers between its own along each axis."""
+    between = [int(inside) for _, _, inside in config]
+    shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
+    whole = uniform(shape, number)
+    if isinstance(x, Registers) and whole.size <= MOST_IN_REGISTERS:
+        out = held(t, whole)
+        out.values[tuple(slice(None, None, i + 1) for i in between)] = x.values
+        return out
+    out = stored(t, whole)
+    steps = [(i + 1) * s for i, s in zip(between, out.strides, strict=True)]
+    fill(t, out, x, strides=steps)
+    return out
+
+
+@structural("iota")
+def _(t, p, avals, *sizes):
+    kind, axis = kind_of(p["dtype"]), p["dimension"]
+    number = lambda index: convert(t, in_lanes(t, index[axis]), kind, False)
+    return Formula(tuple(p["shape"]), kind, number, cheap=True)
+
+
+# --- places that the data name
+
+
+def _within(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Value]:
+    """A place of this type moved to between 0 and the greatest, and whether it was there."""
+    place = convert(t, given, "i64", is_unsigned(dtype))
+    if place.number is not None:
+        inside = 0 <= int(place.number) <= greatest
+        return min(max(int(place.number), 0), greatest), t.constant(inside, "i1")
+    last = t.constant(greatest, "i64")
+    low = compare(t, "ge", place, t.zero("i64"), False)
+    high = compare(t, "le", place, last, False)
+    inside = t.both(low, high)
+    return t.select(low, t.select(high, place, last), t.zero("i64")), inside
+
+
+def _starts(t: Text, starts, dtypes, sizes, shape) -> list[Index]:
+    """Where a block of `sizes` begins, moved so that it lies within the array."""
+    return [
+        _within(t, s.at(t, ()), d, n - m)[0]
+        for s, d, m, n in zip(starts, dtypes, sizes, shape, strict=True)
+    ]
+
+
+@placed("dynamic_slice")
+def _(t, p, avals, d, x, *starts):
+    begin, x = _starts(t, starts, d[1:], p["slice_sizes"], x.shape), in_one(t, x)
+    number = lambda index: x.at(t, [plus(t, i, j) for i, j in zip(index, begin, strict=True)])
+    return Formula(tuple(avals[0].shape), x.kind, number)
+
+
+@placed("dynamic_update_slice")
+def _(t, p, avals, d, x, update, *starts):
+    begin, axes = _starts(t, starts, d[2:], update.shape, x.shape), range(x.ndim)
+    if all(isinstance(i, int) for i in begin):
+        update = settled(t, update)
+    inside = t.constant(True, "i1")
+    return _with_blocks(t, x, update, axes, axes, lambda _: ([*begin], inside))
+
+
+def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
+    """A large array with other numbers in a window, without a copy; `None` unless the window
+    leaves out something along one axis only.
+
+    **Arguments:** the text; the array; of each axis where the window begins and its size; its
+    numbers by their index in it.
+    """
+    axes = [a for a, (_, n) in enumerate(window) if n != x.shape[a]]
+    if len(axes) != 1 or isinstance(x, Registers):
+        return None
+    axis, shape = axes[0], tuple(n for _, n in window)
+    begin, size = window[axis]
+    parts: list[Array] = [part_along(t, x, axis, 0, begin)] if begin else []
+    parts.append(held(t, Formula(shape, x.kind, new)))
+    if begin + size < x.shape[axis]:
+        parts.append(part_along(t, x, axis, begin + size, x.shape[axis]))
+    return Pieces(x.shape, x.kind, axis, tuple(parts))
+
+
+def _copy(t: Text, x: Array, in_memory: bool) -> Registers | Strided:
+    """A copy of an array that may be changed, in memory if it is large or that is asked for."""
+    if in_memory or not isinstance(x, Registers):
+        return stored(t, x)
+    return Registers(x.values.copy(), x.kind)
+
+
+class _Asked(NamedTuple):
+    """Where the data name blocks of an array."""
+
+    indices: Array
+    dtype: Any
+    axes: Sequence[int]
+    """The axes whose places the last axis of the indices names."""
+    batched: Sequence[tuple[int, int]]
+    """Axes whose place is that of an axis of the indices."""
+    greatest: Sequence[int]
+    """The last place at which a block may begin, of each axis."""
+    clipped: bool
+    """Whether a block that is not within the array is moved into it."""
+
+    def corner(self, t: Text, batch: Sequence[Index]) -> tuple[list[Index], Value]:
+        """Where the block begins that is named at a place of the indices, moved into the array; and
+        whether it counts: it was in it, or such blocks are moved."""
+        place: list[Index] = [0] * len(self.greatest)
+        for a, b in self.batched:
+            place[a] = batch[b]
+        inside = t.constant(True, "i1")
+        for k, a in enumerate(self.axes):
+            given = self.indices.at(t, (*batch, k))
+            place[a], here = _within(t, given, self.dtype, self.greatest[a])
+            inside = inside if self.clipped else t.both(inside, here)
+        return place, inside
+
+
+@placed("gather")
+def _(t, p, avals, d, x, indices):
+    n, aval, x, indices = p["dimension_numbers"], avals[0], in_one(t, x), in_one(t, indices)
+    gone = (*n.collapsed_slice_dims, *n.operand_batching_dims)
+    inner = [a for a in range(x.ndim) if a not in gone]
+
+    asked = _Asked(
+        indices, d[1], n.start_index_map,
+        tuple(zip(n.operand_batching_dims, n.start_indices_batching_dims, strict=True)),
+        [size - own for size, own in zip(x.shape, p["slice_sizes"], strict=True)],
+        "FILL" not in str(p["mode"]),
+    )  # fmt: skip
+
+    def number(index: tuple[Index, ...]) -> Value:
+        place, inside = asked.corner(t, [i for a, i in enumerate(index) if a not in n.offset_dims])
+        for a, i in zip(inner, [index[o] for o in n.offset_dims], strict=True):
+            place[a] = plus(t, place[a], i)
+        outside = t.constant(_filling(p["fill_value"], aval.dtype), x.kind)
+        return t.select(inside, x.at(t, place), outside)
+
+    return Formula(tuple(aval.shape), x.kind, number)
+
+
+def _filling(given, dtype):
+    """What JAX takes for a number from outside an array."""
+    if given is not None:
+        return given
+    dtype = np.dtype(dtype)
+    if dtype.kind == "f":
+        return float("nan")
+    if dtype.kind == "b":
+        return True
+    return np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
+
+
+def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices, update) -> Array:
+    """An array with numbers put at places given by the data, or added, … (`how`); what lies outside
+    is left out, unless the mode says that places are moved inside."""
+    d = p["dimension_numbers"]
+    gone = (*d.inserted_window_dims, *d.operand_batching_dims)
+    inner, axes = [a for a in range(x.ndim) if a not in gone], d.update_window_dims
+    sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
+    asked = _Asked(
+        in_one(t, indices), dtypes[1], d.scatter_dims_to_operand_dims,
+        tuple(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True)),
+        [n - sizes.get(a, 1) for a, n in enumerate(x.shape)], "CLIP" in str(p["mode"]),
+    )  # fmt: skip
+    combined = how and partial(ELEMENTWISE[how], t, {}, dtypes)
+    return _with_blocks(t, x, settled(t, update), inner, axes, partial(asked.corner, t), combined)
+
+
+def _with_blocks(
+    t: Text, x: Array, update: Array, inner: Sequence[int], axes: Sequence[int],
+    corner: Callable, combined: Callable[[Value, Value], Value] | None = None,
+) -> Array:  # fmt: skip
+    """An array with blocks of other numbers.
+
+    **Arguments:** the text; the array; the blocks; the axes of the array along which they extend,
+    and which axes of `update` these are; where a block begins by its place along the other axes of
+    `update`, and whether it counts; the new number by the old one and that of `update`, which
+    by default replaces it.
+    """
+    sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
+    others = [n for o, n in enumerate(update.shape) if o not in axes]
+    if int(np.prod(others, dtype=int)) == 1:
+        first, inside = corner([0] * len(others))
+        if all(isinstance(i, int) for i in first) and inside.number:
+            window = [(i, sizes.get(a, 1)) for a, i in enumerate(first)]
+
+            def changed(index: tuple[Index, ...]) -> Value:
+                given: list[Index] = [0] * update.ndim
+                for a, o in zip(inner, axes, strict=True):
+                    given[o] = index[a]
+                if combined is None:
+                    return update.at(t, given)
+                old = x.at(t, [plus(t, i, b) for i, (b, _) in zip(index, window, strict=True)])
+                return combined(old, update.at(t, given))
+
+            found = _patched(t, x, window, changed)
+            if found is not None:
+                return found
+    out = _copy(t, x, not isinstance(update, Registers))
+
+    def put(index: tuple[Index, ...]) -> None:
+        place, inside = corner([i for o, i in enumerate(index) if o not in axes])
+        for a, i in zip(inner, [index[o] for o in axes], strict=True):
+            place[a] = plus(t, place[a], i)
+        value = update.at(t, index)
+        new = lambda old: value if combined is None else combined(old, value)
+        put_at(t, out, place, lambda old: t.select(inside, new(old), old))
+
+    over_all(t, update, put)
+    return out
+
+
+def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callable) -> None:
+    """Change the number of an array at a place: in memory, or in registers at all places that
+    it may be.
+
+    **Arguments:** the text; the array; the place; the new number as a function of the old one.
+    """
+    if isinstance(x, Strided):
+        where, memory = place_of(t, place, x.strides, x.offset), x.source
+        memory.store(t, where, new(memory.load(t, where, x.kind)))  # pyright: ignore[reportAttributeAccessIssue]
+        return
+    for way in np.ndindex(x.shape):
+        here = t.constant(True, "i1")
+        for i, n in zip(place, way, strict=True):
+            if isinstance(i, int):
+                here = t.both(here, t.constant(i == n, "i1"))
+            else:
+                asked = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
+                here = t.both(here, asked)
+        if here.number is None or here.number:
+            x.values[way] = t.select(here, new(x.values[way]), x.values[way])
+
+
+PLACED["scatter"] = partial(_scatter, None)
+for _name in ("add", "mul", "sub", "min", "max"):
+    # JAX 0.10.2 spells some of them with an underscore.
+    for _dash in "-_":
+        PLACED[f"scatter{_dash}{_name}"] = partial(_scatter, _name)
+
+
+# --- sums and the like
+
+# Sums at once of a long sum, each of which waits for itself: a fused multiply-add takes four cycles
+# and two begin in each.
+_SUMS = 8
+
+
+# A bound on the length of what is written, and thereby on the time of compilation.
+_FEW = 4
+
+
+def reduced(
+    t: Text, number: int, term: Callable[[Index], Value], how: Callable, empty: Value,
+    *, in_order: bool = False,
+) -> Value:  # fmt: skip
+    """All terms put together, several chains at once.
+
+    **Arguments:** the text; how many terms; each by its number; of two values one; that of none;
+    whether the terms are written one after the other instead.
+    """
+    if number == 0:
+        return empty
+    if in_order:
+        return functools.reduce(how, map(term, range(number)))
+    chains = _SUMS if number >= 2 * _SUMS else 1
+    turns, rest = divmod(number, chains)
+    first = [term(j) for j in range(chains)]
+
+    def turn(i: Index, carry: list[Value]) -> list[Value]:
+        begin = times(t, plus(t, i, 1), chains)
+        return [how(c, term(plus(t, begin, j))) for j, c in enumerate(carry)]
+
+    found = counted(t, turns - 1, turn, first)
+    found = [*found, *(term(turns * chains + j) for j in range(rest))]
+    while len(found) > 1:
+        pairs = [how(a, b) for a, b in zip(found[::2], found[1::2], strict=False)]
+        found = pairs + found[len(pairs) * 2 :]
+    return found[0]
+
+
+def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
+    """Along some axes all numbers put together by the rule `how`; `empty` stands for none."""
+    ((aval,), axes), in_order = (avals, tuple(map(int, p["axes"]))), isinstance(x, Registers)
+    kind, both = kind_of(aval.dtype), partial(ELEMENTWISE[how], t, {}, [aval.dtype])
+    x = _grouped(t, x, (*([a] for a in range(x.ndim) if a not in axes), axes))
+
+    def number(index):
+        term, none = lambda i: x.at(t, (*index, i)), t.constant(empty, kind)
+        return reduced(t, x.shape[-1], term, both, none, in_order=in_order)
+
+    if in_order:
+        return Registers.of(aval.shape, kind, number)
+    # A loop of its own for each number; they are written one after the other if they are few.
+    formula = Formula(tuple(aval.shape), kind, number)
+    return formula if formula.size <= _FEW else stored(t, formula)
+
+
+def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
+    """An array with its axes in another order, each group of them made one."""
+    x = stored(t, x) if x.cuts else x
+    order = [a for group in groups for a in group]
+    if order != list(range(x.ndim)):
+        x = held(t, transposed(t, x, order))
+    sizes = iter(x.shape)
+    shape = tuple(int(np.prod([next(sizes) for _ in group], dtype=int)) for group in groups)
+    return reshaped(t, x, shape)
+
+
+def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
+    """Each number put together with all before it along an axis, by a rule's name."""
+    how = partial(ELEMENTWISE[name], t, {}, [avals[0].dtype])
+    if isinstance(x, Registers):
+        out = np.moveaxis(x.values, p["axis"], 0).copy()
+        out = out[::-1] if p["reverse"] else out
+        for i in range(1, len(out)):
+            before, here = (Registers(out[n : n + 1], x.kind) for n in (i - 1, i))
+            out[i : i + 1] = mapped(t, how, before, here).values
+        out = out[::-1] if p["reverse"] else out
+        return Registers(np.moveaxis(out, 0, p["axis"]), x.kind)
+    x = in_one(t, x)
+    axis, out = p["axis"], room(t, x.shape, x.kind)
+    length = x.shape[axis]
+    others = [1 if a == axis else n for a, n in enumerate(x.shape)]
+
+    def along(index: tuple[Index, ...]) -> None:
+        def put(i: Index, before: Value | None) -> Value:
+            place = plus(t, length - 1, times(t, i, -1)) if p["reverse"] else i
+            whole = (*index[:axis], place, *index[axis + 1 :])
+            value = x.at(t, whole)
+            value = value if before is None else how(before, value)
+            store_at(t, out, whole, value)
+            return value
+
+        first = put(0, None)
+        counted(t, length - 1, lambda i, carry: [put(plus(t, i, 1), carry[0])], [first])
+
+    over(t, others, along)
+    return out
+
+
+for _name, _how in {"sum": "add", "prod": "mul", "max": "max", "min": "min"}.items():
+    STRUCTURAL["reduce_" + _name] = partial(_reduce, _how, int(_how == "mul"))
+    STRUCTURAL["cum" + _name] = partial(_cumulate, _how)
+STRUCTURAL["reduce_and"] = partial(_reduce, "and", 1)
+STRUCTURAL["reduce_or"] = partial(_reduce, "or", 0)
+
+
+def any_in(t: Text, x: Array) -> Value:
+    """Whether any flag of an array holds."""
+    if not x.ndim:
+        return x.at(t, ())
+    axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)
+    return held(t, STRUCTURAL["reduce_or"](t, axes, [flag], x)).at(t, ())
+
+
+# --- products
+
+
+def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Array:
+    """A product of arrays; `product` says what that of two numbers is."""
+    (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
+    free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
+    free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
+    kind, groups = kind_of(avals[0].dtype), ((batch_a, free_a, over_a), (batch_b, free_b, over_b))
+    in_order = avals[0].size <= MOST_IN_REGISTERS and all(isinstance(x, Registers) for x in (a, b))
+    # Of a product with a vector each number of the matrix is asked for once.
+    once_a, once_b = (
+        int(np.prod([x.shape[i] for i in free], dtype=int)) == 1
+        for x, free in ((b, free_b), (a, free_a))
+    )
+    left, right = (
+        _grouped(t, x if in_order else addressable(t, x if once else settled(t, x)), group)
+        for x, once, group in zip((a, b), (once_a, once_b), groups, strict=True)
+    )
+    shape, length = (left.shape[0], left.shape[1], right.shape[1]), left.shape[2]
+
+    def term(i: tuple[Index, ...], k: Index) -> Value:
+        return product(t, left.at(t, (i[0], i[1], k)), right.at(t, (i[0], i[2], k)))
+
+    if in_order:
+        number = lambda i: reduced(
+            t, length, partial(term, i), partial(add, t), t.zero(kind), in_order=True
+        )
+        found = Registers.of(shape, kind, number)
+    elif length == 1:  # nothing is added up
+        found = Formula(shape, kind, lambda i: t.opaque(term(i, 0)))
+    else:
+        found = _product(t, left, right, shape, kind, product)
+    return reshaped(t, found, avals[0].shape)
+
+
+def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Callable) -> Array:
+    """(batch, n, k) times (batch, m, k): sums of several rows at once, so that none waits for
+    itself and a number of the other side is read once for all of them."""
+    batch, rows, columns = shape
+    turned = columns > rows
+    if turned:
+        left, right, rows, columns = right, left, columns, rows
+    multiplied = (lambda x, y: product(t, y, x)) if turned else partial(product, t)
+    out, length, zero = room(t, shape, kind), left.shape[2], t.zero(kind)
+
+    def block(first: Index, number: int, z: Index, column: Index) -> None:
+        if number < _SUMS // 2 and length >= 2 * _SUMS:
+            sums = []
+            for j in range(number):
+                row = plus(t, first, j)
+                term = lambda i, row=row: multiplied(
+                    left.at(t, (z, row, i)), right.at(t, (z, column, i))
+                )
+                sums.append(reduced(t, length, term, partial(add, t), zero))
+        else:
+
+            def turn(i: Index, carry: list[Value]) -> list[Value]:
+                other = right.at(t, (z, column, i))
+                return [
+                    add(t, c, multiplied(left.at(t, (z, plus(t, first, j), i)), other))
+                    for j, c in enumerate(carry)
+                ]
+
+            sums = counted(t, length, turn, [zero] * number)
+        for j, value in enumerate(sums):
+            row = plus(t, first, j)
+            index = (z, column, row) if turned else (z, row, column)
+            store_at(t, out, index, value)
+
+    whole, rest = divmod(rows, _SUMS)
+    for number, first, turns in ((_SUMS, 0, whole), (rest, whole * _SUMS, 1)):
+
+        def part(i: tuple[Index, ...], number: int = number, first: int = first) -> None:
+            block(plus(t, times(t, i[2], _SUMS), first), number, i[0], i[1])
+
+        if number:
+            over(t, (batch, columns, turns), part)
+    return out
+
+
+STRUCTURAL["dot_general"] = lambda t, p, avals, a, b: _dot(t, p, avals, a, b, mul)
+
+
+@structural("weighted_dot")
+def _(t, p, avals, weight, slope):
+    product = lambda t, a, b: weighted(t, a, mul(t, a, b))
+    if p["weight_first"]:
+        return _dot(t, p, avals, weight, slope, product)
+    return _dot(t, p, avals, slope, weight, lambda t, a, b: product(t, b, a))
