@@ -3,7 +3,7 @@
 A thread takes a group of lanes at a time. All of them go forward until the last has ended, and the
 group's carry is kept of every iteration, on the *tape*. Then it goes back: through `end`, through
 the iterations from the last to the first, through `begin`. A lane takes part in the iterations that
-it had. The driver is scalar code (`_driver.py`); it calls these functions, each of which reads and
+it had. The driver is scalar code (`DRIVER`); it calls these functions, each of which reads and
 writes the group's *frame*, and is written by the method of its name:
 
     begin       takes up new lanes: their inputs, their first carry
@@ -22,25 +22,29 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from ._array_rules import any_in
-from ._arrays import MOST_IN_REGISTERS, Array, Registers, held, mapped, splat
-from ._group import (
-    Frame,
-    add_all,
-    only_in,
-    select_all,
-    tape_add,
-    tape_load,
-    tape_size,
-    tape_store,
-    zeros,
+from ._arrays import (
+    MOST_IN_REGISTERS,
+    Array,
+    Masked,
+    Memory,
+    Registers,
+    Strided,
+    contiguous,
+    fill,
+    held,
+    mapped,
+    selected,
+    splat,
+    stored,
+    uniform,
 )
-from ._memory import gathering, load_pointer, load_stride, over_rows, scatter, shared
-from ._operations import compare, kind_of
+from ._kernel import gathering, load_pointer, load_stride, over_rows, scatter, shared
+from ._operations import add, compare, kind_of
 from ._reverse import ReverseProgram
 from ._text import RARE, FixedText, Text, Value, attributes
 from ._vector import write
 
-# The scalar code that drives a group of lanes forward and back (`_tape.py`), as LLVM's text.
+# The scalar code that drives a group of lanes forward and back, as LLVM's text.
 #
 # The blocks, of which `docs/internals/lanes.md` has the picture:
 #
@@ -190,11 +194,6 @@ def reverse_text(
     return _Writer(program, width, one_for_all).text(bits, entries, most)
 
 
-def _read(t: Text, pointer: str, stride: Value, lane: Value, aval: Any, mask: Value) -> Array:
-    """An array of each lane, zeros where `mask` does not hold (see `gathering`)."""
-    return held(t, gathering(t, pointer, t.binary("mul", lane, stride), aval, mask))
-
-
 # The types of a lane's number, and of what is counted for a lane; of a truth value.
 _LANE, _FLAG = np.zeros((), np.int64), np.zeros((), bool)
 
@@ -209,7 +208,7 @@ class _Writer:
         self.declared: dict[str, str] = {}
         self.arena = 0
         n = len(self.base.in_avals)
-        self.inputs, self.weights = program.in_avals[:n], program.in_avals[n:]
+        self.inputs = program.in_avals[:n]
         self.shared = [
             here and a.size > MOST_IN_REGISTERS
             for here, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
@@ -219,20 +218,19 @@ class _Writer:
         self.carried = [
             a for a, here in zip(program.carry_avals, program.carried, strict=True) if here
         ]
-        # An entry of the tape: the carry, and how many rows were complete before the iteration.
-        self.entry = [*program.carry_avals, _LANE]
         parts = {
-            "now": self.entry,  # as an entry of the tape
+            # An entry of the tape: the carry, and how many rows were complete before the iteration.
+            "carry": program.carry_avals,
+            "rows": [_LANE],
             "lane": [_LANE],  # its number; -1 for a slot without one
             "count": [_LANE],  # its iterations
-            "inputs": self._own(self.inputs),
+            # Those of which each lane has its own, or that are small.
+            "inputs": [x for x, here in zip(self.inputs, self.shared, strict=True) if not here],
             "undefined": [_FLAG],  # whether a cotangent that was given makes all others NaN
             "to_inputs": self.varied,  # cotangents so far
             "to_carry": self.carried,
         }
         self.frame = Frame(parts, width)
-        # Where it has the numbers of rows, the last part of an entry.
-        self.rows_place = self.frame.places["now"] + tape_size(self.entry[:-1], width)
 
     def text(self, bits: int, entries: int, most: int) -> str:
         """LLVM's text of the module: forward sweep, backward sweep, and the driver of both."""
@@ -241,7 +239,7 @@ class _Writer:
         ]  # fmt: skip
         driver = DRIVER.format(
             width=self.width, frame=64 + self.frame.size + self.arena, entries=entries, most=most,
-            entry=tape_size(self.entry, self.width), call=_ARGUMENTS, out_of_memory=OUT_OF_MEMORY,
+            entry=self.frame.places["lane"], call=_ARGUMENTS, out_of_memory=OUT_OF_MEMORY,
         )  # fmt: skip
         return "\n".join([*self.declared.values(), *functions, driver, attributes(bits), RARE, ""])
 
@@ -255,17 +253,11 @@ class _Writer:
 
     # What the functions share
 
-    def _own(self, inputs: list[Any]) -> list[Any]:
-        """Those inputs of which each lane has its own, or that are small."""
-        return [x for x, shared in zip(inputs, self.shared, strict=True) if not shared]
-
     def _load_inputs(self, t: Text) -> list[Array]:
         """The inputs: large ones that all lanes share where XLA keeps them."""
         own = iter(self.frame.load(t, "inputs"))
         return [
-            shared(load_pointer(t, "inputs", i), aval.shape, kind_of(aval.dtype))
-            if here
-            else next(own)
+            shared(load_pointer(t, "inputs", i), aval) if here else next(own)
             for i, (aval, here) in enumerate(zip(self.inputs, self.shared, strict=True))
         ]
 
@@ -287,7 +279,7 @@ class _Writer:
                 row = t.binary("mul", place, t.constant(aval.size, "i64"))
                 start = t.binary("add", start, row)
             pointer = load_pointer(t, "inputs", i)
-            arrays.append(_read(t, pointer, t.constant(1, "i64"), start, aval, mask))
+            arrays.append(held(t, gathering(t, pointer, start, aval, mask)))
         return arrays
 
     def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
@@ -355,11 +347,11 @@ class _Writer:
         lane = t.binary("add", splat(t, "%first", "i64"), Value(f"<{places}>", "i64"))
         present = t.binary("icmp slt", lane, splat(t, "%lanes", "i64"), "i1")
         lane = t.select(present, lane, t.constant(-1, "i64"))
-        inputs = [
-            _read(t, load_pointer(t, "inputs", i), load_stride(t, i), lane, aval, present)
-            for i, aval in enumerate(self.inputs)
-            if not self.shared[i]
-        ]
+        inputs = []
+        for i in (i for i, here in enumerate(self.shared) if not here):
+            pointer = load_pointer(t, "inputs", i)
+            first = t.binary("mul", lane, load_stride(t, i))
+            inputs.append(held(t, gathering(t, pointer, first, self.inputs[i], present)))
         self.frame.store_number(t, "lane", lane)
         self.frame.store(t, "inputs", inputs)
         inputs = self._load_inputs(t)
@@ -370,7 +362,8 @@ class _Writer:
         rows = t.cast("zext", t.both(present, complete.item()), "i64")
         count = t.select(going, t.constant(_NO_END, "i64"), t.zero("i64"))
         self.frame.store_number(t, "count", count)
-        self.frame.store(t, "now", [*carry, Registers.one(rows)])
+        self.frame.store(t, "carry", carry)
+        self.frame.store_number(t, "rows", rows)
         return self._function("i1", "begin", ", i64 %first, i64 %lanes", t, f"i1 {t.any(going)}")
 
     def _step(self) -> str:
@@ -379,14 +372,14 @@ class _Writer:
         t = FixedText(self.width)
         number, count = splat(t, "%number", "i64"), self.frame.number(t, "count")
         mask = t.binary("icmp slt", number, count, "i1")
-        inputs = self._load_inputs(t)
-        *carry, rows = self.frame.load(t, "now")
+        inputs, carry = self._load_inputs(t), self.frame.load(t, "carry")
+        rows = self.frame.number(t, "rows")
         given = zeros(t, [*self.carried, *self.program.weight_avals[self.results :]])
         out: list[Any] = write(t, self.program.step.forward, [*inputs, *carry, *given], mask)
         *new, active, complete = out
-        more = t.binary("add", rows.item(), t.cast("zext", complete.item(), "i64"))
-        new = [*new, Registers.one(more)]
-        self.frame.store(t, "now", select_all(t, mask, new, [*carry, rows]))
+        more = t.binary("add", rows, t.cast("zext", complete.item(), "i64"))
+        self.frame.store(t, "carry", select_all(t, mask, new, carry))
+        self.frame.store_number(t, "rows", t.select(mask, more, rows))
         over = t.both(mask, t.inverse(active.item()))
         following = t.binary("add", number, t.constant(1, "i64"))
         count = t.select(over, following, count)
@@ -398,13 +391,12 @@ class _Writer:
         t = FixedText(self.width)
         lane = self.frame.number(t, "lane")
         present = self._present(t, lane)
-        inputs = self._load_inputs(t)
-        *carry, rows = self.frame.load(t, "now")
+        inputs, carry = self._load_inputs(t), self.frame.load(t, "carry")
         avals = self.program.weight_avals[: self.results]
         weights = self._weights(t, 0, avals, lane, None, present)
         self.frame.store_number(t, "undefined", t.constant(False, "i1"))
         self._undefine_by_weights(t, weights)
-        self._undefine_by_missing_rows(t, lane, rows.item(), present)
+        self._undefine_by_missing_rows(t, lane, self.frame.number(t, "rows"), present)
         args = [*inputs, *carry, *weights]
         to_inputs, to_carry = self._back(t, self.program.end.backward, args, present)
         self.frame.store(t, "to_inputs", to_inputs)
@@ -417,18 +409,16 @@ class _Writer:
         t = FixedText(self.width)
         lane, count = self.frame.number(t, "lane"), self.frame.number(t, "count")
         mask = t.binary("icmp slt", splat(t, "%number", "i64"), count, "i1")
-        inputs = self._load_inputs(t)
-        *carry, rows = tape_load(t, "%before", 0, self.entry)
-        *_, after = self.frame.load(t, "now")
-        complete = t.both(mask, t.binary("icmp slt", rows.item(), after.item(), "i1"))
-        weights = self._row_weights(t, lane, rows.item(), complete)
+        inputs, carry = self._load_inputs(t), self.frame.load(t, "carry", "%before")
+        rows, after = (self.frame.number(t, "rows", place) for place in ("%before", "%frame"))
+        complete = t.both(mask, t.binary("icmp slt", rows, after, "i1"))
+        weights = self._row_weights(t, lane, rows, complete)
         to_carry = self.frame.load(t, "to_carry")
         args = [*inputs, *carry, *to_carry, *weights]
         more, new = self._back(t, self.program.step.backward, args, mask)
-        tape_add(t, "%frame", self.frame.places["to_inputs"], self.varied, more)
+        self.frame.add(t, "to_inputs", more)
         self.frame.store(t, "to_carry", select_all(t, mask, new, to_carry))
-        left = Registers.one(t.select(mask, rows.item(), after.item()))
-        tape_store(t, "%frame", self.rows_place, [left])
+        self.frame.store_number(t, "rows", t.select(mask, rows, after))
         return self._function("void", "step_back", ", ptr %before, i64 %number", t, "void")
 
     def _begin_back(self) -> str:
@@ -436,9 +426,8 @@ class _Writer:
         lane = self.frame.number(t, "lane")
         present = self._present(t, lane)
         inputs = self._load_inputs(t)
-        *_, rows = self.frame.load(t, "now")
-        zero = t.zero("i64")
-        complete = t.both(present, t.binary("icmp sgt", rows.item(), zero, "i1"))
+        rows, zero = self.frame.number(t, "rows"), t.zero("i64")
+        complete = t.both(present, t.binary("icmp sgt", rows, zero, "i1"))
         weights = self._row_weights(t, lane, zero, complete)
         args = [*inputs, *self.frame.load(t, "to_carry"), *weights]
         more, _ = self._back(t, self.program.begin.backward, args, present)
@@ -451,3 +440,90 @@ class _Writer:
             start = t.binary("mul", lane, t.constant(x.size, "i64"))
             scatter(t, load_pointer(t, "outputs", i), start, x, present)
         return self._function("void", "begin_back", "", t, "void")
+
+
+# --- whole arrays of a group of lanes: kept in memory and read again, chosen between, added
+
+
+def only_in(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:
+    """The arrays in the lanes where the flag holds, else zeros; what is zero outside of some lanes
+    must be so outside of these."""
+    chosen = select_all(t, flag, arrays, zeros(t, avals))
+    return [x if isinstance(x, Masked) else y for x, y in zip(arrays, chosen, strict=True)]
+
+
+def select_all(t: Text, flag: Value, a: list[Array], b: list[Array]) -> list[Array]:
+    """The arrays `a` in the lanes where the flag holds, else `b`."""
+    return [selected(t, flag, x, y) for x, y in zip(a, b, strict=True)]
+
+
+def add_all(t: Text, a: list[Array], b: list[Array]) -> list[Array]:
+    """The sums of two lists of arrays."""
+    return [mapped(t, lambda x, y: add(t, x, y), x, y) for x, y in zip(a, b, strict=True)]
+
+
+def zeros(t: Text, avals: list[Any]) -> list[Array]:
+    """Zeros of the given shapes and kinds."""
+    return [held(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
+
+
+class Frame:
+    """What a group of lanes keeps from one function of a kernel to the next, behind `%frame`.
+
+    **Arguments:** the parts by name, each arrays of these shapes and types; the lanes of a group.
+    """
+
+    def __init__(self, parts: dict[str, list[Any]], width: int):
+        self._parts, self.places, size = parts, {}, 0
+        """Where each part begins, in bytes."""
+        for name, avals in parts.items():
+            self.places[name] = size
+            size += sum(a.size for a in avals) * 8 * width
+        # What is behind it begins on a line of the cache, as the frame does.
+        self.size = -(-size // 64) * 64
+        """Bytes of the frame."""
+
+    def _arrays(self, t: Text, part: str, pointer: str = "%frame") -> list[Strided]:
+        """The arrays of a part, one after the other; numbers lie `8 * width` bytes apart."""
+        found, place = [], self.places[part]
+        for aval in self._parts[part]:
+            memory, shape = Memory((pointer, place)), tuple(aval.shape)
+            found.append(Strided(shape, kind_of(aval.dtype), memory, contiguous(shape)))
+            place += aval.size * 8 * t.width
+        return found
+
+    def load(self, t: Text, part: str, pointer: str = "%frame") -> list[Any]:
+        """The arrays of a part, of the frame or of what was copied from it; large ones stay where
+        they are."""
+        return [held(t, x) for x in self._arrays(t, part, pointer)]
+
+    def store(self, t: Text, part: str, arrays: list[Array]) -> None:
+        """Write the arrays of a part."""
+        # What is computed from what is overwritten is computed first.
+        arrays = [x if isinstance(x, Registers) else stored(t, x) for x in arrays]
+        for place, x in zip(self._arrays(t, part), arrays, strict=True):
+            fill(t, place, x)
+
+    def add(self, t: Text, part: str, arrays: list[Array]) -> None:
+        """Add arrays to those of a part, of which they are no functions."""
+        places = self._arrays(t, part)
+        rare: dict[Value, list[tuple[Strided, Array]]] = {}
+        sums = add_all(t, [held(t, x) for x in places], arrays)
+        for place, more, new in zip(places, arrays, sums, strict=True):
+            if isinstance(more, Masked):
+                rare.setdefault(more.mask, []).append((place, new))
+            else:
+                fill(t, place, new)
+        # The weights of a law matter in the iterations with an impact.
+        for mask, pairs in rare.items():
+            with t.skipped_unless(mask, rare=True):
+                for place, new in pairs:
+                    fill(t, place, new)
+
+    def number(self, t: Text, part: str, pointer: str = "%frame") -> Value:
+        """The one number of a part."""
+        return self.load(t, part, pointer)[0].item()
+
+    def store_number(self, t: Text, part: str, value: Value) -> None:
+        """Write the one number of a part."""
+        self.store(t, part, [Registers.one(value)])
