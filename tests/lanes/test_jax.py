@@ -54,7 +54,7 @@ def test_what_a_rule_for_partly_known_values_is_given(monkeypatch):
 
 def test_settings_are_known_by_their_names():
     for name in ("compilation_cache_dir", "enable_compilation_cache", "enable_x64"):
-        assert hasattr(jax.config, f"jax_{name}"), f"no setting {name} (_code.py, _trace.py)"
+        assert hasattr(jax.config, f"jax_{name}"), f"no setting {name} (_code.py, loop.py)"
 
 
 def test_compiler_options_within_a_program_are_refused_in_these_words():

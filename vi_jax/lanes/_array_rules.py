@@ -422,7 +422,7 @@ def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices
         tuple(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True)),
         [n - sizes.get(a, 1) for a, n in enumerate(x.shape)], "CLIP" in str(p["mode"]),
     )  # fmt: skip
-    combined = how and partial(ELEMENTWISE[how], t, {}, dtypes)
+    combined = partial(ELEMENTWISE[how], t, {}, dtypes) if how else None
     return _with_blocks(t, x, settled(t, update), inner, axes, partial(asked.corner, t), combined)
 
 

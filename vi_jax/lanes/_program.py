@@ -94,6 +94,11 @@ class LaneProgram(eqx.Module):
         return batch_of(self.in_avals, shapes)
 
 
+def shape_of(x: Any) -> jax.ShapeDtypeStruct:
+    """The shape and type of an array or of an aval."""
+    return jax.ShapeDtypeStruct(x.shape, x.dtype)
+
+
 def batch_of(avals: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
     """The axes of a batch: those that arrays have beyond the ones of a lane's own shapes."""
     for aval, shape in zip(avals, shapes, strict=True):

@@ -3,7 +3,7 @@
 Each of the three functions of a `LaneProgram` is traced once together with its transposed
 derivative (`jax.vjp`), and that jaxpr is taken apart into the way there and the way back. So both
 hold the same equations for the values, in the same order, and where these are computed again for
-the way back they are the same bits (`_fixed.py`).
+the way back they are the same bits (`FixedText` in `_text.py`).
 """
 
 import functools
@@ -30,9 +30,9 @@ from ._program import (
     evaluated,
     inner,
     loop_depends,
+    shape_of,
     walked,
 )
-from ._trace import shape_of
 from ._vector import Unsupported, check
 from .elementary import elementwise_primitive
 

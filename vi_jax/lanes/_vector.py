@@ -1,29 +1,46 @@
 """A jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, chosen
+from ._array_rules import PLACED, STRUCTURAL, any_in, chosen
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
     Formula,
+    Index,
+    Masked,
     Registers,
+    Strided,
+    addressable,
+    counted,
+    fill,
     held,
+    in_one,
     joined,
+    mapped,
     over,
+    plus,
+    replace,
     room,
+    same,
+    selected,
     settled,
     store_at,
+    stored,
     table,
+    times,
     uniform,
 )
-from ._control import CONTROL
-from ._derived import DERIVED, derived
 from ._operations import ELEMENTWISE, SAME, kind_of
-from ._program import called, inner
+from ._program import called, inner, scan_counts, size_of
 from ._text import Text, Value
 
 
@@ -141,7 +158,7 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
     if (body := called(eqn)) is not None:
         return write(t, body, args, mask)
     if name in CONTROL:
-        return CONTROL[name](write, t, params, [settled(t, x) for x in args], mask)
+        return CONTROL[name](t, params, [settled(t, x) for x in args], mask)
     if name == "custom_linear_solve":
         before, _, solve, _ = np.cumsum([0, *params["const_lengths"]])[1:]
         given = int(before + params["const_lengths"].vecmat), int(solve)
@@ -219,3 +236,372 @@ def _only_number(x: Array) -> Value | None:
     if isinstance(x, Registers):
         return x.item() if x.size == 1 else None
     return x.value if isinstance(x, Formula) else None
+
+
+# --- conditions and loops: jaxprs that are skipped or repeated
+
+# The most operations of a loop of known length, all turns together, that are written one after the
+# other. A bound on the time of compilation.
+_MOST_UNROLLED = 256
+
+# A branch of no more operations than this is computed whether any lane needs it or not.
+_CHEAP = 4
+
+
+def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
+    """Each branch is skipped where no lane of the group takes it, but for a cheap one.
+
+    **Arguments:** as for `CONTROL`.
+    """
+    branches, which, args = params["branches"], args[0].item(), args[1:]
+    last = len(branches) - 1
+    taken = []
+    for i in range(len(branches)):
+        how = "sle" if i == 0 else "sge" if i == last else "eq"
+        if which.kind == "i1":
+            flag = which if i else t.inverse(which)
+        else:
+            flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
+        taken.append(flag)
+    # The cheapest comes first: the results of the others replace its own in their lanes.
+    order = sorted(range(len(branches)), key=lambda i: size_of(inner(branches[i])))
+    result: list[Any] | None = None
+    for i in order:
+        if result is None and _is_cheap(inner(branches[i])):
+            result = [settled(t, x) for x in write(t, branches[i], args, mask)]
+            continue
+        result = _branch_if_any(t, branches[i], args, t.both(mask, taken[i]), result)
+    assert result is not None
+    return [_opaque(t, x) for x in result]
+
+
+def _is_cheap(jaxpr: Jaxpr) -> bool:
+    """Whether a branch is not worth skipping: few operations, or constants however many, such as
+    the zeros that are the cotangents of what a branch does not need."""
+    constant = (
+        eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
+        for eqn in jaxpr.eqns
+    )
+    return size_of(jaxpr) <= _CHEAP or all(constant)
+
+
+def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
+    """The results of a jaxpr in the lanes of `mask`, and `otherwise` (or anything, if that is
+    `None`) in the others; skipped if `mask` has no lane."""
+    inside, skip, after = t.label(), t.label(), t.label()
+    # What is large lies in the same memory whichever way was taken.
+    rooms = [_room_for(t, v.aval) for v in inner(jaxpr).outvars]
+    in_memory = any(r is not None for r in rooms)
+    before = t.block
+    t.fork(t.any(mask), inside, skip if in_memory else after, rare=True)
+    t.open(inside)
+    found = write(t, jaxpr, args, mask)
+    laid: list[Any] = []
+    others: list[Any] = [None] * len(found) if otherwise is None else otherwise
+    for x, y, r in zip(found, others, rooms, strict=True):
+        if r is not None:
+            laid.append(_branch_result(t, x, y, r, args, mask))
+        else:
+            laid.append(x if y is None else selected(t, mask, x, y))
+    end = t.block
+    t.line(f"br label %{after}")
+    t.close()
+    if in_memory:
+        t.open(skip)
+        for x, y, r in zip(laid, others, rooms, strict=True):
+            if r is not None and y is not None and x is r:
+                fill(t, r, y)
+        before = t.block
+        t.line(f"br label %{after}")
+        t.close()
+    t.follow(after)
+    if otherwise is None:
+        others = [mapped(t, lambda a: t.zero(a.kind), x) for x in found]
+
+    def either(a: Value, b: Value) -> Value:
+        return a if a == b else t.phi(a.kind, (a.text, end), (b.text, before))
+
+    return [
+        mapped(t, either, x, y) if r is None else x
+        for x, y, r in zip(laid, others, rooms, strict=True)
+    ]
+
+
+def _branch_result(
+    t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value
+) -> Array:
+    """A branch's large result in the lanes of `mask`, and that of the others in theirs. Nothing is
+    copied that need not be: a derivative's branches hand on whole matrices, or zeros in their
+    place.
+
+    **Arguments:** the text; the result `x`; the others', or `None` if it may be anything; memory
+    for what has to be stored; the branch's arguments; its lanes.
+    """
+    mine, other = (a.value if isinstance(a, Formula) else None for a in (x, y))
+    if mine is not None and mine.number is not None and (y is None or mine == other):
+        return x
+    if y is not None and same(x, y):
+        return y
+    if other == t.zero(r.kind):
+        if not (isinstance(x, Strided) and any(same(x, a) for a in args)):
+            fill(t, r, x)
+            x = r
+        return Masked(r.shape, r.kind, x, mask)
+    fill(t, r, x if y is None else selected(t, mask, x, y))
+    return r
+
+
+def _opaque(t: Text, x: Array) -> Array:
+    """What comes out of a condition or a turn of a loop (see `Text.opaque`)."""
+    return mapped(t, t.opaque, x) if isinstance(x, Registers) else x
+
+
+def _room_for(t: Text, aval: Any) -> Strided | None:
+    """Memory for an array that is too large for registers."""
+    return room(t, aval.shape, kind_of(aval.dtype)) if aval.size > MOST_IN_REGISTERS else None
+
+
+def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
+    """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
+    n, m = params["cond_nconsts"], params["body_nconsts"]
+    cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
+    first = [x if isinstance(x, Registers) else stored(t, x) for x in first]
+    head, inside, after = t.label(), t.label(), t.label()
+    before = t.block
+    t.line(f"br label %{head}")
+    t.open(head)
+    place = len(t.lines)
+    carry = [
+        mapped(t, lambda a: Value(t.fresh(), a.kind), x) if isinstance(x, Registers) else x
+        for x in first
+    ]
+    live = Value(t.fresh(), "i1")
+    # Under `vmap` within a lane several loops are one, as long as any of them goes on.
+    asked = settled(t, write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0])
+    going = t.both(live, any_in(t, asked))
+    t.fork(t.any(going), inside, after)
+    t.open(inside)
+    new = write(t, params["body_jaxpr"], [*body_args, *carry], going)
+    if asked.ndim:
+        new = [_chosen_by(t, asked, x, y) for x, y in zip(new, carry, strict=True)]
+    replace(t, carry, new, going)
+    new = [
+        selected(t, going, x, y) if isinstance(x, Registers) else x
+        for x, y in zip(new, carry, strict=True)
+    ]
+    end = t.block
+    t.line(f"br label %{head}")
+    t.close()
+    t.close()
+    begun, back = ([*_flat(first), mask], before), ([*_flat(new), going], end)
+    t.join([*_flat(carry), live], begun, back, at=place)
+    t.follow(after)
+    return carry
+
+
+def _chosen_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
+    """The first array where a flag of its leading axes holds, else the second."""
+    number = lambda i: t.select(flags.at(t, i[: flags.ndim]), a.at(t, i), b.at(t, i))
+    return held(t, Formula(a.shape, a.kind, number, cuts=joined(a.cuts, b.cuts)))
+
+
+def _flat(arrays: list[Any]) -> list[Value]:
+    """The numbers of those arrays that are in registers."""
+    return [v for x in arrays if isinstance(x, Registers) for v in x.values.flat]
+
+
+def _unflat(t: Text, arrays: list[Any], values: list[Value]) -> list[Any]:
+    """Arrays like those given, with other numbers in registers."""
+    left = iter(values)
+    return [mapped(t, lambda _: next(left), x) if isinstance(x, Registers) else x for x in arrays]
+
+
+def _scan(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
+    """A loop of known length: its turns one after the other, unless they are many."""
+    body, length = inner(params["jaxpr"]), params["length"]
+    n, m = scan_counts(params)
+    if length and size_of(body) * length > _MOST_UNROLLED:
+        return _counted_loop(t, params, args, mask)
+    fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
+    order = range(length)[::-1] if params["reverse"] else range(length)
+    kept: dict[int, list[Any]] = {}
+    for i in order:
+        row = [_row_of(t, x, i) for x in rows]
+        out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
+        carry, kept[i] = [_opaque(t, x) for x in out[:m]], [settled(t, x) for x in out[m:]]
+    columns = []
+    for j, var in enumerate(body.outvars[m:]):
+        aval: Any = var.aval
+        column = [kept[i][j] for i in range(length)]
+        whole = jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)
+        columns.append(held(t, STRUCTURAL["stack"](t, {"axis": 0}, [whole], *column)))
+    return [*carry, *columns]
+
+
+def _row_of(t: Text, x: Array, i: Index) -> Array:
+    return held(t, Formula(x.shape[1:], x.kind, lambda j: x.at(t, (i, *j)), cheap=True))
+
+
+def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
+    """A loop of known length with a scalar counter; its rows lie in memory."""
+    (n, m), length = scan_counts(params), params["length"]
+    fixed, rows = args[:n], [addressable(t, in_one(t, x)) for x in args[n + m :]]
+    first = [x if isinstance(x, Registers) else stored(t, x) for x in args[n : n + m]]
+    made: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]
+    columns = [room(t, (length, *a.shape), kind_of(a.dtype)) for a in made]
+
+    def turn(i: Index, values: list[Value]) -> list[Value]:
+        carry = _unflat(t, first, values)
+        place = plus(t, length - 1, times(t, i, -1)) if params["reverse"] else i
+        row = [_row_of(t, x, place) for x in rows]
+        out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
+        for column, x in zip(columns, out[m:], strict=True):
+            steps = column.strides[1:]
+            fill(t, column, x, offset=times(t, place, column.strides[0]), strides=steps)
+        replace(t, carry, out[:m])
+        return _flat(out[:m])
+
+    carry = [_opaque(t, x) for x in _unflat(t, first, counted(t, length, turn, _flat(first)))]
+    return [*carry, *(held(t, x) for x in columns)]
+
+
+CONTROL: dict[str, Callable[..., list[Any]]] = {"cond": _cond, "while": _while, "scan": _scan}
+"""By the primitive's name, functions of the text, the equation's parameters, its arguments, none of
+them a formula that is dear, and which lanes need the results. They return those."""
+
+
+# --- primitives written in JAX: factorisations of small matrices, sorting, arguments of extremes
+
+
+def _lu(a):
+    """A = P⁻¹LU with the largest pivot of each column, of matrices (…, n, m)."""
+    n, m = a.shape[-2:]
+    rows = jnp.arange(n)
+    order = jnp.broadcast_to(rows, a.shape[:-1])
+    pivots = []
+    for k in range(min(n, m)):
+        column = jnp.where(rows >= k, jnp.abs(a[..., k]), -1.0)
+        greatest = jnp.max(column, axis=-1, keepdims=True)
+        pivot = jnp.min(jnp.where(column == greatest, rows, n - 1), axis=-1, keepdims=True)
+        pivots.append(pivot)
+        here = rows == pivot
+
+        def exchanged(x, here=here, k=k):
+            """Row k and the pivot's, each in the other's place."""
+            wide = here.reshape(*here.shape, *(1,) * (x.ndim - here.ndim))
+            first = x[..., k : k + 1, :] if x.ndim > here.ndim else x[..., k : k + 1]
+            other = jnp.sum(jnp.where(wide, x, 0), axis=here.ndim - 1, keepdims=True)
+            moved = jnp.where(wide, first, x)
+            at_k = (rows == k).reshape(n, *(1,) * (x.ndim - here.ndim))
+            return jnp.where(at_k, other, moved)
+
+        a, order = exchanged(a), exchanged(order)
+        largest = a[..., k : k + 1, k : k + 1]
+        # A column of zeros stays one: the matrix is singular.
+        factor = a[..., k : k + 1] / jnp.where(largest == 0, 1, largest)
+        below, right = (rows > k)[:, None], jnp.arange(m) > k
+        a = jnp.where(below & (jnp.arange(m) == k), factor, a)
+        a = jnp.where(below & right, a - factor * a[..., k : k + 1, :], a)
+    pivot = jnp.concatenate(pivots, axis=-1)
+    return a, pivot.astype(jnp.int32), order.astype(jnp.int32)
+
+
+def _triangular_solve(a, b, *, left_side, lower, transpose_a, unit_diagonal, **_):
+    """X of A X = B or X A = B with a triangular A."""
+    if not left_side:  # the same equation transposed
+        a, b = jnp.swapaxes(a, -1, -2), jnp.swapaxes(b, -1, -2)
+        lower = not lower
+    if transpose_a:
+        a, lower = jnp.swapaxes(a, -1, -2), not lower
+    n = a.shape[-1]
+    rows: dict[int, Any] = {}
+    for k in range(n) if lower else range(n)[::-1]:
+        row = b[..., k, :]
+        for j, known in rows.items():
+            row = row - a[..., k, j, None] * known
+        rows[k] = row if unit_diagonal else row / a[..., k, k, None]
+    x = jnp.stack([rows[k] for k in range(n)], axis=-2)
+    return [x if left_side else jnp.swapaxes(x, -1, -2)]
+
+
+def _cholesky(a, **_):
+    """L of A = L Lᵀ; not a number where A is not positive definite."""
+    n = a.shape[-1]
+    out = jnp.zeros_like(a)
+    for k in range(n):
+        column = a[..., k] - jnp.sum(out * out[..., k : k + 1, :], axis=-1)
+        column = column / jnp.sqrt(column[..., k : k + 1])
+        column = jnp.where(jnp.arange(n) >= k, column, 0.0)
+        out = jnp.where(jnp.arange(n) == k, column[..., None], out)
+    return [out]
+
+
+def _sort(*xs, dimension, num_keys, **_):
+    """Arrays in the order of the first, or of several; equal ones keep theirs."""
+    xs = [jnp.moveaxis(x, dimension, -1) for x in xs]
+    n = xs[0].shape[-1]
+    places = jnp.arange(n)
+    before = jnp.broadcast_to(places[None, :] < places[:, None], (*xs[0].shape, n))
+    for x in xs[:num_keys][::-1]:
+        one, other = x[..., :, None], x[..., None, :]
+        one, other = jnp.broadcast_arrays(one, other)
+        # What is not a number comes last, and is as great as any other such.
+        less, same = other < one, one == other
+        if _is_float(x):
+            less, same = (
+                less | (one != one) & (other == other),
+                same | (one != one) & (other != other),
+            )
+        before = less | same & before
+    rank = jnp.sum(before, axis=-1, dtype=places.dtype)
+    there = rank[..., None, :] == places[:, None]
+
+    def placed(x):
+        found = jnp.sum(jnp.where(there, x[..., None, :], 0), axis=-1, dtype=x.dtype)
+        if not _is_float(x):
+            return found
+        # A sum has lost the sign of -0.
+        negative = jnp.any(there & (1 / x < 0)[..., None, :], axis=-1)
+        return jnp.where((found == 0) & negative, -0.0, found)
+
+    sorted_ = [placed(x) for x in xs]
+    return [jnp.moveaxis(x, -1, dimension) for x in sorted_]
+
+
+def _is_float(x) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.floating)
+
+
+def _first_extreme(extreme: Callable, x, *, axes, index_dtype, **_):
+    (axis,) = axes
+    n = x.shape[axis]
+    places = lax.broadcasted_iota(index_dtype, x.shape, axis)
+    best = extreme(x, axis=axis, keepdims=True)
+    here = (x == best) | (x != x)
+    return [jnp.min(jnp.where(here, places, n - 1), axis=axis)]
+
+
+def _tile(x, *, reps):
+    wide = jnp.broadcast_to(
+        x.reshape([n for m in x.shape for n in (1, m)]),
+        [n for r, m in zip(reps, x.shape, strict=True) for n in (r, m)],
+    )
+    return [wide.reshape([r * m for r, m in zip(reps, x.shape, strict=True)])]
+
+
+DERIVED: dict[str, Callable[..., Any]] = {
+    "lu": lambda a, **_: _lu(a),
+    "triangular_solve": _triangular_solve,
+    "cholesky": _cholesky,
+    "sort": _sort,
+    "tile": _tile,
+    "argmin": functools.partial(_first_extreme, jnp.min),
+    "argmax": functools.partial(_first_extreme, jnp.max),
+}
+"""Functions of a primitive's arguments and parameters that give its results."""
+
+
+def derived(name: str, avals: list[Any], params: dict[str, Any]) -> ClosedJaxpr:
+    """What a primitive does, as a jaxpr of others."""
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    return jax.make_jaxpr(lambda *args: DERIVED[name](*args, **params))(*shapes)

@@ -1,18 +1,27 @@
-"""`run`: one lane's loop, written as JAX; batched by `vmap` it runs as vector code."""
+"""`run`: one lane's loop, written as JAX; batched by `vmap` it runs as vector code.
+
+The functions are traced as jaxprs of flat arguments, once for equal functions and inputs.
+"""
 
 import functools
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
+from types import FunctionType
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer, eval_jaxpr
+from jax.extend.core import ClosedJaxpr
 
 from . import _backward as _backward  # how `lanes_p` is differentiated in reverse mode
 from ._primitive import lanes_p
-from ._shared import within
-from ._trace import Functions, traced
+from ._program import LaneProgram, shape_of
+from ._shared import Recent, within
 
 BACKENDS = ("auto", "xla")
 
@@ -103,3 +112,189 @@ def _no_step(inputs: object, carry: object) -> tuple[Any, Emitted]:
 
 def _end_with(function: Callable[[Any], Any], inputs: object, carry: object) -> Any:
     return function(inputs)
+
+
+# --- tracing
+
+
+class Functions(NamedTuple):
+    """The functions of a lane, as `run` takes them."""
+
+    begin: Callable[..., Any]
+    step: Callable[..., Any]
+    end: Callable[..., Any]
+
+
+class Traced(NamedTuple):
+    """The program of a lane, and how its results are put together again."""
+
+    program: LaneProgram
+    consts: list[Any]
+    """Arrays that the functions close over, which are further inputs."""
+    out: Any
+    """The structure of the results."""
+    row: Any
+    """The structure of a row."""
+
+
+_recent: "Recent[Any, Traced]" = Recent(64)
+
+
+def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: int) -> Traced:
+    """The program for inputs of one structure, and of their leaves' shapes and types.
+
+    **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` of
+    the `LaneProgram`.
+    """
+    shapes = [shape_of(x) for x in leaves]
+    try:
+        jax.eval_shape(_clear_with_jax, jax.ShapeDtypeStruct((), jnp.int32))
+        key = (
+            *map(_function_key, functions),
+            treedef,
+            *((x.shape, x.dtype) for x in shapes),
+            rows,
+            bool(jax.config.jax_enable_x64),  # pyright: ignore
+        )
+        found = _recent.get(key)
+    except (TypeError, ValueError):  # no hash, or whether two are equal is not known
+        return _traced(functions, treedef, shapes, rows)
+    if found is None:
+        found = _traced(functions, treedef, shapes, rows)
+        if not any(isinstance(x, Tracer) for x in found.consts):
+            _recent.put(key, found)
+    return found
+
+
+@jax.jit
+def _clear_with_jax(x: object) -> Any:
+    # Traced again only after `jax.clear_caches()`, which has no public hook (JAX 0.10.2).
+    _recent.clear()
+    return x
+
+
+def _function_key(function: Callable[..., Any]) -> tuple:
+    """A key that is equal only for functions that do the same, as long as they are pure.
+
+    **Raises:** `TypeError` where that cannot be known.
+    """
+    if isinstance(function, functools.partial):
+        if function.keywords:
+            raise TypeError("no place in an order")
+        return (_function_key(function.func), *map(_argument_key, function.args))
+    if not isinstance(function, FunctionType) or function.__closure__ is not None:
+        # A decorated function closes over what it decorates, and a jitted one hides it. If it is
+        # that of its module, there is only one.
+        module = sys.modules.get(getattr(function, "__module__", ""))
+        if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
+            raise TypeError("perhaps made for this call")
+    return (function,)
+
+
+def _argument_key(x: object) -> tuple:
+    """The same for an argument that is bound by `functools.partial`: a function or a pytree."""
+    if isinstance(x, FunctionType | functools.partial):
+        return _function_key(x)
+    leaves, treedef = jtu.tree_flatten(x)
+    return (treedef, *map(_constant_key, leaves))
+
+
+def _constant_key(x: object) -> Any:
+    """A key that is equal only for equal constants: 1, 1.0 and True differ, and 0.0 and -0.0.
+
+    **Raises:** `TypeError` for what may vary.
+    """
+    if isinstance(x, jax.Array):
+        raise TypeError("no constant")
+    if isinstance(x, np.ndarray | np.generic):
+        if x.dtype.hasobject:
+            raise TypeError("no numbers")
+        return np.ndarray, x.shape, x.dtype, x.tobytes()
+    if isinstance(x, float | complex):
+        return type(x), float.hex(x.real), float.hex(x.imag)
+    return type(x), x
+
+
+def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) -> Traced:
+    """As `traced`, without a look at what was traced before."""
+    n = len(leaves)
+    structures: dict[str, Any] = {}
+
+    def begun(*args):
+        carry, (active, complete, row) = functions.begin(jtu.tree_unflatten(treedef, args))
+        found, structures["carry"] = jtu.tree_flatten(carry)
+        first, structures["row"] = jtu.tree_flatten(row)
+        return [*found, _flag(active), _flag(complete), *first]
+
+    begin = jax.make_jaxpr(begun)(*leaves)
+    size = structures["carry"].num_leaves
+    carried = begin.out_avals[:size]
+
+    def stepped(*args):
+        carry = jtu.tree_unflatten(structures["carry"], args[n:])
+        inputs = jtu.tree_unflatten(treedef, args[:n])
+        carry, (active, complete, row) = functions.step(inputs, carry)
+        found = _checked("carry", structures["carry"], carry, carried)
+        next_row = _checked("row", structures["row"], row, begin.out_avals[size + 2 :])
+        return [*found, _flag(active), _flag(complete), *next_row]
+
+    def ended(*args):
+        carry = jtu.tree_unflatten(structures["carry"], args[n:])
+        inputs = jtu.tree_unflatten(treedef, args[:n])
+        out, structures["out"] = jtu.tree_flatten(functions.end(inputs, carry))
+        return out
+
+    both = [*leaves, *map(shape_of, carried)]
+    jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
+    (begin, step, end), consts = _consts_as_inputs(jaxprs, n)
+    program = LaneProgram(begin=begin, step=step, end=end, rows=rows)
+    return Traced(program, consts, structures["out"], structures["row"])
+
+
+def _flag(x: object) -> Any:
+    return jnp.asarray(x, bool)
+
+
+def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
+    """The leaves of what `step` gave, in the types that `begin` gave.
+
+    **Raises:** `TypeError` where structure or shapes differ.
+    """
+    leaves, other = jtu.tree_flatten(tree)
+    if other != treedef:
+        raise TypeError(f"`step` must give a {what} of the structure {treedef}, but gave {other}.")
+    for x, aval in zip(leaves, avals, strict=True):
+        if jnp.shape(x) != aval.shape:
+            raise TypeError(
+                f"`step` must give a {what} with shape {aval.shape}, but gave {jnp.shape(x)}."
+            )
+    return [jnp.asarray(x, aval.dtype) for x, aval in zip(leaves, avals, strict=True)]
+
+
+def _consts_as_inputs(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr], list]:
+    """The jaxprs with the arrays that they close over as inputs behind the first `n`, and the
+    arrays."""
+    consts: list[Any] = []
+    for jaxpr in jaxprs:
+        for x in jaxpr.consts:
+            if isinstance(x, jax.Array) and not any(x is y for y in consts):
+                consts.append(x)
+    if not consts:
+        return jaxprs, consts
+
+    def opened(jaxpr: ClosedJaxpr) -> ClosedJaxpr:
+        rest = jaxpr.in_avals[n:]
+
+        def function(*args):
+            given = args[n : n + len(consts)]
+            held = [
+                next((g for g, y in zip(given, consts, strict=True) if y is x), x)
+                for x in jaxpr.consts
+            ]
+            own = (*args[:n], *args[n + len(consts) :])
+            return eval_jaxpr(jaxpr.jaxpr, held, *own)
+
+        shapes = [*map(shape_of, jaxpr.in_avals[:n]), *map(shape_of, consts), *map(shape_of, rest)]
+        return jax.make_jaxpr(function)(*shapes)
+
+    return [opened(jaxpr) for jaxpr in jaxprs], consts
