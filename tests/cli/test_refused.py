@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from vi_jax import cli
-from vi_jax.cli import verbs
+from vi_jax.cli import command
 
 AXES = "[scan]\naxes = { drive.frequency_ratio = [0.8, 0.9], stops.0.gap = [1, 2] }\n"
 DUFFING = "machine = 'vi_jax.machines:Duffing'\n"
@@ -124,6 +124,6 @@ def test_a_fault_of_the_library_is_not_taken_for_the_users(run, monkeypatch):
     def broken(*args, **options):
         raise TypeError("something else")
 
-    monkeypatch.setattr(verbs, "simulate", broken)
+    monkeypatch.setattr(command, "simulate", broken)
     with pytest.raises(TypeError, match="something else"):
         run("simulate", DUFFING + ONE)

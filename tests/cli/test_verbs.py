@@ -13,7 +13,7 @@ import pytest
 import vi_jax as vi
 import xarray as xr
 from vi_jax import cli
-from vi_jax.cli import verbs
+from vi_jax.cli import command
 
 from differences import quick
 
@@ -240,7 +240,7 @@ PARTS = "[simulate]\ncycles = 40\nsettle = 30\nsamples = 4\noutput = 'o.csv'\n"
 
 def short(monkeypatch):
     """Runs in parts of ten cycles."""
-    monkeypatch.setattr(verbs, "_CYCLES", 10)
+    monkeypatch.setattr(command, "_CYCLES", 10)
 
 
 def test_a_run_in_parts_is_the_same_run(monkeypatch):
@@ -248,7 +248,7 @@ def test_a_run_in_parts_is_the_same_run(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.02)
     options = {"settle": 3, "samples": 4, "impact_log": 2, "method": vi.Adaptive()}
     whole = vi.simulate(scene, scene.start(Y=0.3), 23, **options)
-    parts, _ = verbs.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
+    parts, _ = command.run_in_parts(scene, scene.start(Y=0.3), 23, **options)
     for name in ("sections", "y_min", "impacts", "duration", "samples", "impact_log", "clearance"):
         each = (jax.tree.leaves(getattr(run, name)) for run in (parts, whole))
         for x, y in zip(*each, strict=True):
@@ -260,7 +260,7 @@ def test_a_run_in_parts_is_the_same_run(monkeypatch):
 def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
     short(monkeypatch)
     scene = vi.Parameters(control=-1.0).scene()  # its motor stalls
-    found, _ = verbs.run_in_parts(scene, scene.start(W=0.1), 40)
+    found, _ = command.run_in_parts(scene, scene.start(W=0.1), 40)
     assert not bool(found.successful) and found.impacts.size == 10
 
 
@@ -268,7 +268,7 @@ def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
 def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
     """Pressed while it settles and records its first part, or later; then again and again."""
     short(monkeypatch)
-    compute, calls = verbs.simulate, []
+    compute, calls = command.simulate, []
 
     def computed(*args, **options):
         calls.append(1)
@@ -277,12 +277,12 @@ def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pre
         return compute(*args, **options)
 
     for name in ("_joined", "_write_files"):
-        after = getattr(verbs, name)
+        after = getattr(command, name)
         press = lambda *args, after=after, **options: (
             os.kill(os.getpid(), signal.SIGINT), after(*args, **options)
         )[1]  # fmt: skip
-        monkeypatch.setattr(verbs, name, press)
-    monkeypatch.setattr(verbs, "simulate", computed)
+        monkeypatch.setattr(command, name, press)
+    monkeypatch.setattr(command, "simulate", computed)
     before = signal.getsignal(signal.SIGINT)
     run("simulate", PARTS, 130)
     assert signal.getsignal(signal.SIGINT) is before and len(calls) == pressed
@@ -290,7 +290,7 @@ def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pre
 
 
 def test_ctrl_c_keeps_the_way_up_of_a_sweep(run, monkeypatch):
-    compute, calls = verbs.sweep, []
+    compute, calls = command.sweep, []
 
     def computed(*args, **options):
         calls.append(1)
@@ -298,7 +298,7 @@ def test_ctrl_c_keeps_the_way_up_of_a_sweep(run, monkeypatch):
             raise KeyboardInterrupt
         return compute(*args, **options)
 
-    monkeypatch.setattr(verbs, "sweep", computed)
+    monkeypatch.setattr(command, "sweep", computed)
     text = "[sweep]\nparameter = 'stops.0.gap'\nvalues = [2.0, 1.9]\nsettle = 9\ncycles = 8\n"
     out = run("sweep", text + "up_and_down = true\noutput = 'o.csv'", 130)
     assert "down: Sweep" in out and [row["direction"] for row in rows("o.csv")] == ["down"] * 2
@@ -312,11 +312,8 @@ def test_a_picture_that_cannot_be_drawn_loses_nothing(run):
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
 def test_ready_files(path, monkeypatch):
-    from vi_jax.cli.entry import read
-    from vi_jax.machines.named import machine_of
-
-    tables = read(str(path))
-    machine = machine_of(tables["machine"], tables["arguments"])
-    (verb,) = verbs.VERBS.keys() & tables.keys()
+    tables = command.read(str(path))
+    machine = command.machine_of(tables["machine"], tables["arguments"])
+    (verb,) = command.VERBS.keys() & tables.keys()
     assert f"vi-jax {verb} experiments/{path.name}" in path.read_text("utf-8")
-    assert tables[verb].keys() <= {*verbs.VERBS[verb].keys()} and machine.start() is not None
+    assert tables[verb].keys() <= {*command.VERBS[verb].keys()} and machine.start() is not None

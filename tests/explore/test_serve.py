@@ -50,9 +50,9 @@ def test_what_is_no_machine_is_said_before_anything_starts(
     (tmp_path / "shown.py").write_text(OWN, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "shown", raising=False)
-    monkeypatch.setattr("vi_jax.cli.entry.missing", lambda: None)
+    monkeypatch.setattr("vi_jax.cli.command.missing", lambda: None)
     called = []
-    monkeypatch.setattr("vi_jax.cli.entry.serve", lambda *a, **k: called.append(a))
+    monkeypatch.setattr("vi_jax.cli.command.serve", lambda *a, **k: called.append(a))
     assert cli.main(["explore", "--no-browser", "--machine", name, *more]) == 2
     printed = capsys.readouterr().err
     assert message in printed and printed.count("\n") == 1 and not called

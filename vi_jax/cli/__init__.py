@@ -1,3 +1,3 @@
 """The command line: what a TOML file asks for, as one command for each verb."""
 
-from .entry import main as main
+from .command import main as main

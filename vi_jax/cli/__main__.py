@@ -1,5 +1,5 @@
 """`python -m vi_jax.cli`."""
 
-from .entry import main
+from .command import main
 
 raise SystemExit(main())

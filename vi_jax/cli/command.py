@@ -1,16 +1,31 @@
-"""The verbs of the command line: each calls the function of its name, prints, writes and draws."""
+"""The command line: `vi-jax VERB FILE.toml` for what a file asks, and `vi-jax explore`.
 
+Each verb calls the function of its name, prints, writes and draws. Three values of a file are
+special: `{ from, to, count }` is a row of evenly spaced numbers, a table with the key `class` is an
+object made from its other keys, and dotted keys are names, as in `stops.0.gap = [1.0, 2.0]`. All
+others are passed on as they are.
+"""
+
+import argparse
 import dataclasses
+import difflib
 import functools
+import importlib
 import inspect
+import os
 import re
 import signal
+import sys
+import tomllib
+import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -19,7 +34,9 @@ from matplotlib.figure import Figure
 
 from .. import plot
 from .._checks import unwritable
-from .._messages import Interrupted
+from .._messages import Interrupted, installed_version
+from ..explore.serve import missing, serve
+from ..explore.subject import Subject, ready
 from ..flow import Run, RunOptions, planned, simulate
 from ..machine import (
     AbstractMachine,
@@ -29,7 +46,6 @@ from ..machine import (
     is_autonomous,
     with_leaf,
 )
-from ..machines.named import InputError, check_keys, value_of
 from ..orbit import continue_orbit, find_orbit
 from ..scans import REGIMES, Sweep, basins, scan, sweep
 
@@ -39,6 +55,116 @@ _NOT_NEEDED = {*_LEFT_OUT, "start", "guess"}
 
 # Cycles, or samples, of one part of a run: a fraction of a second, or seconds of a slow machine.
 _CYCLES, _SAMPLES = 1024, 16384
+
+_MACHINE = "a class or a function that makes the machine (module:name or path/to/file.py:name)"
+
+
+class InputError(ValueError):
+    """What is wrong with a file, a name or its arguments, in one sentence."""
+
+
+def check_keys(given: Iterable[str], known: Iterable[str], place: str) -> None:
+    """**Raises:** `InputError` for a key that does not exist, with the nearest ones."""
+    known = list(known)
+    for key in given:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+            hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(known)}"
+            raise InputError(f"unknown key `{key}` in {place}; {hint}")
+
+
+def machine_of(name: object, keywords: Mapping[str, Any]) -> AbstractMachine:
+    """Return the machine that a class or a function makes. **Raises:** `InputError`."""
+    machine = made(name, keywords, "[arguments]")
+    if not isinstance(machine, AbstractMachine):
+        raise InputError(f"{name} must make a machine, but made {machine!r}")
+    return machine
+
+
+def made(name: object, keywords: Mapping[str, Any], place: str) -> Any:
+    """Return what a class or a function makes of keywords. **Raises:** `InputError`.
+
+    **Arguments:** its name, `package.module:name` or `path/to/file.py:name`; a method of a class,
+    as in `vi_jax:Parameters.scene`, gets its own keywords, and the class all others; the keywords
+    as the file has them; their place in the file.
+    """
+    module, _, path = str(name).rpartition(":")
+    if not module or not path:
+        raise InputError(f"a machine or a class is module:name or path/to/file.py:name, not {name}")
+    *outer, last = path.split(".")
+    before, folder = [*sys.path], str(Path(module).resolve().parent)
+    sys.path[:0] = ["", folder] if module.endswith(".py") else [""]
+    try:
+        owner = _imported(module)
+        for attribute in outer:
+            owner = getattr(owner, attribute)
+        make = getattr(owner, last)
+        parameters = inspect.signature(make).parameters
+        if inspect.isclass(owner) and inspect.isfunction(make):
+            others = {key: x for key, x in keywords.items() if key not in parameters}
+            make = getattr(made(f"{module}:{'.'.join(outer)}", others, place), last)
+            keywords = {key: x for key, x in keywords.items() if key in parameters}
+        check_keys(keywords, parameters, place)
+        return make(**{key: _fitting(parameters[key], value_of(x, place))
+                       for key, x in keywords.items()})  # fmt: skip
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        if str(error).startswith("Argument `"):
+            raise InputError(f"{place}: {error}") from None
+        raise InputError(f"{name} raised {type(error).__name__}: {error}{_line(error)}") from error
+    finally:
+        sys.path[:] = before
+
+
+def _imported(module: str) -> Any:
+    if not module.endswith(".py"):
+        return importlib.import_module(module)
+    found = importlib.import_module(Path(module).stem)
+    if Path(str(found.__file__)) != Path(module).resolve():
+        raise ImportError(f"the file needs another name than that of {found.__file__}")
+    return found
+
+
+def _fitting(parameter: inspect.Parameter, value: Any) -> Any:
+    """A whole number as a float where the class declares one: an integer would be compile-time."""
+    words = f"{parameter.annotation} {type(parameter.default).__name__}"
+    wants_float = re.search(r"[Ff]loat|Array", words) and not re.search(r"\bint\b", words)
+    return float(value) if wants_float and type(value) is int else value
+
+
+def _line(error: BaseException) -> str:
+    """The last line of the user's that an error came through."""
+    others = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
+    lines = traceback.extract_tb(error.__traceback__)
+    own = [x for x in lines if not any(other in x.filename for other in others)]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+
+
+def value_of(value: Any, place: str) -> Any:
+    """Return a value of a file as the library takes it (see above). **Raises:** `InputError`."""
+    if isinstance(value, list):
+        return tuple(value_of(x, place) for x in value)
+    if not isinstance(value, dict):
+        return value
+    if "class" in value:
+        keywords = {key: x for key, x in value.items() if key != "class"}
+        return made(value["class"], keywords, place)
+    if value.keys() == {"from", "to", "count"}:
+        try:
+            return np.linspace(value["from"], value["to"], value["count"]).tolist()
+        except (TypeError, ValueError, MemoryError) as error:
+            raise InputError(f"{place}: {value} is no row of numbers: {error}") from None
+    return {name: value_of(x, f"{place}: {name}") for name, x in _flat(value)}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Items by their dotted names, in quotes or not."""
+    for key, value in table.items():
+        if isinstance(value, dict) and not value.keys() & {"class", "from"}:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 class Found(NamedTuple):
@@ -349,3 +475,119 @@ def start_of(machine: AbstractMachine, table: Any) -> Any:
         for name, number in table.items():
             state = with_leaf(state, check_leaf(state, name, argument="start"), number)
         return state
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, 1 (failed), 2 (usage) or 130 (Ctrl-C)."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        options = _parser().parse_args(argv)
+        jax.config.update("jax_enable_x64", True)
+        code = options.run(options)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # the reader has closed the pipe, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _error(error, 1)
+    finally:
+        if signal.getsignal(signal.SIGINT) is not before:
+            signal.signal(signal.SIGINT, before)
+
+
+def _error(problem: object, code: int) -> int:
+    print(f"vi-jax: error: {problem}", file=sys.stderr)
+    return code
+
+
+def read(path: str) -> dict[str, Any]:
+    """Return the tables of a file. **Raises:** `InputError`."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))  # some editors' mark
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _run_file(options: argparse.Namespace) -> int:
+    verb, store = options.command, None
+    try:
+        tables = read(options.file)
+        check_keys(tables, ["machine", "arguments", "start", "method", *VERBS], "the file")
+        name, keywords = tables.get("machine"), tables.get("arguments", {})
+        machine = machine_of(*((options.machine, {}) if options.machine else (name, keywords)))
+        store = (tables[verb] if isinstance(tables.get(verb), dict) else {}).get("store")
+        found = do(verb, machine, tables)
+    except InputError as error:
+        return _error(f"{options.file}: {error}", 2)
+    except KeyboardInterrupt as error:
+        how = "nothing was written"
+        if isinstance(error, Interrupted) and store is not None:
+            how = f"the same command goes on from what is in {store}"
+        print(f"vi-jax: interrupted; {how}", file=sys.stderr)
+        return 130
+    print("\n".join(found.lines))
+    if found.interrupted:
+        print("vi-jax: interrupted; what was computed before is kept", file=sys.stderr)
+        return 130
+    return 0 if found.good else 1
+
+
+def _serve_page(options: argparse.Namespace) -> int:
+    if not 0 <= options.port <= 65535:
+        return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
+    if problem := missing():
+        return _error(problem, 1)
+    jax.config.update("jax_platforms", "cpu")  # the fastest for one motion
+    name, make = next(iter(ready().items()))
+    try:
+        ranges = {name: (float(low), float(high)) for name, low, high in options.range}
+        if options.machine is not None:
+            name, make = options.machine, lambda: Subject(machine_of(options.machine, {}), ranges)
+        say = lambda step: print(f"{step} …", file=sys.stderr, flush=True)
+        serve(options.host, options.port, (name, make()), browser=options.browser, tell=say)
+    except ValueError as error:
+        return _error(error, 2)
+    except OSError as error:
+        return _error(f"cannot serve {options.host} port {options.port}: {error.strerror}", 1)
+    except KeyboardInterrupt:
+        pass
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vi-jax", description="Simulation of vibro-impact systems."
+    )
+    parser.add_argument("--version", action="version", version=f"vi-jax {installed_version()}")
+    commands = parser.add_subparsers(dest="command", required=True)
+    about = "open a page with sliders, on which motions are seen at once"
+    verb = commands.add_parser("explore", help=about, description=f"{about}. Ctrl-C ends it.")
+    verb.add_argument("--host", default="127.0.0.1", help="address to listen at (%(default)s)")
+    verb.add_argument(
+        "--port", type=int, default=8417, help="port to listen at; 0 is any free one (%(default)s)"
+    )
+    verb.add_argument("--machine", metavar="NAME", help=_MACHINE)
+    verb.add_argument(
+        "--range", action="append", default=[], nargs=3, metavar=("NAME", "LOW", "HIGH"),
+        help="the range of a slider of that machine; may be given several times",
+    )  # fmt: skip
+    verb.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="do not open a browser"
+    )
+    verb.set_defaults(run=_serve_page)
+    for name, what in VERBS.items():
+        verb = commands.add_parser(
+            name,
+            help=what.about,
+            description=f"Computes {what.about}. FILE names a `machine`, with its [arguments], and "
+            f"holds [{name}]; it may hold [start] and `method`.",
+            epilog=f"keys of [{name}]: {', '.join(what.keys())}",
+        )
+        verb.add_argument("file", metavar="FILE", help="a TOML file")
+        verb.add_argument("--machine", metavar="NAME", help=f"{_MACHINE}, instead of the file's")
+        verb.set_defaults(run=_run_file)
+    return parser
