@@ -6,9 +6,8 @@ import time
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.explore.motion import WINDOW, look
 from vi_jax.explore.pictures import MAPS, MotionPicture, draw_diagram, gif_of
-from vi_jax.explore.subject import CYCLES, SETTLE, SHOWN, Subject, ready
+from vi_jax.explore.subject import CYCLES, SETTLE, SHOWN, WINDOW, Subject, look, ready
 
 from differences import some
 

@@ -12,8 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..machine import logged_turn, name_in, stops_of
 from ..plot import BLUE, GREEN, RED, animate
-from .motion import WINDOW, Motion, seen_evenly
-from .subject import SHOWN, Diagram
+from .subject import SHOWN, WINDOW, Diagram, Motion, seen_evenly
 
 MAPS = ("section map", "impact map", "drive's speed")
 """What the third picture of a motion shows."""
