@@ -2,10 +2,6 @@
 
 from ._animate import MotionAnimation as MotionAnimation
 from ._animate import animate as animate
-from .branch import axis_name as axis_name
-from .branch import plot_boundary as plot_boundary
-from .branch import plot_branch as plot_branch
-from .branch import plot_sweep as plot_sweep
 from .colors import BLUE as BLUE
 from .colors import DASHES as DASHES
 from .colors import GREEN as GREEN
@@ -20,9 +16,13 @@ from .motion import angle_axis as angle_axis
 from .motion import motion_path as motion_path
 from .motion import plot_history as plot_history
 from .motion import plot_phase_portrait as plot_phase_portrait
+from .orbit import axis_name as axis_name
+from .orbit import plot_boundary as plot_boundary
+from .orbit import plot_branch as plot_branch
 from .orbit import plot_grazing as plot_grazing
 from .orbit import plot_manifold as plot_manifold
 from .orbit import plot_multipliers as plot_multipliers
+from .orbit import plot_sweep as plot_sweep
 from .scan import plot_basins as plot_basins
 from .scan import plot_integrity as plot_integrity
 from .scan import plot_regimes as plot_regimes

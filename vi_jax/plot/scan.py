@@ -18,9 +18,9 @@ from .._messages import so_many
 from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
-from .branch import axis_name
 from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, shades, thick
 from .motion import new_axes
+from .orbit import axis_name
 
 # What was not computed lies below all regimes.
 _LEAST = min(REGIMES) - 1
