@@ -10,7 +10,7 @@ import vi_jax as vi
 from scipy.optimize import brentq
 from vi_jax.orbit import Orbits, _conditions
 from vi_jax.orbit._shooting import Observed
-from vi_jax.orbit.floquet import compound
+from vi_jax.orbit.results import compound
 
 ZETA, XI, GAP = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.gap"
 

@@ -13,14 +13,12 @@ from .curve import branch_hits_in_words as branch_hits_in_words
 from .curve import column_names as column_names
 from .find import find_orbit as find_orbit
 from .find import stands_still as stands_still
-from .floquet import STABILITY as STABILITY
-from .floquet import multipliers_of as multipliers_of
-from .floquet import stability_of as stability_of
 from .grazing import SCENARIOS as SCENARIOS
 from .grazing import Grazing as Grazing
 from .grazing import Motions as Motions
 from .grazing import grazing as grazing
 from .results import ORBIT_RESULTS as ORBIT_RESULTS
+from .results import STABILITY as STABILITY
 from .results import InWords as InWords
 from .results import Orbit as Orbit
 from .results import Orbits as Orbits
@@ -30,6 +28,8 @@ from .results import distance as distance
 from .results import distinct_among as distinct_among
 from .results import distinct_orbits as distinct_orbits
 from .results import in_one_line as in_one_line
+from .results import multipliers_of as multipliers_of
+from .results import stability_of as stability_of
 from .root_finders import AbstractRootFinder as AbstractRootFinder
 from .root_finders import Gradient as Gradient
 from .root_finders import Newton as Newton

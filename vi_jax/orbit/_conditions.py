@@ -21,11 +21,11 @@ from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, units_of, with_leaf
 from ..machine import quantity_of as measured
 from ._chatter import Hops
-from ._corrector import Step, jacobian_at, on_host
 from ._shooting import Observed, Shooting
 from ._sliding import SLIDING, holding
+from ._solution import Step, jacobian_at, on_host
 from ._words import DOUBLING, REST, TORUS, TOUCHING
-from .floquet import compound
+from .results import compound
 
 _SECTION = "section_"
 

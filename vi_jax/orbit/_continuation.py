@@ -12,17 +12,16 @@ from .._checks import flag, given_number, instance_of, interval, one_of, short, 
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf, may_rest
 from ._conditions import Special, as_held, exchange_at, is_defective, names_of, rates_at
-from ._corrector import Step, advance, tangent_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
 from ._problem import check_parameter, cycles_to_fly, legs_of, problem_of, sized, steps_of
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
+from ._solution import Step, advance, tangent_at
 from ._special_table import Intervals, SpecialTable
 from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
 from .curve import Boundary, Branch
-from .floquet import NEUTRAL
-from .results import ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
+from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .special import Point
 
 _NONE: Mapping[str, Any] = MappingProxyType({})

@@ -20,9 +20,9 @@ from .._checks import count, given_number
 from .._messages import Interrupted, Tell, at_work, warn
 from .._types import Vector
 from ..machine import angles_in, nearest_images
-from ._corrector import Step, advance, distance_along, located, off_by, on_host
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
+from ._solution import Step, advance, distance_along, located, off_by, on_host
 from ._surgery import halves_apart
 from .special import Point
 

@@ -19,9 +19,9 @@ from jax.flatten_util import ravel_pytree
 
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
-from ._corrector import on_host, tangent_at
 from ._flight import Event, Flight
 from ._shooting import Shooting
+from ._solution import on_host, tangent_at
 from ._surgery import of_least_period, without_events
 from ._turns import Path, turning
 from ._words import one

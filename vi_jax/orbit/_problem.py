@@ -51,9 +51,9 @@ from ..machine import (
     with_leaf,
     with_modes,
 )
-from ._corrector import off_by
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from ._shooting import Shooting, Unknowns
+from ._solution import off_by
 from .results import Orbit
 
 

@@ -43,7 +43,7 @@ from ..machine import (
 from ._chatter import Hops, escape, hopped, remaining
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from ._turns import Nearest, Path, pull_of, turns_of
-from .floquet import multipliers_of
+from .results import multipliers_of
 
 # A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred
 # times the corrector's tolerance.

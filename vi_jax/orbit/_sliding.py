@@ -27,9 +27,9 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from ._corrector import Step, observe, on_host, state_at, zero_near
 from ._flight import Event, Flight
 from ._shooting import Leg, Shooting
+from ._solution import Step, observe, on_host, state_at, zero_near
 from ._surgery import without_events
 
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"

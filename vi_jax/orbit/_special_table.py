@@ -26,7 +26,11 @@ import numpy as np
 
 from .._messages import so_many
 from ._conditions import Special, is_defective, minors
-from ._corrector import (
+from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
+from ._local_map import LocalMap, graze_at
+from ._motion_table import pulled, room, tests_of
+from ._shooting import ROUNDING, Shooting
+from ._solution import (
     BESIDE,
     MOST,
     Step,
@@ -37,10 +41,6 @@ from ._corrector import (
     located,
     on_host,
 )
-from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
-from ._local_map import LocalMap, graze_at
-from ._motion_table import pulled, room, tests_of
-from ._shooting import ROUNDING, Shooting
 from ._surgery import ALIKE, ROUNDED, halves_apart, may_be_symmetric, repeated, several
 from ._words import (
     AT_CODIMENSION_TWO,

@@ -14,10 +14,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..machine import AbstractMachine, stops_of
-from ._corrector import Step, advance, observe, on_host, state_at, tangent_at, zero_near
 from ._flight import Event
 from ._shooting import ROUNDING, Shooting
-from ._solution import sections_of
+from ._solution import Step, advance, observe, on_host, sections_of, state_at, tangent_at, zero_near
 
 # Halves of a period that differ by less than this are alike, or images of each other; and by less
 # than this but for rounding: choices.

@@ -14,14 +14,22 @@ from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
 from ._conditions import AbstractCondition, Apart, Special
-from ._corrector import Step, advance, jacobian_at, located, state_at, tangent_at
 from ._flight import Event
 from ._local_map import graze_at
 from ._motion_table import tests_of
 from ._problem import events_in
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
-from ._solution import orbit_of, sections_of
+from ._solution import (
+    Step,
+    advance,
+    jacobian_at,
+    located,
+    orbit_of,
+    sections_of,
+    state_at,
+    tangent_at,
+)
 from ._special_table import PERIODS
 from ._surgery import admissible_beside, repeated, several, without_events
 from ._words import (

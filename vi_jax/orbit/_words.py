@@ -1,10 +1,10 @@
 """The kinds of special points, and what is said of them."""
 
 from ..machine import RigidStop, SoftStop, clock_in_words
-from ._corrector import Step
 from ._flight import LANDS, LEAVES, Event
 from ._shooting import Shooting
 from ._sliding import SLIDING
+from ._solution import Step
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"

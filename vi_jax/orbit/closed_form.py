@@ -27,7 +27,7 @@ from .._programs import compiled
 from .._types import Flag, Number, Scalar
 from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
-from .floquet import eigenvalues
+from .results import eigenvalues
 
 # Grid points per drive cycle on which turning points are bracketed: a choice, for ζ well above
 # 1/256.

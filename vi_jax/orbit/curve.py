@@ -25,13 +25,11 @@ from ..machine import (
     with_units,
 )
 from ._conditions import Special, held_in_words
-from ._corrector import Step, located
 from ._shooting import Observed, Shooting
-from ._solution import Hits, energies_of, hits_of, orbit_of, sections_of
+from ._solution import Hits, Step, energies_of, hits_of, located, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
-from .floquet import stability_of
-from .results import InWords, Orbit
+from .results import InWords, Orbit, stability_of
 from .special import Point
 
 # What is a number at each point of every curve.

@@ -50,8 +50,7 @@ from ..machine import (
     with_modes,
 )
 from ._cycle_map import CycleMap, adopted, axes_of, cycle_map, forward_jacobian, tied
-from .floquet import multipliers_of
-from .results import ORBIT_RESULTS, Orbit, distance, trimmed
+from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 
 

@@ -16,10 +16,10 @@ from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, so_many
 from ..flow import NamedEnumeration, simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
-from ._corrector import on_host
 from ._flight import Event
 from ._local_map import Graze, LocalMap, graze_at
 from ._shooting import Shooting
+from ._solution import on_host
 from .results import complex_in_words
 from .special import Point
 

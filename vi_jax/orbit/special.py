@@ -9,10 +9,9 @@ import numpy as np
 
 from .._checks import given_number, one_of
 from ._conditions import alone
-from ._corrector import Step
 from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING
-from ._solution import orbit_of
+from ._solution import Step, orbit_of
 from ._words import (
     DETAILS,
     GRAZING,
