@@ -260,7 +260,7 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
         u = ravel_pytree(problem.state_at(x, leg, s))[0]
         return distance(problem.at(x), s, u), u
 
-    (_, slope), u = jax.jvp(lambda x: guard_and_state(x)[0], (x,), (along,)), guard_and_state(x)[1]
+    _, slope, u = jax.jvp(guard_and_state, (x,), (along,), has_aux=True)
     machine = problem.at(x)
     field = problem.flight(machine, leg).smooth.field
 
@@ -339,24 +339,25 @@ class LocalMap(eqx.Module):
             product = N @ product
         return product
 
+    def later(self, u: np.ndarray, count: int) -> np.ndarray:
+        """∂h·Nⁿ·u, n = 1 … count."""
+        found, matrix = [], self.matrix
+        for _ in range(count):
+            u = matrix @ u
+            found.append(self.gradients[0] @ u)
+        return np.array(found)
+
     def entries(self, count: int) -> np.ndarray:
         """e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: what a penetration to the depth one
         adds to the distance n periods later."""
-        found, u = [], self.kicks[0]
-        for _ in range(count):
-            u = self.matrix @ u
-            found.append(self.gradients[0] @ u)
-        return np.array(found)
+        return self.later(self.kicks[0], count)
 
     def passages(self, n: int) -> np.ndarray:
         """What one impact of depth one in n periods leaves of the distance at the passages between
         its impacts, which must be positive: ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1."""
-        u, found = np.linalg.matrix_power(self.matrix, n), []
-        u = np.linalg.solve(np.eye(len(u)) - u, self.kicks[0])
-        for _ in range(n):
-            u = self.matrix @ u
-            found.append(self.gradients[0] @ u)
-        return np.array(found[:-1]) - found[-1]
+        power = np.linalg.matrix_power(self.matrix, n)
+        found = self.later(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
+        return found[:-1] - found[-1]
 
     def resonance(self, n: int, sign: int) -> float:
         """Zero where a curve of folds (`sign` 1) or doublings (-1) of the motion with one impact in
@@ -508,7 +509,4 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    def guard_and_state(x):
-        return ravel_pytree(problem.state_at(x, leg, s))[0]
-
-    return jax.jvp(guard_and_state, (x,), (along,))
+    return jax.jvp(lambda x: ravel_pytree(problem.state_at(x, leg, s))[0], (x,), (along,))

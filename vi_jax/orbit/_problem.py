@@ -508,7 +508,8 @@ def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> 
         return None if rests else [(clock, Event(number)) for clock, _, number in log]
     later = [(clock + period, kind, number) for clock, kind, number in log[:first]]
     log, found = log[first:] + later, []
-    resting = {number for number in {n for *_, n in log} if _is_held(log, number)}
+    first_of = {n: kind for _, kind, n in reversed(log) if kind != EventKind.impact}
+    resting = {n for n, kind in first_of.items() if kind == EventKind.release}
     for clock, kind, number in log:
         if kind not in (EventKind.rest, EventKind.release):
             found.append((clock, Event(number)))
@@ -526,9 +527,3 @@ def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> 
                 return None
             found[begin:] = [(found[begin][0], Event(number, use=LANDS))]
     return found
-
-
-def _is_held(log: list[tuple[float, int, int]], number: int) -> bool:
-    """Whether a body rests on a stop before the first of some events."""
-    kinds = [kind for _, kind, n in log if n == number and kind != EventKind.impact]
-    return bool(kinds) and kinds[0] == EventKind.release

@@ -70,7 +70,9 @@ class Observed(NamedTuple):
     order: Scalar
     """1 where each switch goes into the mode that is its next one here, else -1."""
     order_margin: Scalar
-    """How far its events are from coming in another order; see `order_margin`."""
+    """How far its events are from coming in another order: the least time between two that follow
+    each other, or the least distance, where one is met, of those that are not met there. Negative
+    where the motion is none of the machine's."""
     duration: Scalar
     """The period in time."""
     averages: dict[str, Scalar]
@@ -98,42 +100,6 @@ class Observed(NamedTuple):
         """How fast events are approached: the scale by which that is judged; host-side."""
         usual = 2 * np.pi * self.length / float(self.duration)
         return max(usual, np.abs(np.asarray(self.approach)).max(initial=0.0))
-
-
-def order_margin(
-    machine: AbstractMachine,
-    events: tuple[Event, ...],
-    modes: tuple[tuple[float, ...], ...],
-    contacts: tuple[tuple[float, ...], ...],
-    clock: Float[Array, " legs"],
-    lengths: Float[Array, " legs"],
-    states: list[State],
-) -> Scalar:
-    """How far the events are from coming in another order: the least time between two that follow
-    each other, or the least distance, where one is met, of those that are not met there. Negative
-    where the motion is none of the machine's.
-
-    **Arguments:** `events` in their order; of each, `modes` and `contacts` of the flight that
-    it begins, its `clock`, in `lengths` the time to the next one, in `states` the state just before
-    it.
-    """
-    least = jnp.asarray(jnp.inf, clock.dtype)
-    for i, event in enumerate(events):
-        least = jnp.minimum(least, lengths[i])
-        before, contact = (
-            tuple(jnp.asarray(mode, clock.dtype) for mode in each[i - 1])
-            for each in (modes, contacts)
-        )
-        for number, other in enumerate(events_of(machine)):
-            if number == event.number or number == section_number(machine):
-                continue
-            if 1.0 + number in contacts[i - 1]:
-                continue
-            room = -guard_of(machine, number, clock[i], states[i], before, contact)
-            if other.from_below:  # beyond it the motion may be, until it comes from below again
-                room = jnp.where(room > 0, room, jnp.inf)
-            least = jnp.minimum(least, room)
-    return least
 
 
 # A hop has the steps of this share of a cycle: the longest one of a chatter (see `legs_of`).
@@ -487,11 +453,9 @@ class Shooting(eqx.Module):
         last = {i: jax.tree.map(lambda a, i=i: a[i], begin) for i in self.landings}
         escapes = (self._escape(machine, i, last[i], clock, states, period) for i in last)
         left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
-        Y, before = jnp.concatenate(places), [self.unravel(u) for u in states]
+        Y = jnp.concatenate(places)
         nearest, pulled = jnp.argmin(turns.nearest.room), jnp.argmin(turns.pull.room)
-        order_of_events = order_margin(
-            machine, self.events, self.modes, self.contacts, clock, ends - clock, before
-        )
+        order_of_events = self._order_margin(machine, clock, ends - clock, states)
         integrals = jax.tree.map(jnp.sum, passed)
         time = integrals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
@@ -510,6 +474,26 @@ class Shooting(eqx.Module):
             largest=jnp.max(largest, axis=0),
             escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
+
+    def _order_margin(
+        self, machine: AbstractMachine, clock: Array, lengths: Array, states: Array
+    ) -> Scalar:
+        least = jnp.asarray(jnp.inf, clock.dtype)
+        for i, event in enumerate(self.events):
+            least, state = jnp.minimum(least, lengths[i]), self.unravel(states[i])
+            before, contact = (
+                tuple(jnp.asarray(mode, clock.dtype) for mode in each[i - 1])
+                for each in (self.modes, self.contacts)
+            )
+            for number, other in enumerate(events_of(machine)):
+                met = number in (event.number, section_number(machine))
+                if met or 1.0 + number in self.contacts[i - 1]:
+                    continue
+                room = -guard_of(machine, number, clock[i], state, before, contact)
+                if other.from_below:  # beyond it the motion may be, until it comes from below again
+                    room = jnp.where(room > 0, room, jnp.inf)
+                least = jnp.minimum(least, room)
+        return least
 
     def _time_left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
         """Time from the end of the chatter that begins with event number i to the next event, if

@@ -180,9 +180,6 @@ class Curve(InWords, abc.ABC):
         """Period in drive cycles."""
         return self.problem.cycles
 
-    def _more_attributes(self) -> dict[str, Any]:
-        return {}
-
     @property
     def stable(self) -> np.ndarray:
         """Whether all multipliers lie inside the unit circle, at each point."""
@@ -344,9 +341,10 @@ class Curve(InWords, abc.ABC):
         }
         data |= special_table(self.special, self.names)
         about = {"parameter": self.names[0], "period_in_cycles": self.cycles}
-        found = xr.Dataset(
-            data, attrs={**about, "ends": list(self.ends), **self._more_attributes()}
-        )
+        about |= {"ends": list(self.ends)}
+        if isinstance(self, Boundary):
+            about["kind"] = self.kind
+        found = xr.Dataset(data, attrs=about)
         own = {name: name for name in (*self.averages, *self.names)}
         own |= {f"special_{name}": name for name in self.names}
         own |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
@@ -442,9 +440,6 @@ class Boundary(Curve):
     def column_names(self) -> tuple[str, ...]:
         """The columns of any curve; for Neimark–Sacker points also the `angle`."""
         return (*super().column_names, *(("angle",) if self.kind == TORUS else ()))
-
-    def _more_attributes(self) -> dict[str, Any]:
-        return {"kind": self.kind}
 
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)

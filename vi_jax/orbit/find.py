@@ -480,7 +480,9 @@ def _judged(
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
-    state = _at_section(guess, sections[0], None if modes is None else modes[0])
+    unravel = ravel_pytree(bare(guess))[1]
+    state = unravel(sections[0])
+    state = state if modes is None else HybridState(state, tuple(modes[0]))
     still = stands_still(machine, state, duration, unit * sizes)
     close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
     found = (root.converged > 0) & again & ~still & close
@@ -495,7 +497,7 @@ def _judged(
         machine=machine,
         method=the_map.method,
         state=state,
-        sections=jax.vmap(ravel_pytree(bare(guess))[1])(sections),
+        sections=jax.vmap(unravel)(sections),
         cycles=least,
         duration=duration,
         frequency_ratio=frequency_ratio(machine, duration / least),
@@ -538,11 +540,6 @@ def _comes_back(start: State, seen: ObservedArc) -> Flag:
     if modes is None or seen.modes is None:
         return jnp.ones((), bool)
     return jnp.all(seen.modes[-1, -1] == jnp.stack(modes))
-
-
-def _at_section(guess: State, section: Array, modes: Array | None) -> State:
-    state = ravel_pytree(bare(guess))[1](section)
-    return state if modes is None else HybridState(state, tuple(modes))
 
 
 def _least_period(

@@ -5,6 +5,7 @@ machine is simulated at some of these values.
 """
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -246,10 +247,8 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
         back = np.linalg.solve(identity - power, power @ kick)  # where it comes to, over y
         lack = depths**2 + (h @ back) * depths
         offset = -lack / local.slopes[0]
-        exists, u = np.ones(len(depths), bool), back + kick
-        for _ in range(1, n):
-            u = N @ u
-            exists &= -lack + (h @ u) * depths > 0
+        passages = local.later(back + kick, n - 1)
+        exists = (-lack + passages[:, None] * depths > 0).all(axis=0)
         kicked = np.einsum("y,i,j->yij", -0.5 / depths, kick, h)
         values = np.linalg.eigvals(power @ (identity + kicked))
         exist.append(_between(offset[exists]))
@@ -420,13 +419,9 @@ def stretch(
         here[half == i].mean() >= _AGREES and there[half[::_SPARSE] == i].all()
         for i in range(parts)
     ]
-    best, begin = (0, 0), None
-    for i, fits in enumerate([*good, False]):
-        if fits and begin is None:
-            begin = i
-        elif not fits and begin is not None:
-            best, begin = max(best, (begin, i), key=lambda b: b[1] - b[0]), None
-    inside = (half >= best[0]) & (half < best[1])
+    runs = (run for run in itertools.combinations(range(parts + 1), 2) if all(good[slice(*run)]))
+    begin, end = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
+    inside = (half >= begin) & (half < end)
     if not inside.any():
         return None, np.nan
     share = np.concatenate([here[inside], there[inside[::_SPARSE]]]).mean()
