@@ -125,8 +125,7 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
 
 
 def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
-    """About how long a chatter goes on after an impact under the force that there is; infinite
-    where that pulls the body off."""
+    """Return about how long a chatter goes on; infinite where the force pulls the body off."""
     stop = stops_of(free.machine)[number]
     here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
     share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))

@@ -105,8 +105,7 @@ class AbstractCondition(eqx.Module):
 
     @abc.abstractmethod
     def missing(self, problem: Shooting, x: Vector, seen: Observed, chatters: Hops) -> Scalar:
-        """What the solution `x`, of which `seen` is observed and whose legs begin with `chatters`,
-        lacks to meet the condition."""
+        """Return what `x` lacks to meet the condition; `chatters`, those that begin its legs."""
 
     def exchanged(self, problem: Shooting, x: Vector, missing: Vector) -> Vector:
         """The residual of the motion's own equations, some of them exchanged if need be."""
@@ -170,8 +169,7 @@ def alone(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
 
 
 def as_held(values: dict[str, float], multipliers: np.ndarray) -> tuple[AbstractCondition, ...]:
-    """The conditions that numbers of these names have these values; `multipliers`, those of the
-    motion that is begun with."""
+    """Return the conditions that these numbers of a motion have these values."""
     greatest = complex(multipliers[0])
     pair = abs(greatest.imag) > 1e-9
     sign = 1 if pair or greatest.real > 0 else -1
@@ -254,8 +252,7 @@ class Special(AbstractCondition):
 
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
-    """The event that grazes, or at which a switch is only just held; `None` at a touch, and where
-    nothing grazes."""
+    """The event that grazes, or at which a switch is only just held; `None` without one."""
     exchange: Exchange | None = None
     speed: Scalar | float = 0.0
     """V⁻ of that impact, for motions beside a grazing."""

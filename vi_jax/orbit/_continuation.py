@@ -134,8 +134,7 @@ def _check_orbit(orbit: Orbit) -> None:
 
 
 def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
-    """**Raises:** `TypeError` or `ValueError` unless these free and hold as many numbers, which the
-    orbit has."""
+    """**Raises:** an error unless these free and hold equally many numbers of the orbit."""
     for argument, given in (("free", free), ("fixed", fixed)):
         if not isinstance(given, Mapping):
             example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
@@ -369,8 +368,7 @@ def _checked_bounds(point: Point, parameter: str, bounds: Any) -> Intervals:
 
 
 def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Shooting, np.ndarray]:
-    """The equations of the curve, with the condition that makes its motions special, and their
-    unknowns at the point where it begins."""
+    """The equations of the curve with its condition, and the unknowns where it begins."""
     old, start, impact = point.problem, np.asarray(point.step.x), point.impact
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the part that vanishes it could not be solved for beyond

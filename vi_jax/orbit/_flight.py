@@ -36,12 +36,10 @@ class Event(NamedTuple):
     cycle: int | None = None
     """The number, from 0, of the cycle of the period that begins with it; `None` if none does."""
     use: str = ""
-    """Of a stop: `LANDS` where the chatter begins that ends in a rest, `LEAVES` where the rest
-    ends; otherwise empty."""
+    """Of a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` where a rest ends."""
 
     def called(self, machine: AbstractMachine) -> str:
-        """What messages call it: its name, or its side, or its kind and place among the machine's
-        events of that kind."""
+        """Its name in messages: its own, its side, or its kind and its place among these."""
         event, events = self.of(machine), events_of(machine)
         if isinstance(event, RigidStop | SoftStop):
             soft = "soft " if isinstance(event, SoftStop) else ""
@@ -119,8 +117,7 @@ class Flight(eqx.Module):
     def step(
         self, s0: Scalar, s1: Scalar, u: Vector, passed: Integrals
     ) -> tuple[Vector, Integrals]:
-        """The state, and the time and integrals beside it, after one step of the method from `s0`
-        to `s1`."""
+        """The state, the time and the integrals beside it, after one step of the method."""
         smooth, state = self.smooth, self.unravel(u)
         beside = carried(smooth, s0, state, passed)
         new, after, _ = self.method.step(smooth, s0, s1, state, beside)
@@ -132,8 +129,7 @@ class Flight(eqx.Module):
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
-        """A function of the flight and of one lane's numbers, evaluated as vector code (see
-        `lanes.once`)."""
+        """A function of the flight and of one lane's numbers, as vector code (`lanes.once`)."""
         numbers, rest = eqx.partition(self, eqx.is_array)
         return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
 

@@ -287,8 +287,7 @@ class _Walk:
         return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
-        """Whether the flights get more steps from here on, where only the motion tells how many
-        they need."""
+        """Give the flights more steps where only the motion tells how many; whether it did."""
         table = self.table
         if not sized_by_motion(table.problem):
             return False
@@ -388,8 +387,7 @@ class Closing:
             self._begin_at(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
-        """The rows of a table for a step between two points: one for each place close by at which
-        the curve was before."""
+        """The rows for a step between two points: one for each place where the curve was before."""
         if not self.points:
             self._begin_at(here)
         if not self.points or self.points[-1] is not here:
@@ -427,8 +425,7 @@ class Closing:
         return float(np.linalg.norm((step.x - begin) / self.table.scale))
 
     def _begin_at(self, first: Step) -> None:
-        """Take unknowns and tangent of the first motion, and of the same one observed
-        otherwise."""
+        """Take unknowns and tangent of the first motion, and of the same one observed otherwise."""
         self.cycle = self._cycle(first)
         scale = self.table.scale
         found = _others_with_rates(self.table.problem, first.x, first.tangent * scale)
@@ -446,8 +443,7 @@ class Closing:
         return float(problem.period(jnp.asarray(step.x))) / problem.cycles
 
     def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
-        """The motion counted from the cycle in which its first event is nearest to that of another
-        one, with its angles as near."""
+        """The motion with its first event and its angles nearest to those of another one."""
         begin = self._turned(begin, here)
         if cycle:
             begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
@@ -471,8 +467,7 @@ def _others_with_rates(problem: Shooting, x, along):
 
 
 def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
-    """The unknowns of the same motion with others of its events as the first, or without events
-    from its other sections on."""
+    """The same motion from other events on, or without events from its other sections on."""
     if problem.autonomous:
         return []
     clock, states = problem.parts(x)

@@ -431,8 +431,7 @@ def graze_at(point: Point) -> Graze:
 
 
 def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
-    """Equations and solution of the motion that grazes, without the impact that does; the event's
-    number and the clock of the touch."""
+    """The motion that grazes without the impact that does; the event's number and its clock."""
     if point.kind != "grazing" or not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but is "
@@ -477,8 +476,7 @@ def _through(problem: Shooting, x, leg):
 
 
 def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) -> np.ndarray:
-    """How a perturbation at clock `s0`, in this leg, is carried to a later clock, through all
-    events between."""
+    """How a perturbation at clock `s0`, in this leg, is carried to a later clock."""
     M, (clock, _, period) = np.eye(problem.states), problem.values(x)
     turn, begin, n = 0.0, s0, leg
     while True:

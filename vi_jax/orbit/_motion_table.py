@@ -142,21 +142,22 @@ class MotionTable(Table):
         super().__init__(problem, bounds)
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
-        self.size, self.duration = None, None
+        self.size, self.duration = 0.0, 0.0  # of the first motion
         self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
         new = super().advance(x, tangent, length)
         if not self.problem.autonomous or not bool(new.good):
             return new
-        if self.size is None:
-            self.size = _size_of(self.problem, x)
+        self.size = self.size or _size_of(self.problem, x)
         return new._replace(good=np.asarray(_size_of(self.problem, new.x) > _STILL * self.size))
 
     def ends(self, here: Step, new: Step) -> list[Event]:
         rows = bounds_of(self)
         if self.problem.autonomous:
-            rows.append(Event(self._not_too_long(here), lambda at: Ending(at, "long")))
+            self.duration = self.duration or float(here.seen.duration)
+            left = lambda step: _LONG - float(step.seen.duration) / self.duration
+            rows.append(Event(left, lambda at: Ending(at, "long")))
         for held in self.problem.conditions:
             if isinstance(held, HeldMultiplier):
                 ahead = lambda step, held=held: -held.overtaken(step.seen)
@@ -188,14 +189,6 @@ class MotionTable(Table):
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
         return point_at(new, at, REST, detail, springs=True)
 
-    def _not_too_long(self, here: Step) -> Callable[[Step], float]:
-        """How far an autonomous motion is from being longer than its steps, as many as ever,
-        allow."""
-        if self.duration is None:
-            self.duration = float(here.seen.duration)
-        first = self.duration
-        return lambda step: _LONG - float(step.seen.duration) / first
-
     def _lost(self, here: Step) -> Iterator[Event]:
         """The rows of events that are lost, of touches, and of events that come otherwise."""
         for i, event in enumerate(self.problem.events):
@@ -220,8 +213,7 @@ class MotionTable(Table):
     def _ended(
         self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
     ) -> Ending:
-        """How a branch ends where this event is lost, something is touched, or events come
-        otherwise (a name in `DETAILS`)."""
+        """The end where an event is lost, something is touched, or events come otherwise."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
             return Ending(at, REST, self._merged(at, flight))
@@ -292,14 +284,12 @@ class MotionTable(Table):
         return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
     def passed(self, here: Step, last: Step) -> Passed:
-        """The bifurcations between two points, the extremes and the zeros of what is watched, in
-        their order."""
+        """Bifurcations, extremes and zeros of what is watched between two points, in order."""
         found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
         return sorted(found, key=lambda f: distance_along(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
-        """Where a number is larger, or less, than at all points close by, and where one that is
-        watched passes zero."""
+        """Where a number is larger, or less, than beside, and where one watched passes zero."""
         known, before = self._known
         before = before if np.array_equal(known, here.x) else self._numbers(here)
         self._known = last.x, self._numbers(last)
@@ -348,9 +338,7 @@ class MotionTable(Table):
         kinds, found, crossed = _changed(here, last, held=held), [], 0
         apart = self._turn_apart(here, last) if TURNS in kinds and not held else ()
         if apart:
-            ends = (here, *apart, last)
-            parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(ends))
-            return list(itertools.chain.from_iterable(parts))
+            return self._within((here, *apart, last), halves_left)
         for kind in kinds:
             at = self._bifurcation(kind, here, last)
             found, crossed = [*found, *at], crossed + len(at) * _CROSS[kind]
@@ -360,8 +348,15 @@ class MotionTable(Table):
         more = abs(after - before)
         if more <= crossed and (crossed - more) % 2 == 0:
             return found
-        halved = self._halved(here, last, halves_left)
-        return self._twice(here, last) or found if halved is None else halved
+        middle = self._on_the_way(here, last, 0.5) if halves_left else None
+        if middle is None or not bool(middle.good):
+            return self._twice(here, last) or found
+        return self._within((here, middle, last), halves_left - 1)
+
+    def _within(self, steps: tuple[Step, ...], halves_left: int) -> Passed:
+        """The bifurcations in several parts of a step."""
+        parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(steps))
+        return list(itertools.chain.from_iterable(parts))
 
     def _turn_apart(self, here: Step, last: Step) -> tuple[Step, ...]:
         """Two points beside the place where the branch turns back between two others, if a
@@ -380,19 +375,8 @@ class MotionTable(Table):
         real = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
         return tuple(sides) if real else ()
 
-    def _halved(self, here: Step, last: Step, halves_left: int) -> Passed | None:
-        """The bifurcations in both halves of a step; `None` where it is not halved any more."""
-        middle = self._on_the_way(here, last, 0.5) if halves_left else None
-        if middle is None or not bool(middle.good):
-            return None
-        return [
-            *self._bifurcations(here, middle, halves_left - 1),
-            *self._bifurcations(middle, last, halves_left - 1),
-        ]
-
     def _twice(self, here: Step, last: Step) -> Passed:
-        """The place between two points close to each other where several multipliers cross the unit
-        circle together."""
+        """The place between two close points where multipliers cross the circle together."""
         outside = _outside(here)
         at = self.where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
         if at is None:
@@ -405,8 +389,7 @@ class MotionTable(Table):
         return []
 
     def _bifurcation(self, kind: str, here: Step, last: Step) -> Passed:
-        """The bifurcation between two points of which a test has changed its sign; none if that is
-        a pole, or rounding."""
+        """The bifurcation between two points at which a test changes its sign, if it is one."""
         at = self.where(here, last, lambda step: tests_of(step)[kind])
         if at is None:
             return []
@@ -538,8 +521,7 @@ def _offs(step: Step) -> dict[str, np.ndarray]:
 
 
 def _outside(step: Step) -> int | None:
-    """The number of multipliers outside the unit circle; `None` where one lies on it, to rounding,
-    or they are not known."""
+    """The number of multipliers outside the unit circle; `None` if not known, as where one is 1."""
     sizes = np.abs(step.seen.multipliers)
     if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
         return None
@@ -547,8 +529,7 @@ def _outside(step: Step) -> int | None:
 
 
 def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
-    """Whether the parameter at a point between two lies beyond that at both, by more than
-    rounding."""
+    """Whether the parameter turns back at a point between two, by more than rounding."""
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
 
@@ -639,8 +620,7 @@ def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Ve
 
 
 def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """The equilibrium near a guess with a pair of imaginary eigenvalues, as the unknowns of a
-    motion there, and its eigenvector."""
+    """The equilibrium near a guess that has imaginary eigenvalues, as unknowns; an eigenvector."""
     n, turn, matrix = problem.states, 2 * np.pi / guess[0], _linear(problem, guess)[0]
     if not np.isfinite(matrix).all():
         return None
@@ -666,8 +646,7 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
-    """A motion of hardly any size about an equilibrium, at the moment at which it passes the
-    section."""
+    """A motion of hardly any size about an equilibrium, where it passes the section."""
     _, section, slope = _linear(problem, x)
     seen, steep = slope @ vector, np.linalg.norm(slope)
     apart = np.linalg.norm(here.x[1:-1] - x[1:-1])

@@ -225,8 +225,7 @@ def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> 
 
 
 def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
-    """The equations with the sizes of a motion whose numbers have these moduli, if one of them has
-    become twice as large; else `None`."""
+    """The equations with the sizes of a motion that has become twice as large; else `None`."""
     before, now = np.asarray(problem.sizes), 0.5 * np.asarray(largest)
     if not (now > 2 * before[1:]).any():
         return None
@@ -357,8 +356,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
 
 
 def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, int, int]]:
-    """Of each event of a run its cycle, the clock since that began, its kind (`EventKind`) and its
-    number among all events."""
+    """Of each event of a run the cycle, the clock in it, the `EventKind` and the number."""
     assert run.event_log is not None
     kind, number, clock = (
         np.asarray(a) for a in (run.event_log.kind, run.event_log.number, run.event_log.phase)
@@ -421,11 +419,11 @@ def legs_of(
             f"changes. {_INSTEAD}"
         )
     corners = [with_leaf(machine, parameter, end) for end in bounds]
+    order, steps = tuple(event for _, event in events), steps_of(flying, corners, state, cycles)
     problem = Shooting(
-        machine, flying, state, cycles, tuple(event for _, event in events),
-        ((),) * max(1, len(events)), steps_of(flying, corners, state, cycles), (parameter,),
+        machine, flying, state, cycles, order, ((),) * max(1, len(events)), steps, (parameter,),
+        held=_contact(machine, state, order),
     )  # fmt: skip
-    problem = dataclasses.replace(problem, held=_contact(machine, state, problem.events))
     clock = np.array([place for place, _ in events])
     rows = _before(orbit, run, clock - _EARLIER * cycle)
     problem = dataclasses.replace(problem, modes=_modes(problem, orbit.state, clock, rows))
@@ -453,8 +451,7 @@ def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
 
 @compiled
 def _state_at(machine, method, like, row, own, clock):
-    """The state at a clock within the cycle that begins in the state of a row, in these modes of
-    the machine's own."""
+    """The state at a clock within the cycle that begins in the state of a row, in these modes."""
     unravel = ravel_pytree(like)[1]
     options = RunOptions(method=method, record="sections", rests=True, until=clock)
     start = lambda u: (machine, with_modes(unravel(u), own))
@@ -462,8 +459,7 @@ def _state_at(machine, method, like, row, own, clock):
 
 
 def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
-    """The machine's modes in each leg, from the state on the section, and clock and state of each
-    event."""
+    """The machine's modes in each leg, from the first state, and clock and state of each event."""
     machine, start = problem.machine, jnp.zeros(())
     modes = begin_modes(machine, start, bare(state), modes_of(state))
     found = [modes] * problem.legs

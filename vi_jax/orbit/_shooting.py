@@ -58,8 +58,7 @@ class Observed(NamedTuple):
     monodromy: Float[Array, "states states"]
     """Derivative by the state just before the first event of the state a period later."""
     approach: Float[Array, " events"]
-    """V⁻ at each impact, and how fast the guard rises at each other event; negative where it has
-    become impossible."""
+    """V⁻ at each impact, of other events how fast the guard rises; negative beyond its loss."""
     y_min: Scalar
     """Smallest position of the first coordinate over the period."""
     y_max: Scalar
@@ -89,8 +88,7 @@ class Observed(NamedTuple):
         return max(y_max - y_min, abs(y_min), abs(y_max))
 
     def admissible(self, events: Sequence[int]) -> bool:
-        """Whether the motion stays inside its stops and approaches each of these events;
-        host-side."""
+        """Whether the motion stays inside its stops and approaches these events; host-side."""
         inside = float(self.nearest.room) >= -ROUNDING * self.length
         slowest = np.asarray(self.approach)[list(events)].min(initial=0.0)
         return bool(inside and slowest >= -ROUNDING * self.fastest)
@@ -148,8 +146,7 @@ class Shooting(eqx.Module):
     widths: Any = ()
     """The sizes of the parameters: half their intervals."""
     held: tuple[float, ...] = eqx.field(static=True, default=())
-    """Of each coordinate that rests all the time its contact (see `Flight.contact`), of others 0;
-    empty if nothing rests."""
+    """Of each coordinate that always rests its `Flight.contact`, of others 0; or empty."""
     conditions: tuple[Any, ...] = ()
     """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
 
@@ -280,8 +277,7 @@ class Shooting(eqx.Module):
         return own_modes(self.machine, self.modes_in(leg))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
-        """`function(event, *inputs)` for the event that begins a leg, whose number may be
-        traced."""
+        """`function(event, *inputs)` for the event that begins a leg, which may be traced."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
         return jax.lax.switch(which, [partial(function, kind) for kind in kinds], *inputs)
@@ -576,8 +572,7 @@ class Shooting(eqx.Module):
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
     def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
-        """1 if a switch goes, at the event that begins a leg, into the mode that the leg has; else
-        -1."""
+        """1 if the event that begins a leg leads its switch into the mode of the leg; else -1."""
 
         def order(event, s, u):
             if not event.of(machine).holds_mode:

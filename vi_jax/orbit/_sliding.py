@@ -89,8 +89,7 @@ def holds(event: AbstractEvent) -> bool:
 
 
 def change_at(problem: Shooting, at: Step) -> Change | None:
-    """What changes at a special point in the sequence of sticking and sliding; `None` if that is
-    none of the four."""
+    """The change of sticking and sliding at a special point; `None` if none of the four."""
     if not problem.modes[0]:
         return None
     found = (
@@ -107,8 +106,7 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
 
 
 def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
-    """The briefest part of the motion between two events of one switch, if it is as brief (as a
-    share of the period)."""
+    """The briefest part between two events of one switch, if shorter than this share."""
     clock, _, period = problem.values(at.x)
     lengths = np.append(clock[1:], clock[0] + period) - clock
     events, found = problem.events, []
@@ -171,8 +169,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
 def holding(
     problem: Shooting, machine: AbstractMachine, leg: Leg, number: int, s: Scalar, state: State
 ) -> Rates:
-    """How far what drives a switch off its surface exceeds what holds it there, with its rates
-    while it is held, in a state of a leg."""
+    """How far what drives a switch off its surface exceeds what holds it, and the rates of that."""
     j, modes = mode_number(machine, number), problem.modes_in(leg)
     modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
     contact = problem.flight(machine, leg).contact

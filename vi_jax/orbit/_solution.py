@@ -115,8 +115,7 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
-    """The solution on the plane across a unit tangent, at this length along it from `x`, both in
-    scaled unknowns."""
+    """The solution on the plane across a unit tangent, at a length along it from `x` (scaled)."""
     return _advanced(problem, x, tangent, problem.scale, float(length))
 
 
@@ -133,8 +132,7 @@ def _lacks(problem: Shooting, x):
 
 
 def off_by(problem: Shooting, x: Unknowns) -> float:
-    """How much twice the steps change the states where each flight ends, relative to their
-    sizes."""
+    """How much twice the steps change the ends of the flights, relative to their sizes."""
     finer = dataclasses.replace(problem, steps=2 * problem.steps)
     return float(np.max(np.abs(_lacks(finer, x) - _lacks(problem, x))))
 
@@ -243,8 +241,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
     begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
 
     def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
-        """How far a point is from it; of a test that only jumps, the last one before the jump is
-        closest."""
+        """How far a point is from it; of a test that jumps, the last one before is closest."""
         left = test(place[1])
         return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
@@ -252,8 +249,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
 
 
 def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
-    """The solution close to one at which a test is zero, by the secant method on the parameter;
-    `None` if there is none."""
+    """The solution near one at which a test is zero, by the secant method; `None` without."""
     found: list[Step] = []
 
     def value(shift: float) -> float:
@@ -350,8 +346,7 @@ def _sections(problem: Shooting, x: Array):
 
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
-    """The states on the sections of a solution, leaves (cycles,), and the largest component of its
-    residual."""
+    """The states on the sections, leaves (cycles,), and the largest component of the residual."""
     return _sections(problem, jnp.asarray(x))
 
 

@@ -98,8 +98,7 @@ class SpecialTable(Table):
         )
 
     def stalled(self, steps: list[Step]) -> Ending:
-        """How a curve ends that the corrector follows no further: perhaps where the motion becomes
-        symmetric."""
+        """The end of a curve that stalls: perhaps where its motions become symmetric."""
         last = steps[-1]
         if self.symmetric and np.linalg.norm(self.images(last)) < ALIKE:
             for here in reversed(steps):
@@ -186,8 +185,7 @@ class SpecialTable(Table):
 
 
 def cosine_of(step: Step) -> float:
-    """The cosine of the angle of the two multipliers whose product is nearest to 1: half their sum,
-    beyond ±1 if they are real."""
+    """The cosine of the angle of the pair whose product is nearest to 1; beyond ±1 if real."""
     values = step.seen.multipliers
     first, second = np.triu_indices(len(values), 1)
     pair = int(np.argmin(np.abs(values[first] * values[second] - 1)))
@@ -421,8 +419,7 @@ def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[f
 def _zero(
     problem: Shooting, here: Step, new: Step, test: Callable[[Step], float], most: float
 ) -> Step | None:
-    """The point between two at which a test is zero; `None` where it has a pole. `most` is the
-    larger of its values at both."""
+    """The point between two at which a test, at most so large there, is zero and has no pole."""
     at = located(problem, here, new, test)
     if at is None or abs(test(at)) <= _ZERO * most:
         return at

@@ -154,8 +154,7 @@ _SAME = 1e-7
 def without_events(
     old: Shooting, x: np.ndarray, which: Sequence[int]
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion without events that change nothing in it (it grazes there), and the
-    unknowns that solve them."""
+    """The equations and unknowns of a motion without events that only graze."""
     clock, states, period = old.values(x)
     keep = [i for i in range(old.legs) if i not in which]
     if keep:

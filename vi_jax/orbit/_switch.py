@@ -78,8 +78,7 @@ def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
 
 
 def _doubled(point: Point, distance: float) -> Orbit:
-    """A motion of twice the period, along what the multiplier -1 makes possible, or of half of it
-    where the branch springs from one."""
+    """A motion of twice the period, or of half of it where the branch springs from one."""
     if point.springs:
         problem, x = point.problem, point.step.x
         step = advance(problem, x, tangent_at(problem, x), distance)
@@ -230,8 +229,7 @@ def _check_plain(problem: Shooting) -> None:
 def _with_touch(
     old: Shooting, x: np.ndarray, number: int, touch: float
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion, without modes, at a touch of this event, which is one of its
-    events there; and their unknowns."""
+    """The equations of a motion with a touch as one of its events; and their unknowns."""
     (clock, states, period), events = old.values(x), list(old.events)
     u, hit = state_at(old, x, *old.leg_at(x, touch))[None], Event(number)
     if not events:

@@ -79,28 +79,24 @@ class _Found(NamedTuple):
     """Whether an event would happen there."""
 
 
-class _Guard(NamedTuple):
-    """Something that may turn along a flight: the guard of the machine's event of this number."""
+class _Watched(NamedTuple):
+    """Something that may turn along a flight, by its number in the machine."""
 
     number: int
 
     def value(self, flight: Flight, s: Scalar, state: State) -> Scalar:
-        return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
+        raise NotImplementedError
 
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        """d/ds of the guard along the flight, or another number of the same sign."""
+        """d/ds of the value along the flight, or another number of the same sign."""
         return self.rates(flight, flight.smooth, s, u).v
 
     def happens(self, flight: Flight, s: Scalar, u: Vector, length: Scalar) -> Flag:
-        """Whether the event would happen if its guard were zero at a `length` from here."""
-        if not events_of(flight.machine)[self.number].from_below:
-            return jnp.ones((), bool)
-        there = flight.unravel(_stepped(flight, (s, length, u)))
-        when = happens_at(flight.machine, self.number, s + length, there, flight.modes)
-        return jnp.ones((), bool) if when is None else when
+        """Whether it would happen, as an event, if it were zero at a `length` from here."""
+        return jnp.ones((), bool)
 
     def rates(self, flight: Flight, smooth: SmoothMachine, s: Scalar, u: Vector) -> Rates:
-        """The guard and its first two derivatives by s."""
+        """The value and its first two derivatives by s."""
 
         def guard(s, state):
             return self.value(flight, s, state)
@@ -108,8 +104,22 @@ class _Guard(NamedTuple):
         return guard_rates(smooth.field, guard, s, flight.unravel(u))
 
 
-class _Body(_Guard):
-    """Something that may turn along a flight: the machine's coordinate of this number."""
+class _Guard(_Watched):
+    """The guard of an event."""
+
+    def value(self, flight, s, state):
+        return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
+
+    def happens(self, flight, s, u, length):
+        if not events_of(flight.machine)[self.number].from_below:
+            return super().happens(flight, s, u, length)
+        there = flight.unravel(_stepped(flight, (s, length, u)))
+        when = happens_at(flight.machine, self.number, s + length, there, flight.modes)
+        return jnp.ones((), bool) if when is None else when
+
+
+class _Body(_Watched):
+    """A coordinate."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -120,19 +130,12 @@ class _Body(_Guard):
             return flight.machine.coordinates[self.number].velocity(state)
         return super().rate(flight, s, u)
 
-    def happens(self, flight, s, u, length):
-        return jnp.ones((), bool)
 
-
-class _Pull(_Guard):
-    """Something that may turn along a flight: the force that pulls a body off the stop of this
-    number, on which it rests."""
+class _Pull(_Watched):
+    """The force that pulls a body off a stop on which it rests."""
 
     def value(self, flight, s, state):
         return -force_on(flight, self.number, s, state)
-
-    def happens(self, flight, s, u, length):
-        return jnp.ones((), bool)
 
 
 class _Room(NamedTuple):
@@ -194,7 +197,7 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
     return bodies, rooms
 
 
-def _turns_in(path: Path, watched: _Guard) -> _Found:
+def _turns_in(path: Path, watched: _Watched) -> _Found:
     flight, places, states, h, closed = path
     # The end of the last step is the next event: its velocity is that of a further step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
@@ -218,14 +221,13 @@ def pull_of(path: Path) -> Nearest:
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
-    """The state after one step; `inputs` are the clock, the length of the step, and the state
-    before it."""
+    """The state after one step from `inputs`, the clock, the step's length and the state."""
     s, h, u = inputs
     return flight.step(s, s + h, u, {})[0]
 
 
 def _turn(
-    watched: _Guard, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
+    watched: _Watched, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
 ) -> _Found:
     """The turning point within a step, if the rate changes its sign (`v0` and `v1` at its ends): by
     Newton's method on the length from the step's start, each trial a step of the method itself."""

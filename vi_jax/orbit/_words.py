@@ -75,8 +75,7 @@ def one(kind: str) -> str:
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
-    """Where within its period a motion is at this reading of its clock, which is counted from the
-    section on."""
+    """Where in its period a motion is at a clock that counts from the section on."""
     period = float(problem.period(at.x))
     return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
 

@@ -119,8 +119,7 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 
 def _places(the_map: CycleMap, state: State) -> int:
-    """At how many places of a cycle the state is looked at: for an autonomous machine only on its
-    section."""
+    """Places of a cycle at which the state is looked at; one on an autonomous machine."""
     return 1 if is_autonomous(the_map.machine, bare(state)) else _PLACES
 
 
@@ -534,8 +533,7 @@ def _in_later_modes(the_map: CycleMap, guess: State) -> State:
 
 
 def _comes_back(start: State, seen: ObservedArc) -> Flag:
-    """Whether a motion comes back to the modes in which it began: after as many cycles as were
-    asked for."""
+    """Whether a motion ends in the modes in which it began, after all cycles asked for."""
     modes = modes_of(start)
     if modes is None or seen.modes is None:
         return jnp.ones((), bool)

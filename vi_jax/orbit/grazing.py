@@ -76,8 +76,7 @@ class Settled(NamedTuple):
     """What the map settles on near the grazing, lane by lane."""
 
     period: np.ndarray
-    """In periods of the motion that grazes; 0 where there is none up to `LONGEST`, -1 where what
-    attracts is not near."""
+    """In periods of the motion that grazes; 0 up to `LONGEST` if none, -1 if it goes away."""
     impacts: np.ndarray
     """At the touches, in a period; a mean over one where there is no period."""
     places: np.ndarray
@@ -225,8 +224,7 @@ class Windows(NamedTuple):
     period: np.ndarray
     """n of each row: how many cycles of the machine one motion takes."""
     exists: np.ndarray
-    """Values of the parameter, less that of the grazing, between which it does, the nearer end
-    first; NaN where nowhere; (n, 2)."""
+    """Offsets of the parameter between which it does, the nearer first, or NaN; (n, 2)."""
     stable: np.ndarray
     """And is stable; (n, 2)."""
 
@@ -354,8 +352,7 @@ _AGREES = 0.75
 
 
 class Motions(NamedTuple):
-    """What is settled on at several values of the parameter, as the local map or the machine has
-    it."""
+    """Attractors at several values of the parameter, of the local map or of the machine."""
 
     offset: Float[np.ndarray, " values"]
     """The parameter, less its value at the grazing."""
@@ -377,8 +374,7 @@ def _position_of(problem: Shooting, states):
 
 
 def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """The first coordinate of states beside the smooth motion's on the section, less that of the
-    latter."""
+    """The first coordinate of states beside the smooth motion's on the section, less its own."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
     there = _position_of(graze.problem, smooth[:, None] + beside)
     return there - _position_of(graze.problem, smooth)[:, None]

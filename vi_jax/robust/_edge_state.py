@@ -162,8 +162,7 @@ def tracked(
 
 
 def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
-    """Two neighbours once they are apart, and the section states half way between them until
-    then."""
+    """Two neighbours once they are apart, and the section states half way between them before."""
     parts = []
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)

@@ -249,8 +249,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
 def _stretch(
     saddle: _Saddle, begin: Row, periods: int, spacing: float
 ) -> tuple[Rows, Bool[np.ndarray, " _"]]:
-    """What becomes of a period's stretch along the eigenvector after some periods, and which
-    neighbours belong together."""
+    """Images of a period's stretch along the eigenvector, and which neighbours belong together."""
 
     def images(parts):
         rows = saddle.place + begin * (saddle.growth**parts)[:, None]

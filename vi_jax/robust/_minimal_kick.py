@@ -289,8 +289,7 @@ def _stands(change: float, last: float) -> bool:
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
-    """Section states of a saddle, and at each the left eigenvector that its unstable direction has
-    there, of unit length."""
+    """Section states of a saddle, and at each its left unstable eigenvector, of unit length."""
     period = int(saddle.cycles)
     rows = np.asarray(in_rows(saddle.sections))[:period]
     the_map = settling.the_map

@@ -52,8 +52,7 @@ Rows = Float[np.ndarray, "_ _"]
 """Of several states."""
 
 RETURNS, ELSEWHERE, INADMISSIBLE = 1, 0, -1
-"""What becomes of a start: it comes back to the motion, it does not, or it is none (beyond a stop,
-outside of the bounds)."""
+"""Verdicts on a start: it comes back to the motion, it does not, or it cannot be one."""
 
 # Lanes of the program by which starts are judged: those beyond the last start are not run, so that
 # few starts cost few. A choice.
@@ -317,8 +316,7 @@ def settling_on(
 
 
 def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:
-    """Rows in parts of as many as the program has lanes, the last one filled up; and which are
-    wanted."""
+    """Rows in parts of as many as there are lanes, the last filled up; and which are wanted."""
     for i in range(0, len(rows), _LANES):
         part = rows[i : i + _LANES]
         more = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
@@ -337,8 +335,7 @@ def _advanced(
 
 
 def _in_other_modes(the_map: CycleMap, states: State) -> Any:
-    """Whether the machine is in other modes of its own in some states than a motion that begins
-    there."""
+    """Whether the machine is in other modes in some states than a motion that begins there."""
     modes, new = modes_of(states) or (), modes_of(begun(the_map.machine, bare(states), 1)) or ()
     pairs = zip(modes, new, strict=True) if modes else ()
     return sum((one != other for one, other in pairs), start=jnp.zeros((), bool))
