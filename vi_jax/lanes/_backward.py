@@ -15,13 +15,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from ._derivative import forward
-from ._primitive import DIRECTIONS, lanes_p, lower_to_kernel, with_lane_axis
-from ._program import LaneProgram, size_of
+from ._primitive import (
+    DIRECTIONS,
+    axes_of,
+    lanes_p,
+    lower_to_kernel,
+    primitive_of_programs,
+    with_lane_axis,
+)
+from ._program import LaneProgram, batch_of, size_of
 from ._reverse import ReverseProgram, reverse
 
 
@@ -94,24 +99,7 @@ _SHORT = 4_000
 # One cotangent by a tape takes as long as so many columns (the same measurement as `_BY_COLUMNS`).
 _COLUMNS_EACH = 4
 
-lanes_backward_p = Primitive("lanes_backward")
-lanes_backward_p.multiple_results = True
-
-
-@lanes_backward_p.def_abstract_eval
-def _(*args, program: ReverseProgram):
-    batch = program.batch([a.shape for a in args])
-    return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.out_avals]
-
-
-@lanes_backward_p.def_impl
-def _(*args, program: ReverseProgram):
-    return _compiled(program)(*args)
-
-
-@functools.lru_cache(64)
-def _compiled(program: ReverseProgram) -> Any:
-    return jax.jit(functools.partial(lanes_backward_p.bind, program=program))
+lanes_backward_p = primitive_of_programs("lanes_backward")
 
 
 # --- the transpose of `lanes`
@@ -121,7 +109,7 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
     """Reverse mode: by a tape for many numbers, where that can be; else by columns."""
     linear = [ad.is_undefined_primal(x) for x in args]
     shapes = [x.aval.shape if u else jnp.shape(x) for x, u in zip(args, linear, strict=True)]
-    batch = program.batch(shapes)
+    batch = batch_of(program, shapes)
     weights = {k: ct for k, ct in enumerate(cotangents) if type(ct) is not ad.Zero}
     number = sum(a.size for a, u in zip(program.in_avals, linear, strict=True) if u)
     found = None
@@ -164,7 +152,7 @@ def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[in
     own = forward(base, program.varied).slopes
     if set(weights) - set(own.values()):
         return None
-    given = tuple(own.get(k, -1) in weights for k in range(_result_count(base)))
+    given = tuple(own.get(k, -1) in weights for k in range(len(base.result_avals)))
     back = reverse(base, wanted, given)
     if back is None:
         return None
@@ -182,10 +170,6 @@ def _tangent_places(program: LaneProgram) -> dict[int, int]:
     return {i: len(program.base.in_avals) + n for n, i in enumerate(moved)}
 
 
-def _result_count(program: LaneProgram) -> int:
-    return len(program.out_avals) + len(program.row_avals)
-
-
 ad.primitive_transposes[lanes_p] = _transposed
 
 
@@ -195,7 +179,7 @@ ad.primitive_transposes[lanes_p] = _transposed
 def _columns(*args, program: ReverseProgram) -> list[Any]:
     """What `lanes_backward` gives, by columns."""
     base, varied = program.program, program.varied
-    n, batch = len(base.in_avals), program.batch([x.shape for x in args])
+    n, batch = len(base.in_avals), batch_of(program, [x.shape for x in args])
     inputs, given = list(args[:n]), args[n:]
     inputs[0] = jnp.broadcast_to(inputs[0], (*batch, *base.in_avals[0].shape))
     derived = forward(base, varied)
@@ -211,18 +195,13 @@ def _batched(args, dims, *, program: ReverseProgram):
     """An axis of `jax.vmap` becomes one of lanes; but many cotangents of the same motions, as
     `jax.jacrev` has them, share columns."""
     args = [jnp.asarray(x) for x in args]
-    n = len(program.program.in_avals)
-    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
-    number = sum(a.size for a in program.out_avals)
+    n, (size, inner) = len(program.program.in_avals), axes_of(program, args, dims)
+    number = sum(a.size for a in program.result_avals)
     alike = all(d is None for d in dims[:n])
     if alike and size * _COLUMNS_EACH > number:
         over = jax.vmap(functools.partial(_columns, program=program), dims)
-        return over(*args), [0] * len(program.out_avals)
-    shapes = [
-        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
-        for x, d in zip(args, dims, strict=True)
-    ]
-    moved = with_lane_axis(args, dims, program.in_avals, program.batch(shapes), size)
+        return over(*args), [0] * len(program.result_avals)
+    moved = with_lane_axis(args, dims, program.in_avals, inner, size)
     out = lanes_backward_p.bind(*moved, program=program)
     return out, [0] * len(out)
 
@@ -244,7 +223,7 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
     else:
         derived, weights = base, dc
     wanted = (*program.varied, *(False for _ in inputs[n:]))
-    given = tuple(k in weights for k in range(_result_count(derived)))
+    given = tuple(k in weights for k in range(len(derived.result_avals)))
     if not weights:
         return values, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
     back = reverse(derived, wanted, given)
@@ -293,7 +272,7 @@ def _transposed_back(cotangents, *args, program: ReverseProgram):
         pairs = [(before.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
         given = {own[k]: x for k, x in pairs if k in own}
         places = {i: k for i, k in _tangent_places(derived).items() if linear[k]}
-        flags = tuple(k in given for k in range(_result_count(along)))
+        flags = tuple(k in given for k in range(len(along.result_avals)))
         back = reverse(along, tuple(i in places for i in range(len(along.in_avals))), flags)
         if back is None:
             raise NotImplementedError("A loop that is taken back by a tape once, but not twice.")

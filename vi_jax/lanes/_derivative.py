@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad
 
-from ._program import DependentParts, LaneProgram, Widening, dependent_parts, rewritten
+from ._program import DependentParts, LaneProgram, Widening, dependent_parts, rewritten, shape_of
 from .elementary import elementwise_primitive
 
 # Division whose derivative divides once, however many directions it is taken in.
@@ -146,27 +147,41 @@ def _with_derivatives(
             primals += [next(given) for _ in varied[begin:end]]
             tangents += [next(given) for here in varied[begin:end] if here]
 
-        def of_varied(*changing):
-            given = iter(changing)
-            return function(
-                *(next(given) if m else p for m, p in zip(varied, primals, strict=True))
-            )
-
-        changing = [p for m, p in zip(varied, primals, strict=True) if m]
-        values, derivatives = jax.jvp(of_varied, changing, tangents)
-        out, at = [], 0
+        values, slopes = map(iter, values_and_slopes(function, varied, wanted, primals, tangents))
+        flags, out = iter(wanted), []
         for size in groups:
-            here = slice(at, at + size)
-            out += values[here]
-            out += [s for s, want in zip(derivatives[here], wanted[here], strict=True) if want]
-            at += size
+            out += islice(values, size)
+            out += islice(slopes, sum(islice(flags, size)))
         return out
 
     shapes: list[Any] = []
     for begin, end in pairwise(ends):
-        part = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in closed.in_avals[begin:end]]
+        part = [shape_of(a) for a in closed.in_avals[begin:end]]
         shapes += part + [s for s, m in zip(part, varied[begin:end], strict=True) if m]
     return jax.make_jaxpr(both)(*shapes)
+
+
+def values_and_slopes(
+    function: Callable[..., Sequence[Any]],
+    varied: Sequence[bool],
+    wanted: Sequence[bool],
+    primals: Sequence[Any],
+    tangents: Sequence[Any],
+) -> tuple[Sequence[Any], Sequence[Any]]:
+    """The results of a function, and the derivatives of those that are `wanted`.
+
+    **Arguments:** the function; which of its arguments have a tangent; which derivatives are
+    wanted; the arguments; the tangents.
+    """
+
+    def of_varied(*changing):
+        given = iter(changing)
+        out = function(*(next(given) if v else x for x, v in zip(primals, varied, strict=True)))
+        return [x for x, w in zip(out, wanted, strict=True) if w], out
+
+    changing = [x for x, v in zip(primals, varied, strict=True) if v]
+    _, slopes, out = jax.jvp(of_varied, changing, [*tangents], has_aux=True)
+    return out, slopes
 
 
 @functools.lru_cache(maxsize=64)

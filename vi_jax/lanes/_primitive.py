@@ -19,7 +19,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
-from ._program import LaneProgram, dependent_parts
+from ._program import LaneProgram, batch_of, dependent_parts, shape_of
 from ._shared import within
 from ._vector import Unsupported
 from .call import header, registered
@@ -34,28 +34,25 @@ def vector_only() -> AbstractContextManager:
     return within(_vector_only, True)
 
 
-lanes_p = Primitive("lanes")
-lanes_p.multiple_results = True
+def primitive_of_programs(name: str) -> Primitive:
+    """A primitive that runs a batch of lanes of its parameter `program`."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+
+    @primitive.def_abstract_eval
+    def _(*args, program: AnyProgram, **others):
+        batch = batch_of(program, [a.shape for a in args])
+        return [ShapedArray((*batch, *a.shape), a.dtype) for a in program.result_avals]
+
+    @functools.lru_cache(64)
+    def compiled(**parameters):
+        return jax.jit(functools.partial(primitive.bind, **parameters))
+
+    primitive.def_impl(lambda *args, **parameters: compiled(**parameters)(*args))
+    return primitive
 
 
-@lanes_p.def_abstract_eval
-def _(*args, program: LaneProgram, backend: str):
-    batch = program.batch([a.shape for a in args])
-    rows = [(*batch, program.rows, *a.shape) for a in program.row_avals]
-    outs = [(*batch, *a.shape) for a in program.out_avals]
-    avals = [*program.out_avals, *program.row_avals]
-    return [ShapedArray(shape, a.dtype) for shape, a in zip([*outs, *rows], avals, strict=True)]
-
-
-@lanes_p.def_impl
-def _(*args, program: LaneProgram, backend: str):
-    return _compiled(program, backend)(*args)
-
-
-@functools.lru_cache(64)
-def _compiled(program: LaneProgram, backend: str) -> Any:
-    return jax.jit(functools.partial(lanes_p.bind, program=program, backend=backend))
-
+lanes_p = primitive_of_programs("lanes")
 
 # The most directions of a derivative that one lane carries along. Six of them took 19 ms
 # so, and 48 ms as lanes of their own.
@@ -66,13 +63,7 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     """An axis of `jax.vmap`, which becomes one of lanes; up to `DIRECTIONS` tangents of one lane
     become directions instead."""
     args = [jnp.asarray(x) for x in args]
-    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
-    many = tuple(d is not None for d in dims)
-    shapes = [
-        x.shape if d is None else x.shape[:d] + x.shape[d + 1 :]
-        for x, d in zip(args, dims, strict=True)
-    ]
-    inner = program.batch(shapes)
+    (size, inner), many = axes_of(program, args, dims), tuple(d is not None for d in dims)
     tangents = program.tangents or (False,) * len(many)
     if all(t or not m for t, m in zip(tangents, many, strict=True)) and 1 < size <= DIRECTIONS:
         return _batched_directions(args, dims, inner, many, size, program, backend)
@@ -85,6 +76,17 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     return [x if w else x[0] for x, w in zip(out, along, strict=True)], [
         0 if w else None for w in along
     ]
+
+
+def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
+    """The length of an axis of `jax.vmap`, and the axes that the lanes have besides.
+
+    **Arguments:** the program; the arrays; of each the place of that axis, or `None`.
+    """
+    pairs = [(x.shape, d) for x, d in zip(args, dims, strict=True)]
+    size = next(shape[d] for shape, d in pairs if d is not None)
+    shapes = [shape if d is None else shape[:d] + shape[d + 1 :] for shape, d in pairs]
+    return size, batch_of(program, shapes)
 
 
 def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
@@ -214,12 +216,10 @@ def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
     **Arguments:** the program; its inputs, each with the axes of the batch before its own, or
     without them where all lanes share it.
     """
-    batch = program.batch([x.shape for x in args])
+    batch = batch_of(program, [x.shape for x in args])
     lanes = math.prod(batch)
     if lanes == 0:
-        avals = [(a, a.shape) for a in program.out_avals]
-        avals += [(a, (program.rows, *a.shape)) for a in program.row_avals]
-        return [jnp.zeros((*batch, *shape), a.dtype) for a, shape in avals]
+        return [jnp.zeros((*batch, *a.shape), a.dtype) for a in program.result_avals]
     axes = [
         None if batch and x.ndim == a.ndim else 0
         for x, a in zip(args, program.in_avals, strict=True)
@@ -257,14 +257,15 @@ def _run_together(
         carry, active, filled, rows = state
         out = step(*inputs, *carry)
         # A lane that has ended keeps what it had.
-        carry = [_where(active, a, b) for a, b in zip(out[:n], carry, strict=True)]
+        kept = lambda a, b: jnp.where(active.reshape(lanes, *(1,) * (a.ndim - 1)), a, b)
+        carry = [kept(a, b) for a, b in zip(out[:n], carry, strict=True)]
         complete = active & out[n + 1]
         rows = stored(rows, filled, complete, out[n + 2 :])
         return carry, active & out[n], filled + complete, rows
 
     rows = [
-        jnp.full((lanes, program.rows, *a.shape), _empty(a.dtype), a.dtype)
-        for a in program.row_avals
+        jnp.full((lanes, *a.shape), jnp.nan if jnp.issubdtype(a.dtype, jnp.inexact) else 0, a.dtype)
+        for a in program.result_avals[len(program.out_avals) :]
     ]
     filled = jnp.zeros(lanes, jnp.int32)
     out = begin(*inputs)
@@ -276,14 +277,6 @@ def _run_together(
         state,
     )
     return [*end(*inputs, *carry), *rows]
-
-
-def _empty(dtype):
-    return jnp.nan if jnp.issubdtype(dtype, jnp.inexact) else 0
-
-
-def _where(flag, a, b):
-    return jnp.where(flag.reshape(flag.shape + (1,) * (a.ndim - 1)), a, b)
 
 
 # --- lowering
@@ -333,12 +326,11 @@ def kernel_call(target: str, kernel, program: AnyProgram, avals, *args):
         for x, aval in zip(args, program.in_avals, strict=True)
     ]
     head = header(kernel.key, _lane_count(program, args), strides)
-    results = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
-    return jax.ffi.ffi_call(target, results)(head, *args)
+    return jax.ffi.ffi_call(target, [*map(shape_of, avals)])(head, *args)
 
 
 def _lane_count(program: AnyProgram, args) -> int:
-    return math.prod(program.batch([x.shape for x in args]))
+    return math.prod(batch_of(program, [x.shape for x in args]))
 
 
 @functools.cache

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from .elementary import horner
+
 
 class LaneProgram(eqx.Module):
     """A lane's loop as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
@@ -66,6 +68,12 @@ class LaneProgram(eqx.Module):
         """Shapes and types of a row."""
         return self.begin.out_avals[len(self.carry_avals) + 2 :]
 
+    @property
+    def result_avals(self) -> list[Any]:
+        """Shapes and types of one lane's results, and then of all of its rows."""
+        rows = [jax.ShapeDtypeStruct((self.rows, *a.shape), a.dtype) for a in self.row_avals]
+        return [*self.out_avals, *rows]
+
     def values_without(
         self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
     ) -> "tuple[LaneProgram, list[bool]] | None":
@@ -76,8 +84,8 @@ class LaneProgram(eqx.Module):
         **Returns:** that program, and which results and rows of this one it gives, in their order;
         `None` if there is none.
         """
-        found, base = [True] * (len(self.out_avals) + len(self.row_avals)), self.base
-        program, batch = self, self.batch(shapes)
+        found, base = [True] * len(self.result_avals), self.base
+        program, batch = self, batch_of(self, shapes)
         while base is not None and any(gone[: len(program.in_avals)]):
             outs, rows = len(base.out_avals), len(base.row_avals)
             skipped = len(program.out_avals) - outs, len(program.row_avals) - rows
@@ -86,12 +94,8 @@ class LaneProgram(eqx.Module):
             found = [f and next(left) for f in found]
             program, base = base, base.base
         number = len(program.in_avals)
-        alike = program.batch(shapes[:number]) == batch
+        alike = batch_of(program, shapes[:number]) == batch
         return (program, found) if alike and not any(gone[:number]) else None
-
-    def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """The axes that inputs of these shapes have beyond those of one lane."""
-        return batch_of(self.in_avals, shapes)
 
 
 def shape_of(x: Any) -> jax.ShapeDtypeStruct:
@@ -99,9 +103,9 @@ def shape_of(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
 
 
-def batch_of(avals: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """The axes of a batch: those that arrays have beyond the ones of a lane's own shapes."""
-    for aval, shape in zip(avals, shapes, strict=True):
+def batch_of(program: Any, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """The axes that inputs of these shapes have beyond those of one lane of a program."""
+    for aval, shape in zip(program.in_avals, shapes, strict=True):
         if len(shape) > aval.ndim:
             return shape[: len(shape) - aval.ndim]
     return ()
@@ -175,16 +179,9 @@ CALLS = {
 _EXPANDED = "call_hi_primitive"
 
 
-def _polynomial(x: Any, *coefficients: Any, **unroll: Any) -> Any:
-    total = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        total = total * x + coefficient
-    return total
-
-
 # Primitives that JAX got with 0.12, by older ones.
 _BY_OLDER = {
-    "polynomial": _polynomial,
+    "polynomial": lambda x, *coefficients, **unroll: horner(coefficients, x),
     "one_minus_square": lambda x: (1 - x) * (1 + x),
     "log2": lambda x, accuracy=None: jnp.log(x) / math.log(2),
 }
@@ -329,13 +326,10 @@ def _dependent_results(jaxpr: Jaxpr, sources: tuple[bool, ...], smooth: bool) ->
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
     """Which results of an equation depend on the arguments `args`, some of which hold."""
-    if not smooth:
-        return _dependent(eqn, args, smooth=False)
-    if eqn.primitive.name in _ZERO_DERIVATIVE:
+    if smooth and eqn.primitive.name in _ZERO_DERIVATIVE:
         return [False] * len(eqn.outvars)
-    inexact = [jnp.issubdtype(v.aval.dtype, jnp.inexact) for v in eqn.outvars]
-    found = _dependent(eqn, args, smooth=True)
-    return [a and b for a, b in zip(found, inexact, strict=True)]
+    found = zip(_dependent(eqn, args, smooth=smooth), eqn.outvars, strict=True)
+    return [a and (not smooth or jnp.issubdtype(v.aval.dtype, jnp.inexact)) for a, v in found]
 
 
 def _dependent(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:

@@ -7,7 +7,7 @@ the way back they are the same bits (`FixedText` in `_text.py`).
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,11 +18,10 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import partial_eval
 
-from ._derivative import with_quotients
+from ._derivative import values_and_slopes, with_quotients
 from ._program import (
     CALLS,
     LaneProgram,
-    batch_of,
     dependent_in_scan,
     dependent_of_equation,
     dependent_parts,
@@ -162,21 +161,11 @@ class ReverseProgram(eqx.Module):
     @property
     def in_avals(self) -> list[Any]:
         """Shapes and types of one lane's inputs, the cotangents of all of its rows included."""
-        outs = sum(self.given[: len(self.program.out_avals)])
-        weights = [
-            shape_of(a)
-            if i < outs
-            else jax.ShapeDtypeStruct((self.program.rows, *a.shape), a.dtype)
-            for i, a in enumerate(self.weight_avals)
-        ]
-        return [*self.program.in_avals, *weights]
-
-    def batch(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """The axes that inputs of these shapes have beyond those of one lane."""
-        return batch_of(self.in_avals, shapes)
+        weights = zip(self.program.result_avals, self.given, strict=True)
+        return [*self.program.in_avals, *(a for a, here in weights if here)]
 
     @property
-    def out_avals(self) -> list[Any]:
+    def result_avals(self) -> list[Any]:
         """Shapes and types of the cotangents asked for, of one lane."""
         return [a for a, v in zip(self.program.in_avals, self.varied, strict=True) if v]
 
@@ -282,13 +271,7 @@ def _along(
 
     def along(*args):
         primals, tangents = args[:number], args[number:]
-
-        def of_varied(*changing):
-            out = function(*_merged(varied, iter(changing), primals))
-            return [x for x, w in zip(out, weighted, strict=True) if w], out
-
-        changing = [x for x, v in zip(primals, varied, strict=True) if v]
-        _, slopes, out = jax.jvp(of_varied, changing, [*tangents], has_aux=True)
+        out, slopes = values_and_slopes(function, varied, weighted, primals, tangents)
         return [*out, *slopes]
 
     if widening is None:
@@ -297,11 +280,6 @@ def _along(
     inputs = (*inputs, *(w for w, v in zip(inputs, varied, strict=True) if v))
     results = (*results, *(w for w, v in zip(results, weighted, strict=True) if v))
     return lambda *args: widening.over(along, args, inputs, results)
-
-
-def _merged(which: Sequence[bool], some: Iterator, others: Sequence) -> list[Any]:
-    """The next of `some` where the flag holds, else what stands there in `others`."""
-    return [next(some) if here else x for here, x in zip(which, others, strict=True)]
 
 
 def _pruned(closed: ClosedJaxpr, wanted: list[bool]) -> ClosedJaxpr:

@@ -214,7 +214,7 @@ class _Writer:
             for here, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
         ]
         self.results = sum(program.given[: len(self.base.out_avals)])
-        self.varied = program.out_avals
+        self.varied = program.result_avals
         self.carried = [
             a for a, here in zip(program.carry_avals, program.carried, strict=True) if here
         ]

@@ -40,7 +40,7 @@ from ._arrays import (
     uniform,
 )
 from ._operations import ELEMENTWISE, SAME, kind_of
-from ._program import called, inner, scan_counts, size_of
+from ._program import called, inner, scan_counts, shape_of, size_of
 from ._text import Text, Value
 
 
@@ -603,5 +603,4 @@ DERIVED: dict[str, Callable[..., Any]] = {
 
 def derived(name: str, avals: list[Any], params: dict[str, Any]) -> ClosedJaxpr:
     """What a primitive does, as a jaxpr of others."""
-    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
-    return jax.make_jaxpr(lambda *args: DERIVED[name](*args, **params))(*shapes)
+    return jax.make_jaxpr(lambda *args: DERIVED[name](*args, **params))(*map(shape_of, avals))
