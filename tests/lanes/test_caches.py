@@ -16,7 +16,7 @@ from lanes.toys import failing
 def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
     def fallen():
         kernel = runtime.Kernel("define void @kernel() { ret void }", None, 8)
-        return kernel._call
+        return kernel.function
 
     monkeypatch.setattr(_code, "_cache_folder", lambda: tmp_path)
     fallen()

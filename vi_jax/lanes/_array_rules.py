@@ -34,13 +34,11 @@ from ._arrays import (
     mapped,
     over,
     over_all,
-    place_of,
     plus,
     room,
     same,
     selected,
     settled,
-    store_at,
     stored,
     times,
     uniform,
@@ -107,7 +105,7 @@ def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_Along]) -> 
             offset += stride * way.begin
             if way.axis is not None:
                 steps[way.axis] += stride * way.by
-        return x.viewed(shape, steps, offset)
+        return x.viewed(t, shape, steps, offset)
     known = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
     number = lambda i: x.at(t, tuple(way.place(t, i) for way in along))
     return Formula(tuple(shape), x.kind, number, is_cheap(x), cuts=known)
@@ -130,7 +128,7 @@ def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
         contiguous(x.shape)[i] for i in mine
     ]:
         x = stored(t, x)
-    return x.viewed(shape, contiguous(shape))
+    return x.viewed(t, shape, contiguous(shape))
 
 
 @structural("transpose")
@@ -270,7 +268,7 @@ def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: V
         return out
     out = stored(t, whole)
     steps = [(i + 1) * s for i, s in zip(between, out.strides, strict=True)]
-    fill(t, out, x, strides=steps)
+    fill(t, out.viewed(t, x.shape, steps), x)
     return out
 
 
@@ -477,9 +475,7 @@ def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callabl
     **Arguments:** the text; the array; the place; the new number as a function of the old one.
     """
     if isinstance(x, Strided):
-        where, memory = place_of(t, place, x.strides, x.offset), x.source
-        memory.store(t, where, new(memory.load(t, where, x.kind)))  # pyright: ignore[reportAttributeAccessIssue]
-        return
+        return x.put(t, place, new(x.at(t, place)))
     for way in np.ndindex(x.shape):
         here = t.constant(True, "i1")
         for i, n in zip(place, way, strict=True):
@@ -589,7 +585,7 @@ def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
             whole = (*index[:axis], place, *index[axis + 1 :])
             value = x.at(t, whole)
             value = value if before is None else how(before, value)
-            store_at(t, out, whole, value)
+            out.put(t, whole, value)
             return value
 
         first = put(0, None)
@@ -682,7 +678,7 @@ def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Call
         for j, value in enumerate(sums):
             row = plus(t, first, j)
             index = (z, column, row) if turned else (z, row, column)
-            store_at(t, out, index, value)
+            out.put(t, index, value)
 
     whole, rest = divmod(rows, _SUMS)
     for number, first, turns in ((_SUMS, 0, whole), (rest, whole * _SUMS, 1)):

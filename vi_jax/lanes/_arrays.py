@@ -6,7 +6,6 @@ and nothing is computed that is not asked for.
 """
 
 import hashlib
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ._text import Block, Text, Value, is_float
+from ._text import Block, Text, Value, literal
 
 # --- places within an array: known while the code is written, the same for all lanes, or each
 # lane's own
@@ -381,10 +380,17 @@ class Strided(Array):
     def at(self, t: Text, index: Sequence[Index]) -> Value:
         return self.source.load(t, place_of(t, index, self.strides, self.offset), self.kind)
 
-    def viewed(self, shape: Sequence[int], strides: Sequence[int], more: Index = 0) -> "Strided":
+    def put(self, t: Text, index: Sequence[Index], value: Value) -> None:
+        """Store the number at a place of each axis."""
+        assert isinstance(self.source, Memory)
+        self.source.store(t, place_of(t, index, self.strides, self.offset), value)
+
+    def viewed(
+        self, t: Text, shape: Sequence[int], strides: Sequence[int], more: Index = 0
+    ) -> "Strided":
         """Other numbers of the same block or table."""
-        assert isinstance(self.offset, int) and isinstance(more, int)
-        return Strided(tuple(shape), self.kind, self.source, tuple(strides), self.offset + more)
+        offset = plus(t, self.offset, more)
+        return Strided(tuple(shape), self.kind, self.source, tuple(strides), offset)
 
 
 @dataclass(eq=False)
@@ -489,18 +495,9 @@ def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
     return Strided(tuple(shape), kind, source, contiguous(shape))
 
 
-def fill(
-    t: Text, out: Strided, x: Array, *, offset: Index = 0, strides: Sequence[int] | None = None
-) -> None:
-    """Store the numbers of an array in room for them, by default in order.
-
-    **Arguments:** the text; the room; the array; the place of its first number, and the places from
-    one number to the next along each axis.
-    """
-    steps = contiguous(x.shape) if strides is None else strides
-    memory = out.source
-    assert isinstance(memory, Memory)
-    over_all(t, x, lambda i: memory.store(t, place_of(t, i, steps, offset), x.at(t, i)))
+def fill(t: Text, out: Strided, x: Array) -> None:
+    """Store the numbers of an array in memory for them."""
+    over_all(t, x, lambda i: out.put(t, i, x.at(t, i)))
 
 
 def stored(t: Text, x: Array) -> Strided:
@@ -525,13 +522,6 @@ def is_cheap(x: Array) -> bool:
     if isinstance(x, Pieces):
         return all(map(is_cheap, x.parts))
     return not isinstance(x, Formula) or x.cheap
-
-
-def store_at(t: Text, x: Strided, index: Sequence[Index], value: Value) -> None:
-    """Store one number of an array in memory."""
-    memory = x.source
-    assert isinstance(memory, Memory)
-    memory.store(t, place_of(t, index, x.strides, x.offset), value)
 
 
 def selected(t: Text, mask: Value, a: Array, b: Array) -> Any:
@@ -575,14 +565,8 @@ def table(t: Text, array: object, kind: str) -> Array:
     word = stored_kind(kind)
     if all(x.tobytes() == numbers[0].tobytes() for x in numbers):
         return uniform(array.shape, t.constant(numbers[0], kind))
-    body = ", ".join(f"{word} {_llvm_number(x, kind)}" for x in numbers)
+    body = ", ".join(f"{word} {literal(x, word)}" for x in numbers)
     content = f"private unnamed_addr constant [{numbers.size} x {word}] [{body}], align 64"
     name = f"@table{hashlib.blake2b(content.encode(), digest_size=8).hexdigest()}"
     t.declared[name] = f"{name} = {content}"
     return Strided(array.shape, kind, Table(name), contiguous(array.shape))
-
-
-def _llvm_number(number: Any, kind: str) -> str:
-    if is_float(kind):
-        return "0x" + struct.pack(">d", float(number)).hex().upper()
-    return str(int(number))

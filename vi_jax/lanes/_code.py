@@ -1,6 +1,5 @@
 """From LLVM's text to machine code, on a thread of its own; kept in files between processes."""
 
-import ctypes
 import functools
 import hashlib
 import os
@@ -153,10 +152,3 @@ _DIGEST = 20
 
 def _digest(code: bytes) -> bytes:
     return hashlib.blake2b(code, digest_size=_DIGEST).digest()
-
-
-def function_at(address: int) -> Any:
-    """The kernel at this address as a function of `ctypes`, with the arguments of `_kernel.py`."""
-    pointer = ctypes.c_void_p
-    kind = ctypes.CFUNCTYPE(None, pointer, pointer, pointer, ctypes.c_int64, pointer, pointer)
-    return kind(address)

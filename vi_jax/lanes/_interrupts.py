@@ -127,14 +127,8 @@ def guard(handler: object) -> int:
         "handler": handler, "interrupt_again": ctypes.pythonapi.PyErr_SetInterruptEx,
     }.items():  # fmt: skip
         address = engine.get_global_value_address(name)
-        ctypes.c_void_p.from_address(address).value = _pointer(function)
+        ctypes.c_void_p.from_address(address).value = ctypes.cast(function, ctypes.c_void_p).value
     return engine.get_function_address("call_handler")
-
-
-def _pointer(function: Any) -> int:
-    found = ctypes.cast(function, ctypes.c_void_p).value
-    assert found is not None
-    return found
 
 
 def install_counter() -> None:

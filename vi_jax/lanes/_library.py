@@ -56,9 +56,7 @@ class Real:
         return self.of(other) / self
 
     def __neg__(self):
-        return Real(
-            self.t, self.t.value(f"fneg {self.t.vector('double')} {self.value.text}", "double")
-        )
+        return Real(self.t, self.t.negative(self.value))
 
     def plus(self, other):
         return self._two("fadd", other)

@@ -134,7 +134,7 @@ def neg(t: Text, a: Value) -> Value:
         return t.binary("sub", t.zero(a.kind), a)
     if a.number is not None:
         return t.constant(-a.number, a.kind)
-    return t.value(f"fneg {t.vector(a.kind)} {a.text}", a.kind)
+    return t.negative(a)
 
 
 def weighted(t: Text, weight: Value, product: Value) -> Value:
@@ -158,10 +158,9 @@ SAME = "stop_gradient copy copy_p name pvary reshard pin".split()
 for _name in SAME:
     ELEMENTWISE[_name] = lambda t, p, d, a: a
 ELEMENTWISE["square"] = lambda t, p, d, a: mul(t, a, a)
-ELEMENTWISE["sqrt"] = lambda t, p, d, a: t.intrinsic("sqrt", a)
 ELEMENTWISE["rsqrt"] = lambda t, p, d, a: div(t, t.constant(1, a.kind), t.intrinsic("sqrt", a))
-ELEMENTWISE["floor"] = lambda t, p, d, a: t.intrinsic("floor", a)
-ELEMENTWISE["ceil"] = lambda t, p, d, a: t.intrinsic("ceil", a)
+for _name in ("sqrt", "floor", "ceil"):
+    ELEMENTWISE[_name] = lambda t, p, d, a, name=_name: t.intrinsic(name, a)
 
 
 @elementwise("abs")
@@ -216,14 +215,8 @@ def _(t, p, d, a):
     return t.select(compare(t, "ne", a, a, False), a, rounded)
 
 
-@elementwise("max")
-def _(t, p, d, a, b):
-    return extreme(t, "gt", a, b, is_unsigned(d[0]))
-
-
-@elementwise("min")
-def _(t, p, d, a, b):
-    return extreme(t, "lt", a, b, is_unsigned(d[0]))
+for _name, _how in {"max": "gt", "min": "lt"}.items():
+    ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: extreme(t, how, a, b, is_unsigned(d[0]))
 
 
 def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
@@ -321,9 +314,7 @@ def _(t, p, d, a, b):
     return t.binary("or", a, b)
 
 
-@elementwise("xor")
-def _(t, p, d, a, b):
-    return t.binary("xor", a, b)
+ELEMENTWISE["xor"] = lambda t, p, d, a, b: t.binary("xor", a, b)
 
 
 # Beyond the last bit LLVM leaves a shift undefined.

@@ -92,6 +92,13 @@ def is_float(kind: str) -> bool:
     return kind in ("double", "float")
 
 
+def literal(number: Any, kind: str) -> str:
+    """A number as LLVM's text."""
+    if is_float(kind):
+        return "0x" + struct.pack(">d", float(number)).hex().upper()
+    return str(bool(number)).lower() if kind == "i1" else str(int(number))
+
+
 class Text:
     """The body of a function while it is written, with equal operations merged.
 
@@ -123,15 +130,11 @@ class Text:
 
     def constant(self, number: Any, kind: str) -> Value:
         """The same number in every lane."""
-        if kind == "i1":
-            word, number = ("true" if number else "false"), bool(number)
-        elif is_float(kind):
+        if is_float(kind):
             number = float(np.float32(number)) if kind == "float" else float(number)
-            word = "0x" + struct.pack(">d", number).hex().upper()
         else:
-            number = int(number)
-            word = str(number)
-        return Value(f"splat ({kind} {word})", kind, number)
+            number = bool(number) if kind == "i1" else int(number)
+        return Value(f"splat ({kind} {literal(number, kind)})", kind, number)
 
     def zero(self, kind: str) -> Value:
         return self.constant(0, kind)
@@ -196,11 +199,14 @@ class Text:
         """An operation on two values of one type; `kind` is its result's type if another."""
         return self.value(f"{operation} {self.vector(a.kind)} {a.text}, {b.text}", kind or a.kind)
 
+    def negative(self, a: Value) -> Value:
+        """A floating-point number with the other sign."""
+        return self.value(f"fneg {self.vector(a.kind)} {a.text}", a.kind)
+
     def cast(self, operation: str, a: Value, kind: str) -> Value:
         """A conversion (`fpext`, `zext`, `bitcast` …) to another type."""
-        return self.value(
-            f"{operation} {self.vector(a.kind)} {a.text} to {self.vector(kind)}", kind
-        )
+        old, new = self.vector(a.kind), self.vector(kind)
+        return self.value(f"{operation} {old} {a.text} to {new}", kind)
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
         """a where the condition holds, else b."""
@@ -265,13 +271,8 @@ class Text:
 
     def open(self, label: str) -> None:
         """Begin a block that the current one dominates, in a scope that lasts until `close`."""
-        self._begin(label)
+        self.follow(label)
         self._seen.append({})
-
-    def _begin(self, label: str) -> None:
-        self.lines.append(f"{label}:")
-        self.block = label
-        self._stores += 1  # what is in memory may have changed on the way to this block
 
     def close(self) -> None:
         """End the last scope: the blocks that follow do not see what was computed in it."""
@@ -296,7 +297,9 @@ class Text:
 
     def follow(self, label: str) -> None:
         """Begin a block that the blocks of all open scopes dominate, without a scope of its own."""
-        self._begin(label)
+        self.lines.append(f"{label}:")
+        self.block = label
+        self._stores += 1  # what is in memory may have changed on the way to this block
 
     def label(self) -> str:
         """A new name of a block."""
@@ -379,11 +382,8 @@ class FixedText(Text):
             return product
         if plain in ("fadd", "fsub") and a.text in self._products:
             x, y = self._products[a.text]
-            return self.intrinsic("fmuladd", x, y, b if plain == "fadd" else self._negative(b))
+            return self.intrinsic("fmuladd", x, y, b if plain == "fadd" else self.negative(b))
         if plain in ("fadd", "fsub") and b.text in self._products:
             x, y = self._products[b.text]
-            return self.intrinsic("fmuladd", x if plain == "fadd" else self._negative(x), y, a)
+            return self.intrinsic("fmuladd", x if plain == "fadd" else self.negative(x), y, a)
         return super().binary(plain, a, b)
-
-    def _negative(self, a: Value) -> Value:
-        return self.value(f"fneg {self.vector(a.kind)} {a.text}", a.kind)

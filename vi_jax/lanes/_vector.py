@@ -33,7 +33,6 @@ from ._arrays import (
     same,
     selected,
     settled,
-    store_at,
     stored,
     table,
     times,
@@ -226,7 +225,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
 
     def put(index: tuple) -> None:
         for out, value in zip(outs, numbers(index), strict=True):
-            store_at(t, out, index, value)
+            out.put(t, index, value)
 
     over(t, shape, put, joined(*(x.cuts for x in args)))
     return list(outs)
@@ -456,8 +455,8 @@ def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[A
         row = [_row_of(t, x, place) for x in rows]
         out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
         for column, x in zip(columns, out[m:], strict=True):
-            steps = column.strides[1:]
-            fill(t, column, x, offset=times(t, place, column.strides[0]), strides=steps)
+            step, *steps = column.strides
+            fill(t, column.viewed(t, x.shape, steps, times(t, place, step)), x)
         replace(t, carry, out[:m])
         return _flat(out[:m])
 

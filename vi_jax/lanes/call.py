@@ -59,10 +59,12 @@ _Extension._fields_ = [
 ]  # fmt: skip
 
 
-class _Version(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("major", c_int), ("minor", c_int),
-    ]  # fmt: skip
+class _Sized(Structure):
+    _fields_ = [("struct_size", c_size_t), ("extension", c_void_p)]
+
+
+class _Version(_Sized):
+    _fields_ = [("major", c_int), ("minor", c_int)]
 
 
 class _Metadata(Structure):
@@ -73,44 +75,34 @@ class _MetadataExtension(Structure):
     _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
 
 
-class _Buffer(Structure):
+class _Buffer(_Sized):
     _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("dtype", c_int), ("data", c_void_p),
-        ("rank", c_int64), ("dims", POINTER(c_int64)),
+        ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64)),
     ]  # fmt: skip
 
 
-class _Buffers(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("size", c_int64),
-        ("types", c_void_p), ("items", POINTER(POINTER(_Buffer))),
-    ]  # fmt: skip
+class _Buffers(_Sized):
+    _fields_ = [("size", c_int64), ("types", c_void_p), ("items", POINTER(POINTER(_Buffer)))]
 
 
-class _ErrorArguments(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("message", c_char_p), ("code", c_int),
-    ]  # fmt: skip
+class _ErrorArguments(_Sized):
+    _fields_ = [("message", c_char_p), ("code", c_int)]
 
 
 # Functions in `XLA_FFI_Api` between `XLA_FFI_Error_Create` and `XLA_FFI_RunId_Get`.
 _BETWEEN = 15
 
 
-class _Api(Structure):
+class _Api(_Sized):
     _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("version", _Version),
-        ("internal", c_void_p),
+        ("version", _Version), ("internal", c_void_p),
         ("error_create", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
         ("others", c_void_p * _BETWEEN), ("run_get", c_void_p),
     ]  # fmt: skip
 
 
-class _Run(Structure):
-    _fields_ = [
-        ("struct_size", c_size_t), ("extension", c_void_p), ("context", c_void_p),
-        ("number", c_int64),
-    ]  # fmt: skip
+class _Run(_Sized):
+    _fields_ = [("context", c_void_p), ("number", c_int64)]
 
 
 _RunGetter = ctypes.CFUNCTYPE(c_void_p, POINTER(_Run))
@@ -202,7 +194,7 @@ def _run_kernel(frame: _Frame) -> int | None:
         return _error(frame, "The kernel of this program is not of this process.", _INTERNAL)
     inputs = [arguments.items[i].contents.data or 0 for i in range(1, arguments.size)]
     outputs = [results.items[i].contents.data or 0 for i in range(results.size)]
-    work = _running[ctypes.addressof(frame)] = kernel.call(inputs, strides, outputs, lanes)
+    work = _running[ctypes.addressof(frame)] = KernelCall(kernel, inputs, strides, outputs, lanes)
     if threading.current_thread() is threading.main_thread():
         succeeded = work.run()
     else:

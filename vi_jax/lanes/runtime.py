@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ._code import compile_in_background, function_at, llvm
+from ._code import compile_in_background, llvm
 from ._kernel import kernel_text
 from ._program import LaneProgram
 from ._reverse import ReverseProgram
@@ -121,34 +121,32 @@ class Kernel:
         self._code = compile_in_background(text, cpu)
 
     @functools.cached_property
-    def _call(self) -> Any:
-        """**Raises:** `RuntimeError` if LLVM could not compile it."""
+    def function(self) -> Any:
+        """The kernel as a function of `ctypes`, with the arguments of `_kernel.py`.
+
+        **Raises:** `RuntimeError` if LLVM could not compile it.
+        """
         try:
             self._engine, address = self._code.result()
         except RuntimeError as error:
             raise RuntimeError(f'LLVM: {error}; `vi_jax.backend("xla")` does without it') from None
-        return function_at(address)
-
-    def call(
-        self, inputs: list[int], strides: list[int], outputs: list[int], lanes: int
-    ) -> "KernelCall":
-        """A call that is to run all lanes.
-
-        **Arguments:** the addresses of the input arrays; the numbers that each has per lane, or 0
-        for one that all lanes share; the addresses of the output arrays; the number of lanes.
-        """
-        return KernelCall(self._call, self.width, inputs, strides, outputs, lanes)
+        pointer = ctypes.c_void_p
+        kind = ctypes.CFUNCTYPE(None, pointer, pointer, pointer, ctypes.c_int64, pointer, pointer)
+        return kind(address)
 
 
 class KernelCall:
     """One call of a kernel, which holds what its threads read and write until they end.
 
-    **Arguments:** the kernel as a function of `ctypes`, the lanes of a group, and those of
-    `Kernel.call`.
+    **Arguments:** the kernel; the addresses of the input arrays; the numbers that each has per
+    lane, or 0 for one that all lanes share; the addresses of the output arrays; the number of
+    lanes.
     """
 
-    def __init__(self, call: Any, width: int, inputs, strides, outputs, lanes: int):
-        self._function, self._lanes = call, lanes
+    def __init__(
+        self, kernel: Kernel, inputs: list[int], strides: list[int], outputs: list[int], lanes: int
+    ):
+        self._function, self._lanes = kernel.function, lanes
         self._table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
         self._steps = (ctypes.c_int64 * max(1, len(strides)))(*strides)
         self._results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
@@ -158,7 +156,7 @@ class KernelCall:
             ctypes.addressof(self._results), lanes, ctypes.addressof(self._given),
             ctypes.addressof(self.stop),
         )  # fmt: skip
-        self._number = min(thread_count(), -(-lanes // width))
+        self._number = min(thread_count(), -(-lanes // kernel.width))
         self._lock, self._inside = threading.Lock(), 0
 
     def run(self) -> bool:
