@@ -334,11 +334,10 @@ class Memory:
         value = t.load(f"load {t.vector(stored)}, ptr {where}, {aligned}", stored)
         return _flag_if(t, value, kind)
 
-    def store(self, t: Text, place: Index, value: Value, mask: Value | None = None) -> None:
-        """Put each lane's number at a place; where `mask` holds, if a place is each lane's own."""
+    def store(self, t: Text, place: Index, value: Value) -> None:
+        """Put each lane's number at a place."""
         if isinstance(place, Value):
-            scattered(t, self._base(t), self._of_slots(t, place), value, mask)
-            return
+            return scattered(t, self._base(t), self._of_slots(t, place), value)
         value = _as_stored(t, value)
         kind = value.kind
         where, aligned = self._address(t, place, kind), f"align {self._alignment(t, kind)}"

@@ -216,12 +216,5 @@ def _widened(widening: Widening) -> LaneProgram:
     base = program.base
     if base is not None and any(batched[: len(base.in_avals)]):
         base = None
-    return LaneProgram(
-        begin=over("begin"),
-        step=over("step"),
-        end=over("end"),
-        rows=program.rows,
-        tangents=program.tangents,
-        base=base,
-        widening=widening,
-    )
+    parts: dict[str, Any] = {name: over(name) for name in ("begin", "step", "end")}
+    return dataclasses.replace(program, **parts, varied=(), base=base, widening=widening)

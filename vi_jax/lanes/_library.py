@@ -461,16 +461,11 @@ def tan(x: Real) -> Real:
     inverse = inverse + inverse * (inverse.call("fma", value, 1.0) + inverse * off)
     even = (2.0 * (0.5 * n).call("roundeven")).equals(n)
     a = x.size()
-    value = _elsewhere("tan", x, a > _TURNED, value.choose(even, inverse))
+    near, far = value.choose(even, inverse).value, a > _TURNED
+    with x.t.skipped_unless(far, rare=True) as fork:  # which takes the C library's
+        chosen = x.t.select(far, x.t.each("tan", x.value), near)
+    value = Real(x.t, fork.joined(chosen, near))
     return x.choose(a < 2.0**-30, value)
-
-
-def _elsewhere(name: str, x: Real, where: Value, value: Real) -> Real:
-    """`value`, but the C library's function where a flag holds; skipped if it does in no lane."""
-    t = x.t
-    with t.skipped_unless(where, rare=True) as fork:
-        laid = t.select(where, t.each(name, x.value), value.value)
-    return Real(t, fork.joined(laid, value.value))
 
 
 def rule(function: Callable[..., Any]) -> Callable[..., Any]:

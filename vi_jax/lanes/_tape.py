@@ -261,8 +261,10 @@ class _Writer:
             for i, (aval, here) in enumerate(zip(self.inputs, self.shared, strict=True))
         ]
 
-    def _present(self, t: Text, lane: Value) -> Value:
-        return t.binary("icmp sge", lane, t.zero("i64"), "i1")
+    def _lanes(self, t: Text) -> tuple[Value, Value]:
+        """The number of each slot's lane, and which slots have one."""
+        lane = self.frame.number(t, "lane")
+        return lane, t.binary("icmp sge", lane, t.zero("i64"), "i1")
 
     def _weights(
         self, t: Text, first: int, avals: list[Any], lane: Value, place: Value | None, mask: Value
@@ -389,8 +391,7 @@ class _Writer:
 
     def _end_back(self) -> str:
         t = FixedText(self.width)
-        lane = self.frame.number(t, "lane")
-        present = self._present(t, lane)
+        lane, present = self._lanes(t)
         inputs, carry = self._load_inputs(t), self.frame.load(t, "carry")
         avals = self.program.weight_avals[: self.results]
         weights = self._weights(t, 0, avals, lane, None, present)
@@ -423,8 +424,7 @@ class _Writer:
 
     def _begin_back(self) -> str:
         t = FixedText(self.width)
-        lane = self.frame.number(t, "lane")
-        present = self._present(t, lane)
+        lane, present = self._lanes(t)
         inputs = self._load_inputs(t)
         rows, zero = self.frame.number(t, "rows"), t.zero("i64")
         complete = t.both(present, t.binary("icmp sgt", rows, zero, "i1"))

@@ -65,12 +65,9 @@ def check(jaxpr: Jaxpr) -> None:
                 "Derivatives of lanes are carried along with them, and a function with a "
                 "`jax.custom_vjp` has none that can be: define it by `jax.custom_jvp`."
             )
-        if not (_bodies(eqn) or _has_rule(eqn.primitive.name)):
+        rules = (ELEMENTWISE, STRUCTURAL, PLACED, DERIVED)
+        if not (_bodies(eqn) or any(eqn.primitive.name in table for table in rules)):
             raise Unsupported(f"the primitive `{eqn.primitive.name}`")
-
-
-def _has_rule(name: str) -> bool:
-    return any(name in rules for rules in (ELEMENTWISE, STRUCTURAL, PLACED, DERIVED))
 
 
 def _bodies(eqn: Any) -> list[Jaxpr]:
@@ -289,7 +286,10 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
     `None`) in the others; skipped if `mask` has no lane."""
     inside, skip, after = t.label(), t.label(), t.label()
     # What is large lies in the same memory whichever way was taken.
-    rooms = [_room_for(t, v.aval) for v in inner(jaxpr).outvars]
+    avals: list[Any] = [v.aval for v in inner(jaxpr).outvars]
+    rooms = [
+        room(t, a.shape, kind_of(a.dtype)) if a.size > MOST_IN_REGISTERS else None for a in avals
+    ]
     in_memory = any(r is not None for r in rooms)
     before = t.block
     t.fork(t.any(mask), inside, skip if in_memory else after, rare=True)
@@ -353,11 +353,6 @@ def _branch_result(
 def _opaque(t: Text, x: Array) -> Array:
     """What comes out of a condition or a turn of a loop (see `Text.opaque`)."""
     return mapped(t, t.opaque, x) if isinstance(x, Registers) else x
-
-
-def _room_for(t: Text, aval: Any) -> Strided | None:
-    """Memory for an array that is too large for registers."""
-    return room(t, aval.shape, kind_of(aval.dtype)) if aval.size > MOST_IN_REGISTERS else None
 
 
 def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:

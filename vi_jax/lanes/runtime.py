@@ -261,10 +261,8 @@ def _new_kernel(
     `kernel_text` say; compiled unless its text is known."""
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
-    if isinstance(program, ReverseProgram):
-        text = reverse_text(program, *form)
-    else:
-        text = kernel_text(program, *form)
+    backward = isinstance(program, ReverseProgram)
+    text = reverse_text(program, *form) if backward else kernel_text(program, *form)
     key = key_of(text, cpu)
     with _lock:
         kernel = _in_use.get(key)
