@@ -94,3 +94,17 @@ def test_a_branch_is_the_same_in_all_units(case):
         np.testing.assert_allclose(
             [at for _, at in special], [at for _, at in found[0][1]], rtol=1e-9, atol=1e-9
         )
+
+
+@pytest.mark.slow
+def test_a_manifold_is_the_same_in_all_units():
+    curves = []
+    for length, time in UNITS[:3]:
+        machine = Struck(length=length, time=time, cubic=1.0, gap=9.0, force=0.4, frequency=1.6)
+        guess = vi.State(x=-1.106 * length, v=1.224 * length / time)
+        saddle = vi.find_orbit(machine, guess, throw=True)
+        found = vi.manifold(saddle, length=0.6, spacing=0.1, progress=False)
+        assert found.lengths == pytest.approx((0.6, 0.6))
+        parts = [np.stack([x.x / length, x.v * time / length]) for x in found.branches]
+        curves.append(np.concatenate(parts, axis=1))
+    np.testing.assert_allclose(curves, np.broadcast_to(curves[0], np.shape(curves)), rtol=1e-6)

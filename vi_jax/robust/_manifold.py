@@ -22,17 +22,13 @@ _BEGIN = 1e-5
 # `spacing` down to which points are set closer for its sake: choices.
 _TURN, _CLOSEST = 0.15, 1 / 64
 
-# Points of an arc that are looked at once, its half angle, and the rounds that narrow it: 64 points
-# in 6 rounds are an angle of 1e-10. Choices.
-_ARC, _HALF, _ROUNDS = 64, 2.4, 6
+# Points of an arc that are looked at once, its half angle, the rounds that narrow it, and by how
+# many points the next arc is wider than two neighbours: 6 rounds are an angle of 1e-9. Choices.
+_ARC, _HALF, _ROUNDS, _WIDER = 64, 2.9, 6, 0.25
 
-# On an arc, what is left of the change of w·(Pⁿ(x) - xₛ) at a zero of a continuous function; at a
-# jump it is all. A choice.
-_CONTINUOUS = 1e-3
-
-# How near to the saddle the image of a point on its stable manifold is taken, where that can be;
-# how near it must be; and how much a difference may grow on the way. Choices.
-_NEAR, _FAR, _GROWTH = 1e-5, 0.2, 1e9
+# How far apart the images of neighbours on an arc are, how near to the saddle an image must be, and
+# how much a difference may grow on the way. Choices.
+_REACH, _FAR, _GROWTH = 0.1, 0.2, 1e6
 
 # Of `spacing`, what a period adds to an unstable manifold that has come to an attractor: a choice.
 _ENDED = 1e-3
@@ -53,7 +49,7 @@ class Manifold(Summarized):
     """Section states along each branch from the saddle on, arrays of shape (points,); NaN where a
     curve is cut at a jump of the section map."""
     lengths: tuple[float, float] = eqx.field(static=True)
-    """Length of each branch, in the units of the state; less than `length` if the branch ends."""
+    """Length of each branch, as `length` of `manifold`; less if the branch ends."""
     machine: AbstractMachine
     """The machine that the saddle is a motion of."""
 
@@ -78,7 +74,8 @@ def manifold(
 
     The stable manifold, the states from which the machine goes to the saddle, is the boundary of
     basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the
-    zero of w·(Pⁿ(x) - xₛ) is taken, with w the saddle's left unstable eigenvector. This needs
+    zero of w·(Pⁿ(x) - xₛ) is taken, with w the saddle's left unstable eigenvector and n as large as
+    neighbours on the arc stay together. This needs
     neither an inverse nor a derivative of the section map, so the manifold continues through kinks
     at grazings. The unstable manifold, the states that come from the saddle, is the image of a
     short stretch along its eigenvector, with points set closer where the images part or turn.
@@ -89,13 +86,14 @@ def manifold(
     - `orbit`: an orbit from `find_orbit`, with one multiplier outside the unit circle and one
       inside.
     - `which`: `"stable"` or `"unstable"`.
-    - `length`: of each branch, in the units of the state.
-    - `spacing`: the greatest distance of neighbouring points. They are closer, to a 64th of that,
-      if the curve turns by more than 0.15 from one to the next.
+    - `length`: of each branch, each component of the state relative to its size in the saddle's
+      motion; of a `Scene` in its own units.
+    - `spacing`: the greatest distance of neighbouring points, likewise. They are closer, to a 64th
+      of that, if the curve turns by more than 0.15 from one to the next.
 
     **Returns:** a `Manifold`. A branch of a stable manifold ends early at a stop, at a jump of
-    the section map, or where its points take too long to come near the saddle; an unstable one goes
-    on behind a jump.
+    the section map, or at a kink that turns by more than 166°; an unstable one goes on behind a
+    jump.
 
     **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
     """
@@ -120,7 +118,7 @@ def manifold(
     parts, lengths = ([saddle.place[None]], [saddle.place[None]]), [0.0, 0.0]
 
     def grown() -> Manifold:
-        first, second = (jax.vmap(saddle.map.state)(saddle.curve(part)) for part in parts)
+        first, second = (jax.vmap(saddle.map.state)(saddle.states(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
     def kept() -> Interrupted | None:
@@ -139,15 +137,18 @@ Pieces = Iterator[tuple[Rows, float]]
 
 
 class _Saddle:
-    """A saddle on its section, with its directions."""
+    """A saddle on its section, with its directions; states as rows of numbers relative to their
+    sizes."""
 
     def __init__(self, orbit: Orbit):
         the_map = cycle_map(orbit.machine, method=orbit.method)
-        self.place = in_row(bare(orbit.state))
-        self.map = Settling(the_map, bare(orbit.state), self.place[None], 1, 1.0)
+        place = in_row(bare(orbit.state))
+        self.map = Settling(the_map, bare(orbit.state), place[None], 1, 1.0)
+        unit = self.map.unit
+        self.place = place / unit
         period = int(orbit.cycles)
         whole = cycle_map(orbit.machine, period, method=orbit.method)
-        jacobian = np.asarray(whole.jacobian(orbit.state))
+        jacobian = np.asarray(whole.jacobian(orbit.state)) * unit / unit[:, None]
         values, right = np.linalg.eig(jacobian)
         order = np.argsort(-np.abs(values))
         growth = np.real(values[order])
@@ -158,78 +159,68 @@ class _Saddle:
         turns = 2 if growth[0] < 0 else 1
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
-    def curve(self, parts: list[Rows]) -> Rows:
-        """Points of a curve, with rows of NaN where an angle passes half a turn."""
-        rows = np.concatenate(parts)
+    def carried(self, rows: Rows, periods: int) -> Rows:
+        """Where states are after some periods."""
+        return self.map.carried(rows * self.map.unit, periods * self.period) / self.map.unit
+
+    def states(self, parts: list[Rows]) -> Rows:
+        """Points of a curve as they are, with rows of NaN where an angle passes half a turn."""
+        rows = np.concatenate(parts) * self.map.unit
         rows = self.map.near(rows, np.zeros_like(rows))
         turned = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
         return np.insert(rows, np.flatnonzero(turned.any(axis=1)) + 1, np.nan, axis=0)
 
-    def side_of(self, rows: Rows, periods: int) -> tuple[Row, Rows]:
-        """w·(Pⁿ(x) - xₛ), and Pⁿ(x) - xₛ."""
-        there = self.map.carried(rows, periods * self.period)
+    def side_of(self, rows: Rows, apart: float) -> tuple[Row, Bool[np.ndarray, " _"]]:
+        """w·(Pⁿ(x) - xₛ) of neighbours that are so far `apart`, and whether Pⁿ(x) is near xₛ."""
+        most = np.log(_GROWTH) / np.log(self.growth)
+        periods = np.clip(np.log(_REACH / apart) / np.log(self.growth), 1, max(most, 1))
+        there = self.carried(rows, int(periods))
         away = self.map.near(there, self.place) - self.place
-        return away @ self.across, away
+        return away @ self.across, np.all(np.abs(away) <= _FAR * (1 + np.abs(self.place)), axis=1)
 
 
 def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     ahead = side * saddle.stable
     here, grown = saddle.place, 0.0
-    step, periods = spacing * _CLOSEST * 4, 1
-    most = max(1, int(np.log(_GROWTH) / np.log(saddle.growth)))
+    step = spacing * _CLOSEST * 4
     while grown < length:
         size = min(step, length - grown + 1e-12)
-        found = _ahead(saddle, here, ahead, size, periods)
-        if found is None:
-            if step <= spacing * _CLOSEST:
-                break
-            step = max(step / 2, spacing * _CLOSEST)
-            continue
-        new, away = found
-        if away > _NEAR and periods < most:
-            periods += 1
-            continue
-        if away > _FAR:
-            break
-        direction = (new - here) / size
+        new = _ahead(saddle, here, ahead, size)
+        direction = ahead if new is None else (new - here) / size
         turn = np.arccos(np.clip(direction @ ahead, -1, 1))
-        if turn > _TURN and step > spacing * _CLOSEST:
+        if (new is None or turn > _TURN) and step > spacing * _CLOSEST:
             step = max(step / 2, spacing * _CLOSEST)
             continue
+        if new is None:
+            break
         here, grown, ahead = new, grown + size, direction
         yield new[None], grown
         step = min(spacing, step * (1.5 if turn < _TURN / 3 else 1.0))
 
 
-def _ahead(
-    saddle: _Saddle, here: Row, ahead: Row, size: float, periods: int
-) -> tuple[Row, float] | None:
-    """The point of the stable manifold at a distance from another one, ahead of it, and how far
-    from the saddle its image is; `None` where there is none."""
+def _ahead(saddle: _Saddle, here: Row, ahead: Row, size: float) -> Row | None:
+    """The point of the stable manifold at a distance from another one, ahead of it; `None` where
+    there is none."""
     middle, low, high = np.arctan2(ahead[1], ahead[0]), -_HALF, _HALF
-    scale, at, rows, away = 0.0, 0, np.zeros((0, 2)), np.zeros((0, 2))
-    for round_ in range(_ROUNDS):
+    new = None
+    for _ in range(_ROUNDS):
         turns = np.linspace(low, high, _ARC)
-        angles = middle + turns
+        angles, apart = middle + turns, turns[1] - turns[0]
         rows = here + size * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        value, away = saddle.side_of(rows, periods)
-        change = np.flatnonzero(value[:-1] * value[1:] <= 0)  # never beside what is no number
+        value, near = saddle.side_of(rows, size * apart)
+        # Far from the saddle the line on which w·(x - xₛ) is zero is not its manifold.
+        change = np.flatnonzero((value[:-1] * value[1:] <= 0) & (near[:-1] | near[1:]))
         if not change.size:
             return None
         at = int(change[np.argmin(np.abs(turns[change]))])
-        low, high = turns[at], turns[at + 1]
-        jump = abs(value[at + 1] - value[at])
-        if not round_:
-            scale = max(jump, np.finfo(float).tiny)
-        elif round_ == _ROUNDS - 1 and jump > _CONTINUOUS * scale:
-            return None
-    distance = np.max(np.abs(away[at]) / (saddle.map.unit + np.abs(saddle.place)))
-    return rows[at], float(distance)
+        low, high = turns[at] - _WIDER * apart, turns[at + 1] + _WIDER * apart
+        new = rows[at]
+    return new
 
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """One branch of an unstable manifold, with rows of NaN at jumps."""
-    begin = side * _BEGIN / np.linalg.norm(saddle.unstable / saddle.map.unit) * saddle.unstable
+    begin = side * _BEGIN * saddle.unstable
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
         periods += 1
@@ -253,7 +244,7 @@ def _stretch(
 
     def images(parts):
         rows = saddle.place + begin * (saddle.growth**parts)[:, None]
-        return saddle.map.carried(rows, periods * saddle.period)
+        return saddle.carried(rows, periods)
 
     parts = np.linspace(0, 1, 9)
     rows = images(parts)
