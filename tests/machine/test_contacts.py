@@ -16,14 +16,7 @@ class Oscillator(vi.AbstractMachine):
     omega: float = 0.9
     gap: float = 1.0
     restitution: float = 0.7
-
-    @property
-    def cycle(self):
-        return 2 * jnp.pi / self.omega
-
-    @property
-    def contacts(self):
-        return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
+    cycle = 7.0
 
     def field(self, t, z):
         return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 0.1 * z.u)
