@@ -100,13 +100,15 @@ def test_a_branch_is_the_same_in_all_units(case):
 
 
 @pytest.mark.slow
-def test_a_manifold_is_the_same_in_all_units():
+def test_manifolds_and_exponents_are_the_same_in_all_units():
     curves = []
     for length, time in UNITS[:3]:
         machine = Struck(length=length, time=time, cubic=1.0, gap=9.0, force=0.4, frequency=1.6)
         guess = vi.State(x=-1.106 * length, v=1.224 * length / time)
         found = vi.manifold(vi.find_orbit(machine, guess), length=0.6, spacing=0.1, progress=False)
         assert found.lengths == pytest.approx((0.6, 0.6))
-        curves.append([[x.x / length, x.v * time / length] for x in found.branches])
+        curve = [[x.x / length, x.v * time / length] for x in found.branches]
+        exponents = vi.lyapunov(machine, guess, 16, settle=20).exponents * time
+        curves.append((curve, exponents))
     for other in curves[1:]:
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, curves[0])

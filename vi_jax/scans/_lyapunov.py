@@ -26,6 +26,7 @@ from ..flow import (
     in_names,
     means,
     present,
+    row_sizes,
     simulate,
     states,
     tidy,
@@ -256,6 +257,9 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
     durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(bare(start))[1]
+    # Directions are of numbers relative to their sizes: in units that differ by much, rounding of
+    # the large ones would hide the small ones.
+    unit = row_sizes(machine, start)
 
     # Where all cycles last alike, turning points need not be met for the sake of durations.
     plain = has_fixed_cycle(machine, bare(start)) and not has_averages(machine)
@@ -274,7 +278,8 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         (x, modes), frame, result = carry
 
         def along(direction):
-            return jax.jvp(lambda x: image(x, modes), (x,), (direction,), has_aux=True)
+            there = jax.jvp(lambda x: image(x, modes), (x,), (unit * direction,), has_aux=True)
+            return there[0], there[1] / unit, there[2]
 
         new, grown, (duration, integrals, ended, modes) = jax.vmap(
             along, in_axes=1, out_axes=(None, 2, None)
