@@ -21,9 +21,6 @@ class Oscillator(vi.AbstractMachine):
     def field(self, t, z):
         return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 0.1 * z.u)
 
-    def start(self):
-        return vi.State(x=0.0, u=0.0)
-
 
 class Stack(vi.Mechanical):
     """A body on rough ground, with another one on it."""
@@ -138,7 +135,7 @@ def test_names_that_are_wrong_are_named(field, message):
 def test_contacts_that_are_wrong_are_told(contacts, message):
     machine = type("Wrong", (Oscillator,), {"contacts": contacts})()
     with pytest.raises((TypeError, ValueError), match=message):
-        vi.simulate(machine)
+        vi.simulate(machine, vi.State(x=0.0, u=0.0))
 
 
 def test_a_subclass_replaces_a_number():

@@ -72,6 +72,5 @@ def test_the_unstable_manifold_leads_to_the_motions_on_both_sides(saddle):
 def test_what_has_no_manifolds(saddle):
     with pytest.raises(ValueError, match="`which` must be one of"):
         vi.manifold(saddle, which="center")
-    scene = saddle.machine
     with pytest.raises(ValueError, match="`orbit` must be a saddle"):
-        vi.manifold(vi.find_orbit(scene, scene.start(Y=1.283, V=1.007), 2))
+        vi.manifold(vi.find_orbit(saddle.machine, saddle.machine.start(Y=1.283, V=1.007), 2))
