@@ -183,8 +183,7 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     height = speed / (beta * limit)
     safe = jnp.where((share > 0) & (height > 0), height, 1.0) ** (5 / 6)
     above = safe - jnp.sign(left) * (left**2) ** (5 / 6)
-    # Far from the limit, as where the stop lets go of it with a force that hardly changes, the
-    # manifold is not known.
+    # Far from the limit, as of a force that hardly changes then, the manifold is not known.
     over = remaining(free, number, hops) < _OVER * left
     above = jnp.where(over, -jnp.abs(above), above)
     above = jnp.where(hops.over, jnp.maximum(above, _ESCAPES * safe), above)

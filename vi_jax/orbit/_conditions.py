@@ -152,8 +152,7 @@ class HeldMultiplier(AbstractCondition):
 
 
 def alone(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
-    """The equations of a motion in the last of their parameters only, without conditions, the
-    others as they are at a step; and the step as theirs."""
+    """The equations and the step in the last parameter only, the others as they are at the step."""
     count = len(problem.parameters)
     if not problem.conditions:
         return problem, step
@@ -298,8 +297,7 @@ def minors(matrix: Array | np.ndarray) -> Array:
 
 
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Whether a double multiplier has one eigenvector. With two of them, as where a motion folds
-    and loses a symmetry, no pair of it becomes complex."""
+    """Whether a double multiplier has only one eigenvector, so that a complex pair can arise."""
     sizes, M = np.asarray(problem.sizes)[1:], step.seen.monodromy
     values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
     return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

@@ -187,8 +187,7 @@ def _freed(
 def _widened(
     problem: Shooting, x: np.ndarray, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
 ) -> Shooting:
-    """The equations with these parameters before their own, and as many steps as flights need
-    anywhere in the intervals of all of them."""
+    """The equations with these parameters before their own, and steps for all their intervals."""
     wide = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
     steps = steps_of(problem.method, wide.corners(ranges), problem.like, cycles_to_fly(problem, x))
     return _scaled(dataclasses.replace(wide, steps=max(problem.steps, steps)), ranges)

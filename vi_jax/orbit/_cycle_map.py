@@ -175,8 +175,7 @@ def cycle_map(
 
 
 def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:
-    """A state as a cycle map needs it, in floating-point arrays of one type, with the machine's own
-    modes if it has some; `name` is the argument that messages blame."""
+    """A state as a cycle map needs it: floating-point arrays of one type, with its modes."""
     modes, state = modes_of(state), bare(state)
     state = adopt(machine, in_cycle_state(machine, name, state))
     check_reals(name, state)

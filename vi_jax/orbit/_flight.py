@@ -74,8 +74,7 @@ def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
 
 
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
-    """The acceleration by s towards stop number `number` of the body on it, if that were free: the
-    force that presses it on, per unit of mass."""
+    """The acceleration by s of a body, if it were free, towards the stop on which it rests."""
     stop = stops_of(flight.machine)[number]
     field = flight.letting_go(stop.coordinate).smooth.field
     return guard_rates(field, partial(stop.guard, flight.machine), s, state).a
@@ -136,9 +135,8 @@ class Flight(eqx.Module):
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
     ) -> tuple[Vector, Integrals, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """The flight from the state `u` at clock `s0` to clock `s1`, in equal steps: the state
-        then; the time that passed and the integrals of these averages; clock and state before each
-        of the steps."""
+        """The flight from `u` at clock `s0` to clock `s1`, in equal steps: the state then; time and
+        integrals of these averages; clock and state before each step."""
         form = prepared(self.machine)
         if form.machine is not self.machine:
             inward = form.inward(self.like)

@@ -48,14 +48,12 @@ _SHORTEST = 1e-6
 # After a step that had to be cut so many have its length, before they grow again.
 _STEADY = 3
 
-# What changes within so much of the way to a place changes there, and so does a test that has
-# become so small a share of what it was: above what tests are off by where the equations are
-# singular.
+# What changes within so much of the way to a place changes there, and so does a test that falls to
+# so small a share of what it was: above what tests are off by where equations are singular.
 _SHORT, _NOISE = 1e-4, 1e-3
 
-# Points whose states twice the steps change by more than this, where no more steps are allowed, are
-# warned of: of a motor whose crank slowed to a fifth it was 0.07, with the steps of its first
-# motion.
+# Points whose states twice the steps change by more than this, if no more are allowed, are warned
+# of: of a motor whose crank slowed to a fifth, with the steps of its first motion, it was 0.07.
 _WRONG = 1e-8
 
 # A curve begins at the zero of a test that has this share of what it has a step further on.

@@ -27,8 +27,7 @@ from ._turns import Path, turning
 from ._words import one
 from .special import Point
 
-# A field that differs by less than this (relative to its own size) is continuous where a switch is
-# touched: a choice.
+# A field that differs by less than this share of its size is continuous at a switch: a choice.
 _CONTINUOUS = 1e-9
 
 # How far off a touch is located, as a share of the state: a choice, ten times what is promised.
@@ -136,8 +135,7 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
 
 
 def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
-    """The state after a contact, less what it would be without; `deep`, the state at the greatest
-    depth of the free flight, and how long that would be beyond the surface."""
+    """What a contact changes in the state; `deep`, the greatest depth of the free flight."""
     from scipy.optimize import brentq  # slow to load
 
     unit = problem.radian
@@ -250,8 +248,7 @@ def touched(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """Where the motion grazes its state, ∂h, a, the derivative of h by the parameter, the gradient
-    of dh/ds, and the kick of a rigid stop."""
+    """At a touch the state, ∂h, a, dh by the parameter, the gradient of dh/ds, and the kick."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
@@ -405,13 +402,9 @@ def graze_at(point: Point) -> Graze:
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(x))
-    touches = sorted(
-        (
-            touch_at(problem, x, along, *found)
-            for found in touched(problem, x, number, clock, point.step.seen.length)
-        ),
-        key=lambda touch: touch.clock % period,
-    )
+    places = touched(problem, x, number, clock, point.step.seen.length)
+    touches = [touch_at(problem, x, along, *place) for place in places]
+    touches.sort(key=lambda touch: touch.clock % period)
     touches = touches[-1:] + touches[:-1]  # behind the first one comes the section
     ends = [
         touch.clock + (np.mod(then.clock - touch.clock, period) or period)

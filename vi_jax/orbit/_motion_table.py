@@ -51,20 +51,14 @@ from ._surgery import (
     without_events,
 )
 from ._words import (
-    ANEW,
     CROSSING,
     DETAILS,
     DOUBLING,
     EXTREMUM,
     FOLD,
-    FROM_HALF,
-    FROM_SYMMETRIC,
     GRAZING,
-    HELD_FOLD,
     HOPF,
-    REORDERED,
     REST,
-    RESTS,
     SYMMETRY,
     TORUS,
     TURN,
@@ -83,8 +77,7 @@ _SHORT = 0.999
 # And what lies before an impact that is lost, where the monodromy matrix has a pole: on so much.
 _BEFORE_POLE = 1 - 1e-6
 
-# An autonomous motion of so much of the size of another is rest: what solves its equations there is
-# an equilibrium.
+# An autonomous motion of so much of the size of another is an equilibrium.
 _STILL = 1e-6
 
 # One of so much of the size of its neighbours is about to shrink to rest.
@@ -111,8 +104,7 @@ _HALVES = 17
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
 _SAME_WAY = 0.99
 
-# A number that is watched passes zero where it is less than this share of what it is beside; else
-# it has a pole or jumps.
+# A number passes zero where it is less than this share of what it is beside; else it jumps.
 _ZERO = 1e-6
 
 # A number that changes less than this along the branch (as a share of it, in the norm of the scaled
@@ -177,13 +169,15 @@ class MotionTable(Table):
     def _divided(self, at: Step) -> Ending:
         """The end where a stop is about to let go of a body within its rest."""
         place = place_in_words(self.problem, at, float(at.seen.pull.clock))
-        return self._named(REST, at, RESTS[LEAVES].format(place=place))
+        detail = f"a rest on a stop is divided {place}, where the force on the body falls to zero"
+        return self._named(REST, at, detail)
 
     def _merged(self, at: Step, release: int) -> Point:
         """The point where two rests become one, of the motion without the flight between them."""
         both = [release, (release + 1) % self.problem.legs]
         clock = float(self.problem.values(at.x)[0][release])
-        detail = RESTS[REORDERED].format(place=place_in_words(self.problem, at, clock))
+        place = place_in_words(self.problem, at, clock)
+        detail = f"two rests on a stop become one: the body no longer leaves it {place}"
         old, at = alone(self.problem, at)
         new, x = without_events(old, at.x, both)
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
@@ -201,14 +195,17 @@ class MotionTable(Table):
         together = ROUNDING * self.problem.radian
         off = 0.0 if here.seen.order_margin > together else together
         for i, event in enumerate(self.problem.landings):
-            lost = partial(self._named, REST, detail=RESTS[LANDS], impact=event)
+            detail = "a rest on a stop is lost: its chatter lasts until the release"
+            lost = partial(self._named, REST, detail=detail, impact=event)
             yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
         if self.problem.rests:
             yield Event(pulled, self._divided)
-        anew, reordered = (partial(self._ended, here, other=kind) for kind in (ANEW, REORDERED))
-        yield Event(room, partial(self._ended, here))
-        yield Event(lambda step: float(step.seen.order), anew)
-        yield Event(lambda step: float(step.seen.order_margin) + off, reordered)
+        anew = "a switch goes into another mode: the motion sticks or slips anew"
+        other = "two of its events coincide, and happen in another order beyond"
+        ended = partial(self._ended, here)
+        yield Event(room, ended)
+        yield Event(lambda step: float(step.seen.order), partial(ended, other=anew))
+        yield Event(lambda step: float(step.seen.order_margin) + off, partial(ended, other=other))
 
     def _ended(
         self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
@@ -226,7 +223,7 @@ class MotionTable(Table):
             detail = SLIDING[change.kind][change.exists].format(name=name, place=place)
             return self._named(change.kind, at, detail, impact)
         if other is not None:
-            return self._named(GRAZING, at, DETAILS[other])
+            return self._named(GRAZING, at, other)
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
             return self._named(GRAZING, at, detail)
@@ -239,9 +236,8 @@ class MotionTable(Table):
         return self._named(GRAZING, at, detail, impact)._replace(until=short)
 
     def _springs_off(self, here: Step) -> Iterator[Event]:
-        """The rows of places where the two halves of the period become alike, or images of each
-        other: beyond, the same motions come again, observed half a period later or in the
-        mirror."""
+        """The rows of places where both halves of the period become alike, or images of each other:
+        beyond, the same motions come again, half a period later or in the mirror."""
         for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self.images)):
             begin = apart(here)
             if np.linalg.norm(begin) < ROUNDED:
@@ -257,7 +253,7 @@ class MotionTable(Table):
                     return None
                 else:
                     at = self._crossing(here, at, FOLD)
-                    point = self._point(kind, at, DETAILS[FROM_SYMMETRIC])
+                    point = self._point(kind, at, "the branch begins at a symmetric motion")
                 # Beyond it the tests have changed twice: what lies before it shows short of it.
                 return Ending(at, kind, point, self._on_the_way(here, at, _SHORT))
 
@@ -271,8 +267,7 @@ class MotionTable(Table):
         return super().stalled(steps) if sprung is None else Ending(sprung[0], DOUBLING, sprung[1])
 
     def _sprung(self, at: Step) -> tuple[Step, Point] | None:
-        """Where the branch springs from a motion of half its period: as a step of the branch, and
-        as a special point of that motion; `None` if that is not close."""
+        """Where the branch springs from a motion of half its period: its step and that motion's."""
         apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at)
         if apart > _ALMOST * ALIKE:
             return None
@@ -280,7 +275,8 @@ class MotionTable(Table):
         if apart > ALIKE and begins is before[1]:
             return None
         at = at if self.problem.conditions else begins
-        point = point_at(half, step, DOUBLING, DETAILS[FROM_HALF], springs=True)
+        detail = "the branch begins at a motion of half the period"
+        point = point_at(half, step, DOUBLING, detail, springs=True)
         return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
     def passed(self, here: Step, last: Step) -> Passed:
@@ -314,8 +310,7 @@ class MotionTable(Table):
                 yield self._point(kind, at, detail, quantity=name), at
 
     def _numbers(self, step: Step) -> dict[tuple[str, str], tuple[float, float]]:
-        """Of each number whose extremes or zeros are sought its value at a point, and what is zero
-        there: how it changes along the branch, or itself."""
+        """Of each number sought its value at a point, and what is to vanish: its rate or itself."""
         found = {}
         if self.extrema:
             direction = step.tangent * self.scale
@@ -412,7 +407,7 @@ class MotionTable(Table):
         elif kind == CROSSING and self.symmetric and self._asymmetry(at) < ALIKE:
             kind, detail = SYMMETRY, DETAILS[SYMMETRY]
         elif kind == CROSSING and held:
-            kind, detail = FOLD, DETAILS[HELD_FOLD]
+            kind, detail = FOLD, "a multiplier passes 1"
         return [(self._point(kind, at, detail), at)]
 
     def _shrinks_to_rest(self, here: Step, at: Step, last: Step) -> bool:
@@ -447,8 +442,7 @@ class MotionTable(Table):
 
 
 def _brief_flight(problem: Shooting, at: Step) -> int | None:
-    """The number of a release whose flight to the same stop is brief, and the shortest interval
-    between two events; `None` without one."""
+    """The number of a release whose flight to the same stop is brief and the shortest, if any."""
     if not problem.landings:
         return None
     clock, _, period = problem.values(at.x)
@@ -539,8 +533,7 @@ def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
 # velocity for every number of the machine. So it is the equilibrium that is solved for there, and
 # the number at which two of its eigenvalues are imaginary.
 
-# The motion that stands for the branch there has so much of the size of the one before it. This and
-# the numbers below are choices.
+# The motion that stands for the branch there has so much of the size of the one before it.
 _TINY = 1e-5
 
 # By how much an eigenvalue's period may differ from that of the last motion, as a share of it.
@@ -603,8 +596,7 @@ def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
 @on_host
 def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
     """What (u, p, ω, Re v, Im v) = y·scale lacks to be an equilibrium u with an eigenvector v to
-    iω, in length and phase like another one, all relative to its size; and the derivative of
-    that."""
+    iω, like another one in length and phase, relative to its size; and its derivative."""
     n = problem.states
 
     def missing(y):

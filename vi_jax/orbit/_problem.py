@@ -122,8 +122,7 @@ def _fewest(method: AbstractMethod, machine: AbstractMachine, like: State) -> Sc
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
-# Events of a cycle that can be followed, of a machine with switches or a section of its own: a
-# choice.
+# Events of a cycle that can be followed, with switches or a section of one's own: a choice.
 _LISTED = 32
 
 # Twice the steps of a flight change its end by less than this (relative to the motion's size); a
@@ -136,15 +135,13 @@ _SETTLED, _MOST = 1e-11, 4096
 COARSE = 1e-10
 
 
-# Events so close (by the clock) are met at one instant, and a guard so far from zero there is not
-# met by the motion: choices.
+# Events so close (by the clock) are at one instant; a guard so far from zero is not met: choices.
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 
 # A number of the state that is less than the first share of the largest one at events, or less than
 # the second in the whole course of a motion, is taken for as large: choices, the second one above
-# what is left of a number that decays to zero. If all numbers are less than the third, the motion
-# is rest, and 1 is its size.
+# what is left of one that decays to zero. If all are less than the third, 1 is their size, at rest.
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
@@ -214,8 +211,7 @@ def problem_of(
 
 
 def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
-    """The equations with the sizes of the clock, for which a cycle is 2π, and of the numbers of the
-    state: half their largest moduli in the course of this solution."""
+    """The equations with the sizes of the clock (a cycle is 2π) and of the numbers of the state."""
     _, states, period = problem.values(x)
     sizes = _sizes(states)
     if largest is not None and np.isfinite(largest).all():
@@ -262,17 +258,15 @@ def _check_instants(
 
 
 def sized_by_motion(problem: Shooting) -> bool:
-    """Whether only the motion itself tells how many steps its flights need: one that paces its own
-    clock, as a motor's crank, may be slow anywhere."""
+    """Whether only the motion tells how many steps it needs, as its pace may be slow anywhere."""
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
 def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
-    """The equations with as many steps as the flights of a solution ask for, which now is `off_by`
-    so much, and a method by which simulations of it are as exact; `None` where more change nothing,
-    or more are not allowed."""
+    """The equations with as many steps as a solution that is now `off_by` so much asks for, and as
+    exact a method; `None` where more steps change nothing, or are not allowed."""
     more = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
@@ -289,8 +283,7 @@ def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
 def _followed(
     blank: Shooting, state: State, found: list[Placed], period: float
 ) -> tuple[np.ndarray, Modes]:
-    """A motion of one period, from event to event: the states just before each of them and at the
-    end, and the modes; `blank`, the equations without events."""
+    """A motion of one period: the states just before each event and at the end, and the modes."""
     machine = blank.machine
     own, state = modes_of(state), bare(state)
     modes = begin_modes(machine, jnp.zeros(()), state, own)

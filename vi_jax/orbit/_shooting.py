@@ -35,7 +35,6 @@ from ..machine import (
     jump_of,
     mode_number,
     nearest_images,
-    own_modes,
     section_number,
     stops_of,
     with_leaf,
@@ -45,8 +44,7 @@ from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from ._turns import Nearest, Path, pull_of, turns_of
 from .results import multipliers_of
 
-# A distance or a speed is zero within this share of the largest of a motion: a choice, a hundred
-# times the corrector's tolerance.
+# A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
 
 
@@ -237,8 +235,7 @@ class Shooting(eqx.Module):
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
     def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Vector:
-        """The vector of unknowns, from `parts` of it, other unknowns that end with the same
-        parameters, and of an autonomous machine the period."""
+        """The unknowns, from `parts`, others with the same parameters, and perhaps a period."""
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = clock.at[0].set(period)
@@ -271,10 +268,6 @@ class Shooting(eqx.Module):
             return ()
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
         return tuple(modes[j] for j in range(len(self.modes[0])))
-
-    def own_modes(self, leg: Leg) -> tuple[Array, ...]:
-        """The machine's own modes in a leg: those that no event holds."""
-        return own_modes(self.machine, self.modes_in(leg))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
         """`function(event, *inputs)` for the event that begins a leg, which may be traced."""
@@ -384,9 +377,7 @@ class Shooting(eqx.Module):
 
     def lacks(self, x: Vector) -> Vector:
         """The left sides of the motion's own equations: what each leg lacks to end where the next
-        one begins, then the guards; zero for a periodic motion. Its Jacobian is taken forward
-        (`jacobian_at`, `advance`), so that each leg is carried along with its
-        derivatives."""
+        one begins, then the guards; zero for a periodic motion."""
         return self._arrivals(x)[0]
 
     def _arrivals(self, x: Vector) -> tuple[Vector, Hops]:
@@ -492,8 +483,7 @@ class Shooting(eqx.Module):
         return least
 
     def _time_left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
-        """Time from the end of the chatter that begins with event number i to the next event, if
-        that is not its release (of which `_escape` says more)."""
+        """Time from the end of a chatter to the next event, if that is not its release."""
         landing = self.events[i]
         if self.events[(i + 1) % self.legs] == landing._replace(use=LEAVES):
             return jnp.full_like(until, jnp.inf)

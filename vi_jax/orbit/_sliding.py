@@ -134,16 +134,12 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     leg, mode = int(leg), _mode(problem, int(leg), number)
     if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
         return None
-    if mode:
-        force = holding_force(problem, at, leg, number, place)[0]
-        # A surface that is touched from one side holds only what the other side's field drives on.
-        return (
-            Change(number, place, (mode, 0.0, mode), False)
-            if force < _ZERO * _unit(problem, at, held=True)
-            else None
-        )
-    away = holding_force(problem, at, leg, number, place)[2]
-    return Change(number, place, (0.0, away, 0.0), False)
+    force, _, away = holding_force(problem, at, leg, number, place)
+    if not mode:
+        return Change(number, place, (0.0, away, 0.0), False)
+    # A surface that is touched from one side holds only what the other side's field drives on.
+    is_held = force < _ZERO * _unit(problem, at, held=True)
+    return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
 def _beginning(problem: Shooting, at: Step) -> Change | None:
@@ -195,8 +191,7 @@ def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
 def holding_force(
     problem: Shooting, at: Step, leg: int, number: int, s: float
 ) -> tuple[float, float, float]:
-    """How far what drives a switch off its surface exceeds what holds it there, how fast that grows
-    while it is held, and the mode in which it would leave."""
+    """By how much a switch is driven off its surface, the rate of that, and its next mode."""
     begins = bool(s == problem.values(at.x)[0][leg])
     force, rate, mode = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
     return float(force), float(rate), float(mode)
@@ -207,8 +202,7 @@ _CLOSE = 1e-8
 
 
 def refined(problem: Shooting, at: Step, change: Change) -> Step:
-    """The special point at which a part of the motion vanishes, from one that is close to it; the
-    same where it is close enough, or no other is found."""
+    """The special point at which a part of the motion vanishes, from one that is close to it."""
     clock = problem.values(at.x)[0]
     close = abs(float(at.seen.order_margin)) < _CLOSE * problem.radian
     if not change.exists or problem.conditions or close:
@@ -231,9 +225,8 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
 def without_part(
     problem: Shooting, at: Step, change: Change
 ) -> tuple[Shooting, np.ndarray, int | None]:
-    """The equations of a motion without the part that vanishes at a special point, and the unknowns
-    that solve them; and its event at which the switch is only just held, `None` where its surface
-    is touched."""
+    """The equations and unknowns of a motion without the part that vanishes, and its event at which
+    the switch is only just held, `None` where its surface is touched."""
     first = int(np.argmin(np.abs(problem.values(at.x)[0] - change.clock)))
     alike = change.modes[0] == change.modes[2]
     if not change.exists:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from .._programs import compiled
 from .._types import Flag, Scalar, State
 from ..flow import simulate
-from ..machine import frequency_ratio, phase_at, with_modes
+from ..machine import frequency_ratio, own_modes, phase_at, with_modes
 from ._shooting import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
@@ -72,8 +72,7 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
-    """Derivative and value. Unlike `jax.jacfwd` it does not ask for a value that is the same for
-    all directions: loops within a function may not give one."""
+    """Derivative and value; unlike `jax.jacfwd`, where loops do not give one value for all."""
 
     def along(direction):
         return jax.jvp(function, (x,), (direction,))
@@ -165,8 +164,7 @@ _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 # equations are singular, what is left to be told is the rounding of the corrector. A choice.
 _TRIALS = 5
 
-# How far beside a point where branches cross (in the norm of the scaled unknowns) it is looked at:
-# a choice.
+# How far beside a point where branches cross (by the scaled unknowns) it is looked at: a choice.
 BESIDE = 1e-3
 
 # At most so many times as far on each side.
@@ -231,8 +229,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
         return None
     except _CloseError:
         root = silent[-1]
-    # Where branches cross, or a motion shrinks to rest, the corrector has no answer; a point short
-    # of it will do.
+    # Where branches cross, or a motion shrinks to rest, a point short of it has to do.
     for short in _SHORT_OF:
         if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
             break
@@ -353,8 +350,9 @@ def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
 def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
     """The state on the first section of a solution, with the machine's own modes."""
     sections = sections_of(problem, x)[0] if sections is None else sections
-    modes = problem.own_modes(int(problem.sections(jnp.asarray(x))[0][0]))
-    return with_modes(jax.tree.map(lambda x: x[0], sections), modes)
+    modes = problem.modes_in(int(problem.sections(jnp.asarray(x))[0][0]))
+    state = jax.tree.map(lambda x: x[0], sections)
+    return with_modes(state, own_modes(problem.machine, modes))
 
 
 def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:

@@ -52,8 +52,6 @@ from ._words import (
     FLIP,
     FOLD,
     GRAZING,
-    ONE_DOUBLING,
-    ONE_FOLD,
     RESONANCE_1,
     RESONANCE_2,
     RESONANCE_3,
@@ -71,8 +69,7 @@ from .special import Point, point_at
 # pole. The second for entries of the local map: one that is as small vanishes as well.
 _ZERO, _ENTRY = 1e-6, 1e-4
 
-# An impact slower than so many times the root of a clearance is the turn that has it: for
-# accelerations of up to 50.
+# An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
 
 # Motions that graze are looked at over so many periods.
@@ -199,8 +196,7 @@ class Vectors(NamedTuple):
     right: np.ndarray
 
 
-# The value of a test at a step and the vectors that it used, given those of a point close by, whose
-# senses they keep.
+# The value of a test and the vectors that it used, in the senses of those of a point close by.
 Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 
@@ -268,10 +264,9 @@ def _resonances(
     known = [local(step) for step in steps]
     both = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
-        begins = RESONANT if both else (ONE_FOLD if sign > 0 else ONE_DOUBLING)
-        what = (
-            f"{AT_CODIMENSION_TWO[begins]} of the motion with one impact in {so_many(n, 'period')}"
-        )
+        begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
+        begins = AT_CODIMENSION_TWO[RESONANT] if both else begins
+        what = f"{begins} of the motion with one impact in {so_many(n, 'period')}"
         test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
         values = [each.resonance(n, sign) for each in known]
         for i, (before, after) in enumerate(itertools.pairwise(values)):

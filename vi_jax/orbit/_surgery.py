@@ -76,8 +76,7 @@ def _halves(
 
 
 def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
-    """How the second half of the period differs from the first one, or from its image under the
-    symmetry of the machine, in the sizes of the unknowns."""
+    """The difference of both halves of the period, or from the image, in the unknowns' sizes."""
     return _halves(problem, step.x, mirrored) / problem.half_scale()
 
 

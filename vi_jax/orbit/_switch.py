@@ -53,12 +53,10 @@ from .special import Point, point_at
 
 _ORBIT = "orbit"
 
-# Periods after which a stable motion near a point has settled, and the impacts of a cycle that are
-# listed: choices.
+# Periods after which a stable motion has settled; impacts of a cycle that are listed: choices.
 _SETTLES, _LISTED = 100, 32
 
-# Events that are closer than this (a cycle is 2π) fall together: a choice, above how close a place
-# is located.
+# Events closer than this (a cycle is 2π) fall together: a choice, above what places are off by.
 _TOGETHER = 1e-6
 
 
@@ -70,8 +68,7 @@ def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
 
 
 def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
-    """The equations of a motion that is gone through n times, the unknowns, and the right singular
-    vectors of the derivative by all but the parameter."""
+    """The motion gone through n times, and right singular vectors of the derivative by its x."""
     new = several(point.problem, n)
     x = repeated(point.problem, point.step.x, new)
     return new, x, np.linalg.svd((jacobian_at(new, x) * new.scale)[:, :-1])[2]
@@ -253,8 +250,7 @@ def _as_kind(kind: str, point: Point, distance: float) -> Point:
 def _in_two(
     point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of motions beside a point of a boundary in its two parameters and under a
-    condition, and the unknowns, from those in the first parameter."""
+    """Equations and unknowns beside a point of a boundary in two parameters, with a condition."""
     ((name, (value, size)),) = point.further.items()
     two = dataclasses.replace(
         problem, parameters=(name, *problem.parameters), conditions=(condition,),

@@ -166,8 +166,7 @@ def _least_room(rooms: dict[int, _Room], h: Scalar) -> Nearest:
 
 
 def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
-    """The turning points of each coordinate, and how near the flight comes to each of the machine's
-    events but its section, in their order."""
+    """The turning points of each coordinate, and of each event but the section how near it is."""
     flight, machine, begin = path.flight, path.flight.machine, path.places[0]
     found = partial(_turns_in, path)
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
@@ -252,8 +251,7 @@ def _turn(
     length = jax.lax.fori_loop(0, 4, newton, stop_gradient(h * share))
     here = at(flight, s, u, length)
     bend = jnp.where(here.a == 0, 1.0, here.a)
-    # A guard with a kink (as that of dry friction, where its force vanishes) may have no turn
-    # there.
+    # A guard with a kink, as that of dry friction where its force vanishes, may have no turn.
     met = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
     shift = jnp.where(met, here.v, 0.0) / bend
     happens = watched.happens(flight, s, u, length)

@@ -1,7 +1,7 @@
 """The kinds of special points, and what is said of them."""
 
 from ..machine import RigidStop, SoftStop, clock_in_words
-from ._flight import LANDS, LEAVES, Event
+from ._flight import Event
 from ._shooting import Shooting
 from ._sliding import SLIDING
 from ._solution import Step
@@ -19,10 +19,8 @@ RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 # Kinds at which something is touched: by a flight, or by a body that is only just held.
 TOUCHING = (GRAZING, REST, *SLIDING)
 
-# What else a motion may end at than a lost event or a touch; a turn that a branch makes where it
-# leaves another one to both sides; a fold where numbers are held; where a branch springs.
-REORDERED, ANEW, TURNS, HELD_FOLD = "reordered", "anew", "turns", "held-fold"
-FROM_HALF, FROM_SYMMETRIC = "from-half", "from-symmetric"
+# A turn that a branch makes where it leaves another one to both sides.
+TURNS = "turns"
 
 # What is said of a special point, by its kind or one of these.
 DETAILS = {
@@ -33,23 +31,8 @@ DETAILS = {
     TORUS: "a complex pair of multipliers leaves the unit circle",
     TURN: "the parameter turns back while other quantities are held",
     TURNS: "a multiplier touches 1: this branch begins at another one, on both sides",
-    HELD_FOLD: "a multiplier passes 1",
     HOPF: "the motion shrinks to an equilibrium",
-    FROM_HALF: "the branch begins at a motion of half the period",
-    FROM_SYMMETRIC: "the branch begins at a symmetric motion",
-    REORDERED: "two of its events coincide, and happen in another order beyond",
-    ANEW: "a switch goes into another mode: the motion sticks or slips anew",
 }
-
-# How a branch words the end of a rest, by the event or the change at which it ends.
-RESTS = {
-    LANDS: "a rest on a stop is lost: its chatter lasts until the release",
-    LEAVES: "a rest on a stop is divided {place}, where the force on the body falls to zero",
-    REORDERED: "two rests on a stop become one: the body no longer leaves it {place}",
-}
-
-# What begins at a resonant grazing of a machine with more than two numbers in its state.
-ONE_FOLD, ONE_DOUBLING = "one-fold", "one-doubling"
 
 # What is said of a point of codimension two.
 AT_CODIMENSION_TWO = {
@@ -62,8 +45,6 @@ AT_CODIMENSION_TWO = {
     RESONANCE_3: "the angle of the multipliers is 2π/3",
     RESONANCE_4: "the angle of the multipliers is π/2",
     RESONANT: "a curve of folds and one of period doublings begin",
-    ONE_FOLD: "a curve of folds begins",
-    ONE_DOUBLING: "a curve of period doublings begins",
     FOLD: "the motion that grazes has a multiplier 1",
     DOUBLING: "the motion that grazes has a multiplier -1",
     SYMMETRY: "the motion loses or gains its symmetry: a curve of symmetry breakings comes here",

@@ -29,8 +29,7 @@ from ..flow import lack_of_closed_form
 from ..machine import IdealDrive, Scene, Shown
 from .results import eigenvalues
 
-# Grid points per drive cycle on which turning points are bracketed: a choice, for ζ well above
-# 1/256.
+# Grid points per drive cycle that bracket turning points: a choice, for ζ well above 1/256.
 _POINTS = 256
 
 

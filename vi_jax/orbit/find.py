@@ -22,16 +22,7 @@ from .._checks import concrete, count, flag
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, State, Vector
-from ..flow import (
-    MethodLike,
-    Run,
-    check_leaves,
-    in_modes,
-    means,
-    row_sizes,
-    shape_of,
-    simulate,
-)
+from ..flow import MethodLike, Run, check_leaves, in_modes, means, row_sizes, shape_of, simulate
 from ..machine import (
     AbstractMachine,
     HybridState,
@@ -103,14 +94,12 @@ def _start_change(
 # Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
 _PLACES = 8
 
-# A motion drifts if so much of what it lacks to be periodic is what no other start would change: by
-# choice, most of it.
+# A motion drifts if no other start would change so much of what it lacks to be periodic: a choice.
 _DRIFTS = 0.5
 
 
 def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
-    """The motion with its impacts. The look at the guess and that at the orbit ask for the same
-    program, if they are as long."""
+    """The motion with its impacts: one program for the guess and the orbit, if as long."""
     places = _places(the_map, state)
     return simulate(
         the_map.machine, state, the_map.cycles, method=the_map.method,
@@ -516,8 +505,8 @@ def _judged(
         history=root.history,
         averages=means(sums, duration),
         result=_verdict(
-            found, least < cycles, near, drifts, still, jnp.isnan(root.residual),
-            (root.converged > 0) & ~again,
+            found, least < cycles, grazing=near, drifts=drifts, equilibrium=still,
+            other_modes=(root.converged > 0) & ~again, not_simulated=jnp.isnan(root.residual),
         ),
     )  # fmt: skip
 
@@ -572,16 +561,10 @@ def _slack(dtype: object) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def _verdict(
-    found: Array, smaller: Array, near_grazing: Array, drifts: Array, still: Array, no_run: Array,
-    other_modes: Array,
-) -> ORBIT_RESULTS:  # fmt: skip
-    """The result of a search: `near_grazing`, where it ended; `no_run`, the guess cannot be
-    simulated; `other_modes`, the motion ends where it began, but in other modes."""
-    where, results = ORBIT_RESULTS.where, ORBIT_RESULTS
-    missed = where(near_grazing, results.grazing, results.no_orbit)
-    missed = where(drifts, results.drifts, missed)
-    missed = where(other_modes, results.other_modes, missed)
-    missed = where(still, results.equilibrium, missed)
-    missed = where(no_run, results.not_simulated, missed)
-    return where(found, where(smaller, results.smaller_period, results.successful), missed)
+def _verdict(found: Array, smaller: Array, **reasons: Array) -> ORBIT_RESULTS:
+    """The result of a search; of several reasons for a failure the last one in this order."""
+    where, missed = ORBIT_RESULTS.where, ORBIT_RESULTS.no_orbit
+    for name in ("grazing", "drifts", "other_modes", "equilibrium", "not_simulated"):
+        missed = where(reasons[name], getattr(ORBIT_RESULTS, name), missed)
+    successful = where(smaller, ORBIT_RESULTS.smaller_period, ORBIT_RESULTS.successful)
+    return where(found, successful, missed)

@@ -205,8 +205,7 @@ def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[s
 
 def _next_to_each_other(offsets: np.ndarray, period: np.ndarray) -> bool:
     """Whether the periods of motions with one impact (0 elsewhere) grow towards the grazing, some n
-    next to n + 1. Between two stops, say, there may be 5 and 7 without 6 or anything beyond: no
-    period adding."""
+    next to n + 1. Between two stops there may be 5 and 7 without 6: no period adding."""
     kinds = np.unique(period[period > 0])
     places = [np.median(np.log(np.abs(offsets[period == n]))) for n in kinds]
     return bool((np.diff(places) < 0).all() and (np.diff(kinds) == 1).any())
@@ -268,8 +267,7 @@ _ROUNDING = 1e-11
 # Far away a motion is periodic if it repeats within 1e-6 of how far it is: a choice.
 _FAR = 1e-3
 
-# A motion on the section farther off than so many kicks of the greatest depth could add up to has
-# left: a choice.
+# A motion farther off on the section than so many of the deepest kicks has left: a choice.
 _KICKS = 64
 
 
@@ -367,10 +365,8 @@ class Motions(NamedTuple):
 
 @on_host
 def _position_of(problem: Shooting, states):
-    flat = states.reshape(-1, problem.states)
-    return jax.vmap(lambda u: problem.machine.position(problem.unravel(u)))(flat).reshape(
-        states.shape[:-1]
-    )
+    place = lambda u: problem.machine.position(problem.unravel(u))
+    return jax.vmap(place)(states.reshape(-1, problem.states)).reshape(states.shape[:-1])
 
 
 def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarray:
@@ -605,8 +601,7 @@ def _within(
 
 
 def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
-    """What the local map forecasts of a grazing, not yet compared with the machine; and what it
-    settles on at each value of the parameter."""
+    """What the local map forecasts, and what it settles on at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     natural, brief = natural_depth(local), _brief_depth(graze)

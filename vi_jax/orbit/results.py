@@ -306,10 +306,7 @@ class Orbit(Summarized):
         variables |= present({name: getattr(self, name) for name in each}, (*batch, "impact"))
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
         variables |= present({"monodromy": self.monodromy}, (*batch, "row", "column"))
-        words = {
-            "result": in_names(self.result),
-            "stability": in_names(self.stability),
-        }
+        words = {"result": in_names(self.result), "stability": in_names(self.stability)}
         data = xr.Dataset(variables | present(words, batch))
         own = {name: name for name in self.averages}
         return tidy(with_units(data, units_of(self.machine), own), along)

@@ -22,8 +22,7 @@ from .._types import Scalar
 
 Matrix = Float[Array, "n n"]
 
-# Where the greatest singular value is larger than this, a motion is so unstable that its rounding
-# hides what is neutral: a choice.
+# Above this singular value a motion is so unstable that rounding hides what is neutral: a choice.
 _STEEP = 1e3
 
 
@@ -46,8 +45,7 @@ def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None
     return jnp.linalg.solve(matrix + filled, missing)
 
 
-# A motion smaller than the first part of the guess, or than the second, is at rest in the origin.
-# Choices.
+# A motion smaller than the first share of the guess, or than the second, is at rest: choices.
 _NOTHING, _REST = 1e-6, 1e-9
 
 Unknowns = Float[Array, "..."]

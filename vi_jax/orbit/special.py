@@ -12,13 +12,7 @@ from ._conditions import alone
 from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING
 from ._solution import Step, orbit_of
-from ._words import (
-    DETAILS,
-    GRAZING,
-    REST,
-    grazing_in_words,
-    one,
-)
+from ._words import DETAILS, GRAZING, REST, grazing_in_words, one
 from .results import InWords, Orbit
 
 # Where something grazes it is touched to rounding, by choice within this share of the motion.

@@ -141,8 +141,7 @@ def tracked(
     trail: list[Rows] | None = None,
     tell: Tell = silent,
 ) -> EdgeState:
-    """The edge state between a start that comes back and one that does not. The sections along the
-    edge are added to `trail`."""
+    """The edge state between a start that comes back and one that does not; adds to `trail`."""
     recurs, trail = _RECURS, [] if trail is None else trail
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)

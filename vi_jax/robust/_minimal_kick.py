@@ -38,8 +38,7 @@ Kicks = Float[np.ndarray, "..."]
 # Points of a ray that are judged at once between two others: a choice, three bits a round.
 _BETWEEN = 7
 
-# Rounds by which the exits of the rays are narrowed before they are compared, and at most those of
-# a closer look. Choices.
+# Rounds that narrow the exits of rays before they are compared; at most, in a closer look. Choices.
 _COARSE, _FINE = 7, 17
 
 # Points on a ray as the rays grow, doubled until one leaves, at most so many times.
@@ -92,8 +91,7 @@ class Exits:
 
 
 def spread(count: int, size: int, seed: int) -> Kicks:
-    """Directions all around: both ways along a line, evenly around a circle, at random in more
-    dimensions."""
+    """Directions all around: both ways, evenly around a circle, at random in more dimensions."""
     if size == 1:
         return np.array([[1.0], [-1.0]])
     if size == 2:
@@ -164,11 +162,8 @@ def first_exits(
         least = found.outside.min()
         closer = exits(settling, kick, rays, 0.0, least, points)
         nearer = closer.outside < found.outside
-        found = Exits(
-            rays,
-            np.where(nearer, closer.inside, found.inside),
-            np.where(nearer, closer.outside, found.outside),
-        )
+        inside = np.where(nearer, closer.inside, found.inside)
+        found = Exits(rays, inside, np.where(nearer, closer.outside, found.outside))
         if found.outside.min() > 0.5 * least:
             break
     return narrowed(settling, kick, found, _COARSE)
@@ -188,9 +183,8 @@ def nearest_first(found: Exits, most: int) -> list[int]:
 def nearer(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, rounds: int, seed: int
 ) -> tuple[Row, float, float]:
-    """A direction near another one that leaves sooner, by looking ever more closely around the
-    best: for a boundary without a derivative; and the last radius that comes back and the first
-    that does not."""
+    """A direction near another that leaves sooner, by looking ever closer around the best; the
+    last radius that comes back and the first that does not."""
     rng = np.random.default_rng(seed)
     best: tuple[Row, float, float] = unit, 0.0, radius
     for _ in range(rounds):
@@ -526,9 +520,8 @@ def _exact(
 ) -> _Found:
     """The shortest kick near a ray that leaves the basin at a radius."""
     unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
-    line = narrowed(
-        settling, kick, Exits(unit[None], np.array([inside]), np.array([outside])), _ROUNDING
-    )
+    line = Exits(unit[None], np.array([inside]), np.array([outside]))
+    line = narrowed(settling, kick, line, _ROUNDING)
     outside = float(line.outside[0])
     ends = kick.rows(np.array([line.inside[0], outside * (1 + _ASIDE)])[:, None] * unit)
     if settling.begin > 0:
@@ -536,9 +529,9 @@ def _exact(
     edge = tracked(settling.starting(0.0), ends[0], ends[1], longest, _ROUNDS)
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
-        if better is not None:
-            if -_SHORTER <= np.linalg.norm(better[0]) / outside - 1 <= _LONGER:
-                return *better, True, edge
+        longer = np.nan if better is None else np.linalg.norm(better[0]) / outside - 1
+        if better is not None and -_SHORTER <= longer <= _LONGER:
+            return *better, True, edge
     narrow = angle / NARROWER**_LOOKS
     unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
     return unit * outside, (outside - inside) / outside, False, edge

@@ -16,15 +16,7 @@ from .._checks import count, given_number
 from .._messages import Tell, silent
 from .._programs import compiled
 from .._types import State
-from ..flow import (
-    RESULTS,
-    MethodLike,
-    Run,
-    RunOptions,
-    simulate,
-    simulate_pool,
-    sizes_on_host,
-)
+from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool, sizes_on_host
 from ..machine import (
     AbstractMachine,
     angles_in,
@@ -54,8 +46,7 @@ Rows = Float[np.ndarray, "_ _"]
 RETURNS, ELSEWHERE, INADMISSIBLE = 1, 0, -1
 """Verdicts on a start: it comes back to the motion, it does not, or it cannot be one."""
 
-# Lanes of the program by which starts are judged: those beyond the last start are not run, so that
-# few starts cost few. A choice.
+# Lanes of the program that judges starts: those beyond the last start are not run. A choice.
 _LANES = 1024
 
 # All relative to the motion's size (see `orbit.distance`). A motion whose sections change by less
@@ -192,9 +183,8 @@ class Settling:
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
-        """Two starts on the line between two others, that comes back and that does not, so close
-        to each other (relative to the motion's size). Fifteen points at once are judged between
-        them."""
+        """Two starts between two others, as close as this (by the motion's size), that comes back
+        and that does not. Fifteen points at once are judged between them."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
         while distance(outside, inside, self.unit) > width:
             between = inside + parts * (outside - inside)
@@ -206,8 +196,7 @@ class Settling:
         return inside, outside
 
     def settled_rows(self, start: Row, longest: int) -> Rows | None:
-        """The section states of one period of the motion that a start settles on; `None` if it has
-        none of at most `longest` cycles, or comes to no end."""
+        """The section states of one period of what a start settles on, of `longest` at most."""
         last = self.carried(start[None], self.settle)
         if not np.isfinite(last).all():
             return None
