@@ -21,12 +21,12 @@ from ._sweep import sweep as sweep
 from ._sweep import taken_along as taken_along
 from .measures import REGIMES as REGIMES
 from .measures import AbstractMeasure as AbstractMeasure
+from .measures import Density as Density
+from .measures import Escape as Escape
 from .measures import Exponent as Exponent
 from .measures import Regime as Regime
 from .measures import Sections as Sections
+from .measures import Statistics as Statistics
+from .measures import escape_rate as escape_rate
 from .program import make_program as make_program
-from .statistics import Density as Density
-from .statistics import Escape as Escape
-from .statistics import Statistics as Statistics
-from .statistics import escape_rate as escape_rate
 from .store import NOT_COMPUTED as NOT_COMPUTED

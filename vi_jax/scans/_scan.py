@@ -9,15 +9,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,25 +22,15 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from .. import lanes
-from .._checks import count, fits_memory, fits_records, flag, instance_of
+from .._checks import count, fits_records, flag, instance_of
 from .._messages import Interrupted, at_work, warn, warning_once
 from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, compiling, preset
 from ..machine import AbstractMachine
-from ..machine import attributes as units_of
-from .grid import Blocks, axes_of, lane_numbers
+from .grid import Blocks, axes_of
 from .program import ScanProgram, check_corners, make_program
-from .store import (
-    MemoryStore,
-    Where,
-    ZarrStore,
-    attributes_of,
-    check_writable,
-    description_of,
-    unit_on_axis,
-    variables_of,
-)
+from .store import MemoryStore, Where, ZarrStore, opened
 
 # Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.
 _MOST, _ON_ACCELERATOR = 4096, 65536
@@ -91,7 +73,9 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
     """As many threads and devices as are asked for, or as there are. **Raises:** `TypeError` or
     `ValueError` for what are no such numbers, more devices than there are, or a cluster that is
     none."""
-    if not (cluster is None or isinstance(cluster, Executor) or hasattr(cluster, "get_executor")):
+    if not (
+        cluster is None or isinstance(cluster, futures.Executor) or hasattr(cluster, "get_executor")
+    ):
         raise TypeError(
             "Argument `cluster` must be a `dask.distributed.Client` or a "
             f"`concurrent.futures.Executor`, but got {cluster!r}."
@@ -112,30 +96,13 @@ def computed(
     """What a program finds on a grid (`blocks`), checked before any work; `store` is a path to keep
     it at, `None` for the memory. **Raises:** as `scan`."""
     program = check_corners(program, blocks)
-    variables = variables_of(program, blocks)
-    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
-    total = blocks.total
-    fits_memory("axes", total * per_lane if store is None else total + 500 * len(blocks))
-    description = description_of(program, blocks)
-    kept = MemoryStore(blocks, variables)
-    if store is not None:
-        check_writable(store)
-        kept = ZarrStore(store, description, blocks, variables)
-
-    def collected() -> "xr.Dataset":
-        data = kept.data()
-        for name in blocks.axes:
-            data[name].attrs |= units_of(unit_on_axis(program, blocks, name))
-        data.attrs = attributes_of(description, program.at(blocks, 0)[0])
-        return data
-
-    with contextlib.closing(kept):
+    with contextlib.closing(opened(program, blocks, store)) as kept:
         todo = kept.open_blocks()
         _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
-        done = total - sum(map(_size_of, todo))
+        done = blocks.total - sum(map(_size_of, todo))
         with at_work(
-            "scan", lambda: ScanInterrupted(collected(), store),
-            progress=progress, unit="lane", total=total, done=done,
+            "scan", lambda: ScanInterrupted(kept.data(), store),
+            progress=progress, unit="lane", total=blocks.total, done=done,
         ) as tell:  # fmt: skip
 
             def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
@@ -146,7 +113,7 @@ def computed(
                 run_blocks(program, blocks, todo, place, write)
             except ClusterLost as lost:
                 raise ConnectionError(_how_to_go_on(kept)) from lost
-        return collected()
+        return kept.data()
 
 
 def _size_of(where: Where) -> int:
@@ -177,7 +144,12 @@ def in_blocks(
     points = program.cycles * max(1, program.options.samples) + 1
     fits_records(at_fault, lanes * points, 12)
     if program.lane_noise is not None and numbers is None:
-        numbers = lane_numbers(total)
+        if total > 2**32:  # by so many numbers lanes are told apart
+            raise ValueError(
+                f"Argument `axes` must have at most {2**32:,} lanes where there is noise, but has "
+                f"{total:,}."
+            )
+        numbers = np.arange(total, dtype=np.uint32)
     return Blocks(grid, lanes, paired=paired, numbers=numbers)
 
 
@@ -237,13 +209,13 @@ def run_blocks(
             elif todo and at_once > 1:
                 # Compiled here, once and not in several threads at a time.
                 compute(program, blocks.values(todo[0]), blocks.lanes, dry=True)
-            pool = stack.enter_context(ThreadPoolExecutor(at_once))
+            pool = stack.enter_context(futures.ThreadPoolExecutor(at_once))
             devices, one_core = place.devices, True
         x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
         task = functools.partial(
             _task, parcel, lanes_of_block=blocks.lanes, devices=devices, x64=x64, one_core=one_core
         )
-        waiting, running = iter(todo), dict[Future, Where]()
+        waiting, running = iter(todo), dict[futures.Future, Where]()
 
         def begin(where: Where) -> None:
             try:
@@ -251,13 +223,13 @@ def run_blocks(
             except RuntimeError as error:
                 raise ClusterLost from error
 
-        def finish(future: Future) -> None:
+        def finish(future: futures.Future) -> None:
             where = running.get(future)
             if where is None:  # given away twice, and done by the other one
                 return
             try:
                 write(where, future.result())
-            except (CancelledError, BrokenExecutor) as error:
+            except (futures.CancelledError, futures.BrokenExecutor) as error:
                 raise ClusterLost from error
             del running[future]
             for other in [x for x in running if twice and running[x] == where]:
@@ -271,7 +243,9 @@ def run_blocks(
                     begin(where)
                 if not running:
                     return
-                done, _ = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                done, _ = futures.wait(
+                    running, timeout=_PATIENCE, return_when=futures.FIRST_COMPLETED
+                )
                 waited = time.monotonic() - since
                 if done:
                     since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
@@ -283,14 +257,14 @@ def run_blocks(
                 for future in done:
                     finish(future)
         finally:
-            wait([future for future in running if not future.cancel()])
+            futures.wait([future for future in running if not future.cancel()])
             for future in list(running):
                 if not future.cancelled() and future.exception() is None:
                     finish(future)
 
 
-def _executor_of(cluster: Any) -> Executor:
-    if isinstance(cluster, Executor):
+def _executor_of(cluster: Any) -> futures.Executor:
+    if isinstance(cluster, futures.Executor):
         return cluster
     if cluster.status != "running":
         raise ClusterLost
@@ -488,7 +462,7 @@ def _verified(
     if blocks.paired:
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
-    numbers = None if program.lane_noise is None else lane_numbers(total)[drawn]  # their own paths
+    numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own paths
     again = in_blocks(program, axes, place, paired=True, numbers=numbers)
     kept = functools.partial(ScanInterrupted, data, store)
     with at_work("verification", kept, progress=False):

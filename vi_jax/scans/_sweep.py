@@ -260,7 +260,7 @@ def sweep(
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
     if numbers is not None:
         check_start(with_leaf(machine, parameter, numbers[0]), bare(start))
-    lane_noise = lane_noise_of(noise, key, (), (), ())
+    lane_noise = lane_noise_of(noise, key)
     if lane_noise is not None:
         check_noise(machine, bare(start), noise)
     options = (settle, cycles, method, rests, regime, max_steps, lane_noise, bare(start))

@@ -14,8 +14,6 @@ from jaxtyping import Array, UInt32
 
 from .._checks import row_of_numbers
 from ..flow import WhiteNoise, lane_key, words_of
-from ..machine import is_own
-from .measures import AbstractMeasure
 
 # The number of a lane among its values, where it has one: no name of an axis.
 LANE = "lane number"
@@ -107,25 +105,12 @@ class Blocks:
 # machine has no prefix.
 MACHINE, START, NOISE = "", "start.", "noise."
 
-# Lanes are told apart by 32 bits.
-_MOST = 2**32
-
 
 def part_of(name: str) -> str | None:
     """What an axis or a derivative is of: `MACHINE`, `START` or `NOISE`; `None` for `LANE`."""
     if name == LANE:
         return None
     return next((prefix for prefix in (START, NOISE) if name.startswith(prefix)), MACHINE)
-
-
-def lane_numbers(total: int) -> np.ndarray:
-    """The numbers of so many lanes. **Raises:** `ValueError` if they are too many to have some."""
-    if total > _MOST:
-        raise ValueError(
-            f"Argument `axes` must have at most {_MOST:,} lanes where there is noise, but has "
-            f"{total:,}."
-        )
-    return np.arange(total, dtype=np.uint32)
 
 
 class LaneNoise(eqx.Module):
@@ -166,11 +151,7 @@ class LaneNoise(eqx.Module):
 
 
 def lane_noise_of(
-    noise: object,
-    key: object,
-    axes: Iterable[str],
-    derivatives: Iterable[str],
-    measures: Iterable[AbstractMeasure],
+    noise: object, key: object, axes: Iterable[str] = (), derivatives: Iterable[str] = ()
 ) -> LaneNoise | None:
     """The noise of a scan, `None` for none; `axes` and `derivatives` are names. **Raises:**
     `TypeError` or `ValueError` for what does not fit together."""
@@ -191,12 +172,5 @@ def lane_noise_of(
             raise ValueError(
                 f"Argument `{which}` must name a number of the noise ({', '.join(offered)}), but "
                 f"got {name!r}."
-            )
-    for measure in measures:
-        if is_own(type(measure).refine):
-            raise ValueError(
-                f"Argument `measure` must not contain {type(measure).__name__} with noise: a "
-                "motion under noise has no period, and the cycles that the measure adds have no "
-                'noise. Use others, such as `measure="extremes"`.'
             )
     return LaneNoise(noise, words_of(key))

@@ -38,6 +38,7 @@ from ..machine import (
     check_name,
     components,
     in_clock,
+    is_own,
     leaf,
     leaf_names,
     may_rest,
@@ -46,8 +47,7 @@ from ..machine import (
     with_leaves,
 )
 from .grid import MACHINE, NOISE, START, Blocks, LaneNoise, lane_noise_of, part_of
-from .measures import MEASURES, AbstractMeasure, Average, Numbers
-from .statistics import Escape
+from .measures import MEASURES, AbstractMeasure, Average, Escape, Numbers
 
 
 class ScanProgram(eqx.Module):
@@ -217,7 +217,14 @@ def make_program(
     method, rests, averages = known
     measures = measures_of(measure, averages)
     derivatives = tuple_of_names("derivatives", derivatives)
-    lane_noise = lane_noise_of(noise, key, names, derivatives, measures)
+    lane_noise = lane_noise_of(noise, key, names, derivatives)
+    for measure in measures if lane_noise is not None else ():
+        if is_own(type(measure).refine):
+            raise ValueError(
+                f"Argument `measure` must not contain {type(measure).__name__} with noise: a "
+                "motion under noise has no period, and the cycles that the measure adds have no "
+                'noise. Use others, such as `measure="extremes"`.'
+            )
     cycles = cycles_for(measures, cycles)
     settle = count("settle", options.settle)
     if template is not None:

@@ -5,6 +5,7 @@ import functools
 import hashlib
 import inspect
 import json
+import math
 import os
 import re
 import sys
@@ -21,11 +22,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._checks import unwritable
+from .._checks import fits_memory, unwritable
 from .._messages import installed_version, warn
 from .._types import xr, zarr
 from ..flow import REASON_NAMES
-from ..machine import AbstractMachine, attributes, leaf, leaf_names, outcomes_of, unit_of, units_of
+from ..machine import attributes, leaf, leaf_names, outcomes_of, unit_of, units_of
 from .grid import LANE, NOISE, START, Blocks, part_of
 from .measures import flags
 from .program import ScanProgram
@@ -65,11 +66,15 @@ class Variable(NamedTuple):
 class MemoryStore:
     """Arrays in memory, for a scan without a store."""
 
-    def __init__(self, blocks: Blocks, variables: Mapping[str, Variable]):
-        self.arrays: Mapping[str, Any] = {
-            name: np.full(blocks.shape + v.sizes, v.empty, v.dtype) for name, v in variables.items()
-        }
-        self.blocks, self.variables = blocks, variables
+    def __init__(self, program: ScanProgram, blocks: Blocks, variables: Mapping[str, Variable]):
+        self.program, self.blocks, self.variables = program, blocks, variables
+        # As a file gives it back.
+        self.about = json.loads(json.dumps(_description_of(program, blocks)))
+        self.arrays: Mapping[str, Any] = self._opened()
+
+    def _opened(self) -> Mapping[str, Any]:
+        shape, variables = self.blocks.shape, self.variables.items()
+        return {name: np.full(shape + v.sizes, v.empty, v.dtype) for name, v in variables}
 
     def open_blocks(self) -> list[Where]:
         """Return the blocks still to be computed."""
@@ -86,7 +91,20 @@ class MemoryStore:
         """Nothing is held."""
 
     def data(self) -> "xr.Dataset":
-        """Return the arrays with their axes and attributes."""
+        """Return what was computed, with units and with what the scan is."""
+        data, (machine, _) = self._labelled(), self.program.at(self.blocks, 0)
+        for name in self.blocks.axes:
+            # Machines that a function makes have no numbers of these names, nor has noise units.
+            known = name.startswith(START) or self.program.build is None
+            if known and part_of(name) != NOISE:
+                data[name].attrs |= attributes(unit_of(units_of(machine), name))
+        data.attrs = {"vi_jax": installed_version(), "machine_class": type(machine).__name__}
+        data.attrs |= {x: self.about[x] for x in ("method", "settle", "cycles", "precision")}
+        tables = [name for name in ("machine", "start", "noise") if name in self.about]
+        data.attrs |= {name: json.dumps(self.about[name]) for name in tables}
+        return data
+
+    def _labelled(self) -> "xr.Dataset":
         return xr.Dataset(
             {
                 name: ((*self.blocks.dims, *v.dims), self.arrays[name], dict(v.attributes))
@@ -105,32 +123,27 @@ class ZarrStore(MemoryStore):
     **Raises:** `ValueError` for a folder that is not the store of this scan, or is in use.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        description: Mapping[str, Any],
-        blocks: Blocks,
-        variables: Mapping[str, Variable],
-    ):
-        self.path, self.blocks, self.variables = Path(path), blocks, variables
-        self.lost: list[str] = []
-        description = json.loads(json.dumps(description))
+    def __init__(self, path: str | Path, *scan: Any):
+        self.path, self.lost = Path(path), list[str]()
+        super().__init__(*scan)
+
+    def _opened(self) -> Mapping[str, Any]:
         new = not (self.path / "zarr.json").exists()
         if new:
             if self.path.exists() and (self.path.is_file() or any(self.path.iterdir())):
                 raise ValueError(
-                    f"Argument `store` must be a new folder or the store of a scan, but {path} "
-                    "is neither."
+                    f"Argument `store` must be a new folder or the store of a scan, but "
+                    f"{self.path} is neither."
                 )
-            _make(self.path, description, blocks, variables)
+            _make(self.path, self.about, self.blocks, self.variables)
         self._lock = _locked(self.path)
         try:
-            self._open(description, new=new)
+            return self._checked(new=new)
         except BaseException:
             self.close()
             raise
 
-    def _open(self, description: Mapping[str, Any], *, new: bool) -> None:
+    def _checked(self, *, new: bool) -> Mapping[str, Any]:
         with zarr.config.set({"array.write_empty_chunks": True}):
             try:
                 group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
@@ -139,8 +152,8 @@ class ZarrStore(MemoryStore):
                     f"Argument `store` must be the store of a scan, but {self.path / 'zarr.json'} "
                     f"cannot be read: {error}."
                 ) from None
-            _refuse_another_scan(self.path, dict(group.attrs), description, new=new)
-            self.arrays = {name: group[name] for name in (*self.variables, *self.blocks.axes)}
+            _refuse_another_scan(self.path, dict(group.attrs), self.about, new=new)
+            arrays: Any = {name: group[name] for name in (*self.variables, *self.blocks.axes)}
         begun, now = group.attrs.get(_RELEASE), installed_version()
         if begun is not None and begun != now:
             warn(
@@ -148,10 +161,11 @@ class ZarrStore(MemoryStore):
                 "still missing come from another release than those that are there."
             )
         for name, x in self.blocks.axes.items():
-            found = _read(self.arrays[name], ...)
+            found = _read(arrays[name], ...)
             if found is None or not np.array_equal(found, x):
                 self.lost.append(name)
-                self.arrays[name][:] = x
+                arrays[name][:] = x
+        return arrays
 
     def close(self) -> None:
         """Let others write."""
@@ -187,8 +201,8 @@ class ZarrStore(MemoryStore):
         corner += [0] * len(self.variables[name].sizes)
         return "/".join([name, "c", *map(str, corner)])
 
-    def data(self) -> "xr.Dataset":
-        """Return the data of the store, which are read when they are used."""
+    def _labelled(self) -> "xr.Dataset":
+        """The data of the store, which are read when they are used."""
         data = xr.open_zarr(str(self.path), chunks=None, mask_and_scale=False)
         return data[[*data["result"].dims, *sorted(map(str, data.data_vars))]]
 
@@ -258,7 +272,20 @@ def _make(
                 raise  # else another scan made it in the meantime
 
 
-def check_writable(path: str | Path) -> None:
+def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None) -> MemoryStore:
+    """Where the numbers of a scan go: into a store, or into the memory where there is no path.
+    **Raises:** `ValueError` for what does not fit into the memory, or a path that is no store's."""
+    variables = _variables_of(program, blocks)
+    per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
+    in_memory = blocks.total * per_lane if path is None else blocks.total + 500 * len(blocks)
+    fits_memory("axes", in_memory)
+    if path is None:
+        return MemoryStore(program, blocks, variables)
+    _check_writable(path)
+    return ZarrStore(path, program, blocks, variables)
+
+
+def _check_writable(path: str | Path) -> None:
     """**Raises:** `ValueError` if no store can be written there; makes the folders above it."""
     problem = "it is empty" if path == "" else unwritable(Path(path).parent)
     if problem is None and "\0" in str(path):
@@ -299,7 +326,7 @@ def _refuse_another_scan(
             )
 
 
-def description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
+def _description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     """What makes two scans the same, in words and numbers that JSON can hold."""
 
     def described(tree: object) -> str:
@@ -451,15 +478,7 @@ def _numbers(tree: Any) -> dict[str, Any]:
     return {name: np.asarray(leaf(tree, name), float).tolist() for name in leaf_names(tree)}
 
 
-def attributes_of(about: dict[str, Any], machine: AbstractMachine) -> dict[str, Any]:
-    """The attributes of a scan's data, from its description and one of its machines."""
-    found = {"vi_jax": installed_version(), "machine_class": type(machine).__name__}
-    found |= {name: about[name] for name in ("method", "settle", "cycles", "precision")}
-    tables = [name for name in ("machine", "start", "noise") if name in about]
-    return found | {name: json.dumps(about[name]) for name in tables}
-
-
-def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
+def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
     """The variables that a program computes, by name, found without computing them."""
     values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
     if blocks.numbers is not None:
@@ -504,13 +523,3 @@ def variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
             )
         found[name] = Variable(dims, tuple(sizes), np.dtype(shape.dtype), about)
     return found
-
-
-def unit_on_axis(program: ScanProgram, blocks: Blocks, name: str) -> str:
-    """The unit of an axis' values; "" where a function makes the machine, which has its own, and of
-    an amplitude of noise."""
-    if part_of(name) == NOISE:
-        return ""
-    if program.build is not None and not name.startswith(START):
-        return ""
-    return unit_of(units_of(program.at(blocks, 0)[0]), name)
