@@ -6,7 +6,7 @@ before it, in lightness too, as seen with normal and with each kind of dichromat
 measures by how much). Bifurcations differ by mark and dash, so that they need no colour.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import matplotlib
@@ -95,7 +95,14 @@ def color_of(cycles: int, impacts: float | int | None = None) -> str:
     return MORE_IMPACTS if cycles == 2 and impacts > 1.5 else color
 
 
-def shades(color: str) -> Iterator[str]:
+def distinct_colors(motions: Iterable[tuple[int, float]]) -> list[str]:
+    """Colours of motions by their periods and impacts, further ones of a kind in other shades."""
+    kinds: dict[str, Iterator[str]] = {}
+    colors = (color_of(int(cycles), float(impacts)) for cycles, impacts in motions)
+    return [next(kinds.setdefault(color, _shades(color))) for color in colors]
+
+
+def _shades(color: str) -> Iterator[str]:
     """The colour, and then others of its hue for further motions of the same kind."""
     yield color
     while True:

@@ -1,6 +1,6 @@
 """Pictures of grids: maps of regimes, basins of attraction, and how basins erode."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from .._messages import so_many
 from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
-from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, shades, thick
+from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, distinct_colors, thick
 from .motion import new_axes
 from .orbit import axis_name
 
@@ -147,7 +147,9 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     x, y = _two_axes(names, None, None)
     ax = new_axes(ax)
     across, up = np.asarray(found.data[x], float), np.asarray(found.data[y], float)
-    colors, irregular = _basin_colors(found), len(REGIMES)
+    irregular = len(REGIMES)
+    colors = [IRREGULAR[regime] for regime in sorted(REGIMES)]
+    colors += distinct_colors((a.period, a.impacts) for a in found.attractors)
     if label.dims == ("sample",):
         ax.scatter(across, up, c=[colors[i + irregular] for i in np.asarray(label)], s=6, lw=0)
     else:
@@ -194,16 +196,6 @@ def _start_name(machine: AbstractMachine, name: str) -> str:
             if float(read(probe)) == value and not words.startswith(f"{name} = "):
                 return f"{words} at the start"
     return by_its_name
-
-
-def _basin_colors(found: Basins) -> list[str]:
-    irregular = [IRREGULAR[regime] for regime in sorted(REGIMES)]
-    kinds: dict[str, Iterator[str]] = {}
-    colors = {}
-    for a in found.attractors:
-        color = color_of(a.period, a.impacts)
-        colors[a.label] = next(kinds.setdefault(color, shades(color)))
-    return irregular + [colors[label] for label in sorted(colors)]
 
 
 def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]:
@@ -287,11 +279,9 @@ def plot_integrity(
     instance_of("profile", profile, IntegrityProfile, "from `integrity_profile`")
     y, legend = one_of("y", y, tuple(_WORDS)), flag("legend", legend)
     ax = new_axes(ax)
-    kinds: dict[str, Iterator[str]] = {}
     percent = 100.0 if y == "share" else 1.0
-    for i, row in enumerate(getattr(profile, y)):
-        color = color_of(int(profile.period[i]), float(profile.impacts[i]))
-        color = next(kinds.setdefault(color, shades(color)))
+    colors = distinct_colors(zip(profile.period, profile.impacts, strict=True))
+    for i, (row, color) in enumerate(zip(getattr(profile, y), colors, strict=True)):
         error = profile.error[i] if y == "share" else profile.resolution
         low, high = percent * np.maximum(row - error, 0.0), percent * (row + error)
         name = profile.name_of(i) if i < _NAMED_LINES else None

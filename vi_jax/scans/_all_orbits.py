@@ -23,7 +23,7 @@ from ..orbit import (
     find_orbit,
     in_one_line,
 )
-from ._basins import starts_in
+from ._basins import in_one_array, starts_in
 from .program import start_with
 
 
@@ -103,11 +103,9 @@ class AllOrbits(InWords):
         words = [str(in_names(o.stability)) for o in self.orbits]
         data["stability"] = "motion", np.array(words, str)
         states = [components(orbit.sections, 1) for orbit in self.orbits]
-        longest = max(self.periods, default=0)
         for name in states[0] if states else ():
-            rows = np.full((len(states), longest), np.nan)
-            for row, state, period in zip(rows, states, self.periods, strict=True):
-                row[:period] = np.asarray(state[name])[:period]
+            rows = zip(states, self.periods, strict=True)
+            rows = in_one_array([np.asarray(state[name])[:period] for state, period in rows])
             data[f"section_{name}"] = ("motion", "cycle"), rows
         if states:
             multipliers = np.stack([np.asarray(orbit.multipliers) for orbit in self.orbits])

@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -44,15 +45,7 @@ from ..machine import (
     with_leaves,
 )
 from ..orbit import distance
-from ._geometry import (
-    BasinEntropy,
-    Cells,
-    Uncertainty,
-    ball_around,
-    entropy_of,
-    largest_ball,
-    uncertainty_of,
-)
+from . import _geometry as geometry
 from ._scan import LanesFailed, ScanInterrupted, scan
 from .grid import START, axes_of
 from .measures import CODES, REGIMES, Regime, Sections, flags
@@ -146,26 +139,26 @@ class Basins(NamedTuple):
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
         centres = [np.asarray(self.data[name], float) for name in names]
         angles = [is_angle(self.machine, name.removeprefix(START)) for name in names]
-        cells = Cells(centres, scale, np.array(ends), np.array(angles))
+        cells = geometry.Cells(centres, scale, np.array(ends), np.array(angles))
         cells = cells._replace(ends=cells.ends & ~cells.round[:, None])
         resolution = 0.5 * float(np.linalg.norm(cells.widths / scale))
         found = []
         for a in self.attractors:
             foreign = there & (label != a.label)
             points = np.stack([a.sections[name.removeprefix(START)] for name in names], axis=1)
-            balls = [ball_around(cells.inside(x), foreign, cells) for x in points]
+            balls = [geometry.ball_around(cells.inside(x), foreign, cells) for x in points]
             around = np.array([x.radius for x in balls])
             local, cut = np.nan, False
             if not np.isnan(around).all():
                 least = int(np.nanargmin(around))
                 local, cut = float(around[least]), balls[least].at_edge
-            ball = largest_ball(there & (label == a.label), foreign, cells)
+            ball = geometry.largest_ball(there & (label == a.label), foreign, cells)
             centre = dict(zip(names, ball.centre.tolist(), strict=True))
             parts = (a.label, local, around, ball.radius, centre, cut, ball.at_edge, resolution)
             found.append(Integrity(*parts))
         return found
 
-    def entropy(self, *, box: int = 5) -> BasinEntropy:
+    def entropy(self, *, box: int = 5) -> geometry.BasinEntropy:
         """Basin entropy and boundary basin entropy: how uncertain the outcome is in a small box of
         starts. Chaotic, unsettled and failed count as outcomes; starts beyond a stop are left out.
 
@@ -175,9 +168,9 @@ class Basins(NamedTuple):
         """
         label, there, _ = self._grid()
         box = count("box", box, least=2, most=min(label.shape))
-        return entropy_of(label, box=box, there=there)
+        return geometry.entropy_of(label, box=box, there=there)
 
-    def uncertainty(self, *, confidence: float = 0.95) -> Uncertainty:
+    def uncertainty(self, *, confidence: float = 0.95) -> geometry.Uncertainty:
         """Uncertainty exponent of the basins' boundaries: how slowly the part of uncertain starts
         decreases with the error of the starts. It is 1 for smooth boundaries.
 
@@ -195,7 +188,7 @@ class Basins(NamedTuple):
                 "An uncertainty exponent needs 16 starts at least along each axis, but there are "
                 f"{min(label.shape)}."
             )
-        return uncertainty_of(label, confidence=float(confidence), there=there)
+        return geometry.uncertainty_of(label, confidence=float(confidence), there=there)
 
     def _grid(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
         """Labels on the grid of the starts, which of these can be at all, the names of its axes."""
@@ -222,12 +215,9 @@ class Basins(NamedTuple):
         for name in ("period", "impacts", "starts", "fraction", "error"):
             values = [getattr(a, name) for a in self.attractors]
             variables[f"motion_{name}"] = "motion", np.asarray(values)
-        longest, units = max((a.period for a in self.attractors), default=0), units_of(self.machine)
         for name in self.attractors[0].sections if self.attractors else ():
-            rows = np.full((len(self.attractors), longest), np.nan)
-            for row, a in zip(rows, self.attractors, strict=True):
-                row[: a.period] = a.sections[name]
-            about = attributes(unit_of(units, name))
+            rows = in_one_array([a.sections[name] for a in self.attractors])
+            about = attributes(unit_of(units_of(self.machine), name))
             variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
         return tidy(self.data.assign(variables), along)
 
@@ -248,6 +238,11 @@ class Basins(NamedTuple):
 
     def _repr_html_(self) -> str:
         return summary_table(str(self))
+
+
+def in_one_array(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows of several lengths, with NaN behind the shorter ones."""
+    return np.array([*itertools.zip_longest(*rows, fillvalue=np.nan)], float).T
 
 
 def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np.ndarray:
@@ -343,20 +338,7 @@ def _sorted_out(
 ) -> Basins:
     """The basins in what `_scanned` found, by a start (`begin`) of which the region's parts are
     replaced."""
-    names = list(components(begin))
-
-    def sections(state: np.ndarray, cycles: int) -> np.ndarray:
-        here = with_leaves(begin, dict(zip(names, state, strict=True)))
-        # Always as many cycles, so that another period is not another program.
-        run = simulate(machine, here, longest, method=method)
-        return np.asarray(in_rows(run.sections))[1 : cycles + 1]
-
-    def sizes(states: np.ndarray) -> np.ndarray:
-        places = [START + name for name in names]
-        starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in places]
-        return sizes_on_host(machine, begin, np.vstack([states, starts]))
-
-    label, motions = _labelled(data, names, apart, sections, angles_in(machine, begin), sizes)
+    label, motions = _labelled(data, machine, begin, apart, longest, method)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
     for number, motion in enumerate(motions):
@@ -366,7 +348,7 @@ def _sorted_out(
             label=number,
             period=len(motion),
             impacts=float(np.median(impacts[here])),
-            sections=dict(zip(names, motion.T, strict=True)),
+            sections=dict(zip(components(begin), motion.T, strict=True)),
             starts=int(np.sum(here)),
             fraction=share,
             error=math.sqrt(share * (1 - share) / label.size),
@@ -478,33 +460,27 @@ def starts_in(
 
 
 def _labelled(
-    data: "xr.Dataset",
-    names: list[str],
-    apart: float,
-    followed: Callable[[np.ndarray, int], np.ndarray],
-    angles: np.ndarray | None,
-    sizes: Callable[[np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, list[np.ndarray]]:
+    data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
+    method: AbstractMethod,
+) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
     """A label for each lane, and the section states (period, components) of each motion, that of
-    the most lanes first.
-
-    **Arguments:** `names` of a state's components; how far states of one motion may be `apart`;
-    `followed`, which gives the section states of a motion from one of them and its period; `angles`
-    among the components; the `sizes` of motions that have these states (`row_sizes`).
-    """
-    period = np.asarray(data["period"]).ravel()
+    the most lanes first; arguments as for `_sorted_out`."""
+    names, period = list(components(begin)), np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []
+    places = [START + name for name in names]
+    starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in places]
+    unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
     # Lanes on one motion fall into few cells; what is found for one of them holds for all.
-    unit = sizes(states[settled])
     cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     motions: list[np.ndarray] = []
     of_cell, known = np.empty(first.size, int), {}
+    angles = angles_in(machine, begin)
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
         # The motions of this period, (motions, period, components), and their numbers.
@@ -515,7 +491,10 @@ def _labelled(
             of_cell[i] = numbers[close[0]]
             continue
         of_cell[i] = len(motions)
-        motions.append(followed(state, p))
+        here = with_leaves(begin, dict(zip(names, state, strict=True)))
+        # Always as many cycles, so that another period is not another program.
+        run = simulate(machine, here, longest, method=method)
+        motions.append(np.asarray(in_rows(run.sections))[1 : p + 1])
         known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, of_cell[i]]
     found = of_cell[inverse.ravel()]
     order = np.argsort(-np.bincount(found), kind="stable")
