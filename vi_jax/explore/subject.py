@@ -174,11 +174,6 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     )
 
 
-def prepare(scene: AbstractMachine, start: State) -> None:
-    """Compile what `look` needs for scenes of this structure."""
-    _exponent_of(scene, look(scene, start, 0).window.last)
-
-
 @compiled
 def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
     """The run observed, its first cycles sampled, its regime, its multipliers, and position and
@@ -310,7 +305,7 @@ class Subject:
         """Compile what the sliders need, and fit the cycles before to how long they take here."""
         tell(f"compiling the {type(self.machine).__name__}")
         start = self.at(self.beginning())[1]
-        prepare(self.machine, start)
+        _exponent_of(self.machine, look(self.machine, start, 0).window.last)
         fits = _fitting(lambda cycles: look(self.machine, start, cycles))
         self.controls[SETTLE] = Control(SETTLE, 0.0, float(fits), 1.0, float(min(300, fits)))
 

@@ -134,11 +134,6 @@ def once(ax: Axes, label: str) -> str | None:
     return None if label in ax.get_legend_handles_labels()[1] else label
 
 
-def is_set(name: Any) -> bool:
-    """Whether one of matplotlib's `rcParams` is another than it is by default."""
-    return matplotlib.rcParams[name] != matplotlib.rcParamsDefault[name]
-
-
 def thick(points: float) -> float:
     """A line's width, thinner or thicker as lines are set to be."""
     name: Any = "lines.linewidth"

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from matplotlib import rcParams, rcParamsDefault
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
@@ -36,7 +37,7 @@ from ..machine import (
     without_turns,
 )
 from ..orbit import Orbit
-from .colors import BLUE, STOP, is_set, once, thick
+from .colors import BLUE, STOP, once, thick
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -46,7 +47,8 @@ def new_axes(ax: Axes | None) -> Axes:
         return ax
     import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
 
-    size = None if is_set("figure.figsize") else (7, 3.5)
+    own = rcParams["figure.figsize"] != rcParamsDefault["figure.figsize"]
+    size = None if own else (7, 3.5)
     return plt.subplots(figsize=size, layout="constrained")[1]
 
 
@@ -277,20 +279,15 @@ def _labels(
     know their machine."""
     if machine is None:
         return motion.labels if isinstance(motion, Run) else ("Y", "V")
-    labels = machine.labels
+    names, labels = PLAIN, machine.labels
     if isinstance(coordinate, str):
-        place, rate = (
-            in_brackets(name, unit_of(units_of(machine), name))
-            for name in (coordinate, f"v.{coordinate}")
-        )
-        return place, rate
-    if coordinate:  # the machine's words are those of the first
+        names = labels = (coordinate, f"v.{coordinate}")
+    elif coordinate:  # the machine's words are those of the first
         plain = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
         labels = names_on(machine, coordinate) or plain
-    named = zip(PLAIN, labels, strict=True)
     position, velocity = (
         in_brackets(label, unit_of(units_of(machine), name)) if name_in(label) == label else label
-        for name, label in named
+        for name, label in zip(names, labels, strict=True)
     )
     return position, velocity
 

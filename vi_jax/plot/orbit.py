@@ -313,7 +313,7 @@ def plot_grazing(
         chaos = IRREGULAR[REGIMES.chaotic]
         ax.plot([], [], ".", color=chaos, label="forecast: no period")
     ax.plot(0.0, 0.0, **{**mark_style("grazing"), "label": "grazing", "zorder": 4})
-    ax.set_xscale("function", functions=(_root, _square))
+    ax.set_xscale("function", functions=(_root, lambda x: x * np.abs(x)))
     farthest = found.forecast.offset[np.argmax(np.abs(found.forecast.offset))]
     ax.plot([farthest, 0.0], [0.0, 0.0], ls="none")  # where nothing is drawn, the axis as it is
     ticks = farthest * (np.arange(_TICKS) / (_TICKS - 1)) ** 2
@@ -350,8 +350,3 @@ def _root(x: object) -> np.ndarray:
     """The square root, continued as an odd function."""
     x = np.asarray(x, float)
     return np.sign(x) * np.sqrt(np.abs(x))
-
-
-def _square(x: object) -> np.ndarray:
-    x = np.asarray(x, float)
-    return np.sign(x) * x * x

@@ -311,17 +311,15 @@ def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
     whole, split = PartitionSpec(), PartitionSpec("lanes")
 
-    def here(program, values, wanted):
-        return program(values, wanted)
-
     def over_devices(program, values, wanted):
         numbers, rest = eqx.partition(program, eqx.is_array)
         return jax.shard_map(
-            lambda numbers, *lanes: here(eqx.combine(numbers, rest), *lanes),
+            lambda numbers, *lanes: eqx.combine(numbers, rest)(*lanes),
             mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False,
         )(numbers, values, wanted)  # fmt: skip
 
-    return CompiledFunction(here if devices == 1 else over_devices, PLAIN, **compiling())
+    function = ScanProgram.__call__ if devices == 1 else over_devices
+    return CompiledFunction(function, PLAIN, **compiling())
 
 
 def compute(
