@@ -208,13 +208,10 @@ def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]
                 else "Scan a second number, or draw this one by `vi.plot_sweep` of a `vi.sweep`."
             )
         )
-    if x is None:
-        x = names[0] if y != names[0] else names[1]
-    if y is None:
-        y = names[1] if x != names[1] else names[0]
-    for argument, name in (("x", x), ("y", y)):
-        if name not in names:
-            raise ValueError(f"Argument `{argument}` must be one of {names}, but got {name!r}.")
+    first = next(name for name in names if name != y)
+    x = first if x is None else one_of("x", x, tuple(names))
+    second = next(name for name in names if name != x)
+    y = second if y is None else one_of("y", y, tuple(names))
     if x == y:
         raise ValueError(f"Arguments `x` and `y` must be different axes, but both are {x!r}.")
     return x, y

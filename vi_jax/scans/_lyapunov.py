@@ -35,6 +35,7 @@ from ..machine import (
     AbstractMachine,
     Stated,
     Summarized,
+    attributes,
     bare,
     cycle_time,
     in_rows,
@@ -98,8 +99,10 @@ class Lyapunov(Summarized):
         variables |= present(self.averages, batch)
         alone = {"spread": self.spread, "result": in_names(self.result)}
         data = xr.Dataset(variables | present(alone, batch))
+        for name in ("exponents", "spread"):
+            data[name].attrs |= attributes(self.unit)
         own = {name: name for name in self.averages}
-        return tidy(with_units(data, dict(self.units), own), along)
+        return tidy(with_units(data, dict(self.units), own) if own else data, along)
 
     def summary(self) -> str:
         """The exponents; of a batch the range of the greatest."""

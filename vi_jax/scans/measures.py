@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._checks import count, given_number, instance_of, require, tuple_of_names
-from .._types import Flag, Scalar, State, xr
+from .._types import Flag, Number, State, xr
 from ..flow import AbstractMethod, Run, has_quantities, row_sizes
 from ..machine import (
     AbstractMachine,
@@ -30,8 +30,6 @@ from ..machine import (
 )
 from ._lyapunov import lyapunov
 from .grid import axes_of
-
-Number = Scalar | float
 
 # How far sections a period apart may differ; so many times that, if a longer period fits within it;
 # and so many times what the longer one differs by. Choices.
