@@ -2,6 +2,7 @@
 path of its own for each by its number in the grid."""
 
 import dataclasses
+import itertools
 import math
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -61,9 +62,6 @@ class Blocks:
             block.append(min(size, room))
             room //= min(size, room)
         self.block = tuple(reversed(block))
-        self.counts = tuple(
-            math.ceil(size / part) for size, part in zip(self.shape, self.block, strict=True)
-        )
         self.numbers = None if numbers is None else numbers.reshape(self.shape)
 
     @property
@@ -76,20 +74,16 @@ class Blocks:
         return ("sample",) if self.paired else (name,)
 
     def __len__(self) -> int:
-        return math.prod(self.counts)
+        return math.prod(map(len, self._edges()))
 
     def __iter__(self) -> Iterator[tuple[slice, ...]]:
-        return (self[i] for i in range(len(self)))
+        """Where each block lies in the grid."""
+        pairs = zip(self._edges(), self.block, self.shape, strict=True)
+        rows = ([slice(i, min(i + n, size)) for i in edges] for edges, n, size in pairs)
+        return itertools.product(*rows)
 
-    def __getitem__(self, index: int) -> tuple[slice, ...]:
-        """Where the block lies in the grid."""
-        if not 0 <= index < len(self):
-            raise IndexError(index)
-        corner = np.unravel_index(index, self.counts)
-        return tuple(
-            slice(int(c) * part, min(size, (int(c) + 1) * part))
-            for c, part, size in zip(corner, self.block, self.shape, strict=True)
-        )
+    def _edges(self) -> list[range]:
+        return [range(0, size, n) for size, n in zip(self.shape, self.block, strict=True)]
 
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of the block's lanes, and their numbers as `LANE`."""

@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, given_number, instance_of, require, tuple_of_names
+from .._checks import count, given_number, instance_of, one_of, require, tuple_of_names
 from .._types import Flag, Number, State, xr
 from ..flow import AbstractMethod, Run, has_quantities, row_sizes
 from ..machine import (
@@ -729,11 +729,7 @@ def escape_rate(
     dims = [str(name) for name in time.dims]
     names = tuple_of_names("over", dims if over is None else over)
     for name in names:
-        if name not in dims:
-            raise ValueError(
-                f"Argument `over` must name dimensions of the lanes, {', '.join(dims)}, "
-                f"but got {name!r}."
-            )
+        one_of("over", name, tuple(dims))
     step = float(time.attrs.get("step", 1.0))
     watched = time > after  # not so for lanes that failed, which are NaN
     escaped = watched & (data["escaped"] == 1)

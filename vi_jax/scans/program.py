@@ -5,7 +5,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -204,17 +204,16 @@ def make_program(
     build, own = None, [name for name in names if part_of(name) == MACHINE]
     template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
     if template is not None:
-        # Its numbers on the axes may let a body rest: `check_corners` tells.
-        known = _known(template, options.method, start)._replace(rests=True)
+        method, _, averages = _known(template, options.method, start)
+        rests = True  # its numbers on the axes may let a body rest: `check_corners` tells
     elif callable(machine):
         build = machine
-        known = _known_of_made(build, own, options.method, start)
+        method, rests, averages = _known_of_made(build, own, options.method, start)
     else:
         raise TypeError(
             "Argument `machine` must be a `Scene`, an `AbstractMachine` or a function that makes "
             f"one, but got {machine!r}."
         )
-    method, rests, averages = known
     measures = measures_of(measure, averages)
     derivatives = tuple_of_names("derivatives", derivatives)
     lane_noise = lane_noise_of(noise, key, names, derivatives)
@@ -253,13 +252,9 @@ def make_program(
     )
 
 
-class _Known(NamedTuple):
-    """What is known of all machines of a scan: how they are carried, whether a body can come to
-    rest in them, and the names of their averages."""
-
-    method: AbstractMethod
-    rests: bool
-    averages: tuple[str, ...]
+# What is known of all machines of a scan: how they are carried, whether a body can come to rest in
+# them, and the names of their averages.
+_Known = tuple[AbstractMethod, bool, tuple[str, ...]]
 
 
 def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known:
@@ -267,7 +262,7 @@ def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known
     if has_averages(machine):
         first = machine.start() if start is None else adopt(machine, start)
         averages = average_names(machine, first)
-    return _Known(chosen(machine, method), may_rest(machine), averages)
+    return chosen(machine, method), may_rest(machine), averages
 
 
 def _known_of_made(
@@ -289,9 +284,8 @@ def _known_of_made(
     def made(values):
         machine = build(**values)
         is_one = isinstance(machine, AbstractMachine)  # else it is refused once there are lanes
-        found.append(
-            _known(machine, method, start) if is_one else _Known(chosen(None, method), True, ())
-        )
+        unknown = chosen(None, method), True, ()
+        found.append(_known(machine, method, start) if is_one else unknown)
 
     jax.eval_shape(made, {name: jnp.zeros(()) for name in names})
     return found[0]
