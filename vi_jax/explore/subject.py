@@ -140,10 +140,7 @@ class Motion(NamedTuple):
 
 
 def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
-    """The motion of a scene after `settle` cycles, by its standard method.
-
-    A start beyond a stop is moved onto it.
-    """
+    """The motion after `settle` cycles; a start beyond a stop is moved onto it."""
     run, window, found, multipliers, places = _seen(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
     exponent = np.nan
@@ -176,8 +173,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
 
 @compiled
 def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
-    """The run observed, its first cycles sampled, its regime, its multipliers, and position and
-    velocity on its sections."""
+    """The run observed, its first cycles sampled, its regime, multipliers and section points."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
     start = taken_along(scene, adopt(scene, start))

@@ -102,8 +102,7 @@ def animate(
 def _frames(
     run: Run, machine: AbstractMachine, path: Any, good: np.ndarray, number: int
 ) -> _Frames:
-    """Frames evenly spaced in time, states in between samples by interpolation, for those points
-    of the path that are `good`."""
+    """Frames evenly spaced in time, interpolated between the points that are `good`."""
     samples = run.samples
     assert samples is not None
     cycles, time = (np.asarray(x, float) for x in (samples.cycles, samples.time))

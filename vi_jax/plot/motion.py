@@ -117,10 +117,7 @@ def drawn_path(
     motion: Run | Samples, *, machine: AbstractMachine | None, **about: Any
 ) -> MotionPath:
     """The path that a picture draws: that of an angle lies within a turn, and its line is broken
-    where it passes half a turn.
-
-    **Arguments and raises:** as `motion_path`.
-    """
+    where it passes half a turn. Arguments and errors are those of `motion_path`."""
     path = motion_path(motion, machine=machine, **about)
     if machine is None or not turns(motion, machine, about["coordinate"]):
         return path
@@ -161,10 +158,8 @@ def _by_number(machine: AbstractMachine, k: int, states: Any) -> tuple[Any, Any]
 
 
 def coordinate_of(machine: AbstractMachine | None, coordinate: int | str) -> int | str:
-    """The number of a coordinate, by its name too; the name of one that no contact limits.
-
-    **Raises:** `ValueError` for a number that the machine has not.
-    """
+    """The number of a coordinate, also by its name; the name of one that no contact limits.
+    **Raises:** `ValueError` for a number that the machine does not have."""
     if isinstance(coordinate, str):
         number = None if machine is None else number_on(machine, coordinate)
         return coordinate if number is None else number
@@ -256,8 +251,7 @@ def plot_history(
 def _draw_stops(
     machine: AbstractMachine, coordinate: int | str, ax: Axes, line: Callable[..., Any]
 ) -> None:
-    """Of a coordinate the rigid stops as thick lines, and the soft ones, which the body goes into,
-    as thin dashed ones."""
+    """Draw rigid stops as thick lines, and soft ones, which the body goes into, as dashed ones."""
     for stop in all_stops(machine, coordinate):
         look = {"lw": thick(1.8), "label": once(ax, "stop")}
         if isinstance(stop, SoftStop):
@@ -275,8 +269,7 @@ def all_stops(machine: AbstractMachine, coordinate: int | str | None = None) -> 
 def _labels(
     motion: Run | Samples, machine: AbstractMachine | None, coordinate: int | str
 ) -> tuple[str, str]:
-    """What position and velocity of a coordinate are called, with their units; samples alone do not
-    know their machine."""
+    """The names of position and velocity, with units; samples do not know their machine."""
     if machine is None:
         return motion.labels if isinstance(motion, Run) else ("Y", "V")
     names, labels = PLAIN, machine.labels

@@ -218,11 +218,8 @@ def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]
 
 
 def _image(ax: Axes, across: np.ndarray, up: np.ndarray, shades: Any, colors: list[str]) -> None:
-    """Cells around the points of a grid, whose rows may be in any order.
-
-    **Arguments:** `across` and `up`, the values on both axes; `shades`, the index into `colors` of
-    each point, (up, across).
-    """
+    """Draw cells around points, whose rows may be in any order: `shades` has the index into
+    `colors` of each, (up, across)."""
     columns, rows = np.argsort(across), np.argsort(up)
     ax.pcolormesh(
         _cell_edges(across[columns]),

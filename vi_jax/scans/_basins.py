@@ -336,8 +336,7 @@ def _sorted_out(
     longest: int,
     method: AbstractMethod,
 ) -> Basins:
-    """The basins in what `_scanned` found, by a start (`begin`) of which the region's parts are
-    replaced."""
+    """The basins in what `_scanned` found; the parts of the region are replaced in `begin`."""
     label, motions = _labelled(data, machine, begin, apart, longest, method)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
@@ -723,8 +722,7 @@ def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
 def _distance(
     a: Attractor, b: Attractor, names: list[str], angles: np.ndarray, widths: np.ndarray
 ) -> float:
-    """How far sections of two motions of one period are apart, as a part of the region's widths,
-    by the best shift in phase."""
+    """How far sections are apart, as a part of the widths, by the best shift in phase."""
     x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
     shifted = (np.roll(y, shift, axis=0) for shift in range(len(y)))
     return float(min((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted))

@@ -253,8 +253,7 @@ def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
 
 
 def _observer(the_map: CycleMap, start, window: int) -> Any:
-    """A function that observes so many cycles: what `_begun` gives carried on, and rates of growth,
-    durations and integrals."""
+    """A function that carries on what `_begun` gives, with rates, durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(bare(start))[1]
     # Directions are of numbers relative to their sizes: in units that differ by much, rounding of

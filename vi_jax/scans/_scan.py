@@ -163,8 +163,7 @@ def _lanes_in(path: Path) -> int | None:
 
 
 def _block_size(total: int, place: Workplace) -> int:
-    """Lanes in a block of a grid of `total` lanes where the user names no number: few sizes,
-    because each is a program of its own; small enough to occupy every core."""
+    """Lanes in a block: few sizes, for each is a program; small enough to occupy every core."""
     if jax.default_backend() != "cpu":
         most, share = _ON_ACCELERATOR * place.devices, total
     else:
@@ -451,8 +450,7 @@ def _verified(
     data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace,
     store: str | Path | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """How some of the lanes, drawn by chance, come out by a better program; attributes by their
-    names."""
+    """Attributes: how some of the lanes, drawn by chance, come out by a better program."""
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))

@@ -290,8 +290,7 @@ def _counted(start: State, lane_noise: LaneNoise | None) -> Any:
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
-    """The values of a sweep, and the same on the host where they are known. **Raises:**
-    `ValueError` unless they are finite and in one row."""
+    """Values as an array, and on the host if known. **Raises:** `ValueError` if of other kinds."""
     values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
     finite = numbers is None or bool(np.isfinite(numbers).all())

@@ -312,8 +312,7 @@ def _as_arrays(tree: Any) -> Any:
 def check_leaf_name(
     machine: AbstractMachine, start: State, name: str, argument: str, lane_noise: LaneNoise | None
 ) -> None:
-    """**Raises:** `ValueError` for a name that no number of the machine, of its start or of the
-    noise has."""
+    """**Raises:** `ValueError` if machine, start and noise have no number of this name."""
     if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
     of_start, names = part_of(name) == START, [START + n for n in components(bare(start))]

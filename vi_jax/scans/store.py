@@ -433,8 +433,7 @@ def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
 
 
 def _parts(thing: Any) -> list[Any]:
-    """What `thing` consists of. **Raises:** `OSError` or `TypeError` for what has neither source
-    nor content."""
+    """Its parts. **Raises:** `OSError` or `TypeError` if it has neither source nor content."""
     if isinstance(thing, set | frozenset):
         return sorted(map(identity, thing))
     if isinstance(thing, list | tuple):
