@@ -124,24 +124,20 @@ def over(
     shape: Sequence[int],
     body: Callable[[tuple[Index, ...]], None],
     cuts: Cuts = NO_CUTS,
+    index: tuple[Index, ...] = (),
 ) -> None:
-    """Loops over all elements of an array of this shape, a loop for each part between `cuts`."""
+    """Loops over all elements of an array of this shape, a loop for each part between `cuts`; of
+    those at an `index` along the first axes."""
+    axis = len(index)
+    if axis == len(shape):
+        return body(index)
+    for begin, end in pairwise(sorted({0, shape[axis], *cuts.get(axis, ())})):
 
-    def nest(index: tuple[Index, ...]) -> None:
-        axis = len(index)
-        if axis == len(shape):
-            body(index)
-            return
-        bounds = sorted({0, shape[axis], *cuts.get(axis, ())})
-        for begin, end in pairwise(bounds):
+        def turn(i: Index, _: list[Value], begin: int = begin) -> list[Value]:
+            over(t, shape, body, cuts, (*index, plus(t, i, begin)))
+            return []
 
-            def turn(i: Index, _: list[Value], begin: int = begin) -> list[Value]:
-                nest((*index, plus(t, i, begin)))
-                return []
-
-            counted(t, end - begin, turn, [])
-
-    nest(())
+        counted(t, end - begin, turn, [])
 
 
 def range_of(t: Text, i: Index, size: int) -> tuple[int, int]:

@@ -164,13 +164,11 @@ def dependent_parts(
     return DependentParts(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
 
 
-# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.9 to 0.12 gives them these
-# names (`tests/lanes/test_jax.py` fails where a later one gives others); "pjit", "remat",
-# "checkpoint" and "core_call" are older ones.
+# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.9.1 to 0.12 gives them these
+# names (`tests/lanes/test_jax.py` fails where a later one gives others).
 CALLS = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "remat2": "jaxpr",
+    "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
     "eval_jaxpr": "call_jaxpr",  # JAX 0.12's `closed_call`
 }  # fmt: skip
 
@@ -219,7 +217,7 @@ def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
 
 
 # Calls without a derivative of their own, and without a say about what is kept for it.
-_INLINED = ("jit", "pjit", "closed_call", "core_call")
+_INLINED = ("jit", "closed_call")
 
 
 def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:

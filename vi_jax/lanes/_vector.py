@@ -177,51 +177,49 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
 def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
     """The results of a rule of `ELEMENTWISE`: number by number of arrays in registers. Of larger
     ones they are formulas; several results, which are computed together, are stored."""
-    rule, shape = ELEMENTWISE[name], avals[0].shape
+    several, shape, kinds = len(avals) > 1, avals[0].shape, [kind_of(a.dtype) for a in avals]
+
+    def results(*numbers: Value) -> tuple[Value, ...]:
+        found = ELEMENTWISE[name](t, params, dtypes, *numbers)
+        return found if several else (found,)
+
     if avals[0].size <= MOST_IN_REGISTERS and all(isinstance(x, Registers) for x in args):
-        values = [x.values for x in args]
+        values: list[Any] = [x.values for x in args]
         if not any(x.shape for x in values):
-            found = rule(t, params, dtypes, *(x[()] for x in values))
-            return [Registers.one(x) for x in (found if len(avals) > 1 else (found,))]
+            return [Registers.one(x) for x in results(*(x[()] for x in values))]
         if any(x.shape != values[0].shape for x in values):
-            values = np.broadcast_arrays(*values)
-        kinds = [kind_of(a.dtype) for a in avals]
+            values = [*np.broadcast_arrays(*values)]
         outs = [np.empty(values[0].shape, object) for _ in avals]
         for i in np.ndindex(values[0].shape):
-            found = rule(t, params, dtypes, *(x[i] for x in values))
-            for out, value in zip(outs, found if len(avals) > 1 else (found,), strict=True):
+            for out, value in zip(outs, results(*(x[i] for x in values)), strict=True):
                 out[i] = value
         return [Registers(out, kind) for out, kind in zip(outs, kinds, strict=True)]
     if name in SAME:
         return args[:1]
-    kinds = [kind_of(a.dtype) for a in avals]
 
-    def numbers(index: tuple) -> Any:
+    def results_at(index: tuple) -> tuple[Value, ...]:
         # JAX lets numbers, and axes of one number, stand for arrays.
-        given = (
+        return results(*(
             x.at(t, [i if n != 1 else 0 for i, n in zip(index, x.shape, strict=False)])
             for x in args
-        )
-        found = rule(t, params, dtypes, *given)
-        # Whether it is stored before it is used must not decide how it is rounded.
-        return t.opaque(found) if len(avals) == 1 else found
+        ))  # fmt: skip
 
     values = [_only_number(x) for x in args]
     if all(v is not None for v in values):
-        found = rule(t, params, dtypes, *values)
-        return [uniform(shape, v) for v in (found if len(avals) > 1 else (found,))]
+        return [uniform(shape, v) for v in results(*values)]
     if name == "select_n" and len(args) == 3 and values[0] is not None:
         if values[0].kind == "i1" and args[1].shape == args[2].shape:
             found = chosen(t, values[0], args[2], args[1])
             if found is not None:
                 return [found]
-    if len(avals) == 1:
+    if not several:
         cuts = joined(*(x.cuts for x in args if x.ndim))
-        return [Formula(shape, kinds[0], numbers, cuts=cuts)]
+        # Whether it is stored before it is used must not decide how it is rounded.
+        return [Formula(shape, kinds[0], lambda i: t.opaque(results_at(i)[0]), cuts=cuts)]
     outs = [room(t, shape, kind) for kind in kinds]
 
     def put(index: tuple) -> None:
-        for out, value in zip(outs, numbers(index), strict=True):
+        for out, value in zip(outs, results_at(index), strict=True):
             out.put(t, index, value)
 
     over(t, shape, put, joined(*(x.cuts for x in args)))
