@@ -1,16 +1,23 @@
 """What is kept: machine code in files, kernels, programs of functions that are alike."""
 
+import gc
+import weakref
 from functools import partial, wraps
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
-from vi_jax.lanes import _code, runtime
+from vi_jax._programs import maps_used
+from vi_jax.lanes import _code, _text, runtime
 
 from lanes.toys import failing
+
+
+def program_of(function, *args):
+    equations = jax.make_jaxpr(function)(*args).jaxpr.eqns
+    return next(e.params["program"] for e in equations if e.primitive.name == "lanes")
 
 
 def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
@@ -45,32 +52,34 @@ def test_where_programs_are_kept(tmp_path):
 
 def test_programs_are_dropped_in_time():
     """Many programs in one process, each used once: memory maps and kernels stay few."""
-    maps = Path("/proc/self/maps")
 
     def one(number):
-        def begin(x):
-            return x, lanes.Emitted(True, False, None)
-
-        def step(x, carry):
-            return carry + number, lanes.Emitted(False, False, None)
-
+        begin = lambda x: (x, lanes.Emitted(True, False, None))
+        step = lambda x, carry: (carry + number, lanes.Emitted(False, False, None))
         return lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0]
 
     def kernels(numbers):
-        from vi_jax.lanes.runtime import kernel_of
-
         for number in numbers:
-            jaxpr = jax.make_jaxpr(lambda: one(float(number)))().jaxpr  # noqa: B023
-            kernel_of(
-                next(e for e in jaxpr.eqns if e.primitive.name == "lanes").params["program"], 1
-            )
+            runtime.kernel_of(program_of(partial(one, float(number))), 1)
 
     kernels(range(80))
-    before = maps.read_bytes().count(b"\n") if maps.exists() else 0
+    before = maps_used() or 0
     kernels(range(80, 240))
-    after = maps.read_bytes().count(b"\n") if maps.exists() else 0
-    assert after - before < 160
+    assert (maps_used() or 0) - before < 160
     assert len(runtime._recent) <= runtime._MOST_KERNELS
+
+
+def test_arrays_in_memory_go_without_the_garbage_collector(monkeypatch):
+    """Or texts, and with them the names of files of machine code, would depend on when it runs."""
+    function = lambda x: (jnp.outer(x, x) @ jnp.sin(x), jnp.sort(x), jnp.cumsum(x))
+    program = program_of(lambda x: lanes.once(function, x), jnp.ones(23))
+    blocks, take = [], _text.Arena.take
+    kept = lambda *args: (blocks.append(weakref.ref(block := take(*args))), block)[1]
+    monkeypatch.setattr(_text.Arena, "take", kept)
+    gc.disable()
+    runtime.kernel_text(program, 8, 512)
+    gc.enable()
+    assert blocks and not any(block() for block in blocks)
 
 
 def _sum(bound, x):
@@ -82,9 +91,7 @@ def test_constants_bound_to_a_function_distinguish_programs():
     """Equal constants make one program, and what only compares equal makes another."""
 
     def found(offset):
-        jaxpr = jax.make_jaxpr(lambda x: lanes.once(partial(_sum, {"offset": offset}), x))(1.0)
-        (eqn,) = (e for e in jaxpr.jaxpr.eqns if e.primitive.name == "lanes")
-        return eqn.params["program"]
+        return program_of(lambda x: lanes.once(partial(_sum, {"offset": offset}), x), 1.0)
 
     assert found(2.0) is found(2.0) and found(2) is found(2)
     assert found(np.array([1.0, 2.0])[1]) is found(np.float64(2.0))
