@@ -245,13 +245,15 @@ def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
     return [read(a) for a in jaxpr.outvars]
 
 
-# What is one jaxpr in several equations stays one, which JAX then differentiates once.
-@functools.lru_cache(maxsize=512)
-def rewritten(jaxpr: Any, one: Callable[[Any], Any]) -> Any:
-    """A jaxpr, closed or not, with `one` of each of its equations in that one's place, in inner
-    jaxprs too; but what has a derivative of its own stays as it is."""
-    if isinstance(jaxpr, ClosedJaxpr):
-        return jaxpr.replace(jaxpr=rewritten(jaxpr.jaxpr, one))
+@functools.lru_cache(maxsize=256)
+def rewritten(closed: ClosedJaxpr, one: Callable[[Any], Any]) -> ClosedJaxpr:
+    """A jaxpr with `one` of each of its equations in that one's place, in inner jaxprs too; but
+    what has a derivative of its own stays as it is."""
+    # What is one jaxpr in several equations stays one, which JAX then differentiates once.
+    return closed.replace(jaxpr=_rewritten(closed.jaxpr, one))
+
+
+def _rewritten(jaxpr: Jaxpr, one: Callable[[Any], Any]) -> Jaxpr:
     eqns = []
     for eqn in map(one, jaxpr.eqns):
         if eqn.primitive.name not in OWN_DERIVATIVE:
@@ -261,8 +263,10 @@ def rewritten(jaxpr: Any, one: Callable[[Any], Any]) -> Any:
 
 
 def _parameter(value: object, one: Callable[[Any], Any]) -> Any:
-    if isinstance(value, Jaxpr | ClosedJaxpr):
+    if isinstance(value, ClosedJaxpr):
         return rewritten(value, one)
+    if isinstance(value, Jaxpr):
+        return _rewritten(value, one)
     if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
         found = [_parameter(x, one) for x in value]
         return type(value)(*found) if hasattr(value, "_fields") else tuple(found)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import partial_eval
 
 from ._derivative import values_and_slopes, with_quotients
@@ -27,6 +27,7 @@ from ._program import (
     dependent_parts,
     dependent_results,
     evaluated,
+    inner,
     loop_depends,
     shape_of,
     walked,
@@ -64,12 +65,13 @@ def _(weight, slope, *, weight_first: bool, **params):
     return ShapedArray(out.shape, out.dtype)
 
 
-def with_weights(jaxpr: Any, weights: Sequence[bool]) -> Any:
-    """The same jaxpr, closed or not, with these products where one factor, or the dividend, depends
-    on one of the arguments `weights`. Its results must be linear in these, or not depend on
-    them."""
-    if isinstance(jaxpr, ClosedJaxpr):
-        return jaxpr.replace(jaxpr=with_weights(jaxpr.jaxpr, weights))
+def with_weights(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:
+    """The same jaxpr with these products where one factor, or the dividend, depends on one of the
+    arguments `weights`. Its results must be linear in these, or not depend on them."""
+    return closed.replace(jaxpr=_rewritten(closed.jaxpr, weights))
+
+
+def _rewritten(jaxpr: Jaxpr, weights: Sequence[bool]) -> Jaxpr:
     eqns = []
 
     def visit(eqn: Any, args: list[bool], _: list[bool]) -> None:
@@ -94,15 +96,19 @@ def _equation(eqn: Any, args: list[bool]) -> Any:
         params = {**params, "weight_first": args[0]}
         return eqn.replace(primitive=weighted_dot_p, invars=list(pair), params=params)
     if name in CALLS:
-        body = with_weights(params[CALLS[name]], args)
-        return eqn.replace(params={**params, CALLS[name]: body})
+        return eqn.replace(params=_with(params, CALLS[name], args))
     if name == "cond":
         branches = tuple(with_weights(b, args[1:]) for b in params["branches"])
         return eqn.replace(params={**params, "branches": branches})
     if name == "scan":
-        body = with_weights(params["jaxpr"], dependent_in_scan(eqn, args))
-        return eqn.replace(params={**params, "jaxpr": body})
+        return eqn.replace(params=_with(params, "jaxpr", dependent_in_scan(eqn, args)))
     return eqn
+
+
+def _with(params: dict[str, Any], key: str, weights: Sequence[bool]) -> dict[str, Any]:
+    held = params[key]
+    new = _rewritten(inner(held), weights)
+    return {**params, key: held.replace(jaxpr=new) if isinstance(held, ClosedJaxpr) else new}
 
 
 class BothWays(NamedTuple):
