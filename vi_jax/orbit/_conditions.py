@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar, State, Vector
+from .._types import Scalar, Vector
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, units_of, with_leaf
 from ..machine import quantity_of as measured
@@ -62,20 +62,17 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
     if name in ("fastest_impact", "slowest_impact"):
         speeds = seen.approach[np.asarray(problem.impacts, int)]
         return jnp.nanmax(speeds) if name == "fastest_impact" else jnp.nanmin(speeds)
-    state = _on_section(problem, x)
+    if problem.events:
+        legs, places = problem.sections(x)
+        state = problem.state_at(x, legs[0], places[0])
+    else:
+        state = problem.unravel(problem.parts(x)[1][0])
     inner = name.removeprefix(_SECTION)
     there = components(state)
     if inner in there:
         return jnp.asarray(there[inner])
     row = jax.tree.map(lambda a: jnp.asarray(a)[None], state)
     return quantities_on(problem.at(x), row)[inner][0]
-
-
-def _on_section(problem: Shooting, x: Vector) -> State:
-    if not problem.events:
-        return problem.unravel(problem.parts(x)[1][0])
-    legs, places = problem.sections(x)
-    return problem.state_at(x, legs[0], places[0])
 
 
 @on_host

@@ -155,11 +155,7 @@ def _freed(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
-    """The equations with further parameters and as many conditions, their unknowns, and the
-    intervals of all parameters.
-
-    **Raises:** `ValueError` for what cannot be freed or held.
-    """
+    """The equations with further parameters and as many conditions, the unknowns, the intervals."""
     if not free:
         return _scaled(problem, [bounds]), x, [bounds]
     machine, values, ranges = problem.machine, [], []
@@ -222,13 +218,8 @@ def _scaled(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shootin
 
 
 def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
-    """The orbit as a solution of its equations from event to event.
-
-    It is refined at its parameter, unless it lies at a fold: then across the branch, which takes a
-    program of its own.
-
-    **Raises:** `ValueError` where there is no solution close to it, or many.
-    """
+    """The orbit as a solution of its equations from event to event: refined at its parameter, or at
+    a fold across the branch, which takes a program of its own."""
     start, moved = _refined(problem, x, np.eye(problem.size)[-1])
     if problem.conditions:
         if bool(start.good):

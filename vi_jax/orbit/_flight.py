@@ -60,12 +60,8 @@ def section_of(machine: AbstractMachine, cycle: int) -> Event:
 
 
 def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
-    """The guard of an event in the course of a motion, zero there and rising; of a release the
-    force that pulls the body off its stop.
-
-    **Arguments:** `before`, the flight that ends there; `s`, the clock since the beginning of the
-    period; `state`, that before the event.
-    """
+    """The guard of an event that ends the flight `before`, in the state before it, zero there and
+    rising; `s` counts from the begin of the period. Of a release it is what pulls the body off."""
     if event.use == LEAVES:
         return -force_on(before, event.number, s, state)
     if event.cycle is not None:

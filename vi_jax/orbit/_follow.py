@@ -89,11 +89,7 @@ class Event(NamedTuple):
 
 
 class Table(abc.ABC):
-    """The equations of a curve, and what can happen on it.
-
-    **Arguments:** the equations; the intervals of the parameters, which are the last unknowns, in
-    their order.
-    """
+    """The equations of a curve, and what can happen on it, with the intervals of its parameters."""
 
     symmetric: bool = False
     """Whether a motion can become its own image, or cease to be it."""
@@ -151,11 +147,8 @@ def both_ways(
     progress: bool,
     settings: dict[str, Any],
 ) -> Any:
-    """The curve through a point, followed ahead and back.
-
-    **Arguments:** a new table for each way; the point; what makes the result, of the fields of a
-    `Curve` and its `special` points; what the curve is called; whether a bar is shown; the settings
-    of the walk.
+    """The curve through a point, followed ahead and back, a new table for each way; `result` makes
+    it of the fields of a `Curve` and its `special` points, `what` it is called.
 
     **Raises:** on Ctrl-C `Interrupted`, with the result so far.
     """
@@ -369,8 +362,6 @@ class Closing:
     motion in the same direction. A curve that only comes close to itself passes that plane
     elsewhere. The motion may be met again some cycles later, with angles that have made whole
     turns, or with another of its events as the first one: that is the same motion.
-
-    **Arguments:** the curve's table.
     """
 
     def __init__(self, table: Table):

@@ -56,10 +56,7 @@ def soft_kick(
     gradient: np.ndarray, fast: np.ndarray, rate: float,
 ) -> Kick:  # fmt: skip
     """The kick of a switch that a motion grazes at this clock in the state u: `gradient` and `fast`
-    are those of the distance h and of dh/ds, `rate` is d²h/ds².
-
-    **Raises:** `ValueError` if the field beyond the surface does not turn the motion back.
-    """
+    are those of the distance h and of dh/ds, `rate` is d²h/ds²."""
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The field, and what it is more beyond the surface."""
@@ -387,11 +384,7 @@ class Graze(NamedTuple):
 
 
 def graze_at(point: Point) -> Graze:
-    """The local map of a special point that is a grazing.
-
-    **Raises:** `ValueError` if nothing is touched there, if what is touched is no stop or switch,
-    or if the motion turns back there in its parameter.
-    """
+    """The local map of a special point that is a grazing of a stop or a switch."""
     problem, x, number, clock = _without_touch(point)
     problem, x = of_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)

@@ -120,12 +120,8 @@ Passed = list[tuple[Point, Step]]
 
 
 class MotionTable(Table):
-    """What can happen on a branch, for each of its steps (see `_follow.Table`).
-
-    **Arguments:** the equations of the motions, with the parameter as their last unknown; the
-    intervals of its parameters, in their order; names of the numbers whose extremes are sought;
-    functions of the orbit whose zeros are, by name.
-    """
+    """What can happen on a branch, for each of its steps; `extrema` are names of numbers whose
+    extremes are sought, `watched` functions of the orbit whose zeros are, by name."""
 
     def __init__(
         self, problem: Shooting, bounds: list[tuple[float, float]],
@@ -566,12 +562,8 @@ def _size_of(problem: Shooting, x: Unknowns) -> float:
 
 
 def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
-    """Where the cycle shrinks onto an equilibrium between two points of a branch; `None` if it
-    does not.
-
-    **Returns:** a motion of hardly any size about the equilibrium whose eigenvalues ±iω are
-    imaginary. One of its multipliers is 1, which is checked.
-    """
+    """A motion of hardly any size about the equilibrium onto which the cycle shrinks between two
+    points, whose eigenvalues ±iω are imaginary. That it has a multiplier 1 is checked."""
     if problem.events != (section_of(problem.machine, 0),) or renews(problem.machine):
         return None
     rates = [_leaving(problem, step.x)[0] for step in (here, new)]

@@ -389,11 +389,8 @@ _ON = 1e-9
 def legs_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion that rests on stops, and the unknowns that it gives.
-
-    **Raises:** `ValueError` of a machine with friction on a stop, or whose cycles an event ends or
-    begin anew; where bodies chatter together, or a switch changes with each hop.
-    """
+    """The equations of a motion that rests on stops, and the unknowns that it gives; bodies chatter
+    one by one, and no switch changes with their hops."""
     machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
     if is_autonomous(machine, state) or renews(machine) or has_contact_friction(machine):

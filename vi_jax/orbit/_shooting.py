@@ -352,10 +352,7 @@ class Shooting(eqx.Module):
         self, machine: AbstractMachine, leg: Leg, s: Scalar, until: Scalar, u: Vector,
         averages: tuple[str, ...] = (),
     ) -> Hops:  # fmt: skip
-        """The last impact before a clock of the chatter with which a leg begins; else its begin.
-
-        **Arguments:** the clock of its first event, and a later one; the state behind that event.
-        """
+        """The last impact, before `until`, of the chatter that begins a leg; else its begin."""
         hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
             free, begin = self.departing(machine, leg), hops._replace(over=~lands | hops.over)
@@ -503,10 +500,8 @@ class Shooting(eqx.Module):
 
     def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
         """χ of the chatter that begins with this event; without its number the least force on a
-        body within its rest, at a turn. Zero where a rest is lost.
-
-        **Arguments:** `chatters`, of each leg the end of the one with which it begins.
-        """
+        body within its rest. Zero where a rest is lost; `chatters`, the ends of those of all
+        legs."""
         machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
         last = lambda i: jax.tree.map(lambda a: a[i], chatters)

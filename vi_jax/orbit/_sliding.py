@@ -239,11 +239,8 @@ def without_part(
 def _with_part(
     problem: Shooting, at: Step, new: Shooting, step: Step, first: int, alike: bool
 ) -> Step:
-    """The solution of the equations with a part that has no length, from that of those without it.
-
-    **Arguments:** `new` and `step`, the equations without it and their solution; `first`, the
-    number of the event with which the part begins; `alike`, whether both its events were left out.
-    """
+    """The solution with a part that has no length and begins with event `first`, from that without
+    it, `step` of `new`; `alike`, whether both events of the part were left out."""
     clock, states, period = new.values(step.x)
     if not new.events:
         clock, states = np.zeros(0), np.zeros((0, problem.states))

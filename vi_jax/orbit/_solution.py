@@ -177,8 +177,6 @@ _ASTRAY = 10.0
 # A zero beside a solution is not further from it (in the parameter's scale): a choice.
 _CLOSE = 1e-2
 
-Advance = Callable[[Any, Any, float], Step]
-
 
 class NoValueError(ArithmeticError):
     """A test has no value, because the corrector has no answer there."""
@@ -269,8 +267,8 @@ def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -
 
 
 def crossing(
-    problem: Shooting, advance: Advance, here: Step, root: float, test: Callable[[Step], float],
-    admits: Callable[[Step, float], bool] = lambda step, length: True,
+    problem: Shooting, advance: Callable[[Any, Any, float], Step], here: Step, root: float,
+    test: Callable[[Step], float], admits: Callable[[Step, float], bool] = lambda *_: True,
 ) -> Step | None:  # fmt: skip
     """The point of a curve at which a test is zero, where its equations are singular: where
     branches cross, or where an impact grazes. `None` if too few points were found, or no zero.

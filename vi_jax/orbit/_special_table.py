@@ -80,11 +80,7 @@ Intervals = tuple[tuple[float, float], tuple[float, float]]
 
 
 class SpecialTable(Table):
-    """What can happen on a curve of special motions, for each of its steps (see `_follow.Table`).
-
-    **Arguments:** the equations of the motions, with two parameters as their last unknowns and
-    the condition that makes them special; the parameters' intervals.
-    """
+    """What can happen on a curve of special motions in two parameters, for each of its steps."""
 
     def __init__(self, problem: Shooting, bounds: Intervals):
         super().__init__(problem, bounds)
@@ -252,11 +248,8 @@ def _grazes(step: Step) -> int | None:
 def _resonances(
     problem: Shooting, impact: int | None, steps: list[Step]
 ) -> Iterator[tuple[float, Step, str]]:
-    """The resonant grazings of a curve: after which step, with the fraction of the way to the next
-    one, the point, and what begins there.
-
-    **Raises:** `ValueError` where the local map is not known (see `grazing`).
-    """
+    """The resonant grazings of a curve: its step, with the fraction of the way to the next one, the
+    point, and what begins there."""
 
     def local(step: Step) -> LocalMap:
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
@@ -298,7 +291,10 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     bare = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
-    double = plain(lambda s: _others(s, 1 if condition.kind == DOUBLING else -1))
+    # The product of all eigenvalues of M ± I but one, where that one is zero.
+    sign = 1 if condition.kind == DOUBLING else -1
+    shifted = lambda s: s.seen.monodromy + sign * np.eye(len(s.seen.monodromy))
+    double = plain(lambda s: float(minors(shifted(s))))
     if condition.kind == FOLD:
         tests = {CUSP: _cusp(bare, 2 if condition.double else 1), FLIP: doubling}
         return tests if condition.double else tests | {RESONANCE_1: double}
@@ -310,11 +306,6 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
         return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
     # Where an impact grazes M has a pole, but not where a stop is touched.
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
-
-
-def _others(step: Step, sign: int) -> float:
-    """The product of all eigenvalues of M ± I but one, where that one is zero."""
-    return float(minors(step.seen.monodromy + sign * np.eye(len(step.seen.monodromy))))
 
 
 def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:

@@ -86,11 +86,8 @@ class Settled(NamedTuple):
 
 
 def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The least period of each lane up to `LONGEST`, or 0.
-
-    **Arguments:** `rows`, what repeats, (lanes, length, numbers); `hits`, the impacts in each
-    iterate, (lanes, length); `size`, how large one kick is, (lanes,).
-    """
+    """The least period of each lane up to `LONGEST`, or 0, with which `rows` (lanes, length,
+    numbers) repeat, to a share of a kick's `size`, and `hits`, the impacts in each iterate."""
     found = np.zeros(len(rows), int)
     for p in range(LONGEST, 0, -1):
         apart = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
@@ -604,7 +601,8 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
     """What the local map forecasts, and what it settles on at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
-    natural, brief = natural_depth(local), _brief_depth(graze)
+    half = 0.5 * _BRIEF * float(graze.problem.period(graze.x)) / graze.problem.cycles
+    natural, brief = natural_depth(local), 0.5 * first.rate * half**2
     if natural < _VANISHES * brief:
         raise ValueError(
             "Argument `point` must be a grazing whose impacts come back to the stop, but here what "
@@ -648,10 +646,3 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
         units=stated(machine),
     )  # fmt: skip
     return unchecked, found
-
-
-def _brief_depth(graze: Graze) -> float:
-    """The depth of a passage beyond the stop that lasts a small share of a cycle."""
-    problem = graze.problem
-    half = 0.5 * _BRIEF * float(problem.period(graze.x)) / problem.cycles
-    return 0.5 * graze.touches[0].rate * half**2

@@ -358,10 +358,7 @@ class Orbit(Summarized):
 
 
 def check_multipliers(name: str, orbit: Orbit) -> None:
-    """**Raises:** `ValueError` if a motion was found without its multipliers.
-
-    **Arguments:** the name of the argument; an orbit, or a batch of them.
-    """
+    """**Raises:** `ValueError` if a motion, or one of a batch, was found without multipliers."""
     if bool(jnp.any(orbit.successful & jnp.isnan(orbit.multipliers).any(axis=-1))):
         raise ValueError(
             f"Argument `{name}` must have multipliers, but they are not a number: find it without "

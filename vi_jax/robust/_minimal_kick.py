@@ -233,10 +233,6 @@ _DIFFERENCE, _STEP = 1e-5, 0.2
 _STRAYS = 0.5
 
 
-Edge = Callable[[Kicks], tuple[Row, Kicks]]
-"""g and its gradient at some kicks."""
-
-
 def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
     """The kick of least norm onto the stable manifold of a saddle, near a kick onto it that is
     known to rounding; `None` where Newton's method finds none, as beside a grazing.
@@ -300,7 +296,8 @@ def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
     return rows, np.array(normals)
 
 
-def _newton(edge: Edge, z: Row) -> tuple[Row, float] | None:
+def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, float] | None:
+    """As `shortest`, with g and its gradient at some kicks."""
     size, multiplier, last = z.size, None, np.inf
     for _ in range(_STEPS):
         step = _DIFFERENCE * np.linalg.norm(z)
@@ -396,24 +393,21 @@ class MinimalKick(Summarized):
         parts = state_in_words({name: np.asarray(x) for name, x in self.kick.items()}, 9, units)
         how = "exact" if self.exact else "by simulations only"
         sure = "confirmed" if self.confirmed else "NOT confirmed"
+        when = f", {float(self.phase):.9g} after the section of cycle {self.cycle}"
+        when = when if self.cycle or float(self.phase) else ""
         leads = "no motion that repeats was found"
         if self.settles is not None:
             leads = str(self.settles).splitlines()[0]
         edge = self.edge.summary().splitlines()
         lines = [
             f"Minimal kick of norm {float(self.norm):.9g}: {parts}",
-            f"  to: {state_in_words(self.start, 9, units)}{self._when()}",
+            f"  to: {state_in_words(self.start, 9, units)}{when}",
             f"  settles on: {leads}",
             f"  edge: {edge[0] if len(edge) == 1 else f'{self.edge.kind}, {edge[1]}'}",
             f"  residual {float(self.residual):.1g} ({how}), {sure} by simulation at 1 ± 1e-6",
         ]
         lines += [f"  another: norm {float(other.norm):.9g}" for other in self.others]
         return "\n".join(lines)
-
-    def _when(self) -> str:
-        if not self.cycle and not float(self.phase):
-            return ""
-        return f", {float(self.phase):.9g} after the section of cycle {self.cycle}"
 
 
 def minimal_kick(

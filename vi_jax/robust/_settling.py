@@ -143,10 +143,8 @@ class Settling:
         self, rows: Rows, cycles: int, wanted: Bool[np.ndarray, " lanes"], begin: float
     ) -> list[np.ndarray]:
         """States so many cycles later, whether they got there, and whether they were no starts.
-
-        **Raises:** `ValueError` where the machine is in other modes then than a motion that begins
-        there, since states alone are told apart.
-        """
+        Since states alone are told apart, their modes may not be others than those that begin
+        there."""
         numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
         *found, other = (np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers))
         _refuse_other_modes(other)
@@ -161,11 +159,8 @@ class Settling:
         return np.concatenate(found)
 
     def first_change(self, rows: Float[np.ndarray, "rays points states"]) -> tuple[Any, Any]:
-        """Of points in a row, the first that does not come back.
-
-        **Returns:** its place in each row, as many as there are points if all come back; and
-        whether that one is elsewhere (not inadmissible).
-        """
+        """Of points in each row, the place of the first that does not come back, or their number;
+        and whether that one is elsewhere (not inadmissible)."""
         rays, points, states = rows.shape
         verdict = self.judge(rows.reshape(-1, states)).reshape(rays, points)
         left = verdict != RETURNS
@@ -221,10 +216,7 @@ class Settling:
         return orbit if self.distance_to(row, sections).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
-        """What judges starts so long after a section state of the motion, and the state then.
-
-        **Raises:** `ValueError` for an equilibrium, and for a phase beyond the cycle.
-        """
+        """What judges starts so long after a section state of the motion, and the state then."""
         machine, method = self.the_map.machine, self.the_map.method
         if bool(stands_still(machine, self.state(start), machine.cycle, self.unit)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
@@ -273,13 +265,8 @@ def settling_on(
     name: str,
     cycle: int = 0,
 ) -> tuple[Settling, Row]:
-    """What judges starts by whether they come back to a motion, and a state of the motion.
-
-    **Arguments:** those of `edge_state`; the name of the motion's argument; which of the section
-    states of an orbit is asked for.
-
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
-    """
+    """What judges starts by whether they come back to a motion, the argument `name`, and a state of
+    it: of an orbit that of the section `cycle`. Other arguments are those of `edge_state`."""
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
@@ -367,13 +354,8 @@ def _until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
 def images(
     the_map: CycleMap, like: State, rows: Array, cycles: Array, begin: Array
 ) -> tuple[Array, Array]:
-    """States so many cycles later (at least one), and their derivatives by the states.
-
-    **Arguments:** `rows`, (lanes, states); `cycles`, another number of which is not another
-    program; `begin`, the clock of the states since the section.
-
-    **Returns:** (lanes, states) and (lanes, states, states).
-    """
+    """States so many cycles later (at least one), and their derivatives by the states, (lanes,
+    states, states). Another number of `cycles` is not another program."""
 
     def ends(rows):
         return in_rows(_runs(the_map, like, rows, 1, cycles - 1, begin).sections, 2)[:, -1]
