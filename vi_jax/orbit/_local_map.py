@@ -217,7 +217,7 @@ def _rooms(problem: Shooting, x):
         _, _, path = flight.fly(s0, s1, after, problem.steps)
         h = (s1 - s0) / problem.steps
         _, rooms = turning(Path(flight, path[0], path[1], h, not problem.events))
-        return jnp.stack([r.room for r in rooms]), jnp.stack([r.clock for r in rooms])
+        return jnp.stack([room for room, _ in rooms]), jnp.stack([s for _, s in rooms])
 
     ends = problem.ends(clock, problem.period(x))
     return jax.vmap(follow)(jnp.arange(problem.legs), clock, ends, states)

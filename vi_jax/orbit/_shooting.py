@@ -438,7 +438,8 @@ class Shooting(eqx.Module):
         escapes = (self._escape(machine, i, last[i], clock, states, period) for i in last)
         left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
         Y = jnp.concatenate(places)
-        nearest, pulled = jnp.argmin(turns.nearest.room), jnp.argmin(turns.pull.room)
+        low, high, nearest, pull = turns
+        i, j = jnp.argmin(nearest.room), jnp.argmin(pull.room)
         order_of_events = self._order_margin(machine, clock, ends - clock, states)
         integrals = jax.tree.map(jnp.sum, passed)
         time = integrals.pop(TIME)
@@ -447,10 +448,10 @@ class Shooting(eqx.Module):
             multipliers=multipliers_of(monodromy),
             monodromy=monodromy,
             approach=approach.ravel(),
-            y_min=jnp.minimum(jnp.min(Y), jnp.min(turns.low)),
-            y_max=jnp.maximum(jnp.max(Y), jnp.max(turns.high)),
-            nearest=jax.tree.map(lambda x: x[nearest], turns.nearest),
-            pull=jax.tree.map(lambda x: x[pulled], turns.pull),
+            y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
+            y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
+            nearest=jax.tree.map(lambda x: x[i], nearest),
+            pull=jax.tree.map(lambda x: x[j], pull),
             order=jnp.min(order),
             order_margin=reduce(jnp.minimum, left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,

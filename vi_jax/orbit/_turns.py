@@ -52,18 +52,6 @@ class Nearest(NamedTuple):
     """The number of the event."""
 
 
-class Turns(NamedTuple):
-    """What the turning points of a flight say of its extremes and of grazing."""
-
-    low: Scalar
-    """The least position of the first coordinate at one; infinite if there is none."""
-    high: Scalar
-    """The greatest; -infinite if there is none."""
-    nearest: Nearest
-    pull: Nearest
-    """Of the forces on bodies that rest, as `pull_of`."""
-
-
 class _Found(NamedTuple):
     """The turning points of a function of the state along a flight, one for each step."""
 
@@ -138,21 +126,17 @@ class _Pull(_Watched):
         return -force_on(flight, self.number, s, state)
 
 
-class _Room(NamedTuple):
-    """How near a flight comes to one of the machine's events at its turns, one for each step."""
-
-    room: Float[Array, " steps"]
-    """Distance to the event at the turn, as `Nearest.room`; infinite where the step has no turn."""
-    clock: Float[Array, " steps"]
-    """Clock of the turn."""
+_Room = tuple[Float[Array, " steps"], Float[Array, " steps"]]
+"""`Nearest.room` of one event in each step, infinite without a turn; and its clock."""
 
 
-def turns_of(path: Path) -> Turns:
-    """The turning points of all coordinates and guards along a flight."""
+def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
+    """The least and the greatest turn of the first coordinate, infinite if there is none; the turn
+    nearest to an event; and that of `pull_of`."""
     bodies, rooms = turning(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return Turns(low, high, _least_room(dict(enumerate(rooms)), path.h), pull_of(path))
+    return low, high, _least_room(dict(enumerate(rooms)), path.h), pull_of(path)
 
 
 def _least_room(rooms: dict[int, _Room], h: Scalar) -> Nearest:
@@ -177,7 +161,7 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
         if flight.contact:  # one that is let go of begins to move with velocity zero
             free = flight.contact[stop.coordinate] == 0
             facing = facing & free & (at.place > begin + _TURNED * path.h)
-        rooms.append(_Room(jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
+        rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
     for number, event in enumerate(events_of(machine)):
         if number < len(stops_of(machine)) or number == section_number(machine):
             continue
@@ -192,7 +176,7 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
             # Right behind the event itself it is zero, to rounding of either sign.
             below = -_ROUNDED * jnp.max(jnp.abs(value))
             facing = facing & at.happens & (jax.lax.cummin(value) < below)
-        rooms.append(_Room(jnp.where(facing, -at.height, jnp.inf), at.place))
+        rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
     return bodies, rooms
 
 
@@ -215,7 +199,7 @@ def pull_of(path: Path) -> Nearest:
         at = _turns_in(path, _Pull(number))
         rests = flight.contact[stop.coordinate] == 1.0 + number
         force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
-        forces[number] = _Room(force, at.place)
+        forces[number] = (force, at.place)
     return _least_room(forces, path.h)
 
 
