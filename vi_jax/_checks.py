@@ -3,8 +3,9 @@
 import dataclasses
 import math
 import os
+import reprlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -167,7 +168,7 @@ def interval(name: str, value: Any) -> tuple[float, float]:
     )
 
 
-def row_of_numbers(values: object) -> np.ndarray | None:
+def _row_of_numbers(values: object) -> np.ndarray | None:
     """Finite real numbers in one row, one at least, or `None` for other values. Texts, truth
     values, dates and complex numbers are no real numbers, even where NumPy takes them."""
     if isinstance(values, list | tuple) and any(isinstance(x, bool | np.bool_) for x in values):
@@ -180,6 +181,26 @@ def row_of_numbers(values: object) -> np.ndarray | None:
         return None
     row = row.astype(float)
     return row if np.isfinite(row).all() else None
+
+
+def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
+    """The axes as rows of numbers. **Raises:** `ValueError` that names the axis, or `TypeError` for
+    what is no mapping."""
+    if not isinstance(axes, Mapping) or not axes:
+        raise TypeError(
+            f"Argument `{argument}` must map names of numbers to rows of values, such as "
+            f'{{"drive.frequency_ratio": [0.8, 0.9]}}, but got {axes!r}.'
+        )
+    found = {}
+    for name, values in axes.items():
+        row = _row_of_numbers(values)
+        if row is None:
+            raise ValueError(
+                f"Axis {name!r} must be one row of finite real numbers, but got "
+                f"{reprlib.repr(values)}."
+            )
+        found[str(name)] = row
+    return found
 
 
 def flag(name: str, value: object) -> bool:

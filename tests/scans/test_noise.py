@@ -9,7 +9,7 @@ import vi_jax as vi
 import xarray as xr
 from vi_jax.flow import RunOptions
 from vi_jax.scans import make_program
-from vi_jax.scans.grid import LANE
+from vi_jax.scans.program import LANE
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.7, gap=1.5, damping_ratio=0.1)
 NOISE, KEY = vi.WhiteNoise({"V": 0.1}, impulses=16), jax.random.key(3)

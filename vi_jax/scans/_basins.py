@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import count, fits_records, given_number, require
+from .._checks import axes_of, count, fits_records, given_number, require
 from .._messages import at_work, so_many, warning_once
 from .._types import State, xr
 from ..flow import (
@@ -47,9 +47,8 @@ from ..machine import (
 from ..orbit import distance
 from . import _geometry as geometry
 from ._scan import LanesFailed, ScanInterrupted, scan
-from .grid import START, axes_of
 from .measures import CODES, REGIMES, Regime, Sections, flags
-from .program import check_leaf_name, start_with
+from .program import START, check_leaf_name, start_with
 
 _BEYOND = REASON_NAMES.index("bad_start")
 

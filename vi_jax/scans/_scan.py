@@ -22,14 +22,13 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from .. import lanes
-from .._checks import count, fits_records, flag, instance_of
+from .._checks import axes_of, count, fits_records, flag, instance_of
 from .._messages import Interrupted, at_work, warn, warning_once
 from .._programs import PLAIN, CompiledFunction
 from .._types import State, xr
 from ..flow import REASON_NAMES, AbstractMethod, MethodLike, RunOptions, compiling, preset
 from ..machine import AbstractMachine
-from .grid import Blocks, axes_of
-from .program import ScanProgram, check_corners, make_program
+from .program import Blocks, ScanProgram, check_corners, make_program
 from .store import MemoryStore, Where, ZarrStore, opened
 
 # Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.

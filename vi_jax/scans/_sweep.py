@@ -23,6 +23,7 @@ from ..flow import (
     check_start,
     chosen,
     in_names,
+    lane_key,
     machine_of,
     present,
     simulate,
@@ -51,8 +52,8 @@ from ..machine import (
     with_unit,
     with_units,
 )
-from .grid import LANE, LaneNoise, lane_noise_of
 from .measures import CODES, REGIMES, Regime, Usual, flags
+from .program import LaneNoise, lane_noise_of
 
 # A jump is so many times the change at the values beside it, and this part of the largest
 # position, or of ζ: choices.
@@ -327,7 +328,10 @@ def _sweep(
         here, noise = with_leaf(machine, parameter, value), {}
         state, number = (state, None) if lane_noise is None else state
         if lane_noise is not None:
-            noise = dict(zip(("noise", "key"), lane_noise.lane({LANE: number}), strict=True))
+            noise = {
+                "noise": lane_noise.noise,
+                "key": lane_key(lane_noise.key, jnp.asarray(number)),
+            }
         state = taken_along(here, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,

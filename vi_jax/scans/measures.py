@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, given_number, instance_of, one_of, require, tuple_of_names
+from .._checks import axes_of, count, given_number, instance_of, one_of, require, tuple_of_names
 from .._types import Flag, Number, State, xr
 from ..flow import AbstractMethod, Run, has_quantities, row_sizes
 from ..machine import (
@@ -29,7 +29,6 @@ from ..machine import (
     nearest_images,
 )
 from ._lyapunov import lyapunov
-from .grid import axes_of
 
 # How far sections a period apart may differ; so many times that, if a longer period fits within it;
 # and so many times what the longer one differs by. Choices.

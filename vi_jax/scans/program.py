@@ -1,10 +1,13 @@
-"""What a scan computes of its lanes: a pytree that is compiled once and can be sent away."""
+"""What a scan computes: lanes on a grid, in blocks; their noise, of which each has its own path by
+its number; and the program of them, a pytree that is compiled once and can be sent away."""
 
 import dataclasses
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, Shaped, UInt32
 
 from .._checks import count, strongly_typed, tuple_of_names
 from .._types import State
@@ -20,15 +23,18 @@ from ..flow import (
     AbstractMethod,
     MethodLike,
     RunOptions,
+    WhiteNoise,
     average_names,
     check_noise,
     check_reals,
     check_values,
     chosen,
     has_averages,
+    lane_key,
     machine_of,
     number_of,
     simulate_pool,
+    words_of,
 )
 from ..machine import (
     AbstractMachine,
@@ -46,8 +52,116 @@ from ..machine import (
     with_leaf,
     with_leaves,
 )
-from .grid import MACHINE, NOISE, START, Blocks, LaneNoise, lane_noise_of, part_of
 from .measures import MEASURES, AbstractMeasure, Average, Escape, Numbers
+
+# The number of a lane among its values, where it has one: no name of an axis.
+LANE = "lane number"
+
+# What the name of an axis begins with, of a number of the start and of one of the noise; one of the
+# machine has no prefix.
+MACHINE, START, NOISE = "", "start.", "noise."
+
+
+def part_of(name: str) -> str | None:
+    """What an axis or a derivative is of: `MACHINE`, `START` or `NOISE`; `None` for `LANE`."""
+    if name == LANE:
+        return None
+    return next((prefix for prefix in (START, NOISE) if name.startswith(prefix)), MACHINE)
+
+
+class Blocks:
+    """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order. If its
+    axes are `paired`, their values are taken together, one lane for each place in the rows. With
+    `numbers`, one for each lane in the grid's order, they are among the lanes' values."""
+
+    def __init__(
+        self,
+        axes: Mapping[str, np.ndarray],
+        lanes: int,
+        *,
+        paired: bool = False,
+        numbers: np.ndarray | None = None,
+    ):
+        self.axes, self.paired, self.lanes = dict(axes), paired, lanes
+        self.dims = ("sample",) if paired else tuple(axes)
+        self.shape = tuple(x.size for x in axes.values())[: 1 if paired else None]
+        room = lanes
+        block = []
+        for size in reversed(self.shape):
+            block.append(min(size, room))
+            room //= min(size, room)
+        self.block = tuple(reversed(block))
+        self.numbers = None if numbers is None else numbers.reshape(self.shape)
+
+    @property
+    def total(self) -> int:
+        """Number of lanes in the whole grid."""
+        return math.prod(self.shape)
+
+    def dims_of(self, name: str) -> tuple[str]:
+        """The dimension along which an axis' values lie."""
+        return ("sample",) if self.paired else (name,)
+
+    def __len__(self) -> int:
+        return math.prod(map(len, self._edges()))
+
+    def __iter__(self) -> Iterator[tuple[slice, ...]]:
+        """Where each block lies in the grid."""
+        pairs = zip(self._edges(), self.block, self.shape, strict=True)
+        rows = ([slice(i, min(i + n, size)) for i in edges] for edges, n, size in pairs)
+        return itertools.product(*rows)
+
+    def _edges(self) -> list[range]:
+        return [range(0, size, n) for size, n in zip(self.shape, self.block, strict=True)]
+
+    def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
+        """The axes' values of the block's lanes, and their numbers as `LANE`."""
+        beside = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}
+        if self.paired:
+            return {name: x[where] for name, x in self.axes.items()} | beside
+        rows = [x[part] for x, part in zip(self.axes.values(), where, strict=True)]
+        grid = np.meshgrid(*rows, indexing="ij")
+        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)} | beside
+
+
+class LaneNoise(eqx.Module):
+    """The noise of a scan."""
+
+    noise: WhiteNoise
+    key: UInt32[Array, "2"]
+    """The words of its key, of which each lane's is made."""
+
+    def described(self) -> dict[str, Any]:
+        """What makes two noises the same, as JSON can hold it."""
+        sizes = {name: np.asarray(x).tolist() for name, x in self.noise.amplitudes.items()}
+        words = [f"{int(word):08x}" for word in np.asarray(self.key)]
+        return {"amplitudes": sizes, "impulses": self.noise.impulses, "key": " ".join(words)}
+
+
+def lane_noise_of(
+    noise: object, key: object, axes: Iterable[str] = (), derivatives: Iterable[str] = ()
+) -> LaneNoise | None:
+    """The noise of a scan, `None` for none; `axes` and `derivatives` are names. **Raises:**
+    `TypeError` or `ValueError` for what does not fit together."""
+    given = {"axes": axes, "derivatives": derivatives}
+    names = [
+        (which, name) for which, row in given.items() for name in row if part_of(name) == NOISE
+    ]
+    if noise is None:
+        if key is not None or names:
+            what = "`key`" if key is not None else f"`{names[0][0]}`, which names {names[0][1]!r},"
+            raise ValueError(f"Argument {what} needs noise: give `noise`, a `WhiteNoise`.")
+        return None
+    if not isinstance(noise, WhiteNoise):
+        raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
+    for which, name in names:
+        offered = [NOISE + x for x in (*noise.amplitudes, *(["path"] if which == "axes" else []))]
+        if name not in offered:
+            raise ValueError(
+                f"Argument `{which}` must name a number of the noise ({', '.join(offered)}), but "
+                f"got {name!r}."
+            )
+    return LaneNoise(noise, words_of(key))
 
 
 class ScanProgram(eqx.Module):
@@ -102,6 +216,16 @@ class ScanProgram(eqx.Module):
         """Machine and start of the lane at this place of all axes."""
         return self.lane({name: jnp.asarray(x[place]) for name, x in blocks.axes.items()})
 
+    def noise_of(
+        self, values: Mapping[str, Any], nudge: Array | None = None
+    ) -> tuple[WhiteNoise, Array]:
+        """Noise and key of a lane, whose number is among its values; `nudge` as in `lane`."""
+        assert self.lane_noise is not None
+        noise, number = self.lane_noise.noise, jnp.asarray(values[LANE], jnp.uint32)
+        sizes = {name: values.get(NOISE + name, x) for name, x in noise.amplitudes.items()}
+        sizes = self._nudged(sizes, NOISE, nudge) | dict(noise.functions)
+        return dataclasses.replace(noise, amplitudes=sizes), lane_key(self.lane_noise.key, number)
+
     def _nudged(self, tree: Any, prefix: str, nudge: Array | None) -> Any:
         """`tree` with the numbers moved that derivatives are asked for."""
         if nudge is None:
@@ -145,7 +269,7 @@ class ScanProgram(eqx.Module):
         options = dataclasses.replace(self.options, clock=None)  # `lane` has seen to it
         noise_of = None
         if self.lane_noise is not None:
-            noise_of = functools.partial(self.lane_noise.lane, names=self.derivatives, nudge=nudge)
+            noise_of = functools.partial(self.noise_of, nudge=nudge)
         run = simulate_pool(lane_of, values, self.cycles, options, wanted, noise_of)
 
         def measured(values, run):
@@ -361,7 +485,7 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         check_reals("start", start)
         check_values(machine, start)
         if program.lane_noise is not None:
-            check_noise(machine, start, program.lane_noise.noise_of(lane))
+            check_noise(machine, start, program.noise_of({LANE: 0, **lane})[0])
     if program.build is not None:
         return program
     return dataclasses.replace(program, options=dataclasses.replace(program.options, rests=rests))

@@ -27,9 +27,8 @@ from .._messages import installed_version, warn
 from .._types import xr, zarr
 from ..flow import REASON_NAMES
 from ..machine import attributes, leaf, leaf_names, outcomes_of, unit_of, units_of
-from .grid import LANE, NOISE, START, Blocks, part_of
 from .measures import flags
-from .program import ScanProgram
+from .program import LANE, NOISE, START, Blocks, ScanProgram, part_of
 
 try:
     import fcntl
