@@ -53,7 +53,7 @@ from ..machine import (
     with_units,
 )
 from .measures import CODES, REGIMES, Regime, Usual, flags
-from .program import LaneNoise, lane_noise_of
+from .program import lane_noise_of
 
 # A jump is so many times the change at the values beside it, and this part of the largest
 # position, or of ζ: choices.
@@ -265,8 +265,10 @@ def sweep(
     if lane_noise is not None:
         check_noise(machine, bare(start), noise)
     options = (settle, cycles, method, rests, regime, max_steps, lane_noise, bare(start))
+    # With noise beside it the number of the value, by which each has its own path.
+    begin = start if lane_noise is None else (start, jnp.uint32(0))
     if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
-        return _sweep(machine, parameter, values, _counted(start, lane_noise), *options)[1]
+        return _sweep(machine, parameter, values, begin, *options)[1]
     # All by one program: the last part is filled up by what ends at once.
     size, missing = values.size, -values.size % _AT_ONCE
     rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
@@ -280,14 +282,8 @@ def sweep(
         return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
     return in_parts(
-        "sweep", step, _counted(start, lane_noise), pieces, joined, progress=progress, unit="value",
-        total=size,
-    )  # fmt: skip
-
-
-def _counted(start: State, lane_noise: LaneNoise | None) -> Any:
-    """The start, with noise beside the number of the value, by which each has its own path."""
-    return start if lane_noise is None else (start, jnp.uint32(0))
+        "sweep", step, begin, pieces, joined, progress=progress, unit="value", total=size
+    )
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
@@ -321,8 +317,8 @@ def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, regime, max_steps,
     lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
-    """The state after the last value, and what was found at each; `start` is as `_counted` has it,
-    `first` the state at the first value of all."""
+    """The state after the last value, and what was found at each; `start`, with noise with
+    the number of the first value; `first`, the state at the first value of all."""
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}
