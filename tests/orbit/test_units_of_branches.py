@@ -90,6 +90,9 @@ def test_a_branch_is_the_same_in_all_units(case):
         assert branch.admissible[1:-1].all()
         found.append((branch.ends, [(p.kind, p.parameter) for p in branch.special], branch))
     assert found[0][1], found[0][2]
+    if case == "impacts":  # the parameter changes how long a cycle takes
+        touch = next(p for p in found[0][2].special if p.kind == "grazing")
+        assert vi.grazing(touch, progress=False).agreement == 1
     for ends, special, branch in found[1:]:
         assert ends == found[0][0] and [k for k, _ in special] == [k for k, _ in found[0][1]], (
             str(found[0][2]), str(branch),

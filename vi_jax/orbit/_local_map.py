@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.lax import stop_gradient
 
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
@@ -493,4 +494,11 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    return jax.jvp(lambda x: ravel_pytree(problem.state_at(x, leg, s))[0], (x,), (along,))
+    """The state on the section at clock `s`, and its derivative: the section moves with the period."""
+    turns = jnp.round(s / problem.period(x))
+
+    def placed(x):
+        moved = s + turns * (problem.period(x) - stop_gradient(problem.period(x)))
+        return ravel_pytree(problem.state_at(x, leg, moved))[0]
+
+    return jax.jvp(placed, (x,), (along,))
