@@ -494,7 +494,7 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    """The state on the section at clock `s`, and its derivative: the section moves with the period."""
+    """The state on the section at clock `s`, which moves with the period; and its derivative."""
     turns = jnp.round(s / problem.period(x))
 
     def placed(x):
