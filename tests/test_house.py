@@ -15,7 +15,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each may import from those before it.
 ORDER = "lanes machine flow machines orbit scans robust plot explore cli".split()
-LATE = [["explore", "serve"], ["explore", "subject"]]
+LATE = [["machines", "named"], ["explore", "serve"], ["explore", "subject"]]
 TOOLS = {"_checks", "_messages", "_programs", "_types"}
 
 

@@ -1,0 +1,128 @@
+"""Machines and other objects by their names, as a file, a command or a page gives them.
+
+Three values are special: `{ from, to, count }` is a row of evenly spaced numbers, a table with the
+key `class` is an object made from its other keys, and dotted keys are names, as in
+`stops.0.gap = [1.0, 2.0]`. All others are passed on as they are.
+"""
+
+import difflib
+import importlib
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..machine import AbstractMachine
+
+
+class InputError(ValueError):
+    """What is wrong with a file, a name or its arguments, in one sentence."""
+
+
+def check_keys(given: Iterable[str], known: Iterable[str], place: str) -> None:
+    """**Raises:** `InputError` for a key that does not exist, with the nearest ones."""
+    known = list(known)
+    for key in given:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+            hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(known)}"
+            raise InputError(f"unknown key `{key}` in {place}; {hint}")
+
+
+def machine_of(name: object, keywords: Mapping[str, Any]) -> AbstractMachine:
+    """Return the machine that a class or a function makes. **Raises:** `InputError`."""
+    machine = made(name, keywords, "[arguments]")
+    if not isinstance(machine, AbstractMachine):
+        raise InputError(f"{name} must make a machine, but made {machine!r}")
+    return machine
+
+
+def made(name: object, keywords: Mapping[str, Any], place: str) -> Any:
+    """Return what a class or a function makes of keywords. **Raises:** `InputError`.
+
+    **Arguments:** its name, `package.module:name` or `path/to/file.py:name`; a method of a class,
+    as in `vi_jax:Parameters.scene`, gets its own keywords, and the class all others; the keywords
+    as the file has them; their place in the file.
+    """
+    module, _, path = str(name).rpartition(":")
+    if not module or not path:
+        raise InputError(f"a machine or a class is module:name or path/to/file.py:name, not {name}")
+    *outer, last = path.split(".")
+    before, folder = [*sys.path], str(Path(module).resolve().parent)
+    sys.path[:0] = ["", folder] if module.endswith(".py") else [""]
+    try:
+        owner = _imported(module)
+        for attribute in outer:
+            owner = getattr(owner, attribute)
+        make = getattr(owner, last)
+        parameters = inspect.signature(make).parameters
+        if inspect.isclass(owner) and inspect.isfunction(make):
+            others = {key: x for key, x in keywords.items() if key not in parameters}
+            make = getattr(made(f"{module}:{'.'.join(outer)}", others, place), last)
+            keywords = {key: x for key, x in keywords.items() if key in parameters}
+        check_keys(keywords, parameters, place)
+        return make(**{key: _fitting(parameters[key], value_of(x, place))
+                       for key, x in keywords.items()})  # fmt: skip
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        if str(error).startswith("Argument `"):
+            raise InputError(f"{place}: {error}") from None
+        raise InputError(f"{name} raised {type(error).__name__}: {error}{_line(error)}") from error
+    finally:
+        sys.path[:] = before
+
+
+def _imported(module: str) -> Any:
+    if not module.endswith(".py"):
+        return importlib.import_module(module)
+    found = importlib.import_module(Path(module).stem)
+    if Path(str(found.__file__)) != Path(module).resolve():
+        raise ImportError(f"the file needs another name than that of {found.__file__}")
+    return found
+
+
+def _fitting(parameter: inspect.Parameter, value: Any) -> Any:
+    """A whole number as a float where the class declares one: an integer would be compile-time."""
+    words = f"{parameter.annotation} {type(parameter.default).__name__}"
+    wants_float = re.search(r"[Ff]loat|Array", words) and not re.search(r"\bint\b", words)
+    return float(value) if wants_float and type(value) is int else value
+
+
+def _line(error: BaseException) -> str:
+    """The last line of the user's that an error came through."""
+    others = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
+    lines = traceback.extract_tb(error.__traceback__)
+    own = [x for x in lines if not any(other in x.filename for other in others)]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+
+
+def value_of(value: Any, place: str) -> Any:
+    """Return a value of a file as the library takes it (see above). **Raises:** `InputError`."""
+    if isinstance(value, list):
+        return tuple(value_of(x, place) for x in value)
+    if not isinstance(value, dict):
+        return value
+    if "class" in value:
+        keywords = {key: x for key, x in value.items() if key != "class"}
+        return made(value["class"], keywords, place)
+    if value.keys() == {"from", "to", "count"}:
+        try:
+            return np.linspace(value["from"], value["to"], value["count"]).tolist()
+        except (TypeError, ValueError, MemoryError) as error:
+            raise InputError(f"{place}: {value} is no row of numbers: {error}") from None
+    return {name: value_of(x, f"{place}: {name}") for name, x in _flat(value)}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Items by their dotted names, in quotes or not."""
+    for key, value in table.items():
+        if isinstance(value, dict) and not value.keys() & {"class", "from"}:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
