@@ -64,6 +64,7 @@ from ._words import (
     TURN,
     TURNS,
     WATCHED,
+    coincidence_in_words,
     grazing_in_words,
     place_in_words,
 )
@@ -196,16 +197,19 @@ class MotionTable(Table):
             yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
         if self.problem.rests:
             yield Event(pulled, self._divided)
-        anew = "a switch goes into another mode: the motion sticks or slips anew"
-        other = "two of its events coincide, and happen in another order beyond"
+        anew = lambda _: "a switch goes into another mode: the motion sticks or slips anew"
+        coincidence = partial(coincidence_in_words, self.problem)
         ended = partial(self._ended, here)
         yield Event(room, ended)
         yield Event(lambda step: float(step.seen.order), partial(ended, other=anew))
-        yield Event(lambda step: float(step.seen.order_margin) + off, partial(ended, other=other))
+        yield Event(
+            lambda step: float(step.seen.order_margin) + off, partial(ended, other=coincidence)
+        )
 
     def _ended(
-        self, here: Step, at: Step, *, impact: int | None = None, other: str | None = None
-    ) -> Ending:
+        self, here: Step, at: Step, *, impact: int | None = None,
+        other: Callable[[Step], str] | None = None,
+    ) -> Ending:  # fmt: skip
         """The end where an event is lost, something is touched, or events come otherwise."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
@@ -219,7 +223,7 @@ class MotionTable(Table):
             detail = SLIDING[change.kind][change.exists].format(name=name, place=place)
             return self._named(change.kind, at, detail, impact)
         if other is not None:
-            return self._named(GRAZING, at, other)
+            return self._named(GRAZING, at, other(at))
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
             return self._named(GRAZING, at, detail)

@@ -1,5 +1,7 @@
 """The kinds of special points, and what is said of them."""
 
+import numpy as np
+
 from ..machine import RigidStop, SoftStop, clock_in_words
 from ._flight import Event
 from ._shooting import Shooting
@@ -21,6 +23,9 @@ TOUCHING = (GRAZING, REST, *SLIDING)
 
 # A turn that a branch makes where it leaves another one to both sides.
 TURNS = "turns"
+
+# Events within this share of a period come together: a choice, far above rounding.
+_TOGETHER = 1e-6
 
 # What is said of a special point, by its kind or one of these.
 DETAILS = {
@@ -59,6 +64,17 @@ def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
     """Where in its period a motion is at a clock that counts from the section on."""
     period = float(problem.period(at.x))
     return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
+
+
+def coincidence_in_words(problem: Shooting, at: Step) -> str:
+    """Which two events of a motion come together, if they follow each other, and where."""
+    clock, _, period = problem.values(at.x)
+    later = [*clock[1:], clock[0] + period]
+    i = int(np.argmin(later - clock))
+    names = [problem.events[j % problem.legs].called(problem.machine) for j in (i, i + 1)]
+    which = f" ({' and '.join(names)}, {place_in_words(problem, at, float(clock[i]))})"
+    together = later[i] - clock[i] < _TOGETHER * period
+    return f"two of its events coincide{which * bool(together)}, and change their order beyond"
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
