@@ -4,6 +4,7 @@ they are shown, as text and as a table."""
 import dataclasses
 import difflib
 import html
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -58,7 +59,8 @@ def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scal
 
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
     """The numbers of a state of any kind, in their units; of one with many the first few."""
-    parts = components(state).items()
+    # JAX sorts the names of a dictionary, but not of this one.
+    parts = components(OrderedDict(state) if isinstance(state, Mapping) else state).items()
     return ", ".join(first_few([f"{k} = {in_unit(plain(x, digits), units, k)}" for k, x in parts]))
 
 
