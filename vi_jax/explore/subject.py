@@ -106,7 +106,7 @@ class Motion(NamedTuple):
     quantities: dict[str, float]
     """The machine's own quantities on the last section, and its averages over the cycles."""
     window: Run
-    """What is drawn."""
+    """The cycles that the page draws, with dense samples."""
 
     @property
     def regime(self) -> str:

@@ -547,7 +547,7 @@ def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
 
     if in_order:
         return Registers.of(aval.shape, kind, number)
-    # A loop of its own for each number; they are written one after the other if they are few.
+    # Each number is a loop. A few loops are written where the numbers are used.
     formula = Formula(tuple(aval.shape), kind, number)
     return formula if formula.size <= _FEW else stored(t, formula)
 

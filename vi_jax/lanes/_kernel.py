@@ -384,7 +384,7 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
 def over_rows(
     t: Text, first: Value, number: int, mask: Value, body: Callable[[Value, Value], None]
 ) -> None:
-    """The rows of each lane from one of its own on.
+    """Write a loop over the rows of each lane, from that lane's first row on.
 
     **Arguments:** each slot's first row; how many a lane has room for; which slots take part; what
     is done with the row of each slot, and which slots have it.

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.lax import stop_gradient
 
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
@@ -494,11 +493,10 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    """The state on the section at clock `s`, which moves with the period; and its derivative."""
-    turns = jnp.round(s / problem.period(x))
+    """The state on the section at clock `s`, and its derivative by the parameter."""
+    turns = jnp.round(s / problem.period(x))  # 0 or 1: the section moves with the period
 
     def placed(x):
-        moved = s + turns * (problem.period(x) - stop_gradient(problem.period(x)))
-        return ravel_pytree(problem.state_at(x, leg, moved))[0]
+        return ravel_pytree(problem.state_at(x, leg, turns * problem.period(x)))[0]
 
     return jax.jvp(placed, (x,), (along,))

@@ -445,8 +445,7 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
     """The number of a release whose flight to the same stop is brief and the shortest, if any."""
     if not problem.landings:
         return None
-    clock, _, period = problem.values(at.x)
-    lengths = np.append(clock[1:], clock[0] + period) - clock
+    lengths = problem.lengths(at.x)
     first = int(np.argmin(lengths))
     this, after = (problem.events[i % problem.legs] for i in (first, first + 1))
     lands = this.use == LEAVES and after == this._replace(use=LANDS)

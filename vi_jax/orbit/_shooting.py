@@ -228,6 +228,11 @@ class Shooting(eqx.Module):
         clock, states = self.parts(x)
         return np.asarray(clock), np.asarray(states), float(self.period(x))
 
+    def lengths(self, x: Unknowns) -> np.ndarray:
+        """How long each leg lasts by the clock; host-side."""
+        clock, _ = self.parts(x)
+        return np.asarray(self.ends(clock, self.period(x)) - clock)
+
     def period(self, x: Unknowns) -> Array:
         """The period by the clock."""
         if self.autonomous:
@@ -500,9 +505,9 @@ class Shooting(eqx.Module):
         return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
 
     def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
-        """χ of the chatter that begins with this event; without its number the least force on a
-        body within its rest. Zero where a rest is lost; `chatters`, the ends of those of all
-        legs."""
+        """χ of the chatter that begins with the event `landing`, or, if that is `None`, the least
+        force on a body within its rest. Both are zero where a rest is lost. `chatters` holds the
+        last impact of the chatter of each leg."""
         machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
         last = lambda i: jax.tree.map(lambda a: a[i], chatters)

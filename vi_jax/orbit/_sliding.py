@@ -107,8 +107,7 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
 
 def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     """The briefest part between two events of one switch, if shorter than this share."""
-    clock, _, period = problem.values(at.x)
-    lengths = np.append(clock[1:], clock[0] + period) - clock
+    (clock, _, period), lengths = problem.values(at.x), problem.lengths(at.x)
     events, found = problem.events, []
     for i, event in enumerate(events):
         if event != events[(i + 1) % len(events)] or not holds(event.of(problem.machine)):

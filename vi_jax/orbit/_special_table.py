@@ -192,7 +192,7 @@ class Vectors(NamedTuple):
     right: np.ndarray
 
 
-# The value of a test and the vectors that it used, in the senses of those of a point close by.
+# A test of a step returns its value and its vectors, with the signs of those of a nearby step.
 Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 

@@ -45,6 +45,7 @@ from ._words import (
     RESONANT,
     REST,
     SYMMETRY,
+    TOGETHER,
     TORUS,
 )
 from .find import find_orbit
@@ -55,9 +56,6 @@ _ORBIT = "orbit"
 
 # Periods after which a stable motion has settled; impacts of a cycle that are listed: choices.
 _SETTLES, _LISTED = 100, 32
-
-# Events closer than this (a cycle is 2π) fall together: a choice, above what places are off by.
-_TOGETHER = 1e-6
 
 
 def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
@@ -136,10 +134,10 @@ def _swapped(point: Point) -> Iterator[State]:
     """The state on the section where an event that falls on it comes on the other side of it."""
     problem, x = point.problem, jnp.asarray(point.step.x)
     machine, clock, states = problem.at(x), *problem.parts(x)
-    lengths = np.abs(problem.ends(clock, problem.period(x)) - clock) / problem.radian
+    lengths = np.abs(problem.lengths(x)) / problem.radian
     for i, event in enumerate(problem.events):
         after = problem.events[(i + 1) % problem.legs]
-        if 0 not in (event.cycle, after.cycle) or lengths[i] > _TOGETHER:
+        if 0 not in (event.cycle, after.cycle) or lengths[i] > TOGETHER:
             continue
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
         # The section's state is that behind it.

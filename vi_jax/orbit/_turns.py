@@ -107,7 +107,7 @@ class _Guard(_Watched):
 
 
 class _Body(_Watched):
-    """A coordinate."""
+    """A coordinate, which turns where its velocity is zero."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -131,8 +131,8 @@ _Room = tuple[Float[Array, " steps"], Float[Array, " steps"]]
 
 
 def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
-    """The least and the greatest turn of the first coordinate, infinite if there is none; the turn
-    nearest to an event; and that of `pull_of`."""
+    """The least and the greatest turn of the first coordinate (infinite without a turn), the turn
+    nearest to an event, and the result of `pull_of`."""
     bodies, rooms = turning(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))

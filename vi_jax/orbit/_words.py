@@ -24,8 +24,8 @@ TOUCHING = (GRAZING, REST, *SLIDING)
 # A turn that a branch makes where it leaves another one to both sides.
 TURNS = "turns"
 
-# Events within this share of a period come together: a choice, far above rounding.
-_TOGETHER = 1e-6
+# Events closer than this (a cycle is 2π) fall together: a choice, above what places are off by.
+TOGETHER = 1e-6
 
 # What is said of a special point, by its kind or one of these.
 DETAILS = {
@@ -68,13 +68,13 @@ def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
 
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
     """Which two events of a motion come together, if they follow each other, and where."""
-    clock, _, period = problem.values(at.x)
-    later = [*clock[1:], clock[0] + period]
-    i = int(np.argmin(later - clock))
-    names = [problem.events[j % problem.legs].called(problem.machine) for j in (i, i + 1)]
-    which = f" ({' and '.join(names)}, {place_in_words(problem, at, float(clock[i]))})"
-    together = later[i] - clock[i] < _TOGETHER * period
-    return f"two of its events coincide{which * bool(together)}, and change their order beyond"
+    lengths, which = problem.lengths(at.x), ""
+    i = int(np.argmin(lengths))
+    if lengths[i] < TOGETHER * problem.radian:
+        names = [problem.events[j % problem.legs].called(problem.machine) for j in (i, i + 1)]
+        place = place_in_words(problem, at, float(problem.values(at.x)[0][i]))
+        which = f" ({' and '.join(names)}, {place})"
+    return f"two of its events coincide{which}, and change their order beyond"
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:

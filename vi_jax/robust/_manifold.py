@@ -75,11 +75,10 @@ def manifold(
     The stable manifold, the states from which the machine goes to the saddle, is the boundary of
     basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the
     zero of w·(Pⁿ(x) - xₛ) is taken, with w the saddle's left unstable eigenvector and n as large as
-    neighbours on the arc stay together. This needs
-    neither an inverse nor a derivative of the section map, so the manifold continues through kinks
-    at grazings. The unstable manifold, the states that come from the saddle, is the image of a
-    short stretch along its eigenvector, with points set closer where the images part or turn.
-    Host-side: not to be traced.
+    neighbours on the arc stay together. This needs neither an inverse nor a derivative of the
+    section map, so the manifold continues through kinks at grazings. The unstable manifold, the
+    states that come from the saddle, is the image of a short stretch along its eigenvector, with
+    points set closer where the images part or turn. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -199,8 +198,7 @@ def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Piec
 
 
 def _ahead(saddle: _Saddle, here: Row, ahead: Row, size: float) -> Row | None:
-    """The point of the stable manifold at a distance from another one, ahead of it; `None` where
-    there is none."""
+    """The point of the stable manifold ahead of `here`, at the distance `size`, if one is found."""
     middle, low, high = np.arctan2(ahead[1], ahead[0]), -_HALF, _HALF
     new = None
     for _ in range(_ROUNDS):

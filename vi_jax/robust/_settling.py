@@ -143,8 +143,7 @@ class Settling:
         self, rows: Rows, cycles: int, wanted: Bool[np.ndarray, " lanes"], begin: float
     ) -> list[np.ndarray]:
         """States so many cycles later, whether they got there, and whether they were no starts.
-        Since states alone are told apart, their modes may not be others than those that begin
-        there."""
+        Only states are compared, so their modes must be those of a motion that begins there."""
         numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
         *found, other = (np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers))
         _refuse_other_modes(other)
