@@ -1,4 +1,4 @@
-"""How a machine moves: methods, the hybrid step, the closed-form flight, `simulate`, results."""
+"""Simulation: methods of integration, the hybrid step, closed forms, `simulate` and its results."""
 
 from ._lane import has_fixed_cycle as has_fixed_cycle
 from ._own import average_names as average_names

@@ -1,4 +1,4 @@
-"""What the flat loop carries: one trajectory on its way, and what is asked of it."""
+"""The state of the flat loop: one trajectory, its record, and the plan of the simulation."""
 
 import functools
 import operator
@@ -31,50 +31,50 @@ from .methods import AbstractMethod
 from .results import EventKind, code
 from .smooth import TIME, Integrals, rounding, unit_of
 
-# What the next step aims at: nothing, or one of those below. Numbers, which the loop carries.
+# Targets of the next step, as numbers, which the loop carries: none, or one of the following.
 FREE = 0.0
 
 
 def to_event(number: int) -> float:
-    """The target of a step that is aimed at the event of this number (see `events_of`), positive;
-    `Lane.contact` names stops by the same numbers. All other targets are negative."""
+    """Return the target of a step to the event of this number (see `events_of`); it is positive.
+    `Lane.contact` uses the same numbers for stops. All other targets are negative."""
     return 1.0 + number
 
 
 def to_turn_of(k: int) -> float:
-    """The target of a step that is aimed at a turning point of coordinate number k."""
+    """Return the target of a step to a turning point of coordinate number k."""
     return -1.0 - 2 * k
 
 
 def to_release(k: int) -> float:
-    """The target of a step that is aimed at the release of coordinate number k from its stop."""
+    """Return the target of a step to the release of coordinate number k from its stop."""
     return -2.0 - 2 * k
 
 
 def total(tree: object, start: Scalar) -> Scalar:
-    """Sum of all numbers in a tree and of `start`: finite if all of them are."""
+    """Return the sum of all numbers in a tree and of `start`. It is finite if all of them are."""
     for leaf in jtu.tree_leaves(tree):
         start = start + jnp.sum(leaf)
     return start
 
 
 def any_of(like: Flag, flags: Iterable[Flag]) -> Flag:
-    """Whether any of these flags holds, of the shape of `like`."""
+    """Return whether any of the flags is true, as an array like `like`."""
     return functools.reduce(operator.or_, flags, jnp.zeros_like(like))
 
 
 def select(condition: Flag, a: object, b: object) -> Any:
-    """`jnp.where` for pytrees; what is the same in both is left as it is."""
+    """`jnp.where` for pytrees; leaves that are the same object in both are returned unchanged."""
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
 
 def in_place(values: tuple, k: int, value: object) -> tuple:
-    """The values with another one in place number k."""
+    """Return a copy of `values` whose entry k is `value`."""
     return (*values[:k], value, *values[k + 1 :])
 
 
 class Record(NamedTuple):
-    """What is kept of an interval between two record points; `None` where it was not asked for."""
+    """The record of an interval between two record points; `None` for what is not recorded."""
 
     integrals: Integrals
     y_max: Scalar | None
@@ -83,77 +83,77 @@ class Record(NamedTuple):
     impact_speed: Scalar | None
     impact_energy: Scalar | None
     rests: Scalar | None
-    """Times the body came to rest on a stop."""
+    """Number of times that a body came to rest on a stop."""
     log: Float[Array, "3 size"] | None
-    """Clock, V⁻ and stop of each impact, NaN where there was none."""
+    """Clock, V⁻ and stop of each impact; unused columns are NaN."""
     clearance: Scalar | None
     events: Float[Array, "4 listed"] | None
-    """Clock, kind, number and value of each event, NaN where there was none."""
+    """Clock, kind, number and value of each event; unused columns are NaN."""
 
 
 class Lane(NamedTuple):
-    """One trajectory on its way. All floats: other types would keep the loop from fusing. A step
-    makes another lane of it, and so does each event that is met there."""
+    """The state of the loop for one trajectory. All components are floats, since other types would
+    prevent the loop from fusing. Each step, and each event in it, returns a new lane."""
 
     s: Scalar
     state: State
     record: Record
     direction: Scalars
-    """Of each coordinate, the sign of its velocity since the last turn or impact."""
+    """For each coordinate, the sign of its velocity since the last turning point or impact."""
     contact: Scalars | None
-    """Of each coordinate, 1 + i while it rests on stop number i, else 0; absent where none can."""
+    """For each coordinate, 1 + i while it rests on stop number i, else 0; `None` without rests."""
     modes: Scalars
-    """Of each switch, then the machine's own."""
+    """The mode of each switch, then the machine's own modes."""
     below: Scalars
-    """Of each event that happens from below (see `AbstractEvent.from_below`), 1 once its guard has
-    been below zero since the last jump, else 0; and -1 till then from where the motion begins."""
+    """For each event with `AbstractEvent.from_below`: 1 if its guard was negative at some time
+    since the last jump, else 0; -1 as long as neither has happened since the start."""
     length: Scalar
     """Length proposed for an ordinary step."""
     attempt: Scalar
     """Length of the next step."""
     target: Scalar
-    """What the next step aims at."""
+    """The target of the next step."""
     aims: Scalar
-    """Times aimed since the last step taken."""
+    """Number of attempts to reach a target since the last accepted step."""
     part: Scalar
     """Index of the interval within its cycle."""
     done: Scalar
     """Number of completed intervals."""
     fault: Scalar
-    """Reason why the lane ended before its time (see `results`), or 0."""
+    """Reason why the lane ended early (see `results`), or 0."""
     steps: Scalar
     spent: Scalar
-    """Steps tried in the interval on its way."""
+    """Steps tried in the current interval."""
     rejected: Scalar
     last_impulse: Scalar | None = None
-    """The time of the interval at the last impulse of noise; absent where impulses come at times
-    that are known beforehand."""
+    """Time since the begin of the interval at the last impulse of noise; `None` if the impulses
+    come at times known in advance."""
     completed: Flag | None = None
-    """Whether the interval is complete, while the events of a step are applied; absent between
+    """True if the interval is complete, while the events of a step are applied; `None` between
     steps."""
 
     def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
-        """The lane with a reason to end, the name of one of `RESULTS` or its number, if the event
-        was met (`where`) and ends the lane (`when`, `None` if it never can)."""
+        """Return the lane, ended with `reason` (a name in `RESULTS` or its number) where `where &
+        when`; `where`: the event happened; `when`: it ends the lane, or `None` if it never does."""
         if when is None:
             return self
         number = code(reason) if isinstance(reason, str) else reason
         return self._replace(fault=jnp.where(where & when, number, self.fault))
 
     def completing(self, when: Flag) -> "Lane":
-        """The lane with its interval complete where `when` holds."""
+        """Return the lane with its interval marked as complete where `when` is true."""
         assert self.completed is not None
         return self._replace(completed=self.completed | when)
 
     def recording(self, **changes: Any) -> "Lane":
-        """The lane with other fields of its record."""
+        """Return the lane with fields of its record replaced."""
         return self._replace(record=self.record._replace(**changes))
 
     def noting(
         self, when: Flag, clock: Scalar, kind: EventKind | Scalar, number: Any, value: Any
     ) -> "Lane":
-        """The lane with an event in the log of all events, if it happened (`when`) and there is
-        room; `kind`, `number` and `value` as in `EventLog`."""
+        """Return the lane with an entry added to the event log if `when` is true and there is room;
+        `kind`, `number` and `value` as in `EventLog`."""
         events = self.record.events
         if events is None:
             return self
@@ -162,19 +162,19 @@ class Lane(NamedTuple):
 
 
 def written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
-    """A log with an entry at this place, if it has one."""
+    """Return a log with an entry in column `place` where `when` is true, if it has that column."""
     here = when & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
     column = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
     return jnp.where(here, column[:, None], log)
 
 
 def ticks(machine: AbstractMachine, state: State) -> bool:
-    """Whether the independent variable itself counts the cycles."""
+    """Return whether the independent variable itself counts the cycles."""
     return clock_of(machine, state) is None and not is_autonomous(machine, state)
 
 
 def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
-    """Whether all cycles have the same duration (`cycle_time`)."""
+    """Return whether all cycles have the same duration (`cycle_time`)."""
     return (
         ticks(machine, state)
         and machine.pace(jnp.zeros_like(machine.position(state)), state) is None
@@ -182,26 +182,27 @@ def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
 
 
 class Impulses(eqx.Module):
-    """White noise as the loop needs it: impulses on velocities, at instants of each cycle."""
+    """White noise in the form that the loop uses: impulses on velocities at instants of a cycle."""
 
     key: UInt32[Array, "2"]
     scales: tuple[Array | None, ...]
-    """Of each array of the state, the standard deviation of one impulse on it; `None`: none."""
+    """For each array of the state, the standard deviation of one impulse; `None`: no noise."""
     count: int = eqx.field(static=True)
     """Impulses in a cycle; a multiple of the record points."""
     functions: tuple[Callable | None, ...] = eqx.field(static=True)
-    """Of each array of the state, a factor of its own as a function of the state; `None`: none."""
+    """For each array of the state, a factor of its impulses as a function of the state, or
+    `None`."""
     timed: bool = eqx.field(static=True)
-    """Whether the time between two impulses is measured on the way; then the scales are those of a
-    unit of time."""
+    """True if the loop measures the time between impulses; `scales` are then for one unit of
+    time."""
     modes: tuple[Array | None, ...] = ()
-    """Of each array of the state, the matrix that makes of an impulse on it one on what the loop
-    carries in its place, where that are natural modes."""
+    """For each array of the state, the matrix that transforms its impulse to natural modes, if the
+    loop carries these instead."""
 
 
 class Plan(eqx.Module):
-    """What the loop is to do, the same for all lanes of a batch. All that is static is a part of
-    the compiled program."""
+    """The plan of a simulation, the same for all lanes of a batch. Static fields are compile-time
+    constants."""
 
     machine: AbstractMachine
     method: AbstractMethod
@@ -210,45 +211,45 @@ class Plan(eqx.Module):
     parts: int = eqx.field(static=True)
     """Record points per cycle."""
     motion: bool = eqx.field(static=True)
-    """Whether extremes, durations and impact speeds are recorded."""
+    """True if extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
     events: int = eqx.field(static=True)
     """Events of all kinds to log in each cycle."""
     averages: tuple[str, ...] = eqx.field(static=True)
     """Names of the machine's averages, if motion is recorded."""
     rests: bool = eqx.field(static=True)
-    """Whether the body may come to rest on a stop."""
+    """True if a body may come to rest on a stop."""
     backend: str = eqx.field(static=True)
-    """Which compiler runs it (see `lanes.backend`)."""
-    # Numbers that are no part of the program, so that others are not another one.
+    """The compiler of the loop (see `lanes.backend`)."""
+    # These are arguments of the compiled program, so that other values do not compile again.
     settle: Scalar
     """Cycles before the first one recorded."""
     max_steps: Scalar
     max_impacts: Scalar
     noise: Impulses | None = None
-    """Impulses of white noise; without it the program has nothing of it."""
+    """Impulses of white noise; `None` leaves noise out of the program."""
     begin: Scalar | None = None
-    """Clock of the start, where that is not on the section."""
+    """Clock of the start, if it is not on the section."""
     until: Scalar | None = None
-    """Clock at which the one cycle ends, where that is not the machine's own."""
+    """Clock at which the only cycle ends, if it is not the end of the machine's cycle."""
     own: Scalars | None = None
-    """The machine's own modes in the start, where it says them."""
+    """The machine's own modes at the start, if the start contains them."""
     stop: Any = None
-    """What ends a lane early (see `RunOptions`); what it would have recorded then is no number."""
+    """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
 
     sizes: State | None = None
-    """Of each number of the state how small it is (see `loop.sizes_of`)."""
+    """The size of each number of the state, at most 1 (see `loop.sizes_of`)."""
     extents: tuple[Any, ...] | None = None
-    """Of each coordinate, then of the guard of each of `others`, how small it is, if it is less
-    than 1; else 1, and of a machine whose numbers are about 1 absent. Of an event that holds a
-    mode a pair, out of mode 0 and in it, where its guard is another quantity."""
+    """The size, at most 1, of each coordinate, then of the guard of each of `others`; `None` for a
+    machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of mode 0
+    and in it, since its guard is another quantity there."""
 
     def extent(self, k: int) -> Scalar | float:
-        """A length by which those of coordinate number k are judged."""
+        """Return the length scale of coordinate number k."""
         return 1.0 if self.extents is None else self.extents[k]
 
     def guard_extent(self, number: int, lane: "Lane") -> Scalar | float:
-        """A size by which the guard of an event that is no stop is judged in the lane's modes."""
+        """Return the size of the guard of an event other than a stop, in the modes of the lane."""
         if self.extents is None:
             return 1.0
         found = self.extents[len(self.machine.coordinates) + self.others(lane.state).index(number)]
@@ -258,11 +259,11 @@ class Plan(eqx.Module):
         return jnp.where(held, found[1], found[0])
 
     def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
-        """What rounding leaves of place and velocity of coordinate number k (see `rounding`)."""
+        """Return bounds of the rounding errors of position and velocity of coordinate number k."""
         return rounding(self.machine, k, state, self.extent(k), self.unit)
 
     def beyond_a_stop(self, state: State) -> Flag:
-        """Whether a coordinate is beyond one of its stops by more than rounding."""
+        """Return whether a coordinate is beyond one of its stops by more than rounding."""
         found = jnp.zeros((), bool)
         for stop in stops_of(self.machine):
             place = self.machine.coordinates[stop.coordinate].position(state)
@@ -272,17 +273,17 @@ class Plan(eqx.Module):
 
     @property
     def kept(self) -> int:
-        """Number of intervals to record."""
+        """Number of recorded intervals."""
         return self.cycles * self.parts
 
     @property
     def intervals(self) -> Scalar:
-        """Number of intervals to go through: whole cycles before those recorded."""
+        """Number of simulated intervals: one for each cycle of `settle`, then the recorded ones."""
         return self.settle + self.kept
 
     @property
     def instants(self) -> int:
-        """Instants of a cycle that steps end on: record points and impulses of noise."""
+        """Number of instants in a cycle at which steps end: record points or impulses of noise."""
         return self.parts if self.noise is None else self.noise.count
 
     @property
@@ -291,79 +292,79 @@ class Plan(eqx.Module):
         return unit_of(self.machine)
 
     def in_units(self, threshold: Any) -> Any:
-        """A threshold in `s`, given for a cycle of about 2π."""
+        """Return a threshold in `s`, given for a cycle of about 2π, in the unit of `s`."""
         unit = self.unit
         return threshold if isinstance(unit, float) else threshold * unit
 
     def cycle_of(self, done: Scalar) -> Scalar:
-        """The cycle on its way when so many intervals are done, counted from the start."""
+        """Return the number of the current cycle, from the start, after `done` intervals."""
         recorded = jnp.floor((done - self.settle) / self.parts)
         return jnp.where(done < self.settle, done, self.settle + recorded)
 
     def is_record_point(self, part: Scalar, done: Scalar) -> Flag:
-        """Whether the end of the `part`-th piece between two impulses completes an interval."""
+        """Return whether the `part`-th piece between two impulses completes an interval."""
         behind, every = part + 1, self.instants // self.parts
-        # A product of whole numbers is exact, a quotient need not be.
+        # A product of integers is exact, a quotient may be rounded.
         whole = behind == every * jnp.round(behind / every)
         return (behind >= self.instants) | (done >= self.settle) & whole
 
     def others(self, state: State) -> list[int]:
-        """The numbers of the events, besides stops, whose guards are looked at in each step."""
+        """Return the numbers of the events, other than stops, whose guards each step checks."""
         last = section_number(self.machine) + (section_in(self.machine, state) is not None)
         return list(range(len(stops_of(self.machine)), last))
 
     def from_below(self, state: State) -> list[int]:
-        """Those of `others` that happen only from below (see `AbstractEvent.from_below`)."""
+        """Return those of `others` that happen only from below (see `AbstractEvent.from_below`)."""
         events = events_of(self.machine)
         return [number for number in self.others(state) if events[number].from_below]
 
     def end(self, part: Scalar) -> Scalar:
-        """Clock reading at the end of the `part`-th piece of a cycle: an interval, or the way from
-        one impulse of noise to the next."""
+        """Return the clock at the end of the `part`-th piece of a cycle: an interval, or the time
+        from one impulse of noise to the next."""
         cycle = jnp.asarray(self.machine.cycle if self.until is None else self.until, part.dtype)
         return cycle * (part + 1) / self.instants if self.instants > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
-        """`Lane.part` as a cycle begins, when so many intervals are done: 0, or in a cycle that is
-        not recorded the last one, so that it is one interval; with noise it has all impulses."""
+        """Return `Lane.part` at the begin of a cycle, after `done` intervals. Without noise, a
+        cycle that is not recorded is a single interval, the last of the cycle; else this is 0."""
         if self.noise is not None:
             return jnp.zeros_like(done)
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
     def ticks(self, state: State) -> bool:
-        """Whether `s` itself counts the cycles."""
+        """Return whether `s` itself counts the cycles."""
         return ticks(self.machine, state)
 
     def clock(self, s: Scalar, state: State) -> Scalar:
-        """The reading of what counts the cycles, `s` itself or the machine's clock."""
+        """Return the variable that counts the cycles: `s` or the machine's clock."""
         clock = clock_of(self.machine, state)
         return s if clock is None else clock
 
     def timed(self, state: State) -> bool:
-        """Whether the duration of a cycle is recorded, which only a fixed one need not be; or the
-        time between impulses is measured."""
+        """Return whether the loop integrates time: cycles without a fixed duration are recorded, or
+        the time between impulses is measured."""
         if self.noise is not None and self.noise.timed:
             return True
         return self.motion and not has_fixed_cycle(self.machine, state)
 
     @property
     def meets_every_turn(self) -> bool:
-        """Whether steps always end on every turning point: switches and events may be there."""
+        """True if steps end on every turning point, since switches and events may be there."""
         return bool(switches_of(self.machine) or others_of(self.machine))
 
     def meets_turns(self, done: Scalar) -> Flag:
-        """Whether steps end on every turning point, for extremes too, when so many intervals are
-        done; else only on those close to a stop."""
+        """Return whether steps end on every turning point, after `done` intervals, as extremes
+        require; else only on those close to a stop."""
         if self.motion and not self.meets_every_turn:
             return done >= self.settle
         return jnp.full_like(done, self.meets_every_turn, bool)
 
     def point(self, state: State, modes: Scalars) -> State:
-        """What is kept of the end of an interval: the state, with the machine's own modes."""
+        """Return the recorded state of a record point: the state with the machine's own modes."""
         return with_modes(state, own_modes(self.machine, modes))
 
     def fresh(self, state: State) -> Record:
-        """The record of an interval that begins in `state`."""
+        """Return the record of an interval that begins in `state`."""
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
         names = (TIME, *self.averages) if self.timed(state) else self.averages
@@ -383,20 +384,20 @@ class Plan(eqx.Module):
     def at_stop(
         self, k: int, contact: Scalar, part: Callable[[RigidStop], Any], otherwise: Scalar
     ) -> Scalar:
-        """A part of the stop that coordinate number k rests on (see `Lane.contact`); `otherwise`
-        while it rests on none."""
+        """Return `part` of the stop on which coordinate number k rests (see `Lane.contact`), or
+        `otherwise` if it does not rest."""
         for i, stop in enumerate(stops_of(self.machine)):
             if stop.coordinate == k:
                 otherwise = jnp.where(contact == to_event(i), part(stop), otherwise)
         return otherwise
 
     def away(self, k: int, contact: Scalar) -> Scalar:
-        """The sign of the direction away from the stop that coordinate number k rests on, or 0."""
+        """Return the sign of the direction away from the stop of coordinate number k, or 0."""
         return self.at_stop(k, contact, lambda stop: -float(stop.sign), jnp.zeros_like(contact))
 
     def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
-        """The sign (1 right, -1 left) and the gap of the stop of coordinate number k that is named
-        by `contact`; of its first stop if none is."""
+        """Return the sign (1 right, -1 left) and the gap of the stop in `contact` of coordinate
+        number k; those of its first stop if `contact` names no other."""
         mine = [(i, stop) for i, stop in enumerate(stops_of(self.machine)) if stop.coordinate == k]
         (_, first), others = mine[0], mine[1:]
         sign, gap = float(first.sign), first.gap

@@ -1,5 +1,5 @@
-"""What is checked of a machine that a user wrote, in words that name it, and the quantities that it
-names itself: functions of its state, and averages over a cycle."""
+"""Checks of a machine written by a user, with errors that name it; and the names of its own
+quantities: functions of its state, and averages over a cycle."""
 
 import contextlib
 import dataclasses
@@ -57,15 +57,15 @@ _NO_NUMBERS = (
     jax.errors.TracerIntegerConversionError,
 )
 
-# A field that differs by more than this at the ends of its cycle has another period; with a period
-# of five digits it differs by less.
-# It is compared with its size there, and at this share of a cycle, where few inputs are zero.
+# A field whose values at the ends of its cycle differ by more than this share has another period;
+# with a period of five digits they differ by less. They are compared with the field's size there,
+# and at this share of a cycle, where few inputs are zero.
 _APART, _INSIDE = 1e-4, 0.29
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
-    """**Raises:** `TypeError` for a field (or a section) that cannot be traced, takes other
-    arguments or returns no state; while the loop is traced, and at no cost where it runs."""
+    """Check the field and the section, while the loop is traced, at no cost at run time.
+    **Raises:** `TypeError` if one cannot be traced, takes other arguments or returns no state."""
     whose = f"`field` of a {type(machine).__name__}"
     modes = shown_modes(machine, modes)
     check_takes(machine.field, whose, "`s`, the state", (s, state, *modes), len(modes))
@@ -100,7 +100,7 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
 
 
 def rows_of(machine: AbstractMachine) -> str:
-    """A hint at numbers of a machine that are rows, perhaps of many machines."""
+    """Return a hint at fields of a machine that are arrays, perhaps of many machines."""
     rows = [name for name, x in vars(machine).items() if eqx.is_array(x) and x.ndim]
     if not rows:
         return ""
@@ -108,7 +108,7 @@ def rows_of(machine: AbstractMachine) -> str:
 
 
 def in_short(tree: Any) -> str:
-    """The structure of a tree, with types and shapes for numbers."""
+    """Return the structure of a tree as text, with types and shapes for numbers."""
 
     def blank(x: Any) -> Any:
         return jnp.zeros(x.shape, x.dtype) if hasattr(x, "shape") else x
@@ -126,7 +126,7 @@ def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
 
 @contextlib.contextmanager
 def in_words_of(whose: str) -> Iterator[None]:
-    """Errors about traced numbers and assignments as one sentence that says what to write."""
+    """Turn errors about traced numbers and assignments into one sentence with the remedy."""
     try:
         yield
     except jax.errors.TracerBoolConversionError as error:
@@ -150,8 +150,8 @@ def _output_shapes(whose: str, function: Callable[..., Any], *arguments: Any) ->
 
 
 def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
-    """**Raises:** `TypeError` for a restitution law that cannot be traced or gives no number; as
-    `check_field`."""
+    """Check restitution laws. **Raises:** `TypeError` if one cannot be traced or returns no number;
+    as `check_field`."""
     for i, stop in enumerate(stops_of(machine)):
         if stop.is_one_number:
             continue
@@ -171,15 +171,15 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             )
 
 
-# A guard is evaluated in so many states around the start, with modes among these beside the first
-# ones, and places at these distances (beside 1 + its size): choices.
+# A guard is evaluated in this many states around the start. Their modes are those of the start or
+# these. Each number is moved by these distances, relative to 1 + its size. Choices.
 _TRIED, _MODES, _FAR = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 
 def check_values(machine: AbstractMachine, start: State) -> None:
-    """Warn once of a field that is not the same at both ends of its cycle, and of an event whose
-    guard is not below zero in any of many states around the start. Machines of this package and
-    machines with traced numbers are not checked."""
+    """Warn once if the field differs at the ends of its cycle, or if an event's guard is not
+    negative in any of many states around the start. Machines of this package and machines with
+    traced numbers are not checked."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or any(isinstance(x, Tracer) for x in leaves):
@@ -192,7 +192,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         with jax.ensure_compile_time_eval():
             zero, state = jtu.tree_map(jnp.asarray, (np.zeros(()), start))
             found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
-    except Exception:  # the error is raised in words where field and guards are traced
+    except Exception:  # the error is raised with a better message when field and guards are traced
         return
     cycle, first, within, last, below = found
     parts = jtu.tree_leaves_with_path(start) if ticks else []
@@ -207,16 +207,16 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         _warn_of_guard(kind, int(i), event.name or type(event).__name__)
 
 
-# A slip is evaluated at so many instants of a cycle, and where it changes most so often between two
-# of them. One that still changes by this share of that jumps; one that changes by so much of its
-# range between two instants is steep. Choices.
+# A slip is evaluated at this many instants of a cycle. Then the interval of its greatest change is
+# halved this many times. If this share of the change is left, the slip jumps. If it changes by more
+# than this share of its range between two instants, it is steep. Choices.
 _SLIPS, _HALVES, _STILL, _STEEP = 1024, 40, 0.5, 0.05
 
 
 def _check_slips(machine: AbstractMachine, start: State) -> None:
     """Warn once of friction on a surface whose speed changes so fast that steps may be too long.
 
-    **Raises:** `ValueError` if it jumps within a cycle.
+    **Raises:** `ValueError` if the speed jumps within a cycle.
     """
     for number, friction in enumerate(switches_of(machine)):
         if not isinstance(friction, DryFriction) or not friction.slip_takes_time:
@@ -224,7 +224,7 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
         try:
             with jax.ensure_compile_time_eval():
                 time, extent, coarse, fine = map(np.asarray, _steepest(machine, number, start))
-        except Exception:  # the error is raised in words where the friction is traced
+        except Exception:  # the error is raised with a better message when the friction is traced
             return
         if coarse > 0 and fine > _STILL * coarse:
             raise ValueError(
@@ -240,8 +240,8 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
-    """Where within a cycle a slip changes most, the range of its values, and how much it changes
-    there between two of many instants, and between two that are far closer."""
+    """Return the place in a cycle where a slip changes most, the range of its values, and its
+    change there between two of many instants and between two that are far closer."""
     friction: Any = switches_of(machine)[number]
     slip = lambda s: jnp.asarray(friction.speed_of_slip(machine, s, start), float)
     s = jnp.asarray(machine.cycle, float) * (np.arange(_SLIPS) / _SLIPS)
@@ -262,9 +262,9 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """The cycle; the field where it begins, within it and where it ends, if `s` `ticks`; which
-    guards are below zero in any state around the start. `zero` is an argument, since what is
-    computed from constants alone is compiled by itself."""
+    """Return the cycle; the field at its begin, within it and at its end, if `s` `ticks`; for each
+    guard, whether it is negative in any state around the start. `zero` is an argument, since JAX
+    evaluates what depends on constants alone separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     instants = (zero, _INSIDE * cycle, cycle) if ticks else ()
@@ -335,8 +335,8 @@ _KINDS = {
 
 
 def check_parts(machine: AbstractMachine) -> None:
-    """**Raises:** `TypeError` or `ValueError` for a machine whose parts are not what they must be;
-    before anything is traced."""
+    """Check the parts of a machine before anything is traced. **Raises:** `TypeError` or
+    `ValueError` for an invalid one."""
     name = type(machine).__name__
     for what, (kind, words) in _KINDS.items():
         parts = listed(getattr(machine, what))
@@ -401,7 +401,7 @@ def _check_names(machine: AbstractMachine) -> None:
 
 
 def _check_frictions(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for friction on a stop that there is not, or not along it."""
+    """**Raises:** `ValueError` for friction with an unknown stop, or across its stop."""
     name = type(machine).__name__
     known = {
         "stop": ("stop", len(stops_of(machine))),
@@ -427,8 +427,8 @@ def _check_frictions(machine: AbstractMachine) -> None:
 
 
 def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
-    """**Raises:** `TypeError` for a coordinate or an event whose functions do not return what they
-    must; while the loop is traced, and at no cost where it runs."""
+    """Check coordinates and events, while the loop is traced, at no cost at run time. **Raises:**
+    `TypeError` if one of their functions does not return what it must."""
     name = type(machine).__name__
     for k, coordinate in enumerate(machine.coordinates if stops_of(machine) else ()):
         _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
@@ -475,7 +475,7 @@ def _check_event(
             f"`when` of {whose} must return a flag, but returned {in_short(when)}. Compare it with "
             "a number: `state.V > 0`."
         )
-    if isinstance(event, Reset):  # its modes are asked for in the state after it
+    if isinstance(event, Reset):  # `after` evaluates its modes in that state
         new = _output_shapes(f"`reset` of {whose}", lambda: event.jump(machine, s, state, *modes))
         _check_state(f"The state after {whose}", state, new)
     found = _output_shapes(f"`after` of {whose}", lambda: event.after(*around, **more))
@@ -506,7 +506,7 @@ def _check_state(whose: str, state: State, found: Any) -> None:
         )
 
 
-# What results have by these names already: columns of runs, orbits, branches and scans, and axes.
+# Names that results use already: columns of runs, orbits, branches and scans, and axes.
 _TAKEN = frozenset(
     """admissible clearance column cycle cycles duration error event exponent exponents extremes
     frequency_ratio history impact impact_energy impact_phase impact_rate impact_speed impact_stop
@@ -517,18 +517,18 @@ _TAKEN = frozenset(
 
 
 def has_averages(machine: AbstractMachine) -> bool:
-    """Whether a machine names averages at all."""
+    """Return whether a machine defines averages."""
     return is_own(type(machine).averages)
 
 
 def has_quantities(machine: AbstractMachine) -> bool:
-    """Whether a machine names functions of its state."""
+    """Return whether a machine defines functions of its state."""
     return is_own(type(machine).quantities)
 
 
 def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
-    """The names of a machine's averages in their order. **Raises:** `TypeError` for averages that
-    are no numbers by name; `ValueError` for a name that something else has."""
+    """Return the names of a machine's averages in their order. **Raises:** `TypeError` if the
+    averages are not a mapping to numbers; `ValueError` if a name is in use already."""
     if not has_averages(machine):
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
@@ -544,7 +544,7 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
 
 
 def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
-    """The names of the functions of a machine's state. **Raises:** as `average_names`."""
+    """Return the names of the functions of a machine's state. **Raises:** as `average_names`."""
     if not has_quantities(machine):
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
@@ -552,8 +552,8 @@ def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
 
 
 def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> dict[str, Array]:
-    """The machine's functions of its state on sections, which are in a row; by name. With `lead`
-    axes in front of machine and sections, as `vmap` gives them."""
+    """Return the machine's functions of its state on sections (states along one axis), by name.
+    Machine and sections may have `lead` batch axes in front, as `vmap` gives them."""
     if not has_quantities(machine):
         return {}
     dtype = jnp.result_type(*jtu.tree_leaves(sections))
@@ -572,20 +572,20 @@ def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> d
 def _names(
     machine: AbstractMachine, which: str, function: Callable, start: State, arguments: tuple
 ) -> tuple[str, ...]:
-    """The names of a machine's averages or quantities (`which`), sorted; those of `start` are
-    taken. **Raises:** as `average_names`."""
+    """Return the names of a machine's averages or quantities (`which`), sorted; names of components
+    of `start` are in use already. **Raises:** as `average_names`."""
     whose = f"`{which}` of a {type(machine).__name__}"
     with in_words_of(whose):
         found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)
     taken = _TAKEN | set(leaf_names(machine)) | set(components(start))
     for name, value in found.items():
-        if name in taken or name.startswith("section_"):  # as columns of a branch are called
+        if name in taken or name.startswith("section_"):  # columns of a branch have such names
             raise ValueError(f"{whose} must have names of their own, but {name!r} is taken.")
         if value.shape:
             raise TypeError(
                 f"{whose} must be numbers, but {name!r} is an array of shape {value.shape}."
             )
-    return tuple(sorted(found))  # as pytrees have them
+    return tuple(sorted(found))  # in the order of pytrees
 
 
 def _as_arrays(whose: str, found: object) -> dict[str, Array]:

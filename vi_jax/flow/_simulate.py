@@ -1,4 +1,4 @@
-"""`simulate`: a machine, a start, a number of cycles and a method give a run."""
+"""`simulate`: returns a run from a machine, a start, a number of cycles and a method."""
 
 import dataclasses
 from collections.abc import Callable
@@ -38,9 +38,9 @@ from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reas
 from .smooth import TIME, means
 
 _CPU_OPTIONS = {
-    # Small kernels lose more by being split over threads than they gain.
+    # Small kernels lose more time by being split over threads than they gain.
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
-    # The widest there are; XLA itself prefers half of that.
+    # The widest available vectors; XLA's default is half of that.
     "xla_cpu_prefer_vector_width": 512,
 }
 
@@ -48,15 +48,15 @@ _CPU_OPTIONS = {
 def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:
     """Compile as `jax.jit`, with compiler options for batches of simulations on a CPU.
 
-    On other backends it is plain `jax.jit`, whose options it takes. On 1,024 motor lanes on one
-    core it saves a tenth to a third of the time. For outermost use only: JAX refuses compiler
-    options inside of another `jit`.
+    On other backends it is plain `jax.jit`. All options of `jax.jit` are accepted. On 1,024 lanes
+    with a motor on one core it saves 10 to 33 % of the time. Use it outermost only: JAX refuses
+    compiler options within another `jit`.
     """
     return jax.jit(function, **{**compiling(), **options})
 
 
 def compiling() -> dict[str, Any]:
-    """Options for `jax.jit`, by backend."""
+    """Return compiler options as keyword arguments of `jax.jit` for the default backend."""
     return {"compiler_options": _CPU_OPTIONS} if jax.default_backend() == "cpu" else {}
 
 
@@ -86,48 +86,48 @@ def simulate(
 ) -> Run:
     """Simulate `machine` from `start` for a number of drive cycles.
 
-    Works under `jit`, under `vmap` over any leaf of machine and start, and is differentiable
+    Works under `jit`, and under `vmap` over any leaf of machine and start. It is differentiable
     through impacts to any order, forward and in reverse. A gradient with respect to more than four
-    numbers goes back along the stored motion and costs about four simulations. Otherwise, on XLA's
-    backend, or if a step has no transpose (a loop of varying length), it runs forward along each
-    number. Outside of a transformation it compiles itself, once for each structure.
+    numbers goes back along the stored motion and costs about four simulations. It runs forward
+    along each number if there are at most four, on XLA's backend, or if a step has no transpose (a
+    loop of varying length). Outside of a transformation `simulate` compiles itself, once for each
+    structure.
 
     **Arguments:**
 
     - `machine`: a `Scene`, or an `AbstractMachine` of your own.
     - `start`: the state on the first section, from `machine.start(...)`; or `last` of another run,
-      to continue it with its discrete modes (see `HybridState`). By default the machine's own,
-      `machine.start()`.
+      to continue it with its discrete modes (see `HybridState`). Default: `machine.start()`.
     - `cycles`: number of drive cycles to record, 1 by default; static.
-    - `settle`: drive cycles simulated before them, which are not recorded; a new value does not
-      compile again.
+    - `settle`: number of drive cycles simulated before them, which are not recorded. A new value
+      does not compile again.
     - `method`: `Adaptive(...)`, `FixedStep(...)`, `Taylor(...)`, `ExactFlight()`, or the name of a
       `preset`, by default `"standard"`.
     - `clock`: `"phase"` or `"time"`; `None` leaves the machine's own. The phase clock needs a crank
       that turns forward; the time clock also allows a start from rest and a stall.
     - `samples`: dense samples per cycle, evenly spaced on the drive's clock. Steps end on them, so
-      that they have the method's own accuracy.
-    - `impact_log`: number of impacts to log in each cycle; with it comes `Run.clearance`.
+      that they are as accurate as the method.
+    - `impact_log`: number of impacts to log in each cycle. It also records `Run.clearance`.
     - `event_log`: number of events of any kind to log in each cycle (`EVENTS`): impacts, coming to
-      rest, releases, changes of mode.
-    - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds
-      (then `None`), which is faster.
+      rest, releases, changes of mode, resets.
+    - `record`: `"motion"`, or `"sections"` to leave out extremes, durations and impact speeds (then
+      `None`), which is faster.
     - `estimate`: repeat the run with a tighter method (`AbstractMethod.tighter`) and return the
       differences as `Run.errors`, for two to three times the work.
-    - `rests`: whether the body may come to rest on a stop; `False` leaves that out of the program,
-      which is a fifth faster. By default it is left out if all gaps are known and greater than 1,
-      so that nothing can press the body on.
-    - `max_impacts`: impacts in one cycle (or sampling interval) beyond which a lane ends as
-      chattering.
-    - `max_steps`: steps beyond which a lane ends, apart from 65,536 in any one cycle (or sampling
-      interval).
+    - `rests`: True if the body may come to rest on a stop. `False` leaves rests out of the program,
+      which is a fifth faster. They are left out by default if all gaps are known and greater than
+      1, so that nothing can press the body on.
+    - `max_impacts`: greatest number of impacts in one cycle (or sampling interval). A lane with
+      more ends as chattering.
+    - `max_steps`: greatest number of steps of a lane. In addition, no cycle (or sampling interval)
+      may have more than 65,536.
     - `throw`: raise an error if a lane fails, instead of only reporting it in `result`.
-    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's for each lane.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one JAX key for each lane.
 
     **Returns:** a `Run`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be run, before any work.
-    Traced starts and parameters cannot be checked before; an invalid one ends its lane as
+    **Raises:** `ValueError` or `TypeError` for invalid arguments, before the simulation. Traced
+    starts and parameters cannot be checked then. An invalid one ends its lane as
     `RESULTS.bad_start`, without effect on the others.
     """
     estimate, throw = flag("estimate", estimate), flag("throw", throw)
@@ -153,7 +153,7 @@ def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
 
 
 def _errors(run: Run, tighter: Run) -> Errors:
-    """The differences between a run and one by a tighter method; NaN where either failed."""
+    """Return the differences between a run and one by a tighter method; NaN if either failed."""
 
     def apart(a: Any, b: Any) -> Any:
         both = run.successful & tighter.successful
@@ -175,12 +175,12 @@ def simulate_pool(
     wanted: Array | None = None,
     noise_of: Callable[[Any], tuple[Any, Any]] | None = None,
 ) -> Run:
-    """As `simulate` under `vmap`, for lanes some of which are not wanted (they are not run and come
-    back as failed); forward mode only.
+    """Simulate as `simulate` under `vmap`, in forward mode only. Lanes that are not `wanted` are
+    not run, and are returned as failed.
 
-    **Arguments:** `lane_of`, machine and start of one lane from its values; the `values` of all
-    lanes, with one leading axis; `wanted`, a flag of each lane, by default all; `noise_of`, noise
-    and key of one lane from its values.
+    **Arguments:** `lane_of`, returns machine and start of one lane from its values; `values` of all
+    lanes, with one leading axis; `wanted`, a flag for each lane, by default all true; `noise_of`,
+    returns noise and key of one lane from its values.
     """
 
     def one(value, wanted):
@@ -196,8 +196,8 @@ def simulate_pool(
 
 
 def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Record) -> Run:
-    """The run from how a lane ended, and the states (`points`) and records of its intervals, as
-    `run_lane` returns them; if `sampled`, the states are given as samples."""
+    """Return the run of a lane from its ends, and the states (`points`) and records of its
+    intervals, as `run_lane` returns them. If `sampled`, the states are also returned as samples."""
     machine, parts = plan.machine, plan.parts
     points, modes = bare(points), modes_of(points) or ()
     records = jtu.tree_map(lambda x: x[1:], records)
@@ -217,7 +217,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         duration = period if times is None else per_cycle(times, jnp.sum)
     averages = {}
     if integrals:
-        # Where s does not measure time but is in proportion to it, the integrals are over s.
+        # If s is proportional to time but does not measure it, the integrals are over s.
         length = jnp.asarray(machine.cycle, period.dtype) if times is None else duration
         sums = {name: per_cycle(x, jnp.sum) for name, x in integrals.items()}
         averages = means(sums, length)
@@ -270,13 +270,11 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
 
 
 def _log(plan: Plan, entries: Any) -> ImpactLog:
-    """The first `plan.log` impacts of each cycle, from those of its intervals."""
     phase, speed, stop = _by_cycle(plan, entries, used=2)
     return ImpactLog(as_logged(plan.machine, phase), speed, _numbers(stop))
 
 
 def _events(plan: Plan, entries: Any) -> EventLog:
-    """The first `plan.events` events of each cycle, from those of its intervals."""
     phase, code, number, value = _by_cycle(plan, entries, used=1)
     names = tuple(event.name for event in others_of(plan.machine))
     clock = as_logged(plan.machine, phase)
@@ -284,8 +282,8 @@ def _events(plan: Plan, entries: Any) -> EventLog:
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:
-    """The rows of a log (intervals, rows, size), each as (cycles, size): the entries of a cycle in
-    their order, unused places last, which have NaN in the row `used`."""
+    """Return the rows of a log (intervals, rows, size), each as (cycles, size): the first entries
+    of each cycle in their order. Row `used` is NaN in unused places, which come last."""
     rows, size = entries.shape[1:]
     entries = entries.reshape(plan.cycles, plan.parts, rows, size)
     entries = jnp.moveaxis(entries, 2, 0).reshape(rows, plan.cycles, plan.parts * size)
@@ -297,12 +295,12 @@ def _numbers(x: Array) -> Array:
     return jnp.where(jnp.isnan(x), -1.0, x).astype(jnp.int32)
 
 
-# A lane that failed has no derivatives: they are NaN. The loop would give zeros, since what follows
-# a failure is not computed, and an optimiser would take that for a stationary point.
+# A failed lane has no derivatives: they are NaN. The loop would return zeros, since nothing is
+# computed after a failure, and an optimiser would take that for a stationary point.
 
 
 def failed_derivatives(run: Run) -> Run:
-    """The same run, whose derivatives are NaN if it failed."""
+    """Return the same run, with derivatives that are NaN if it failed."""
     numbers, rest = eqx.partition(run, eqx.is_inexact_array)
     return eqx.combine(_marked(run.successful, numbers), rest)
 
@@ -337,7 +335,7 @@ def _transposed(weight, good, _, *, back: bool):
     return None, weight if type(weight) is ad.Zero else _fail.bind(good, weight, back=not back)
 
 
-# Linear as JAX understands it, with a transpose that arithmetic could not have: what asks for
-# nothing of a lane, as a loss that leaves failed ones out, gets nothing.
+# Linear for JAX, with a transpose that arithmetic cannot have: a zero cotangent stays zero. So a
+# loss that leaves failed lanes out has a finite gradient.
 _fail = elementwise_primitive("fail_derivatives", _value, _jvp)
 ad.primitive_transposes[_fail] = _transposed

@@ -1,8 +1,8 @@
-"""Where in a step a stop is met or the motion turns.
+"""Derivatives of guards along a step, and the places of impacts and turning points in it.
 
-A step knows the position and its first two derivatives at both ends. The quintic through them says
-where to aim; the step taken to that place then meets the event with the solver's own accuracy, and
-Taylor's series about its end removes what is left.
+Position and its first two derivatives are known at both ends of a step. The root of the quintic
+through them is the target of the next step. That step then meets the event with the solver's
+accuracy, and a Taylor expansion about its end removes the remaining offset.
 """
 
 from collections.abc import Callable
@@ -15,32 +15,32 @@ from .._types import Flag, Scalar, Scalars, State
 from ..machine import horner
 from .smooth import SmoothMachine
 
-# d(state)/ds of s and the state.
+# d(state)/ds as a function of s and the state.
 Field = Callable[[Scalar, State], State]
 
 
 class Rates(NamedTuple):
-    """A coordinate and its first two derivatives by s."""
+    """A coordinate and its first two derivatives with respect to s."""
 
     x: Scalar
     v: Scalar
     a: Scalar
 
     def scaled(self, factor: int, offset: Scalar) -> "Rates":
-        """Rates of factor·x - offset."""
+        """Return the rates of factor·x - offset."""
         return Rates(factor * self.x - offset, factor * self.v, factor * self.a)
 
 
 def rates(field: Field, coordinate: Callable[[State], Scalar], s: Scalar, state: State) -> Rates:
-    """Rates of `coordinate(state)` along the flow of `field`, by two forward derivatives."""
+    """Return the rates of `coordinate(state)` along the flow of `field`."""
     return guard_rates(field, lambda _, state: coordinate(state), s, state)
 
 
 def guard_rates(
     field: Field, guard: Callable[[Scalar, State], Any], s: Scalar, state: State
 ) -> Rates:
-    """`Rates` of `guard(s, state)` along the flow of `field`, by two forward derivatives; of a tree
-    of guards the rates of trees."""
+    """Return the `Rates` of `guard(s, state)` along the flow of `field`, by two forward
+    derivatives. For a tree of guards they are rates of trees."""
     one = jnp.ones_like(s)
 
     def first(s, state):
@@ -54,9 +54,9 @@ def force_rate(
     machine: SmoothMachine, position: Callable[[State], Scalar], holding: SmoothMachine, s: Scalar,
     state: State,
 ) -> Scalar:  # fmt: skip
-    """d/ds of the acceleration that a body would have if it were free, as it is in `machine`, while
-    it moves along with `holding`, a machine in which it may be held. A constant for
-    differentiation: it tells where to look."""
+    """Return d/ds of the acceleration that a body would have if it were free, as it is in
+    `machine`, along the flow of `holding`, in which it may be held. It is a constant for
+    differentiation, since it is only used to search for events."""
     s, state = jax.lax.stop_gradient((s, state))
 
     def force(s, state):
@@ -67,7 +67,7 @@ def force_rate(
 
 
 def quintic(begin: Rates, end: Rates, h: Scalar) -> Scalars:
-    """Coefficients in θ ∈ [0, 1] of the quintic Hermite interpolant of a step of length h."""
+    """Return the coefficients in θ ∈ [0, 1] of the quintic Hermite interpolant of a step h."""
     v0, v1 = h * begin.v, h * end.v
     a0, a1 = 0.5 * h * h * begin.a, 0.5 * h * h * end.a
     rise = end.x - begin.x
@@ -83,8 +83,8 @@ def quintic(begin: Rates, end: Rates, h: Scalar) -> Scalars:
 
 
 def highest(begin: Rates, end: Rates, h: Scalar) -> Scalar:
-    """What the quintic through both ends of a step stays below: the largest of its coefficients in
-    Bernstein's basis."""
+    """Return an upper bound of the quintic through both ends of a step: the largest of its
+    coefficients in Bernstein's basis."""
     v0, v1 = 0.2 * h * begin.v, 0.2 * h * end.v
     a0, a1 = 0.05 * h * h * begin.a, 0.05 * h * h * end.a
     from_begin = jnp.maximum(jnp.maximum(begin.x, begin.x + v0), begin.x + 2 * v0 + a0)
@@ -93,14 +93,14 @@ def highest(begin: Rates, end: Rates, h: Scalar) -> Scalar:
 
 
 def slope(c: Scalars) -> Scalars:
-    """Coefficients of the derivative, padded to the same length."""
+    """Return the coefficients of the derivative, padded to the same length."""
     return (*(n * c[n] for n in range(1, len(c))), jnp.zeros_like(c[0]))
 
 
 def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
-    """The θ in [0, 1] at which a polynomial that ends positive first rises through zero. Newton's
-    method kept inside a bracket. A polynomial that starts at zero and falls (the body leaves the
-    stop) has its root later; one that falls at a positive value has passed it."""
+    """Return the θ in [0, 1] at which a polynomial that ends positive first rises through zero, by
+    Newton's method inside a bracket. If the polynomial starts at zero and falls (the body leaves
+    the stop), the root comes later. Where it falls at a greater value, the root lies before."""
     derivative = slope(c)[:-1]
     low, high = jnp.zeros_like(c[0]), jnp.ones_like(c[0])
     end, end_rate = sum(c[1:], c[0]), sum(derivative[1:], derivative[0])
@@ -120,8 +120,8 @@ def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
 
 
 def landing(gap: Rates) -> tuple[Scalar, Scalar]:
-    """Offset δ at which gap + gap'·δ + ½ gap''·δ² rises through zero, and the slope there squared.
-    Where the square is negative the coordinate turns short of the stop, and δ is meaningless."""
+    """Return the offset δ at which gap + gap'·δ + ½ gap''·δ² rises through zero, and the squared
+    slope there. If the square is not positive, the coordinate turns short of the stop: δ = ∞."""
     square = gap.v * gap.v - 2 * gap.x * gap.a
     real = square > 0
     root = jnp.sqrt(jnp.where(real, square, 1.0))
@@ -133,13 +133,13 @@ def landing(gap: Rates) -> tuple[Scalar, Scalar]:
 
 
 def to_turn(end: Rates) -> Scalar:
-    """Offset from a step's end to the turning point near it."""
+    """Return the offset from a step's end to the turning point near it."""
     bend = jax.lax.stop_gradient(end.a)
     return -jax.lax.stop_gradient(end.v) / jnp.where(bend == 0, 1.0, bend)
 
 
 def turns_within(length: Scalar, end: Rates) -> Flag:
-    """Whether `to_turn` is at most this length; without a division, since each step asks for it."""
+    """Return whether |`to_turn`| ≤ `length`, without a division, since each step calls it."""
     bend = jax.lax.stop_gradient(end.a)
     return jnp.abs(jax.lax.stop_gradient(end.v)) <= length * jnp.where(
         bend == 0, 1.0, jnp.abs(bend)

@@ -1,4 +1,4 @@
-"""The loop around the hybrid step, and how small the numbers of its motion are, by which the errors
+"""The loop around the hybrid step, and the sizes of the state's numbers, relative to which errors
 of steps are judged."""
 
 import dataclasses
@@ -47,22 +47,21 @@ from .noise import in_modes_of
 from .results import code
 from .smooth import in_modes
 
-# A number of the state that is this share of what the others make of it has still to grow. In so
-# many instants of a cycle the rates are asked for. Choices.
+# A number of the state smaller than this share of what the other numbers make of it has still to
+# grow. Rates are evaluated at this many instants of a cycle. Choices.
 _GROWS, _INSTANTS = 1e-3, 7
 
-# A motion whose numbers are smaller is at rest in the origin, but for the rounding of numbers about
-# 1. A choice.
+# A number of this size or smaller counts as zero: it is rounding of numbers about 1. A choice.
 _REST = 1e-15
 
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """About how large each number of the state will be, if that is less than 1; else 1. `None`
-    of a machine whose numbers are about 1 by definition.
+    """Return the expected size of each number of the state if that is less than 1; else 1. `None`
+    for a machine whose numbers are about 1 by definition.
 
-    It is the value in the start, or what the rates there make of it in the 2π-th part of a cycle,
-    or what the other numbers make of it. Nothing is known of a number that is zero and that nothing
-    moves yet.
+    The size is the greater of the value at the start and its change in cycle/2π at the rates there.
+    If both are tiny, it is the change that the sizes of the other numbers cause. The size of a
+    number that is zero and that nothing moves yet is unknown, and is returned as 1.
     """
     if scales_known(machine):
         return None
@@ -71,11 +70,11 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
-    """Return the size of each number of a state, in the order of `in_rows`: about how large it is
-    along a motion; 1 for an angle, if it is zero to rounding, or for a machine whose numbers are
-    about 1 by definition. States are compared relative to these sizes.
+    """Return the size of each number of a state, in the order of `in_rows`: its expected magnitude
+    along a motion. It is 1 for an angle, for a number that is zero to rounding, and for a machine
+    whose numbers are about 1 by definition. States are compared relative to these sizes.
 
-    **Arguments:** `start`, where the motion begins; `rows`, other states of it, (..., states).
+    **Arguments:** `start`, the state at the begin; `rows`, other states of it, (..., states).
     """
     state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), bare(start))  # integers too
     row, unravel = ravel_pytree(stop_gradient(state))
@@ -96,8 +95,8 @@ _compiled_sizes = compiled(row_sizes)
 
 
 def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> np.ndarray:
-    """Return `row_sizes` as an array of the host, by a program that is compiled once for any number
-    of `rows`."""
+    """Return `row_sizes` as a NumPy array, by a program that is compiled once for any number of
+    `rows`."""
     largest = np.abs(rows.reshape(-1, rows.shape[-1])).max(axis=0)
     return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
 
@@ -105,9 +104,9 @@ def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> n
 def _known_sizes(
     machine: AbstractMachine, s: Scalar, start: State, modes: Scalars, values: State
 ) -> State:
-    """`sizes_of`, large ones too, and 0 where nothing is known; `values`, the moduli in `start`."""
+    """Return `sizes_of` without its limit of 1, and 0 if unknown; `values`: moduli in `start`."""
     holding = [x for x in events_of(machine) if x.holds_mode]
-    # While something sticks or slides along a surface, its rate tells nothing of its size.
+    # While something sticks or slides along a surface, its rate does not show its size.
     sticks = [getattr(x, "blends", False) or x.is_dry for x in holding] + [False] * len(modes)
     slips = (jnp.where(x == 0, 1.0, x) if y else x for x, y in zip(modes, sticks, strict=False))
     smooth = in_modes(machine, tuple(slips))
@@ -119,7 +118,7 @@ def _known_sizes(
     sizes = jtu.tree_map(
         lambda x, v: jnp.maximum(x, unit * jnp.max(jnp.abs(v), axis=0)), values, rates
     )
-    # Factors that differ keep what acts on a difference from cancelling.
+    # Different factors prevent a force that acts on a difference from cancelling.
     leaves, tree = jtu.tree_flatten(sizes)
     draw = np.random.default_rng(0)
     signs = [draw.choice([-1, 1], x.shape) * draw.uniform(0.7, 1.0, x.shape) for x in leaves]
@@ -136,8 +135,8 @@ def _known_sizes(
 def extents_of(
     plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
 ) -> tuple[Any, ...]:
-    """As `Plan.extents`: of each coordinate, then of the guard of each event that is no stop, how
-    small it is, if it is less than 1; else 1. `sizes` are from `sizes_of`."""
+    """Return `Plan.extents`: the size, at most 1, of each coordinate, then of the guard of each
+    event other than a stop. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
     s, start = stop_gradient((s, start))
@@ -156,7 +155,7 @@ def extents_of(
         if not event.holds_mode:
             found.append(of_guard(number, modes, rest))
             continue
-        if contact and isinstance(event, ContactFriction):  # it holds a body that rests
+        if contact and isinstance(event, ContactFriction):  # it holds a resting body
             k = stops_of(machine)[event.stop].coordinate
             rest = (*contact[:k], jnp.full_like(s, to_event(event.stop)), *contact[k + 1 :])
         own = mode_number(machine, number)
@@ -166,13 +165,13 @@ def extents_of(
 
 
 def _small(size: Array) -> Array:
-    """A size; 1 if it is larger, since a motion may become smaller than it begins, or unknown."""
+    """Return a size; 1 if it is unknown, or larger, since the motion may become smaller."""
     return jnp.where((size > 0) & (size < 1), size, 1.0)
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
-    """The lane as its loop begins, in the state `start`; one that cannot be run, or is not
-    `wanted`, has ended already."""
+    """Return the lane at the begin of its loop, in the state `start`. A lane that cannot be
+    simulated, or is not `wanted`, has ended already."""
     machine = plan.machine
     Y = machine.position(start)
     bad = ~jnp.isfinite(total((start, machine.cycle), plan.settle)) | ~jnp.asarray(wanted)
@@ -186,7 +185,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     modes = begin_modes(machine, s, start, plan.own)
     free = in_modes(machine, modes)
     here = [rates(free.field, x.position, s, start) for x in machine.coordinates]
-    # At rest the acceleration says which way the motion goes.
+    # At rest the sign of the acceleration is the direction of motion.
     direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
     contact = None
     if plan.rests:
@@ -198,7 +197,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             for x, j, along in zip(here, growth, direction, strict=True)
         )
         for i, stop in enumerate(stops_of(machine)):
-            # A little off the stop it would come to rest there: no derivative by the start.
+            # From slightly off the stop it would come to rest there too: no derivatives.
             at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
@@ -232,9 +231,9 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
 def _rests_on(
     plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float, slow: Scalar | float
 ) -> Scalar:
-    """The stop that coordinate number k rests on as the motion begins: pressed on, or about to
-    be by a force that grows; its place is known to within `slack`, its velocity to `slow`, and
-    both to the rounding of a search that ends there."""
+    """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
+    about to be by a force that grows. Its position is known to within `slack`, its velocity to
+    `slow`, and both to the rounding of a search that ends there."""
     contact, least = jnp.zeros_like(here.x), 4 * jnp.finfo(here.x.dtype).eps * plan.extent(k)
     slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
     for i, stop in enumerate(stops_of(plan.machine)):
@@ -256,7 +255,7 @@ _Inputs = tuple[Plan, State, Array]
 
 
 class Ends(NamedTuple):
-    """What is kept of a lane when it has ended."""
+    """The values that are kept of a lane after its end."""
 
     fault: Scalar
     steps: Scalar
@@ -264,18 +263,18 @@ class Ends(NamedTuple):
 
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
-    """A lane to its end, in one flat loop: in a batch no lane waits for another at a section.
+    """Run a lane to its end in one flat loop; in a batch no lane waits for another at a section.
 
-    **Returns:** how it ended, and the states and records of the intervals kept, with leading axis
-    `plan.kept + 1`: the first holds the state in which recording begins, and no record. States of a
-    machine with modes of its own are `HybridState`s.
+    **Returns:** its ends; states and records of the recorded intervals, with leading axis
+    `plan.kept + 1`. The first is the state in which recording begins, with an empty record. States
+    of a machine with modes of its own are `HybridState`s.
     """
     form = prepared(plan.machine)
     own = form.machine is plan.machine
     if not own:
         if plan.noise is not None:
             plan = dataclasses.replace(plan, noise=in_modes_of(form, plan.noise, start))
-        # What ends a lane early knows the machine's own state only.
+        # The condition that ends a lane early is a function of the machine's own state.
         plan = dataclasses.replace(plan, machine=form.machine, stop=None)
         start = form.inward(start)
     zero = jnp.zeros_like(plan.machine.position(start))

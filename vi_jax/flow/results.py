@@ -1,4 +1,4 @@
-"""Why a simulation ended, and what it returns."""
+"""Reasons why a simulation ended, and the classes of its results."""
 
 import difflib
 import enum
@@ -30,7 +30,7 @@ from ..machine import (
     with_units,
 )
 
-# Of a batch no more than so many are listed one by one: a choice, what fits a line.
+# A batch of at most this many members is listed one by one: a choice, as many as fit a line.
 _NAMED = 8
 
 if TYPE_CHECKING:
@@ -96,32 +96,32 @@ else:
 
         @classmethod
         def where(cls, condition, a, b):
-            """`jnp.where` of two members."""
+            """Apply `jnp.where` to two members."""
             return _Member(jnp.where(condition, a.number, b.number), cls)
 
 
 def names_of(kind: Any) -> np.ndarray:
-    """The names of the members of an enumeration, in their order."""
+    """Return the names of the members of an enumeration, in their order."""
     return np.asarray(list(kind._texts))
 
 
 def in_names(member: Any) -> np.ndarray:
-    """The names of members, one for each lane."""
+    """Return the names of members, one for each lane."""
     return np.asarray(names_of(member.kind)[np.asarray(member.number)])
 
 
 def number_of(member: Any) -> Int[Array, "..."]:
-    """The place of a member in its enumeration; a number for each lane."""
+    """Return the index of a member in its enumeration; one for each lane."""
     return jnp.asarray(member.number)
 
 
 def member_of(kind: Any, number: Any) -> Any:
-    """The member of an enumeration at this place; one for each lane."""
+    """Return the member of an enumeration with this index; one for each lane."""
     return _Member(jnp.asarray(number, jnp.int32), kind)
 
 
 class EventKind(enum.IntEnum):
-    """What may happen to a motion, as `EventLog` lists it."""
+    """The kinds of events in an `EventLog`."""
 
     impact = 0
     """A body hits a rigid stop."""
@@ -136,15 +136,15 @@ class EventKind(enum.IntEnum):
 
 
 EVENTS = tuple(kind.name for kind in EventKind)
-"""The names of what may happen to a motion, as `EventLog` lists it: an impact on a stop; a body
-that comes to rest on one; a body that leaves the stop on which it rested; a switch that changes its
-mode; one of the machine's `events`."""
+"""The names of the kinds of events in an `EventLog`: an impact on a stop; a body comes to rest on a
+stop; a body leaves the stop on which it rested; a switch changes its mode; one of the machine's
+`events`."""
 
 Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
 
 
 def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
-    """Names of the batch axes. **Raises:** `ValueError` if others are given than there are."""
+    """Return the names of the batch axes. **Raises:** `ValueError` if `dims` has another number."""
     if dims is None:
         return ("lane",) if number == 1 else tuple(f"lane_{i}" for i in range(number))
     if isinstance(dims, str) or len(dims) != number:
@@ -155,7 +155,7 @@ def batch_names(dims: Sequence[str] | None, number: int) -> tuple[str, ...]:
 
 
 def states(prefix: str, state: State, dims: tuple[str, ...]) -> Variables:
-    """The components of a state, each a variable; an array among them has axes of its own."""
+    """Return the components of a state as variables; arrays among them have further dimensions."""
     found = {}
     for name, x in by_name(state).items():
         name, x = name or "state", np.asarray(x)
@@ -165,14 +165,13 @@ def states(prefix: str, state: State, dims: tuple[str, ...]) -> Variables:
 
 
 def present(values: Mapping[str, Any], dims: tuple[str, ...]) -> Variables:
-    """The entries that are not `None`."""
+    """Return the entries that are not `None`, as variables."""
     return {name: (dims, np.asarray(x)) for name, x in values.items() if x is not None}
 
 
 def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
-    """Of a data set what lies along one of its dimensions, so that it makes a table with one row
-    for each of its places; all of it by default. **Raises:** `ValueError` if there is no such
-    dimension."""
+    """Return the variables of a data set along one dimension, as a table with a row for each of its
+    points; by default the data set. **Raises:** `ValueError` if there is no such dimension."""
     if along is None:
         return data
     columns = {}
@@ -184,7 +183,7 @@ def tidy(data: "xr.Dataset", along: str | None) -> "xr.Dataset":
 
 
 def _columns(name: str, x: Any) -> dict[str, Any]:
-    """A variable, or those of the single numbers of an array of the state (see `states`)."""
+    """Return a variable, or one for each number of an array in the state (see `states`)."""
     inner = [dim for dim in map(str, x.dims) if name.endswith("_" + dim.rpartition("_")[0])]
     if not inner:
         return {name: x}
@@ -195,13 +194,12 @@ def _columns(name: str, x: Any) -> dict[str, Any]:
     }
 
 
-# What tells, along these dimensions, which places of a log are used.
+# Logs, by their dimension, and the variable that is negative in unused places.
 _LISTED = {"impact": "log_stop", "event": "event_number"}
 
 
 def _met(log: Any, number: str) -> Any:
-    """The entries of a log, one after the other, without unused places: those where the variable
-    `number` is negative."""
+    """Return the entries of a log as rows, without unused places, in which `number` is negative."""
     rows = log.stack(row=log[number].dims).reset_index("row")
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
 
@@ -209,7 +207,7 @@ def _met(log: Any, number: str) -> Any:
 def run_dataset(
     run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None
 ) -> "xr.Dataset":
-    """A run as a data set (see `Run.to_xarray`)."""
+    """Return a run as a data set (see `Run.to_xarray`)."""
     batch = batch_names(dims, run.steps.ndim)
     cycle, section = (*batch, "cycle"), (*batch, "section")
     names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
@@ -249,7 +247,7 @@ def run_dataset(
 
 
 class RESULTS(NamedEnumeration):
-    """The reason why a lane ended, one for each."""
+    """The reason why a lane ended, one for each lane."""
 
     successful = ""
     bad_start = (
@@ -300,31 +298,31 @@ class RESULTS(NamedEnumeration):
 
 
 REASON_NAMES = tuple(names_of(RESULTS).tolist())
-"""Their names, in the order of the numbers by which the loop carries them."""
+"""The names of `RESULTS`, in the order of the numbers by which the loop represents them."""
 
 
 def code(name: str) -> float:
-    """The number by which the loop carries the reason of this name; 0 is success."""
+    """Return the number that represents the reason of this name in the loop; 0 is success."""
     return float(REASON_NAMES.index(name))
 
 
-# The number of an outcome is a fraction that is added to the common reason, `ended`.
+# The number of an outcome is added as a fraction to the common reason, `ended`.
 _OUTCOMES = 64
 
 
 def code_of_outcome(number: int) -> float:
-    """The reason of a lane that an event ended, as a number, with the number of its outcome."""
+    """Return the reason of a lane that an event ended, with the number of its outcome."""
     return code("ended") + number / _OUTCOMES
 
 
 def outcome_of(reason: Scalar) -> Int[Array, ""]:
-    """The number of the outcome among the machine's; -1 of a lane that no event of its ended."""
+    """Return the index of the outcome among the machine's; -1 if no event ended the lane."""
     number = jnp.round((reason - code("ended")) * _OUTCOMES).astype(jnp.int32)
     return jnp.where(jnp.floor(reason) == code("ended"), number, -1)
 
 
 def reason_of(reason: Scalar) -> RESULTS:
-    """The enumeration item for a reason carried as a number."""
+    """Return the member of `RESULTS` for a reason as a number."""
     return member_of(RESULTS, jnp.floor(reason))
 
 
@@ -332,24 +330,24 @@ class Samples(Shown):
     """Dense samples, evenly spaced in the cycle; arrays have shape (cycles · samples + 1,)."""
 
     cycles: Float[Array, " points"]
-    """Place of the sample on the drive's clock, in cycles since the start."""
+    """Positions of the samples on the drive's clock, in cycles since the start."""
     time: Float[Array, " points"]
     """Time τ since the start (in units of `s` for machines of your own)."""
     state: State
     """The states, a pytree like the start."""
     quantities: dict[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
-    """The machine's own quantities there, by name (see `AbstractMachine.quantities`)."""
+    """The machine's own quantities at the samples, by name (see `AbstractMachine.quantities`)."""
     modes: tuple[Float[Array, " points"], ...] = ()
-    """The machine's own modes there (see `AbstractMachine.modes`)."""
+    """The machine's own modes at the samples (see `AbstractMachine.modes`)."""
 
 
-# Cycles of which a text tells, and events of each.
+# Greatest numbers of cycles, and of events in each, in a printed summary.
 _CYCLES, _EVENTS = 8, 6
 
 
 def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
-    """How many there are of `what`, and those of the first cycles one by one, by the `word` for a
-    place of the log, of which `used` tells which are: (cycles, size), batch axes before them."""
+    """Return the number of entries and a line for each of the first cycles. `used`, (…, cycles,
+    size), is true for entries in use; `word` returns the text of the entry at a cycle and place."""
     used = np.asarray(used)
     if used.ndim > 2:
         return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"
@@ -374,14 +372,14 @@ class ImpactLog(Summarized):
 
     phase: Float[Array, "cycles size"]
     """Clock of the cycle at the impact, in the machine's units: the crank angle in [0, 2π] for a
-    `Scene`, what counts the cycles for any other."""
+    `Scene`, the variable that counts the cycles for any other."""
     speed: Float[Array, "cycles size"]
     """V⁻, speed of approach just before the impact."""
     stop: Int[Array, "cycles size"]
     """Number of the rigid stop."""
 
     def summary(self) -> str:
-        """Impacts of the first cycles: where on the clock, on which stop, and how fast."""
+        """Return the impacts of the first cycles: clock, stop and speed."""
 
         def word(i: int, j: int) -> str:
             return f"stop {self.stop[i, j]} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
@@ -399,18 +397,18 @@ class EventLog(Summarized):
     phase: Float[Array, "cycles size"]
     """Clock of the cycle at the event, as in `ImpactLog`."""
     kind: Int[Array, "cycles size"]
-    """What happened: an index into `EVENTS`."""
+    """The kind of the event: an index into `EVENTS`."""
     number: Int[Array, "cycles size"]
-    """Which one: a number among the rigid stops; for a mode among soft stops, frictions and
-    switches; for a reset among the other events."""
+    """The number of the stop, switch or event: among the rigid stops; for a mode among soft stops,
+    frictions and switches; for a reset among the other events."""
     value: Float[Array, "cycles size"]
-    """V⁻ of an impact, or of the impact that came to rest; the mode of a switch after its change;
-    of a reset what its `value` says; NaN for a release."""
+    """V⁻ of an impact, or of the impact before rest; the mode of a switch after its change; the
+    `value` of a reset; NaN for a release."""
     names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the machine's resets, by number; "" for one without a name."""
 
     def summary(self) -> str:
-        """Events of the first cycles: what, of which stop, switch or event, where on the clock."""
+        """Return the events of the first cycles: kind; stop, switch or event; clock."""
 
         def word(i: int, j: int) -> str:
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
@@ -423,18 +421,18 @@ class EventLog(Summarized):
 
 
 class Errors(Shown):
-    """Estimated errors of a run: its differences to a run by the method's `tighter` one.
+    """Estimated errors of a run: its differences from a run by the method's `tighter` one.
 
-    NaN where either run failed. In a chaotic motion they grow until they are as large as the
+    They are NaN if either run failed. In a chaotic motion they grow until they are as large as the
     motion. Under `vmap` batch axes come first.
     """
 
     sections: State
-    """Of the section states, a pytree like them; leaves (cycles + 1,)."""
+    """Errors of the section states, a pytree like them; leaves (cycles + 1,)."""
     y_max: Float[Array, " cycles"] | None
-    """Of the greatest Y in each cycle."""
+    """Error of the greatest Y in each cycle."""
     y_min: Float[Array, " cycles"] | None
-    """Of the smallest Y in each cycle."""
+    """Error of the smallest Y in each cycle."""
     impacts: Int[Array, " cycles"]
     """Difference of the impact counts in each cycle."""
 
@@ -447,10 +445,10 @@ class Run(Summarized):
     """
 
     sections: State
-    """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,), of
-    an array in the state with its own axes behind."""
+    """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,), with
+    further axes for an array in the state."""
     y_max: Float[Array, " cycles"] | None
-    """Greatest position (of the first coordinate) of the motion in each cycle, not of sample
+    """Greatest position (of the first coordinate) of the motion in each cycle, not only of sample
     points."""
     y_min: Float[Array, " cycles"] | None
     """Smallest position of the motion in each cycle."""
@@ -459,31 +457,31 @@ class Run(Summarized):
     impact_speed: Float[Array, " cycles"] | None
     """Greatest V⁻ in each cycle, 0 without impact."""
     rests: Int[Array, " cycles"] | None
-    """Times the body came to rest on a stop, its endless last impacts completed at once (they are
-    not among `impacts`)."""
+    """Number of times that the body came to rest on a stop. Its infinitely many last impacts are
+    completed at once, and are not among `impacts`."""
     impact_energy: Float[Array, " cycles"] | None
-    """Energy lost in impacts in each cycle, Σ ½(1 - k²)V⁻², and ½V⁻² where the body came to rest,
-    times the mass that an impact acts on."""
+    """Energy lost in impacts in each cycle: ½(1 - k²)V⁻² for each impact, ½V⁻² where the body came
+    to rest, times the mass on which the impact acts."""
     clearance: Float[Array, " cycles"] | None
-    """Smallest distance to a stop at which the body turned back in each cycle without touching it,
-    infinite where it did not; recorded along with the impact log."""
+    """Smallest distance to a stop at which the body turned back in each cycle without touching it;
+    infinite if it did not. It is recorded if `impact_log` is set."""
     duration: Float[Array, " cycles"] | None
     """Time τ that each cycle took."""
     frequency_ratio: Float[Array, " cycles"] | None
     """ζ: mean speed of the drive over each cycle."""
     samples: Samples | None
-    """Dense samples, if asked for."""
+    """Dense samples, if requested."""
     impact_log: ImpactLog | None
-    """The impacts, if asked for."""
+    """The impacts, if requested."""
     event_log: EventLog | None
-    """Events of all kinds, if asked for."""
+    """Events of all kinds, if requested."""
     errors: Errors | None
-    """Estimated errors, if asked for."""
+    """Estimated errors, if requested."""
     result: RESULTS
-    """Why the run ended: `RESULTS.successful`, or what went wrong."""
+    """The reason why the run ended: `RESULTS.successful`, or a failure."""
     steps: Int[Array, ""]
-    """Steps tried, those included that were rejected or shortened to meet an impact (in single
-    precision no more than 2²⁴ are seen)."""
+    """Steps tried, including those rejected or shortened to end at an event (in single precision
+    they are counted up to 2²⁴)."""
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
     averages: dict[str, Float[Array, " cycles"]] = eqx.field(default_factory=dict)
@@ -492,33 +490,33 @@ class Run(Summarized):
     quantities: dict[str, Float[Array, " sections"]] = eqx.field(default_factory=dict)
     """The machine's own functions of its state on the sections, by name; (cycles + 1,)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)
-    """What position and velocity are called, in the machine's words."""
+    """The names of position and velocity for this machine."""
     units: Stated = eqx.field(static=True, default=())
-    """In which units its quantities are, as the machine states it."""
+    """The units of its quantities, as the machine states them."""
     modes: tuple[Float[Array, " sections"], ...] = ()
     """The machine's own modes on the sections (see `AbstractMachine.modes`), each (cycles + 1,)."""
     outcome: Int[Array, ""] | None = None
-    """With which outcome an event ended the motion, an index into `outcomes`; -1 if none did,
-    `None` for a machine without outcomes."""
+    """The outcome with which an event ended the motion, as an index into `outcomes`; -1 without,
+    and `None` for a machine without outcomes."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the outcomes with which events and stops of the machine end a motion."""
 
     @property
     def successful(self) -> jax.Array:
-        """Whether the lane completed all its cycles."""
+        """True if the lane completed all its cycles."""
         return self.result == RESULTS.successful
 
     @property
     def last(self) -> State:
         """The state on the last section: a start to continue from, or a guess for `find_orbit`. For
-        a machine with discrete modes it is a `HybridState`, which has them too."""
-        # Batch axes are in front, those of an array in the state behind; how many there are in
-        # front is shown by a number for each lane.
+        a machine with discrete modes it is a `HybridState`, which contains them."""
+        # Batch axes come before the axis of the sections, those of an array in the state after it.
+        # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
         return jtu.tree_map(lambda x: x[place], with_modes(self.sections, self.modes))
 
     def mean_averages(self) -> dict[str, Scalar]:
-        """The machine's own averages over the time of all cycles, of one lane."""
+        """Return the machine's own averages over the time of all cycles, of one lane."""
         if self.duration is None:
             return {}
         whole = jnp.sum(self.duration)
@@ -527,33 +525,33 @@ class Run(Summarized):
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """This run as an `xarray.Dataset`, labelled by cycle, section and sample.
+        """Return this run as an `xarray.Dataset`, labelled by cycle, section and sample.
 
-        States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`; an array
+        States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`. An array
         in the state keeps its axes, as `q_0`, and a state that is one array is `section_state`. The
-        impact log becomes `log_phase`, `log_speed` and `log_stop`; that of all events
-        `event_phase`, `event_kind` in words, `event_number` and `event_value`; the machine's own
-        quantities are `section_lift` and `sample_lift`; all else, its averages among it, keeps its
-        name, and `result` is the reason's. Host-side: not to be traced.
+        impact log becomes `log_phase`, `log_speed` and `log_stop`; the log of all events
+        `event_phase`, `event_kind` (in words), `event_number` and `event_value`. The machine's own
+        quantities are `section_lift` and `sample_lift`. All other variables, averages included,
+        keep their names, and `result` is the name of the reason. It runs on the host and cannot be
+        traced.
 
         As a table, everything together would have a row for each combination of a cycle, a section,
         a sample and an impact. `to_xarray(along="cycle").to_dataframe()` has one for each cycle.
 
-        **Arguments:** names of the batch axes of a run under `vmap`, by default `lane`; `along`, to
-        keep only what lies along one dimension: `"cycle"`, `"section"`, `"sample"`, `"impact"`
-        or `"event"` (then a row for each that was met), or a batch axis.
+        **Arguments:** `dims`, names of the batch axes of a run under `vmap`, by default `lane`;
+        `along`, the dimension to keep: `"cycle"`, `"section"`, `"sample"`, `"impact"` or `"event"`
+        (with a row for each that happened), or a batch axis.
 
-        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
-        such dimension.
+        **Raises:** `ValueError` if there are not as many names as batch axes, or no such dimension.
         """
         return run_dataset(self, dims, in_names(self.result), along)
 
     def drawn(self) -> Any:
-        """The smallest position in each cycle."""
+        """Return the numbers of the picture: the smallest position in each cycle."""
         return None if self.steps.ndim else self.y_min
 
     def summary(self) -> str:
-        """The last section and cycle, and how the run ended."""
+        """Return the last section and cycle, and the reason why the run ended, as text."""
         if self.steps.ndim:
             good = int(jnp.sum(self.successful))
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"

@@ -1,5 +1,5 @@
-"""A machine as one step sees it: in its modes, with the bodies held that rest; and integrals along
-its motion, on which nothing that moves depends."""
+"""The smooth machine of one step, with fixed modes and held bodies; and integrals along its motion,
+on which the motion does not depend."""
 
 from collections.abc import Callable
 from math import pi
@@ -30,13 +30,14 @@ from ..machine import (
     stops_of,
 )
 
-# Thresholds in `s` are for cycles of about 2π, up to so many times shorter or longer: a choice.
+# Thresholds in `s` are for cycles of about 2π, and hold for cycles up to this factor shorter or
+# longer: a choice.
 _USUAL = 100.0
 
 
 def unit_of(machine: AbstractMachine) -> Scalar | float:
-    """A length of `s` by which short ones are judged: 1, or the 2π-th part of a cycle that is much
-    shorter or much longer than that."""
+    """Return the unit of `s` for thresholds: 1, or cycle/2π of a cycle that is much shorter or
+    longer than 2π."""
     cycle = machine.cycle
     if scales_known(machine) or (isinstance(cycle, float | int) and 1 / _USUAL < cycle < _USUAL):
         return 1.0
@@ -45,27 +46,27 @@ def unit_of(machine: AbstractMachine) -> Scalar | float:
 
 
 def limited_of(machine: AbstractMachine) -> list[int]:
-    """The numbers of the coordinates that stops limit."""
+    """Return the numbers of the coordinates that stops limit."""
     return sorted({stop.coordinate for stop in stops_of(machine)})
 
 
 class SmoothMachine(eqx.Module):
-    """What a step asks of a machine: smooth, since its modes stay as they are and the bodies that
-    rest are held."""
+    """A machine during one step. It is smooth, since its modes stay fixed and resting bodies are
+    held."""
 
     machine: AbstractMachine
     modes: Scalars
     contact: Scalars
-    """Of each coordinate, 1 + i while it rests on stop number i, else 0; or none at all."""
+    """For each coordinate, 1 + i while it rests on stop number i, else 0; or an empty tuple."""
 
     def field(self, s: Scalar, state: State) -> State:
-        """d(state)/ds, without motion of a body that is held."""
+        """Return d(state)/ds, without motion of held bodies."""
         traced = any(isinstance(x, Tracer) for x in jtu.tree_leaves((self, s, state)))
         field: Any = _traced_once if traced else SmoothMachine.held_field
         return field(self, s, state)
 
     def held_field(self, s: Scalar, state: State) -> State:
-        """The same, traced anew."""
+        """Return the same as `field`, traced inline."""
         machine = self.machine
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
@@ -74,7 +75,7 @@ class SmoothMachine(eqx.Module):
         several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
             flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
-        for k in () if several else limited:  # without rounding where one body rests
+        for k in () if several else limited:  # no rounding if one body rests
             flow = _held_still(machine.coordinates[k], state, flow, self.contact[k] > 0)
         return flow
 
@@ -86,8 +87,8 @@ def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
 
 
 def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
-    """The rate of a state along `flow` while this coordinate keeps its place and velocity, if it
-    `rests`: without what its force takes, or the derivative of `placed`, which need not be
+    """Return the rate of a state along `flow` while this coordinate keeps its position and velocity
+    if it `rests`: without the part along `push`, or the derivative of `placed`, which need not be
     linear."""
     if coordinate.push is not None:
         taken = jnp.where(rests, -gained(coordinate, state, flow), 0.0)
@@ -100,15 +101,15 @@ def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) 
 
 
 def in_modes(machine: AbstractMachine, modes: Scalars) -> SmoothMachine:
-    """The machine with its modes as they are and nothing held."""
+    """Return the machine in these modes, with nothing held."""
     return SmoothMachine(machine, modes, ())
 
 
 def holding(
     machine: AbstractMachine, modes: Scalars, contact: Scalars | None, but: int | None = None
 ) -> SmoothMachine:
-    """The machine in its modes, with those bodies held that rest on a stop (see `Lane.contact`);
-    that of coordinate number `but` is free."""
+    """Return the machine in these modes, with the bodies held that rest on a stop (see
+    `Lane.contact`). The body of coordinate number `but` is free."""
     if contact is None or (but is not None and len(contact) == 1):
         return in_modes(machine, modes)
     others = (x if j != but else jnp.zeros_like(x) for j, x in enumerate(contact))
@@ -116,8 +117,8 @@ def holding(
 
 
 def exact(machine: AbstractMachine, state: State) -> bool:
-    """Whether one number of the state is all that stops limit, so that it can be put on a stop
-    without rounding; known while a step is traced."""
+    """Return whether stops limit only one number of the state itself, so that it can be put on a
+    stop without rounding. The result is known at trace time."""
     place = machine.coordinates[0].position(state)
     own = any(place is x for x in jtu.tree_leaves(state))
     return own and len(machine.coordinates) == 1
@@ -132,8 +133,8 @@ _BILINEAR = {"dot_general", "mul"}
 
 
 def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
-    """Return whether a function of the state is a sum of its numbers with constant factors, so that
-    it is known as well as they are; found while a step is traced."""
+    """Return whether a function of the state is affine with constant factors, so that its value is
+    as accurate as the state; found at trace time."""
 
     def moved(eqn: Any, moves: list[bool]) -> list[bool]:
         name, body = eqn.primitive.name, called(eqn)
@@ -154,9 +155,9 @@ def rounding(
     machine: AbstractMachine, k: int, state: State, least: Scalar | float = 1.0,
     unit: Scalar | float = 1.0,
 ) -> tuple[Scalar | float, Scalar | float]:  # fmt: skip
-    """How far coordinate number k may be beyond its stop, and its velocity from zero, by rounding
-    alone: not at all where the place is a number of the state itself. A place has the size `least`
-    at least, in `unit`s of s."""
+    """Return bounds of the rounding errors of position and velocity of coordinate number k at its
+    stop: 0 if the position is itself a number of the state. A position counts as at least `least`
+    large, a velocity as `least / unit`."""
     if exact(machine, state):
         return 0.0, 0.0
     body = machine.coordinates[k]
@@ -172,17 +173,17 @@ def _rounding(part: Callable[[State], Scalar], state: State, least: Scalar | flo
 
 
 Integrals = dict[str, Scalar]
-"""Integrals since the last record point: the elapsed time by the name `TIME`, where it is recorded;
-of each average, by its name, the integral over time (over s if the machine has no `pace`)."""
+"""Integrals since the last record point: the elapsed time by the name `TIME`, if it is recorded;
+and each average's integral over time, by its name (over s if the machine has no `pace`)."""
 
 TIME = "elapsed time"
-"""The name of the elapsed time; no name of an average, since it is no identifier."""
+"""The name of the elapsed time. No average has it, since it is no identifier."""
 
 
 def rate_of_integrals(
     smooth: SmoothMachine, s: Scalar, state: State, integrals: Integrals
 ) -> Integrals:
-    """Return d/ds of the integrals of these names."""
+    """Return d/ds of the integrals with these names."""
     if not integrals:
         return {}
     pace, rates = smooth.machine.pace(s, state), {}
@@ -197,7 +198,7 @@ def rate_of_integrals(
 
 
 def carried(smooth: SmoothMachine, s: Scalar, state: State, integrals: Integrals) -> Integrals:
-    """Return those integrals that a method has to carry along: not a time that `s` measures."""
+    """Return the integrals that a method must carry: all but a time that `s` measures."""
     paced = TIME in integrals and smooth.machine.pace(s, state) is not None
     return {name: x for name, x in integrals.items() if name != TIME or paced}
 
@@ -208,5 +209,4 @@ def elapsed(old: Integrals, new: Integrals, h: Scalar) -> Integrals:
 
 
 def means(integrals: dict[str, Any], duration: object) -> dict[str, Any]:
-    """Return the averages of integrals over this duration."""
     return {name: x / duration for name, x in integrals.items()}
