@@ -1,5 +1,5 @@
-"""Where the next step should end: at the first event that a tried step ran past, or that a motion
-known beforehand comes to."""
+"""The end of the next step: the first event that a tried step passed, or that a motion known in
+advance will meet."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,25 +22,25 @@ from ..smooth import exact
 from .guards import Crossing, Side, at_stops, beyond, for_each, may_be_above
 from .trial import Path, Trial
 
-# A hump of a guard this close to an end of a step (as a share of it) is seen from there: a choice.
+# A hump of a guard this close to an end of a step (as a share of it) is visible there: a choice.
 _BRIEF = 1e-3
 
-# The polynomial of a guard is evaluated where so many parts of the step are over, and corrected by
-# stages that are no closer to its ends than this share. Choices.
+# The polynomial of a guard is evaluated at the ends of this many parts of the step. It is corrected
+# by stages that are no closer to its ends than this share. Choices.
 _PARTS = 16
 _EDGE = 0.1
 
-# Steps shorter than this (in s, for a cycle of about 2π) are not shortened any more, in double and
-# in single precision, whose landings are that much coarser; and for a dip of the velocity.
+# Steps shorter than this (in s, for a cycle of about 2π) are not shortened any more: in double
+# precision; in single precision, which lands less accurately; and for a dip of the velocity.
 _SHORTEST, _SHORTEST_SINGLE, _SHORTEST_DIP = 1e-6, 1e-3, 1e-3
 
 
 def _corner(
     begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar], h: Scalar, bent: Flag
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Where, after the begin of a step, the tangents at both ends meet, and how high: no curve that
-    is bent one way goes beyond. And where the curve is greatest, if its slope changes evenly.
-    `begin` and `end` are value and slope there."""
+    """Return the place, from the begin of a step, where the tangents at both ends meet, and their
+    height there, which no curve bent one way exceeds; and the place of the maximum if the slope
+    changes linearly. `begin` and `end` are value and slope at the ends."""
     (x0, v0), (x1, v1) = begin, end
     fall = jnp.where(bent, v0 - v1, 1.0)
     place = (x1 - v1 * h - x0) / fall
@@ -48,9 +48,9 @@ def _corner(
 
 
 def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
-    """Whether a guard that is negative at both ends may have been positive in between, and where
-    it was greatest; or where one that falls at both, as of a body that has just passed through its
-    standstill, has begun to rise, from where its greatest value shows."""
+    """Return whether a guard that is negative at both ends may have been positive in between, and
+    the place of its maximum. For a guard that falls at both ends but has risen in between, as after
+    a standstill of a body, it is a place from which the maximum is visible."""
     begin, end = stop_gradient((c.begin, c.end))
     rises = (begin.x < 0) & (end.x < 0) & (begin.v > 0) & (end.v < 0)
     _, bound, place = _corner((begin.x, begin.v), (end.x, end.v), h, rises)
@@ -65,8 +65,8 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
 def crests(
     plan: Plan, sides: list[Side], below: list[Flag], shares: tuple[float, ...], h: Scalar
 ) -> list[tuple[Flag, Scalar]]:
-    """Return of functions whether each may have been positive within a step, and the first place
-    where; of those that do not end it `below` zero nothing is asked. `shares` are the places of the
+    """Return for each function whether it may have been positive within a step, and the first such
+    place. Functions whose flag `below` is false are skipped. `shares` are the places of the
     stages."""
     ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
     values = [stop_gradient(x.within) for x in sides]
@@ -100,10 +100,10 @@ def crests(
 def _crest(
     plan: Plan, shares: tuple[float, ...], h: Scalar, ends: Scalars, values: Array, slack: Scalar
 ) -> tuple[Flag, Scalar]:
-    """As `crests` for one function, by value and slope at the `ends`, and the `values` at the
-    stages. The function is taken for the cubic through both ends of the step, plus what it is off
-    at the stages: that is divided by the shape of the cubic's error and interpolated linearly. By
-    how much it differs from stage to stage is the margin of doubt."""
+    """Return `crests` of one function from value and slope at the `ends`, and `values` at stages.
+    The function is replaced by the cubic through both ends plus a correction, exact at the stages.
+    The correction is the shape of the cubic's error times a factor, interpolated linearly. The
+    factor's greatest change from stage to stage is a margin."""
     x0, v0, x1, v1 = ends
     over, rises, over_end, falls = x0 - slack, h * v0, x1 - slack, h * v1
     grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
@@ -134,7 +134,7 @@ def _may_be_shortened(plan: Plan, h: Scalar) -> Flag:
 
 
 def _inner(shares: tuple[float, ...]) -> list[int]:
-    """Which stages are apart from the ends of the step and from each other, in their order."""
+    """Return the stages that are apart from the ends of the step and from each other, in order."""
     found: dict[float, int] = {}
     for n, share in enumerate(shares):
         if _EDGE <= share <= 1 - _EDGE:
@@ -143,9 +143,9 @@ def _inner(shares: tuple[float, ...]) -> list[int]:
 
 
 def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar]:
-    """Whether a curve is positive between its ends, and where first, as a share of the way: by
-    parabolas through its heights at equal distances, ends included, and through its slopes there by
-    that distance."""
+    """Return whether a curve is positive between its ends, and the first such place as a share. The
+    curve consists of parabolas through its heights at equal distances, ends included, and through
+    the slopes `rise` and `fall` at the ends, per distance."""
     parts = heights.size - 1
     before, here, after = heights[:-2], heights[1:-1], heights[2:]
     bend, tilt = 2 * here - before - after, after - before
@@ -166,14 +166,14 @@ def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar
 
 
 def _bump(share: np.ndarray) -> np.ndarray:
-    """The shape of a cubic Hermite interpolant's error; 1 in the middle."""
+    """Return the shape of a cubic Hermite interpolant's error; 1 in the middle."""
     return (4 * share * (1 - share)) ** 2
 
 
 def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag:
-    """Whether the velocity, of one sign at both ends, dips so deep that it may have been zero; then
-    the step is halved, until the turns lie apart or the dip is too short to matter. A force that
-    sags, by how fast it changes, is not taken for straight."""
+    """Return whether the velocity, of one sign at both ends, may have been zero in between. Then
+    the step is halved, until each step has one turning point or the dip is too short to matter. The
+    rates of the force, if known, show whether it sags; else it counts as linear."""
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
@@ -193,9 +193,9 @@ def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag
 
 
 def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Scalar]:
-    """Whether the force, of one sign at both ends, may have had the other in between for a body
-    that is slow enough to notice, and where it turned. It releases a body at rest for a moment, or
-    turns one twice that has just left the stop."""
+    """Return whether the force, of one sign at both ends, may have changed sign in between for a
+    body slow enough to be affected, and the place of its extremum. Such a force releases a body at
+    rest for a moment, or turns a body twice that has just left the stop."""
     assert path.surge is not None
     begin, end, (rate0, rate1, brief) = path.begin, path.end, path.surge
     a0, a1 = begin.a, end.a
@@ -204,7 +204,7 @@ def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Sca
     turns = bent & (place > brief) & (h - place > brief)
     hidden = turns & (a0 * a1 >= 0) & (bound * (a0 + a1) < 0)
     if lane.contact is not None:
-        # At rest the step may begin, to rounding, where the window does.
+        # The step may begin at rest, to rounding, where the window of force begins.
         direction = lane.direction[k]
         pressed = (lane.contact[k] > 0) & (direction * a1 >= 0) & (direction * bound < 0)
         hidden = hidden | (turns & pressed)
@@ -216,49 +216,49 @@ def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Sca
 # Coefficients in θ, which goes from 0 to 1 along a step.
 Curve = Scalars
 
-# An event, whether a step ends beyond it, and its guard along the step; of a coordinate whether it
-# turned within the step, and itself along it. Curves are asked for only where something is met.
+# An event, whether a step ends beyond it, and its guard along the step. For a coordinate, whether
+# it turned within the step, and its path along it. Curves are computed only if an event is met.
 Passed = tuple[Crossing, Flag, Callable[[], Curve]]
 Course = tuple[Flag, Callable[[], Curve]]
 
-# Turning points this far inside the gap (in units of `Plan.extent`) are passed by where only
-# impacts matter. A choice: the quintic through a step's ends has to be right to this.
+# Turning points this far inside the gap (in units of `Plan.extent`) are not located if only impacts
+# matter. A choice: the quintic through a step's ends has to be accurate to this.
 _MARGIN = 0.02
 
-# By so much a bound is wider, for what rounding makes of it.
+# Factor that widens a bound to cover rounding.
 _WIDER = 1.001
 
-# A turn whose velocity is known no better than to this share of that at the step's ends: a choice.
+# A turn's place is uncertain if the velocity there is above this share of that at the ends.
 _UNCERTAIN = 1e-3
 
 
 class First(NamedTuple):
-    """What a step meets first."""
+    """The first event of a step."""
 
     crossed: Flag
     """The step ends beyond an event."""
     turned: Flag
     """There is a turn that matters, which comes before."""
     theta: Scalar
-    """Where it lies, if there is one."""
+    """The place of the event or turn within the step, if there is one."""
     target: Scalar
 
 
 def first_event(
     plan: Plan, lane: Lane, guards: list[Passed], courses: list[Course], met: Flag, corrections: int
 ) -> First:
-    """The first event of a step.
+    """Return the first event of a step.
 
-    **Arguments:** `guards` and `courses`, what is known of the events and of each coordinate, not
-    both empty; `met`, whether the step landed where it was aimed; `corrections` of a root: a
-    motion's own polynomial is worth them, one through a step's ends only says where to aim.
+    **Arguments:** `guards` and `courses`, of the events and of each coordinate, not both empty;
+    `met`, whether the step landed on its target; `corrections`, how often a root is corrected.
+    A quintic through a step's ends needs none, since its root is only the next target.
     """
     found, crossed, any_turn = [], jnp.zeros_like(met), jnp.zeros_like(met)
     for guard, over, curve in guards:
-        # The chord tells well enough which event is the first: a landing that lies beyond another
-        # one is not accepted.
+        # The chord is accurate enough to find the first event: a landing that lies beyond another
+        # event is not accepted.
         begin, end = guard.begin.x, guard.end.x
-        # One that a step without length is beyond is met where it begins.
+        # An event that lies behind a step of length zero is met at its begin.
         rise = jnp.where(end > begin, end - begin, 1.0)
         place = jnp.where(over, jnp.maximum(-begin, 0.0) / rise, jnp.inf)
         if guard.above is not None:  # before any turn
@@ -277,10 +277,10 @@ def first_event(
 
     for k, (turned, _) in enumerate(courses):
         facing = tuple(-lane.direction[k] * c for c in slope(paths[k]))
-        # The motion turned within the step. Unless it went through a stop before, that comes
-        # first: what lies beyond the turn is met from there.
+        # The motion turned within the step. Unless it went through a stop before, that comes first:
+        # events beyond the turn are met by the next steps.
         turned, place = turned & ~_ran_into_stop(plan, lane, guards, k), -1.0
-        if len(courses) > 1:  # of their turns that matter the earliest comes first
+        if len(courses) > 1:  # of the turns that matter the earliest comes first
             theta, known = _root(facing, corrections)
             turned, place = that_matter(k, turned, theta, known), theta - 2
         found.append((jnp.where(turned, place, jnp.inf), to_turn_of(k), facing, None))
@@ -295,11 +295,11 @@ def first_event(
 
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
-    """Of what a step met the earliest: its target, the curve that rises through zero there, and
-    whether that is where the step begins (`None` if it cannot be).
+    """Return the earliest event of a step: its target, the curve that rises through zero there, and
+    whether it lies at the begin of the step (`None` if it cannot).
 
-    **Arguments:** `found`, of each of these before the three its place: infinite if it was not met,
-    below zero if it comes before any event.
+    **Arguments:** `found`, for each event its place, then these three. The place is infinite if the
+    event was not met, and negative if it comes before any other.
     """
     (soonest, target, curve, at_once), *others = found
     target = jnp.full_like(lane.s, target)
@@ -323,9 +323,9 @@ def _ran_into_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Flag
 
 
 def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
-    """Where a curve first rises through zero; and, where the root was corrected, whether it is
-    known well enough: by what was left before the last correction, beside the curve at its ends."""
-    # The low orders lead near the root; what is left is a correction.
+    """Return the place where a curve first rises through zero. If it was corrected, also return
+    whether the value before the last correction was small relative to the curve's ends."""
+    # The low orders dominate near the root; the rest is a correction.
     theta, value = rising_root(stop_gradient(curve[:7])), jnp.zeros_like(curve[0])
     if not corrections:
         return theta, None
@@ -339,8 +339,8 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
 
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
-    """Whether a step of length h may have to end at a turning point of coordinate number k: by a
-    bound, before the place of the turn is known."""
+    """Return whether a step of length h may have to end at a turning point of coordinate number k.
+    It is a bound that does not need the place of the turn."""
 
     def bound(stop: RigidStop) -> Scalar:
         gap = stop_gradient(stop.gap)
@@ -352,9 +352,8 @@ def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scal
 def _has_to_be_met(
     plan: Plan, lane: Lane, k: int, depth: Callable[[RigidStop], Scalar], margin: float
 ) -> Flag:
-    """Whether a step has to end at a turning point of coordinate number k: at each one (see
-    `Plan.meets_turns`), or at one that is `depth` beyond a stop, or short of it by less than
-    `margin`."""
+    """Return whether a step has to end at a turning point of coordinate number k: at each one (see
+    `Plan.meets_turns`), or if its `depth` beyond a stop is greater than -`margin`, in extents."""
     close = plan.meets_turns(lane.done)
     if plan.meets_every_turn:
         return close
@@ -365,9 +364,9 @@ def _has_to_be_met(
 
 
 def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
-    """The lane with its next step cut at the first event of `motion`, of a method that knows it
-    before it takes a step (`Taylor`): at stops and a clock in the state. `aim_at` finds other
-    events."""
+    """Return the lane with its next step cut at the first event of `motion`, for a method that
+    computes it before the step (`Taylor`). It finds stops, turning points and a clock in the state;
+    `aim_at` finds other events."""
     limit = stop_gradient(jnp.asarray(plan.method.longest(plan.machine, lane.s, lane.state)))
     h = jnp.minimum(lane.attempt, motion.reach(limit))
     if plan.ticks(lane.state):
@@ -395,7 +394,7 @@ def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
 def _foreseen(
     plan: Plan, lane: Lane, motion: Foreseen, h: Scalar
 ) -> tuple[list[Passed], list[Course]]:
-    """What `first_event` asks about a step of length h along `motion`."""
+    """Return the arguments of `first_event` for a step of length h along `motion`."""
     machine, courses, ends, paths = plan.machine, [], [], []
     if plan.motion or stops_of(machine):
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
@@ -426,15 +425,15 @@ def _foreseen(
 
 
 def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, Scalar, Scalar]:
-    """Whether a tried step has to be shortened to end at an event, to what length, and its target
-    (see `Lane.target`). If the motion is `foreseen`, `aim_ahead` has looked before."""
-    # What is found out here is only where to look.
+    """Return whether a tried step has to be shortened to end at an event, to what length, and its
+    target (see `Lane.target`). If the motion is `foreseen`, `aim_ahead` has found its turns."""
+    # The result only directs the search, so that it needs no derivatives.
     trial = trial._replace(h=stop_gradient(trial.h), paths=stop_gradient(trial.paths))
     nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:
         return nothing
     seen = _seen(plan, lane, trial)
-    # Rare: skipped where no lane of a group has met anything.
+    # Rare: skipped if no lane of a group has met anything.
     return jax.lax.cond(
         _met_something(plan, lane, trial, seen, foreseen),
         lambda _: _aimed(plan, lane, trial, seen),
@@ -444,27 +443,27 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
 
 
 def at_a_turn(trial: Trial) -> Flag:
-    """Whether the step met a turning point that it was aimed at."""
+    """Return whether the step met a turning point that was its target."""
     return any_of(trial.good, (path.at_turn for path in trial.paths))
 
 
 class _Seen(NamedTuple):
-    """What both ends of a tried step say of the events between them."""
+    """The events between the ends of a tried step, as found from its ends and stages."""
 
     guards: list[Passed]
     courses: list[Course]
-    """Both as `first_event` asks for them: quintics through the step's ends."""
+    """Both are arguments of `first_event`: quintics through the step's ends."""
     humps: list[tuple[Flag, Scalar]]
-    """Of the guards that hold a mode, where they may have been positive in between."""
+    """For each guard that holds a mode, whether and where it may have been positive between."""
     rises: list[tuple[Flag, Scalar]]
-    """Of those that were evaluated at stages, and of the forces on bodies that rest, likewise,
-    also before what was landed upon."""
+    """The same for guards that were evaluated at stages and for forces on resting bodies, also
+    before an event on which the step landed."""
     twice: Flag
-    """A motion may have turned twice."""
+    """True if a motion may have turned twice."""
 
 
 def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: bool) -> Flag:
-    """Whether a step may have met anything; if not, `_aimed` need not be evaluated."""
+    """Return whether a step may have met anything; if not, `_aimed` need not be evaluated."""
     if any(path.leaves is not None for path in trial.paths):
         anything = jnp.ones_like(trial.good)
         return anything if trial.clear is None else ~trial.clear
@@ -480,17 +479,17 @@ def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: 
 
 
 class _Goal(NamedTuple):
-    """Where the next step ends."""
+    """The end of the next step."""
 
     event: Flag
-    """At an event that was met."""
+    """True if it is at an event that was met."""
     before: Flag
-    """At a turning point, or where something may have happened twice: before any event."""
+    """True at a turning point, or if something may have happened twice: before any event."""
     length: Scalar
     target: Scalar
 
     def cut(self, when: Flag, length: Scalar) -> "_Goal":
-        """At this length where `when` holds, whatever may be met there."""
+        """Return the goal at this length where `when` is true, without a target."""
         return _Goal(
             self.event & ~when,
             self.before | when,
@@ -500,7 +499,7 @@ class _Goal(NamedTuple):
 
 
 def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Scalar, Scalar]:
-    """What `aim_at` returns for a step that may have met something."""
+    """Return the result of `aim_at` for a step that may have met something."""
     h, landed = trial.h, any_of(trial.good, (c.landed for c in trial.crossings))
     first = first_event(plan, lane, seen.guards, seen.courses, landed, corrections=0)
     met = landed | at_a_turn(trial)
@@ -512,7 +511,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
     goal = goal.cut(seen.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
         if path.surge is not None:
-            # What the step met may not have been the first: look at the turn of the force before.
+            # An event may have come before the one that was met: step to the force's extremum.
             hidden, place = force_may_turn(lane, k, path, h)
             goal = goal.cut(trial.good & hidden & ~met, place)
         if path.leaves is not None:
@@ -529,7 +528,6 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
 
 
 def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
-    """What both ends of a tried step say of the events between them."""
     h, good, guards, courses, humps = trial.h, trial.good, [], [], []
     sides, below = [], []
     for c in trial.crossings:
@@ -552,9 +550,9 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not exactly:
-            # One that is closer than the clock can tell, as of a body that a rounded difference
-            # has all but stopped, has nothing before it that could be stepped to. Nor is it one if
-            # all that moves is rounding, as between bodies that go on together.
+            # A turn that is closer than the clock resolves, as of a body that a rounded difference
+            # has almost stopped, has nothing before it to step to. Nor does it count if all that
+            # moves is rounding, as between bodies that move together.
             now = 4 * eps * (plan.unit + stop_gradient(trial.s))
             moves = jnp.abs(end.v) * h > eps * (plan.extent(k) + jnp.abs(end.x))
             turned = turned & (jnp.abs(to_turn(end)) > now) & moves
@@ -568,7 +566,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
-    """The goal, where Newton's step is better than a root of the quintic: close to it."""
+    """Return the goal with lengths by Newton's method, which is better close to an event."""
     turns, h = goal.before, trial.h
     for k, path in enumerate(trial.paths):
         shift, turn = to_turn(path.end), to_turn_of(k)

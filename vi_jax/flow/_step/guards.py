@@ -1,9 +1,9 @@
-"""The events of a machine as a step sees them, by its ends and by its stages.
+"""The guards of a machine's events at the ends and the stages of a step.
 
-The error of a step is that of its state. A guard that is another function of the state and of `s`
-is no part of it: the force that holds a body at rest, the pull on a body that sticks, the distance
-from a curved stop, a threshold that moves. These guards are evaluated at the stages as well. Their
-integral over the step counts in its error, and `aim.crests` tells where they may be positive.
+The error of a step is that of its state. It does not include guards that are other functions of the
+state and of `s`: the force that holds a body at rest, the pull on a body that sticks, the distance
+from a curved stop, a threshold that moves. These guards are evaluated at the stages as well. The
+error of their integral over the step is added, and `aim.crests` finds where they may be positive.
 """
 
 import functools
@@ -35,45 +35,44 @@ from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
 from ..smooth import SmoothMachine, exact, is_affine, limited_of
 
-# Of a motion known beforehand, where guards are evaluated within a step, as shares of it.
+# Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
 
-# Stages that are closer to each other than this share of a step show the same. A choice.
+# One of several stages closer together than this share of a step is used. A choice.
 _APART = 0.08
 
 
 class Within(NamedTuple):
-    """Guards at the stages of a step: of each an array with a value for each stage."""
+    """Guards at the stages of a step; each array has a value for each stage."""
 
     forces: dict[int, Array]
-    """By coordinate, the force that pulls a body at rest away from its stop; negative while it is
-    pressed on. Of a body that is free and slow its velocity, positive once it has turned; -1 of a
-    faster one."""
+    """For each coordinate: at rest, the force that pulls the body away from its stop, negative
+    while it is pressed on; if the body is free and slow, its velocity, positive once it has turned;
+    else -1."""
     events: dict[int, tuple[Array, ...]]
-    """By event, the values of each side of its guard (see `AbstractEvent.sides`)."""
+    """For each event, the values of each side of its guard (see `AbstractEvent.sides`)."""
     slow: dict[int, Flag]
-    """By coordinate, whether it is so slow, and so close to a stop, that it may turn twice within
-    the step and touch in between."""
+    """For each coordinate, true if it is so slow, and so close to a stop, that it may turn twice
+    within the step and touch the stop in between."""
     slack: dict[int, Scalar]
-    """What rounding leaves of the forces."""
+    """Bounds of the rounding errors of the forces."""
     error: Scalar | None = None
     """The largest error of the forces, relative to the tolerance."""
 
     def only(self, places: list[int]) -> "Within":
-        """The values at some of the stages."""
         kept = self.forces, self.events
         forces, events = jtu.tree_map(lambda x: x[np.asarray(places)], kept)
         return self._replace(forces=forces, events=events)
 
 
 def looks_within(plan: Plan, state: State) -> bool:
-    """Whether there are guards to be evaluated at stages; static."""
+    """Return whether some guards have to be evaluated at stages; known at trace time."""
     return plan.rests or bool(events_looked_at(plan, state))
 
 
 def events_looked_at(plan: Plan, state: State) -> list[int]:
-    """The numbers of the events whose guards are evaluated at stages: not those of stops on
-    coordinates that are known as well as the state."""
+    """Return the numbers of the events whose guards are evaluated at stages: not those of stops on
+    coordinates that are as accurate as the state."""
     machine, events, stops = plan.machine, events_of(plan.machine), []
     if not exact(machine, state):
         known = [is_affine(x.position, state) for x in machine.coordinates]
@@ -86,7 +85,7 @@ def guards_error(
     plan: Plan, seen: Within, stages: list[Stage], h: Scalar, longest: Scalar
 ) -> Scalar | None:
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
-    `None` without guards, or of a method that estimates none."""
+    `None` without guards, or for a method without an estimate."""
     events, errors = events_of(plan.machine), [seen.error]
     for number, sides in seen.events.items():
         acts = events[number].holds_mode
@@ -112,9 +111,9 @@ def within(
 ) -> Within:  # fmt: skip
     """Return the guards at the stages of a step.
 
-    **Arguments:** `alone`, of each coordinate the machine with the other bodies held that rest;
-    `ends`, its rates at both ends; `at(share)`, the state at a share of the step, asked for where
-    the stages have none; `longest`, the length of the longest step.
+    **Arguments:** `alone`, for each coordinate the machine with its body free and the others held
+    if they rest; `ends`, its rates at both ends; `at(share)`, returns the state at a share of the
+    step, for stages without a state; `longest`, the length of the longest step.
     """
     if not stages:
         return Within({}, {}, {}, {})
@@ -180,9 +179,9 @@ def within(
 
 
 def for_each(function: Callable[..., Any], given: tuple) -> Any:
-    """Constant values of a function for each of some arguments, stacked along their first axis. On
-    a CPU a loop, which is compiled once. On a GPU each turn of a loop starts kernels of its own,
-    and `vmap` took 0.7 of its time (H200, 100,000 lanes)."""
+    """Return the values of a function, as constants, for each row of its arguments, stacked along
+    the first axis. A CPU runs a loop, which compiles the function once. On a GPU each pass of a
+    loop starts kernels, and `vmap` took 0.7 of its time (H200, 100,000 lanes)."""
     if jax.default_backend() != "cpu":
         return jax.vmap(lambda x: stop_gradient(function(*x)))(given)
     return jax.lax.scan(lambda c, x: (c, stop_gradient(function(*x))), None, given)[1]
@@ -192,11 +191,11 @@ def may_be_above(
     begin: Sequence[Scalar], end: Sequence[Scalar], inner: Array, shares: Sequence[float],
     zero: Scalar | float,
 ) -> Flag:  # fmt: skip
-    """Whether a function may be above `zero` within a step, at a glance: by value and slope at both
-    ends, and its values at stages.
+    """Return whether a function may exceed `zero` within a step, by a quick test of value and slope
+    at both ends, and of its values at stages.
 
-    The top of a parabola between two places is above both by at most an eighth of what it falls to
-    the next place; half of that is granted here. Where the function falls at the begin of the step,
+    The top of a parabola between two places exceeds both by at most an eighth of its fall to the
+    next place; a half of that fall is allowed here. If the function falls at the begin of the step,
     or rises at its end, it has no top there.
     """
     (x0, v0), (x1, v1) = begin, end
@@ -207,9 +206,9 @@ def may_be_above(
 
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:
-    """Whether a body may turn twice within a step and touch a stop in between, as one that has just
-    left it: slow where the step begins, going the same way where it ends, and as close to the stop
-    at both as it may get in this time."""
+    """Return whether a body may turn twice within a step and touch a stop in between, like one that
+    has just left it: it is slow at the begin of the step, moves the same way at the end, and at
+    both could get to the stop in this time."""
     begin, end = ends
     slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
     stops = [stop for stop in stops_of(plan.machine) if stop.coordinate == k]
@@ -217,13 +216,13 @@ def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scala
 
 
 def _reaches(stop: RigidStop, here: Rates, h: Scalar) -> Flag:
-    """Whether a body may get to a stop in the time h, before or after, if its acceleration stays
-    that large."""
+    """Return whether a body may get to a stop within the time h, before or after, with this
+    acceleration."""
     return -stop.beyond(here.x) <= (jnp.abs(here.v) + 0.5 * jnp.abs(here.a) * h) * h
 
 
 def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -> Scalar:
-    """How far a coordinate is beyond one of its stops; -1 of one that rests."""
+    """Return the distance of a coordinate beyond one of its stops; -1 at rest."""
     stop = stops_of(machine)[number]
     beyond = stop.beyond(machine.coordinates[stop.coordinate].position(state))
     if lane.contact is None:
@@ -231,15 +230,14 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
     return jnp.where(lane.contact[stop.coordinate] > 0, -1.0, beyond)
 
 
-# Newton's method on a smooth flow needs two or three aims. Where rounding keeps it from gaining
-# more, a lane that has aimed this often (a choice) accepts a thousand times the tolerance.
+# Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
+# a lane with this many attempts (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
-# A guard has jumped above zero by more than this (a choice), which is more than rounding leaves of
-# one that was met.
+# A guard above this (a choice) has jumped: it is more than the rounding error at an event.
 JUMPED = 1e-9
 
-# The place of a jump within a step is looked for down to this length (in s): a choice.
+# The place of a jump within a step is bisected to this length (in s): a choice.
 _SUDDEN = 1e-12
 
 
@@ -251,45 +249,45 @@ class Side(NamedTuple):
     within: Array
     """The value at each stage."""
     slack: Scalar | float = 0.0
-    """What counts as zero."""
+    """Values up to this count as zero."""
     asked: Flag | None = None
-    """Where it is a constant below zero if not, whether it is asked for."""
+    """True if the function is used; else it is a constant below zero. `None`: always used."""
 
 
 class Crossing(NamedTuple):
-    """An event g = 0 seen by a step: g at both ends, and how a step aimed at it landed."""
+    """An event g = 0 in a step: g at both ends, and how a step aimed at it landed."""
 
     event: AbstractEvent
     number: int
-    """Its place among the machine's events."""
+    """Its index among the machine's events."""
     begin: Rates
     end: Rates
     scale: Scalar
-    """Of g, for its rounding."""
+    """The size of g, for its rounding."""
     coordinate: int | None = None
-    """That it limits, as stops do."""
+    """The coordinate that a stop limits."""
     slack: Scalar | None = None
-    """By so much, which is rounding's, a step may begin or end beyond it; `None` where places on it
+    """A step may begin or end beyond the event by this rounding error; `None` if positions on it
     are exact."""
     above: Flag | None = None
-    """The guard has jumped above zero as the step begins, with the clock as a cycle begins anew,
-    say; `None` for a stop."""
+    """True if the guard has jumped above zero at the begin of the step, for example with the clock
+    of a new cycle; `None` for a stop."""
     offset: Any = None
-    """δ to the event from the step's end, where it was tried."""
+    """δ from the step's end to the event."""
     landed: Any = None
     near: Any = None
-    """The step ended there, whatever it was aimed at."""
+    """The step ended at the event, independent of its target."""
     again: Any = None
-    """The step was aimed at it and has to be corrected by δ."""
+    """The step was aimed at the event and has to be corrected by δ."""
     sudden: Any = None
-    """The guard jumped above zero there; its place says nothing of when; `None` where none can."""
+    """True if the guard jumped above zero there; its slope does not locate a jump; or `None`."""
     sides: tuple[Side, ...] = ()
-    """The smooth functions of which the greatest is g, where they were evaluated at stages."""
+    """The smooth functions whose maximum is g, if they were evaluated at stages."""
 
     @property
     def at_once(self) -> Flag | None:
-        """Whether the step begins at rest on its surface, on its way through, or above it; `None`
-        where nothing is on it but exactly."""
+        """True if the step begins on the event's surface at rest and about to cross it, or above
+        it; `None` if steps begin on it exactly."""
         x, v, a = stop_gradient(self.begin)
         if self.slack is None:
             return None
@@ -301,18 +299,18 @@ def crossings(
     plan: Plan, lane: Lane, holding: SmoothMachine, paths: list[Any], there: tuple,
     ends: tuple[Flag, Flag], seen: Within,
 ) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
-    """The events that a step saw, and `Lane.below` at its end.
+    """Return the events in a step, and `Lane.below` at its end.
 
-    **Arguments:** `holding`, the machine as the step saw it; `paths`, what it saw of each
-    coordinate; `there`, s at its end, its length and the state; `ends`, whether it was good, and
-    ends an interval; `seen`, guards at the stages.
+    **Arguments:** `holding`, the machine during the step; `paths`, the path of each coordinate;
+    `there`, s at its end, its length and the state; `ends`, whether the step was good, and ends an
+    interval; `seen`, guards at the stages.
     """
     machine, (s1, h, new), (good, last) = plan.machine, there, ends
     others, below = _others(plan, lane, holding, (s1, new), seen)
     stops = at_stops(plan, [(path.begin, path.end) for path in paths])
     guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
-    # The stops of one coordinate and a clock are never met together but on a section, where a step
-    # ends; other events can be.
+    # The stops of one coordinate and a clock coincide only on a section, where a step ends; other
+    # events may coincide.
     if plan.others(lane.state) or not exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
@@ -321,19 +319,19 @@ def crossings(
 
 
 def _jumped(guard: Crossing) -> Crossing:
-    """The event, with whether its guard has jumped above zero as the step begins: by more than what
+    """Set `above` of an event: its guard is above zero at the begin of the step, by more than
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
     return guard._replace(above=x > JUMPED * jnp.abs(x) + guard_rounding(guard.scale))
 
 
 def guard_rounding(scale: Scalar) -> Scalar:
-    """What a search's step leaves of a guard of this size that is zero."""
+    """Return the rounding error of a guard of this size at its zero after a search."""
     return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
-    """The stops as a step sees them, from the rates of each coordinate where it begins and ends."""
+    """Return the stops in a step, from the rates of each coordinate at its begin and end."""
     found = []
     for i, stop in enumerate(stops_of(plan.machine)):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
@@ -343,8 +341,8 @@ def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
 
 
 def _with_stages(lane: Lane, c: Crossing, seen: Within) -> Crossing:
-    """A stop with its distance at the stages, where that was evaluated; at -1 while its body
-    rests on it."""
+    """Return a stop with its distance at the stages, if that was evaluated; -1 while its body rests
+    on it."""
     if c.number not in seen.events:
         return c
     begin, end, (values,) = c.begin, c.end, seen.events[c.number]
@@ -357,8 +355,8 @@ def _with_stages(lane: Lane, c: Crossing, seen: Within) -> Crossing:
 def _others(
     plan: Plan, lane: Lane, moving: SmoothMachine, there: tuple[Scalar, State], seen: Within
 ) -> tuple[list[Crossing], Scalars]:
-    """The events besides stops as a step sees them, with that of a clock in the state, which counts
-    the cycles; and `Lane.below` at the step's end, `there`."""
+    """Return the events in a step other than stops, including the end of a cycle by a clock in the
+    state; and `Lane.below` at the step's end, `there`."""
     machine, found, below = plan.machine, [], []
     numbers, around = plan.others(lane.state), (lane.modes, lane.contact or ())
     clocked = clock_of(machine, lane.state) is not None
@@ -366,7 +364,7 @@ def _others(
         return [], ()
 
     def guards(s: Scalar, x: State) -> list[list[Scalar]]:
-        """Of each event its guard, or the sides of it, and how far the clock is beyond its end."""
+        """Return for each event its guard, or its sides; and the clock relative to its end."""
         values = [
             sides_of(machine, i, s, x, *around)
             if len(seen.events.get(i, ())) > 1
@@ -377,7 +375,7 @@ def _others(
             values.append([clock - plan.end(lane.part)])
         return [[jnp.asarray(each) for each in of_one] for of_one in values]
 
-    # All at once, so that the field along which they change is written once.
+    # All in one call, so that the field along which they change is compiled once.
     begins, arrives = (
         jax.tree.map(Rates, *guard_rates(moving.field, guards, *place))
         for place in ((lane.s, lane.state), there)
@@ -398,7 +396,7 @@ def _others(
         if event.holds_mode:
             sides = [side._replace(begin=_falling(plan, side.begin, scale)) for side in sides]
         begin, end = sides[0].begin, sides[0].end
-        for side in sides[1:]:  # that which is the guard where the step ends
+        for side in sides[1:]:  # the side that is the guard at the step's end
             greater = stop_gradient(side.end.x > end.x)
             begin, end = select(greater, (side.begin, side.end), (begin, end))
         crossing = Crossing(event, number, begin, end, scale)
@@ -411,9 +409,9 @@ def _others(
 
 
 def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
-    """The rates of a guard where a step begins, without a rise that is rounding's: behind an event
-    that has just been landed upon the guard may be zero with its slope, as the velocity of a body
-    that begins to slip, and it is the second derivative by which it falls."""
+    """Return the rates of a guard at the begin of a step, without a rise by rounding. After an
+    event the guard and its slope may both be zero, as the velocity of a body that begins to slip;
+    its second derivative then makes it fall."""
     x, v, a = stop_gradient(begin)
     near = jnp.abs(x) <= 4 * float(jnp.finfo(x.dtype).eps) * scale
     risen = near & (v > 0) & (2 * v <= -plan.in_units(landing_tolerance(x)) * a)
@@ -421,13 +419,13 @@ def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
 
 
 def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
-    """Whether a guard counts that does so only once it has been below zero, and `Lane.below` at the
-    step's end. One that begins at zero and falls counts."""
-    # On it is also what a search's step left so close to it: a cycle is no shorter.
+    """Return whether a guard that must have been negative counts now, and `Lane.below` at the
+    step's end. A guard that begins at zero and falls counts."""
+    # The end of a search, so close to the surface, is on it too: a cycle is no shorter.
     rounding = guard_rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
-    # Where the motion has begun on it, which is behind it, rounding may be all that falls.
+    # If the motion began on the surface, which is then behind it, rounding may be all that falls.
     deep = here.v * here.v > 2 * rounding * jnp.maximum(here.a, 0.0)
     falls = falls & ((below == 0) | deep)
     armed = (below > 0) | (here.x < -rounding) | falls
@@ -435,14 +433,14 @@ def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple
 
 
 def _if_armed(armed: Flag, r: Rates) -> Rates:
-    """The rates of a guard that counts; of one that does not, those of a constant -1."""
+    """Return the rates of a guard that counts; else those of a constant -1."""
     return Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
 
 
 def beyond(event: Crossing) -> Flag:
-    """Whether a step ends beyond an event. One that begins there to rounding, after the event
-    before, and still falls has not met it: it may end at once, at a turning point. Nor has one that
-    stays there to rounding, as of bodies that touch at rest."""
+    """Return whether a step ends beyond an event. It does not if it begins there, to rounding, and
+    the guard falls at both ends: it may end at once, at a turning point. Nor does it if it stays
+    there to rounding, like bodies that touch at rest."""
     begin, end = event.begin, event.end
     if event.slack is None:
         return end.x > 0
@@ -454,18 +452,17 @@ def _seen(
     plan: Plan, lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing,
     all_of_them: list[Crossing],
 ) -> Crossing:  # fmt: skip
-    """The event, with whether a step that was aimed at it landed on it, or has to be aimed again. A
-    step that ends an interval (`ends`) as it meets a stop, to rounding, is aimed at it: an impact
-    on the section belongs to the cycle that ends there, so that it is not now in one, now in the
-    next."""
+    """Return the event with the result of a step aimed at it: landed, or to be aimed again. A step
+    that ends an interval (`ends`) and meets a stop there, to rounding, counts as aimed at it. An
+    impact on the section always belongs to the cycle that ends there."""
     end = guard.end
     aimed = good & (lane.target == to_event(guard.number))
     eps = float(jnp.finfo(h.dtype).eps)
     for other in all_of_them:
         if other.number == guard.number:
             continue
-        # What lies beyond another event was not reached. Events may come together, but for the
-        # stops of one coordinate: then one is met after the other.
+        # A point beyond another event was not reached. Events may coincide, except for the stops of
+        # one coordinate: then one is met after the other.
         alone = guard.coordinate is not None and guard.coordinate == other.coordinate
         if alone or other.slack is None:
             aimed = aimed & ~beyond(other)
@@ -476,15 +473,15 @@ def _seen(
             aimed, ends = aimed & reached, ends & reached
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
-    # Two ways of being there to rounding: in place along the path, or, near grazing, in position.
+    # Two tests of being on the event to rounding: along the path, or, near grazing, in position.
     close = size <= landing_tolerance(h) * leniency(plan, lane)
     there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
-    # One that is there may have no way left along a parabola: a body that is at rest on a surface.
+    # On the event a parabola may have no root: a body that is at rest on a surface.
     near = close & real | there
     landed = pin_flag(aimed & near, h)
     again = aimed & ~landed & real & (size < 0.25 * h)
-    # Where bodies touch at rest, what is left of their speed is rounding.
+    # When bodies touch at rest, their remaining speed is rounding.
     rises = end.v > 0 if guard.slack is None else end.v * lane.length > guard.slack
     again = again | ends & there & close & rises
     sudden = None
@@ -494,27 +491,27 @@ def _seen(
         )
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
-        # What Newton's method does not come to is looked for by halves.
+        # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.aims < _PATIENCE)
     return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
 def leniency(plan: Plan, lane: Lane) -> Scalar:
-    """By what factor a lane's landing tolerance is larger: after so many aims, and in its unit."""
+    """Return the factor of a lane's landing tolerance: its unit, and 1,000 after many attempts."""
     return plan.in_units(jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims)))
 
 
 def landing_tolerance(x: Scalar) -> float:
-    """Largest accepted |δ|, the distance in `s` from the step's end to the event. State and
-    derivatives are carried over it to first order (`drift.drifted`): errors are of order δ²."""
+    """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. State
+    and derivatives are carried over it to first order (`drift.drifted`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 
 def furthest_landing(x: Scalar) -> float:
-    """Largest |δ| that is believed: one near grazing, or accepted after many aims."""
+    """Return the largest trusted |δ|: near grazing, or after many attempts."""
     return max(turn_tolerance(x), 1e3 * landing_tolerance(x))
 
 
 def turn_tolerance(x: Scalar) -> float:
-    """Largest accepted offset from a turning point, whose height it enters in third order."""
+    """Return the largest accepted offset from a turning point; its height's error is cubic in it."""
     return 1e-5 if x.dtype == jnp.float64 else 1e-2

@@ -1,4 +1,4 @@
-"""A step that is tried, and what it meets on its way."""
+"""A tried step, and the events in it."""
 
 from typing import NamedTuple
 
@@ -29,36 +29,36 @@ from .guards import (
     within,
 )
 
-# After so many aims at a release in turn its place is halved: a choice, three or four are usual.
+# Attempts in a row at a release until its distance is halved: a choice, three or four are usual.
 _PATIENCE = 8.0
 
 
 class Release(NamedTuple):
-    """Where a body at rest leaves its stop."""
+    """The release of a resting body from its stop."""
 
     left: Flag
-    """It did so within the step."""
+    """True if the body left the stop within the step."""
     landed: Flag
-    """The step ended there."""
+    """True if the step ended at the release."""
     place: Scalar
-    """Length of the next step towards it."""
+    """Length of the next step towards the release."""
     offset: Scalar
-    """To it from the step's end."""
+    """Offset from the step's end to the release."""
 
 
 def release(
     plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> Release:
-    """Where coordinate number k leaves the stop that it rests on, if it does, by the rates of the
-    free coordinate at both ends of the step.
+    """Return the release of coordinate number k from its stop, if it is released, by the rates of
+    the free coordinate at both ends of the step.
 
-    It is held while it is pressed on, and leaves when the force changes sign: the acceleration that
-    a free body would have there. The drive goes on turning, with the reaction of a spring whose end
-    is held.
+    The body is held while it is pressed on. It leaves when the force changes sign: the acceleration
+    that a free body would have there. The drive goes on turning, with the reaction of a spring
+    whose end is held.
     """
     assert lane.contact is not None
-    # It is approached by steps taken from the pressed side, each a share short of where the last
-    # one says that it is, until one is so short that the force is straight over it: choices.
+    # Steps approach the release from the pressed side. Each ends a share short of the last
+    # estimate, until one is so short that the force is linear over it: choices.
     short, straight = (1e-3, 1e-5) if h.dtype == jnp.float64 else (1e-2, 1e-3)
     close, straight = plan.in_units(landing_tolerance(h)), plan.in_units(straight)
     away = plan.away(k, lane.contact[k])
@@ -70,16 +70,16 @@ def release(
     near = jnp.abs(stop_gradient(offset)) <= close
     aimed = held & (lane.target == to_release(k))
     met = rising & aimed & (h <= 2 * straight) & near
-    # A step that short was aimed at a force that is all rounding where it begins, and may be still:
-    # that of a stack let go of as one, say, whose bodies part by what comes later.
+    # At the begin of so short a step the force was all rounding, and may still be: for example that
+    # of a stack released as one, whose bodies separate by what comes later.
     landed = met | aimed & (h <= close)
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
-    # Over a force that is hardly positive, but for long, chords do not get on: half the way does.
+    # If the force is barely positive, but for long, chords do not converge: bisect.
     share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > straight, share * place, place)
-    # By rounding's measure late rather than early, when it would be pressed on again; and no step
-    # towards it is so short that it would not move on.
+    # Late rather than early by a rounding error, when it would be pressed on again; and no step
+    # towards the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
     place = jnp.maximum(place, 2 * late)
     landed, offset = pin_flag(landed, h), jnp.where(met, offset, 0.0)
@@ -87,67 +87,67 @@ def release(
 
 
 # A window of force shorter than this share of the longest step moves the body by its third power,
-# 1e-9 of what a whole step does.
+# 1e-9 of the motion in a whole step.
 _SLIVER = 1e-3
 
 
 class Path(NamedTuple):
-    """What a step shows of one coordinate."""
+    """One coordinate during a step."""
 
     begin: Rates
     end: Rates
     at_turn: Flag
-    """The step was aimed at a turning point of it, and met it."""
+    """True if the step was aimed at a turning point of the coordinate, and met it."""
     leaves: Release | None
-    """Whether and where it is released, if it can rest."""
+    """Its release, if it can rest."""
     surge: tuple[Scalar, Scalar, Scalar] | None
-    """How fast the force changes at both ends, and the shortest step that is cut at a turn of the
-    force; absent where the body cannot rest."""
+    """Rates of the force at both ends, and the length of the shortest step that is cut at an
+    extremum of the force; `None` if the body cannot rest."""
     pull: Side | None
-    """The force away from the stop that it rests on, or its velocity against its direction while
-    it is slow; absent where it cannot rest."""
+    """The force away from the stop on which the body rests, or its velocity against its direction
+    while it is slow; `None` if it cannot rest."""
 
 
 class Trial(NamedTuple):
-    """A step that was tried."""
+    """A tried step."""
 
     h: Scalar
     """The step's length in `s`."""
     s: Scalar
-    """Independent variable, state and integrals where it ends."""
+    """Independent variable, state and integrals at the step's end."""
     state: State
     integrals: Integrals
     error: Scalar
-    """Relative to the tolerance, as the method says."""
+    """Relative to the tolerance, from the method."""
     good: Flag
-    """Its end is a number, and its error small enough."""
+    """True if the end is finite, and the error small enough."""
     ends_interval: Flag
-    """Its end is that of an interval of `s`."""
+    """True if the step's end is that of an interval of `s`."""
     crossings: tuple[Crossing, ...]
-    """The machine's events as it saw them."""
+    """The machine's events in the step."""
     paths: tuple[Path, ...]
-    """What it saw of each coordinate; none where nothing asks for it."""
+    """The path of each coordinate; empty if none is needed."""
     below: Scalars
-    """As in `Lane`, at the step's end."""
+    """As `Lane.below`, at the step's end."""
     shares: tuple[float, ...]
     """The places within the step at which guards were evaluated, as shares of it; static."""
     smooth: SmoothMachine
-    """The machine as the step saw it: its bodies held where they rest."""
+    """The machine during the step: its resting bodies are held."""
     alone: tuple[SmoothMachine, ...]
-    """Of each coordinate, the machine in its modes with the other bodies held that rest."""
+    """For each coordinate, the machine with its body free and other resting bodies held."""
     clear: Flag | None
-    """Nothing can have been met within it; absent where that is never known before."""
+    """True if nothing can be met within the step; `None` if that is never known in advance."""
 
 
 class Situation(NamedTuple):
-    """A step that was tried, as its events are applied."""
+    """A tried step while its events are applied."""
 
     plan: Plan
     old: Lane
     """The lane before the step."""
     trial: Trial
     taken: Flag
-    """Whether the step is taken."""
+    """True if the step is taken."""
     flow: FlowToEvent
     """The motion from the step's end on."""
 
@@ -155,10 +155,10 @@ class Situation(NamedTuple):
 def attempt(
     plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
-    """Try the next step and see what it meets; of length zero for a lane that has ended.
+    """Try the next step and find its events. For a lane that has ended, the step has length zero.
 
-    **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with those
-    bodies held that rest; `motion`, that ahead, of a method that knows it.
+    **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with
+    resting bodies held; `motion`, the motion ahead, for a method that computes it in advance.
     """
     machine, method = plan.machine, plan.method
     free = lane.target == FREE
@@ -169,7 +169,7 @@ def attempt(
     nothing = None if clear is None else free & (h <= clear)
     s1, last = lane.s + h, jnp.zeros_like(free)
     if plan.ticks(lane.state):
-        # The margin spares a step for the last sliver that rounding leaves.
+        # The margin avoids an extra step for a remainder of rounding.
         last = free & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
         s1 = jnp.where(last, bound, s1)
     s1 = jnp.where(active, s1, lane.s)
@@ -231,8 +231,8 @@ def attempt(
 
 
 def _clear(plan: Plan, lane: Lane) -> Scalar | None:
-    """How long nothing can be met from here, in which only the end of a step counts; 0 where it is
-    not so, `None` where that is never known."""
+    """Return the time within which nothing can be met, so that only the end of a step counts; 0 if
+    something can, `None` if that is never known."""
     if plan.averages or plan.meets_every_turn:
         return None
     clear = plan.method.clear(plan.machine, lane.s, lane.state)
@@ -254,17 +254,17 @@ def _path(
     good: Flag,
     seen: Within,
 ) -> Path:
-    """What a step shows of coordinate number k.
+    """Return the path of coordinate number k during a step.
 
-    **Arguments:** `free`, the machine with this body free and the others held that rest; `smooth`,
-    that with which the step was taken; `ends`, the rates in the former at both ends; `there`, s and
-    state at its end, its length and the longest length; `good`, whether the step was; `seen`,
+    **Arguments:** `free`, the machine with this body free and other resting bodies held; `smooth`,
+    the machine during the step; `ends`, the rates in `free` at both ends; `there`, s and state at
+    the end, the step's length and the longest length; `good`, whether the step was good; `seen`,
     guards at the stages.
     """
     (begin, end), (s1, new, h, limit) = ends, there
     position = plan.machine.coordinates[k].position
     if lane.contact is not None and not exact(plan.machine, lane.state):
-        # Of a body at rest place and velocity are known better than the state tells them, where
+        # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
         rests = lane.contact[k] > 0
         place = plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x)
