@@ -1,4 +1,4 @@
-"""Where a step leads: rebounds, rest, changes of mode, and what is recorded of the way."""
+"""The end of a step: impacts, rest, changes of mode and resets, and the record of the interval."""
 
 from typing import NamedTuple
 
@@ -34,33 +34,33 @@ from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
 from .impact import is_compound, settle, stilled, strike_in_turn, strike_once
 from .trial import Release, Situation, Trial
 
-# Events of one instant that set each other off for ever happen so often each, by choice, before the
-# lane ends.
+# Each event of one instant may happen this often, by choice, before the lane ends: some trigger
+# each other for ever.
 _ROUNDS = 4
 
 
 class _Due(NamedTuple):
-    """What is still due at one instant, between two of its events."""
+    """The state of one instant between two of its events, and the events that are due."""
 
     lane: Lane
     due: Scalars
-    """Of each event that is no impact, 1 while it is still to happen."""
+    """For each event that is no impact, 1 while it is due, else 0."""
     near: Scalars
-    """Of each of those that happen from below, 1 if its guard is at zero too, and it has not
+    """For each event that happens from below, 1 if its guard is at zero too and it has not
     happened."""
 
 
 def happened(
     plan: Plan, taken: Flag, lane: Lane, due: dict[int, Flag], near: dict[int, Flag]
 ) -> Lane:
-    """The lane after those events that are no impacts, and what they set off.
+    """Return the lane after the events that are no impacts, and after all that they trigger.
 
-    Of events at one instant the first listed comes first. What a jump does to a guard decides what
-    happens next: one that it takes from below zero to above happens, and so does one that was at
-    zero as well and is not any more. An event does not set off itself.
+    Of events at one instant the first listed comes first. The jumps of guards decide which events
+    come next: an event happens if its guard jumps from below zero to above, or was near zero and
+    jumps away from it. No event triggers itself.
 
-    **Arguments:** of the events by their numbers, which are `due`, and which are `near`: their
-    guards are at zero to rounding.
+    **Arguments:** `due` and `near`, flags by the numbers of events: those that are due, and those
+    whose guards are at zero to rounding.
     """
     zero = jnp.zeros_like(lane.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
@@ -75,7 +75,7 @@ def happened(
                 left, lambda x: _next(plan, taken, tuple(due), x), lambda x: x, x
             ), None
 
-        # Not as many turns as there are to do: that has no transpose.
+        # The number of iterations is constant, since a loop of varying length has no transpose.
         end, _ = jax.lax.scan(turn, begin, None, length=_ROUNDS * len(due))
         endless = sum(end.due, start=zero) > 0
         return end.lane.ended(endless, endless, "simultaneous")
@@ -86,12 +86,11 @@ def set_off(
     plan: Plan, lane: Lane, when: Flag, before: tuple[State, Scalars],
     turns: dict[int, Flag], near: Scalars,
 ) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
-    """The lane with those guards to come from below anew (see `Lane.below`) that a jump has put on
-    their surface or beyond, and of what happened; which events the jump sets off; and what is left
-    of those near.
+    """Return the lane after a jump, the events that the jump triggers, and the remaining `near`. In
+    `Lane.below` of the lane, guards that happened, or that the jump moved to or above zero, are 0.
 
-    **Arguments:** `when` state or modes jumped; these `before`; `turns`, of each event whether it
-    was its turn; `near`, as in `_Due`.
+    **Arguments:** `when`, whether state or modes jumped; `before`, both before the jump; `turns`,
+    for each event whether it caused the jump; `near`, as in `_Due`.
     """
     (old, modes), contact, machine = before, lane.contact or (), plan.machine
     below, nearby, off = [], [], {}
@@ -109,8 +108,8 @@ def set_off(
         moved, own = jnp.abs(now - was) > slack, turns.get(number, jnp.zeros_like(when))
         rises = when & (was < -slack) & (now > slack)
         if number == section_number(machine):
-            rises = jnp.zeros_like(when)  # where a jump passes over the section no cycle ends
-        # What is left of its way to zero it goes by itself, if it still does.
+            rises = jnp.zeros_like(when)  # no cycle ends if a jump passes over the section
+        # If its guard did not jump and still rises, a near event happens by itself later.
         missed = when & (close > 0) & (moved | (rate <= 0))
         off[number] = (rises | missed) & ~own
         nearby.append(jnp.where(own | missed, 0.0, close))
@@ -119,7 +118,7 @@ def set_off(
 
 
 def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
-    """The instant after the first listed of the events that are due."""
+    """Return the instant after the first listed of the events that are due."""
     machine, lane, old = plan.machine, x.lane, x.lane.state
     modes_before, contact = lane.modes, lane.contact or ()
     none = jnp.zeros_like(taken)
@@ -168,7 +167,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
-    """The lane, ended where an event happened that ends the motion."""
+    """Return the lane, ended if an event happened that ends the motion."""
     if not event.ends:
         return lane
     outcome = code_of_outcome(outcomes_of(machine).index(event.ends))
@@ -176,8 +175,8 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
 
 
 def _comes_back(plan: Plan, i: int, lane: Lane) -> Flag | None:
-    """Whether the field behind a switch, event number i, points back at its surface, as that before
-    it did: the motion would slide along it. `None` for a kind of switch whose motion cannot."""
+    """Return whether the field behind a switch, event number i, points back at its surface, like
+    the field before it: the motion would slide along it. `None` for switches that cannot slide."""
     machine = plan.machine
     if not events_of(machine)[i].may_slide:
         return None
@@ -195,8 +194,8 @@ def _comes_back(plan: Plan, i: int, lane: Lane) -> Flag | None:
 def _turned_over(
     plan: Plan, lane: Lane, when: Flag, number: int, before: tuple[State, Scalars]
 ) -> Flag:
-    """Whether the guard of a switch has jumped above zero with state or modes, as that of friction
-    does that held a pull which is another one now: it has no place where it passes zero."""
+    """Return whether the guard of a switch has jumped above zero with state or modes, for example
+    of friction whose pull has changed. Such a guard does not pass through zero."""
     contact, (old, modes_before) = lane.contact or (), before
     was = guard_of(plan.machine, number, lane.s, old, modes_before, contact)
     now = guard_of(plan.machine, number, lane.s, lane.state, lane.modes, contact)
@@ -209,11 +208,11 @@ def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
     before: tuple[State, Scalars], resting: Scalars | None = None,
 ) -> Lane:  # fmt: skip
-    """The lane with those bodies free that were pressed on their stops before an event, and are
-    pulled away behind it: a force that jumps has no place where it passes zero.
+    """Return the lane with those bodies free that were pressed on their stops before an event, and
+    are pulled away after it: a force that jumps does not pass through zero.
 
-    **Arguments:** `when` the event happens; state and modes `before` it; what rested then
-    (`resting`), if that may be another than now.
+    **Arguments:** `when`, whether the event happens; `before`, state and modes before it;
+    `resting`, the contacts before it, if they may differ from the present ones.
     """
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
@@ -239,13 +238,13 @@ def release_pulled(
 
 
 def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
-    """The lane behind an event that `happens`, and may move the state where it `jumps`: which way
-    the motion goes on, in its modes then, and which bodies still rest. A lane whose body was put
+    """Return the lane after an event that `happens` and may change the state if it `jumps`: with
+    the directions of motion in its new modes, and the bodies that still rest. A lane with a body
     beyond a stop ends."""
     if stops_of(plan.machine) and others_of(plan.machine):
         lane = lane.ended(jumps, plan.beyond_a_stop(lane.state), "bad_reset")
         lane = lane._replace(contact=contacts_after_jump(plan, lane, jumps, old))
-    # A switch leaves velocities as they are; but of a state without them it changes the rate.
+    # A switch does not change velocities; but it changes the rate of a state without velocities.
     when = jumps if has_velocity(plan.machine, lane.state) else happens
     if others_of(plan.machine) or when is happens:
         lane = lane._replace(direction=_directions_after_event(plan, lane, when, old))
@@ -253,14 +252,14 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
 
 
 def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
-    """The lane with the directions of all coordinates, and the stops rested on, `when` its state
-    was put in place of an `old` one."""
+    """Return the lane with the directions of all coordinates and the contacts after its state
+    replaced the `old` one, if `when` is true."""
     lane = lane._replace(contact=contacts_after_jump(plan, lane, when, old))
     return lane._replace(direction=_directions_after_event(plan, lane, when, old))
 
 
 def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars | None:
-    """The stops rested on after the state was replaced: what was moved rests no longer."""
+    """Return the contacts after the state was replaced: bodies that were moved rest no longer."""
     if lane.contact is None:
         return None
     contacts = list(lane.contact)
@@ -290,7 +289,7 @@ def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> S
 
 
 def disarmed_itself(plan: Plan, lane: Lane, c: Crossing) -> Lane:
-    """With the guard of an event that was met to come from below anew."""
+    """Return the lane with `below` = 0 for an event that was met."""
     numbers = plan.from_below(lane.state)
     if c.number not in numbers:
         return lane
@@ -299,14 +298,14 @@ def disarmed_itself(plan: Plan, lane: Lane, c: Crossing) -> Lane:
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
-    """The lane after a step, with its event applied and recorded, and whether the interval is
-    complete. If the step is not `taken`, the lane stays what it was."""
+    """Return the lane after a step, with its events applied and recorded, and whether the interval
+    is complete. If the step is not `taken`, the lane is unchanged."""
     position = plan.machine.position
     arrived = lane._replace(
         s=trial.s, state=trial.state, direction=_directions_at_end(plan, lane, trial),
         below=trial.below, completed=trial.ends_interval,
     ).recording(integrals=trial.integrals)  # fmt: skip
-    # Y where the step ends, and before the state jumps there, where something may move it.
+    # Y at the step's end, and Y before the state jumps there, if an event may change it.
     here = position(trial.state)
     places = (here, here) if others_of(plan.machine) else (here,)
     flow = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
@@ -314,7 +313,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     if trial.crossings:
         leaves = [path.leaves.landed for path in trial.paths if path.leaves is not None]
         met = any_of(taken, [*(c.landed for c in trial.crossings), *leaves])
-        # Rare: skipped where no lane of a group has met anything.
+        # Rare: skipped if no lane of a group has met anything.
         arrived, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (arrived, places))
     arrived = arrived.recording(**_reached(at, places))
     assert arrived.completed is not None
@@ -347,10 +346,10 @@ def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
         if trial.paths:
             v = stop_gradient(trial.paths[k].end.v)
             turned = jnp.where(v == 0, along, jnp.sign(v))
-            # At a turn the sign of the velocity is rounding's.
+            # At a turning point the sign of the velocity is rounding.
             away = -along
             if plan.others(lane.state) or len(trial.paths) > 1:
-                # Where a turn is another event too, it may have been met before.
+                # If a turning point is also another event, it may have been met before.
                 met_before = lane.target != to_turn_of(k)
                 away = jnp.where(met_before, stop_gradient(jnp.sign(trial.paths[k].end.a)), away)
             along = jnp.where(trial.paths[k].at_turn, away, turned)
@@ -359,9 +358,9 @@ def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
 
 
 def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
-    """The lane after the event that the step landed on, and Y there and before a jump: first the
-    last part of the way, then the jump. Another event at the same instant is landed upon by the
-    next step, which has no length."""
+    """Return the lane after the event on which the step landed, and Y there and before a jump. The
+    motion first goes on to the event, then comes the jump. Another event at the same instant is met
+    by the next step, which has length zero."""
     plan, trial, flow = at.plan, at.trial, at.flow
     landed = {c.number: c.landed for c in trial.crossings}
     before = places[1:]
@@ -380,15 +379,15 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         if path.leaves is not None:
             lane = _released(at, lane, k, path.leaves)
     places = (plan.machine.position(lane.state), *before)
-    # Where a switch is met the field may have an infinite slope (Hertz's damper as it is touched),
-    # which only derivatives along with the event do not see.
+    # At a switch the field may have an infinite slope (Hertz's damper at first touch), which does
+    # not appear only if derivatives move along with the event.
     fixed = plan.ticks(lane.state) and not switches_of(plan.machine)
     return (_at_fixed_clock(at, lane) if fixed else lane), places
 
 
 def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
-    """The lane after the event that the step landed on, and all that it sets off; `at_event`, the
-    state before it."""
+    """Return the lane after the event on which the step landed, and after all that it triggers;
+    `at_event`: the state before it."""
     plan, machine, trial = at.plan, at.plan.machine, at.trial
     landed = {c.number: c.landed for c in trial.crossings}
     near = _near(at)
@@ -410,7 +409,6 @@ def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
             lane = lane._replace(state=select(c.landed, at_event, lane.state))
             here = c.landed | off[c.number] if c.number in off else c.landed
             if c.number == section_number(machine):
-                # What begins anew with a cycle does so at its end.
                 lane = disarmed_itself(plan, lane.completing(here), c)
             else:
                 due[c.number] = here
@@ -418,8 +416,8 @@ def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
 
 
 def _near(at: Situation) -> dict[int, Flag]:
-    """Of each event that happens from below, whether its guard is at zero to rounding where the
-    step landed on another event."""
+    """Return for each event that happens from below whether its guard is at zero to rounding at
+    another event on which the step landed."""
     plan, trial = at.plan, at.trial
     numbers = plan.from_below(trial.state) if others_of(plan.machine) else []
     found = {}
@@ -436,12 +434,12 @@ def _near(at: Situation) -> dict[int, Flag]:
 
 
 def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
-    """The same lane with the derivatives that it has at a fixed reading of the clock. Behind an
-    event that a parameter makes come sooner or later, s has a derivative; it is carried over to the
-    state, so that the steps to come need none by `s`."""
+    """Return the lane with its derivatives at a fixed clock. After an event whose time depends on a
+    parameter, s has a derivative. It is transferred to the state, so that later steps need no
+    derivative with respect to `s`."""
     smooth = holding(at.plan.machine, lane.modes, lane.contact)
     bound = at.plan.end(lane.part)
-    # The end of the interval may depend on what is differentiated by.
+    # The end of the interval may depend on a differentiated parameter.
     moved = jnp.where(at.trial.ends_interval, bound - stop_gradient(bound), 0.0)
     s = stop_gradient(lane.s) + moved
     moving = lane.s, lane.state, lane.record.integrals
@@ -451,7 +449,7 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
 
 
 def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
-    """The lane with coordinate number k free, where the step ended at its release."""
+    """Return the lane with coordinate number k free, if the step ended at its release."""
     plan, flow, contact = at.plan, at.flow, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
@@ -459,7 +457,7 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.drifted(offset, moving)
     if not exact(plan.machine, state):
-        # While they were held their places were kept to the method's error.
+        # While held, their positions were accurate to the method's error only.
         limited = limited_of(plan.machine)
         walls = {i: contact[i] for i in limited}
         put, _ = stilled(plan, lane.s, state, {i: walls[i] > 0 for i in limited}, walls)
@@ -477,24 +475,24 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
 
 
 def _offset(at: Situation, c: Crossing) -> Scalar:
-    """How far in s an event is from the step's end, with the derivatives of the time at which it is
-    met; 0 in value where the step landed on another."""
+    """Return the offset in s from the step's end to an event, with the derivatives of the event's
+    time; its value is 0 if the step landed on another event."""
     plan, trial, flow = at.plan, at.trial, at.flow
-    # Of a motion so flat that the event's place is known worse than its surface, it is here.
+    # In a motion so flat that the event's place is less certain than its surface, it is here.
     near = c.landed & (jnp.abs(c.offset) <= plan.in_units(furthest_landing(trial.h)))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
     if plan.ticks(trial.state):
-        # Met on the section it is not beyond it.
+        # An event on the section is not beyond it.
         beyond = trial.s + offset - plan.end(at.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
-    # With the derivatives of what is met, which mean nothing where nothing is.
+    # These derivatives have no meaning if the event was not met.
     met = flow.met_after(flow.guard(c.number), offset)
     return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
 def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
-    """The lane after the rebound from the stops `landed` upon, or at rest on them; `at_event`, the
-    state before the impact."""
+    """Return the lane after the rebound from the stops in `landed`, or at rest on them; `at_event`:
+    the state before the impact."""
     plan, machine, before = at.plan, at.plan.machine, at.old
     landed = {number: landed[number] for number in range(len(stops_of(machine)))}
     strike = strike_in_turn if is_compound(machine) else strike_once
@@ -506,7 +504,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State)
         if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
             v = stop_gradient(body.velocity(lane.state))
             direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
-        if k in blows:  # what is left of an approach is rounding
+        if k in blows:  # any remaining approach is rounding
             sign, _ = plan.wall(k, blows[k].struck)
             away = -sign
             if lane.contact is not None:
@@ -518,20 +516,19 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State)
             given = machine, lane.s, at_event, lane.state, modes
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
-        # What friction has to hold depends on who rests now.
+        # The force that friction has to hold depends on the bodies that rest now.
         new = struck_modes(machine, lane.s, lane.state, modes, contact=contact)
         modes = select(met, new, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(blows) == 1:
         return lane
-    # What rests on other stops may be let go of by it. A stop may have changed the modes already.
+    # It may release bodies on other stops. A stop may have changed the modes already.
     return release_pulled(plan, lane, at.taken, met, (at_event, before.modes), before.contact)
 
 
 def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
-    """Greatest and smallest Y so far in this interval, by the `places` where the step leads and
-    before a jump, and the smallest distance to a stop at a turning point; `None` if it is not
-    recorded."""
+    """Return the extremes of Y in this interval so far, and the smallest distance to a stop at a
+    turning point; `None` if not recorded. `places` are Y at the step's end and before a jump."""
     plan, lane, trial, taken = at.plan, at.old, at.trial, at.taken
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
@@ -552,8 +549,8 @@ def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
 
 
 def _top(trial: Trial, k: int, flow: FlowToEvent) -> Scalar:
-    """The position of coordinate number k at the turning point that the step was aimed at; else
-    where the step ends."""
+    """Return the position of coordinate number k at the turning point that was the step's target;
+    else at the step's end."""
     path = trial.paths[k]
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)

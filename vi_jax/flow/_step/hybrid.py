@@ -1,16 +1,16 @@
-"""The hybrid step: one flat loop in which every lane advances, aims or lands by itself.
+"""The hybrid step: one flat loop in which every lane advances, aims or lands independently.
 
 Each iteration tries one step of one lane:
 
-- *advance*: the step holds no event and is taken;
+- *advance*: the step contains no event and is taken;
 - *aim*: it crosses a stop (or a section of the time clock, or a turning point that matters); it is
   not taken, and the next one is shortened to end there;
-- *land*: the shortened step ends within 1e-9 of the event; the offset of a second-order expansion
-  δ = t* - t puts the state on it, and the jump is applied. Otherwise it is aimed once more.
+- *land*: the shortened step ends within 1e-9 of the event; the offset of a second-order expansion δ
+  = t* - t moves the state to it, and the jump is applied. Otherwise it is aimed once more.
 
-The length of an aimed step is a constant for differentiation, while δ carries dt*/dp, so that
-forward and reverse derivatives through an impact are exact (the saltation matrix). Behind an impact
-they are those at a fixed reading of the clock, so that the steps to come carry none of the clock's.
+The length of an aimed step is a constant for differentiation, while δ carries dt*/dp. Therefore
+forward and reverse derivatives through an impact are exact (the saltation matrix). After an impact
+they are those at a fixed clock, so that later steps need no derivative of the clock.
 """
 
 import jax
@@ -40,25 +40,25 @@ from .aim import aim_ahead, aim_at
 from .arrive import after_jump, arrive, contacts_after_jump, release_pulled
 from .trial import Trial, attempt
 
-# A lane that has aimed this often without landing is lost; after so many impacts in one interval
-# it was chattering. Both are choices: a smooth flow needs two or three aims.
+# A lane has failed after this many attempts without landing; with this many impacts in one interval
+# it was chattering. Both are choices: a smooth flow needs two or three attempts.
 _LOST, _MANY = 64.0, 16.0
 
-# Nothing that a lane could do in one interval takes so many steps; a power of two, by choice.
+# No motion needs this many steps in one interval; a power of two, by choice.
 _STUCK = 65536.0
 
-# A slip jumps where it changes by this share of itself: a choice. If it is zero to rounding, the
-# modes behind a jump are those before it.
+# A slip jumps if it changes by this share of itself: a choice. If it is zero to rounding, the modes
+# stay the same.
 _JUMPS = 1e-6
 
-# Of a cycle, a step that is long enough to tell by it whether anything moves: a choice, below the
-# step by which a motion gets away from an event that it does not meet.
+# A step of this share of a cycle is long enough to show whether anything moves: a choice, below the
+# step by which a motion leaves an event that it does not meet.
 _LONG = 5e-4
 
 
 def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
-    """One step of one lane: advance, aim or land. A lane that has ended is left as it is. Returns
-    the lane; whether an interval ended; what is recorded of that."""
+    """Take one step of one lane: advance, aim or land. A lane that has ended is unchanged. Returns
+    the lane; whether an interval ended; the record of that interval."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     smooth = holding(plan.machine, lane.modes, lane.contact)
     beside = carried(smooth, lane.s, lane.state, lane.record.integrals)
@@ -85,7 +85,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
         aims=jnp.where(aim, lane.aims + 1, 0.0),
         done=done,
         steps=lane.steps + jnp.where(active, 1.0, 0.0),
-        # Counted anew in each interval: in single precision the sum of all stands still at 2²⁴.
+        # Counted anew in each interval: in single precision the total does not increase beyond 2²⁴.
         spent=jnp.where(reached, 0.0, lane.spent + 1.0),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
@@ -97,8 +97,8 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
 
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
-    """The length of the next step that is aimed at nothing. One that was aimed at an event and fell
-    short of it is followed by one as long: so the place where a guard jumps is halved down to."""
+    """Return the length of the next step without a target. After a step that was aimed at an event
+    and fell short of it, it is at most as long: so the place where a guard jumps is bisected."""
     if not plan.others(lane.state):
         return length
     short = taken & (lane.target >= to_event(len(stops_of(plan.machine))))
@@ -109,14 +109,14 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
 
 
 def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
-    """Whether a motion has died out, to rounding, in an equilibrium that lies on the machine's
-    section: a step changes nothing, and it is twice as long on its way as a cycle is expected to
-    take. It would meet the section by accident of rounding only, or never."""
+    """Return whether a motion has died out, to rounding, in an equilibrium on the machine's
+    section. Then a step changes nothing, and the cycle lasts twice as long as expected. The motion
+    would meet the section by rounding only, or never."""
     old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, arrived.state))
     sizes = [1.0] * len(old) if plan.sizes is None else jtu.tree_leaves(plan.sizes)
     slack, cycle = 8 * float(jnp.finfo(arrived.s.dtype).eps), plan.machine.cycle
     share = jnp.ones_like(arrived.s)
-    # One that is aimed at something may be so short that nothing has time to change.
+    # A step with a target may be so short that nothing has time to change.
     still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
     for before, after, size in zip(old, new, sizes, strict=True):
         still = still & jnp.all(jnp.abs(after - before) <= slack * (size + jnp.abs(before)))
@@ -127,8 +127,8 @@ def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
 
 
 def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
-    """The lane as its next interval begins, where one was `completed`; and as its next cycle
-    begins, where that was the cycle's last. The step `reached` the end of a piece of its cycle."""
+    """Return the lane at the begin of its next interval, if one was `completed`; and of its next
+    cycle, if that was the cycle's last. The step `reached` the end of a piece of its cycle."""
     turned, part, state = reached, arrived.part, arrived.state
     if plan.instants > 1:
         part = part + jnp.where(reached, 1.0, 0.0)
@@ -149,8 +149,8 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
 
 
 def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
-    """The lane with the modes behind a jump of a slip as a cycle begins: by `renewed`, or as the
-    clock of a surface that moves begins anew."""
+    """Return the lane with its modes after a jump of a slip at the begin of a cycle: by `renewed`,
+    or since the clock of a moving surface begins anew."""
     machine, renewed = plan.machine, new.state is not old.state
     dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]
     if not any(renewed or x.slip_takes_time for x in dry):
@@ -164,27 +164,27 @@ def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
     def struck(new: Lane) -> Scalars:
         return struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
 
-    # Rare: skipped where no lane of a group has such a jump.
+    # Rare: skipped if no lane of a group has such a jump.
     return new._replace(modes=jax.lax.cond(jumps, struck, lambda new: new.modes, new))
 
 
 def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
-    """The length proposed for the next ordinary step. A step that is to be shortened to an event
-    was neither `taken` nor `rejected`."""
+    """Return the length proposed for the next ordinary step. A step that is to be shortened to an
+    event was neither `taken` nor `rejected`."""
     if not plan.method.adaptive:
         return lane.length
     h = stop_gradient(trial.h)
     factor = plan.method.resize(trial.error)
-    # Choices: 0.7 is what a step shrinks to at most where its error is too large, 0.2 where it was
-    # rejected for another reason (NaN, say). A step cut short by an event says little about how
-    # long the next may be.
+    # Choices: if its error is too large, a step shrinks at least by 0.7; if it was rejected for
+    # another reason (NaN, for example), by 0.2. A step cut short by an event says little about the
+    # length of the next.
     grown = jnp.where(h < lane.length, jnp.maximum(lane.length, h * factor), h * factor)
     shrunk = h * jnp.where(trial.error > 1, jnp.minimum(factor, 0.7), 0.2)
     return jnp.where(taken, grown, jnp.where(rejected, shrunk, lane.length))
 
 
 def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
-    """The lane behind the impulse at the end of a piece of its cycle, if that is `reached`."""
+    """Return the lane after the impulse at the end of a piece of its cycle, if it is `reached`."""
     assert plan.noise is not None
     old, since = lane, None
     if lane.last_impulse is not None:
@@ -194,30 +194,30 @@ def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lan
     where = stop_gradient((plan.cycle_of(lane.done), lane.part))
     lane = lane._replace(state=with_impulse(plan.noise, reached, *where, old.state, since))
     if _may_change_modes(plan):
-        # A body that was moved rests no longer, which friction on its stop has to know.
+        # A body that was moved does not rest any more, which affects friction on its stop.
         contact = contacts_after_jump(plan, lane, reached, old.state) or ()
         modes = struck_modes(plan.machine, lane.s, lane.state, lane.modes, contact=contact)
         lane = lane._replace(modes=select(reached, modes, old.modes))
     lane = after_jump(plan, lane, reached, old.state)
     freed = release_pulled(plan, lane, reached, reached, (old.state, old.modes))
-    return freed._replace(record=lane.record)  # where nothing is logged of impulses
+    return freed._replace(record=lane.record)  # releases by impulses are not logged
 
 
 def _may_change_modes(plan: Plan) -> bool:
-    """Whether a jump of velocities may put a switch into another mode: all but adhesive soft stops,
-    which know a body's place alone."""
+    """Return whether a jump of velocities may change the mode of a switch. It may for all but
+    adhesive soft stops, which depend on a body's position alone."""
     return any(not (isinstance(x, SoftStop) and x.adhesive) for x in switches_of(plan.machine))
 
 
 def _faults(
     plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag, new: Lane
 ) -> list[tuple[Flag, Scalar | float]]:
-    """What ends a lane, and the reason's number; the first that holds is the reason. `new` is the
-    lane after the trial."""
+    """Return conditions that end a lane, and the reasons' numbers; the first true one is the
+    reason. `new` is the lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
     many = impacts > _MANY
     if is_alive(plan.machine, trial.state) is not None:
-        # A clock that breaks down makes the steps shrink to nothing.
+        # If a clock breaks down, the steps shrink to zero.
         broken = code("stalled")
     ends = [
         (impacts > plan.max_impacts, code("chatter")),

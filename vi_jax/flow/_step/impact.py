@@ -1,10 +1,9 @@
-"""The impacts of one instant: one blow on a stop, or a sequence between bodies that touch; and how
-a body comes to rest on a stop.
+"""The impacts of one instant: one impact on a stop, or a sequence between bodies that touch; and
+the transition of a body to rest on a stop.
 
-With small impact speeds and a force that presses the body on, impacts follow each other ever
-faster, their speeds a geometric series in k, and end in rest after a finite time (chatter):
-Σ 2 kⁿ V⁻/a = 2 k V⁻ / (a (1 - k)). The series is completed at once where what is left of it is
-brief.
+If a force presses the body on, small impacts follow each other ever faster. Their speeds are a
+geometric series in k, and end in rest after a finite time (chatter): Σ 2 kⁿ V⁻/a = 2 k V⁻ / (a (1 -
+k)). The series is completed at once when its remaining time is short.
 """
 
 from typing import NamedTuple
@@ -39,30 +38,30 @@ from ..results import EventKind
 from ..smooth import SmoothMachine, holding, in_modes, limited_of
 from .trial import Situation
 
-# By so many roundings a rebound may be faster than the approach: a choice, a few more than the one
-# or two that a law's own arithmetic makes.
+# Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
+# the one or two of a law's own arithmetic.
 _FASTER = 16.0
 
 
 class Blow(NamedTuple):
-    """What the impacts of one instant were to one coordinate."""
+    """The impacts of one instant on one coordinate."""
 
     struck: Scalar
     """1 + i if stop number i was struck last, 0 if none was."""
     approach: Scalar
     """The greatest speed of approach."""
     share: Scalar
-    """What is left of that speed."""
+    """The share of that speed that is left."""
 
 
 def is_compound(machine: AbstractMachine) -> bool:
-    """Whether several velocities change in an impact, across stops or along them; static."""
+    """Return whether several velocities change in an impact, across stops or along them; static."""
     return len(limited_of(machine)) > 1 or has_contact_friction(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
-    """Whether an impact leaves faster than it came, or goes on into the stop; `None` where the law
-    is one number, whose range is known."""
+    """Return whether an impact leaves faster than it came, or goes on into the stop; `None` if the
+    law is one number, whose range is checked."""
     if stop.is_one_number:
         return None
     leaves = stop_gradient(-stop.sign * rebound)
@@ -73,8 +72,8 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 def recorded(
     plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar
 ) -> Lane:
-    """The lane with an impact counted and logged, if a stop is `hit` by a step that is taken, in
-    the state `at_event`."""
+    """Return the lane with an impact counted and logged, if a stop is `hit` by a step that is
+    taken, in the state `at_event`."""
     clock, record = plan.clock(lane.s, at_event), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
@@ -89,9 +88,9 @@ def recorded(
 def strike_once(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, Blow]]:
-    """The lane after an impact, and what it was to the coordinate, by its number, where stops limit
-    one coordinate and nothing rubs. By the stops' numbers, `landed` is whether the step landed on
-    it, in the state `at_event`."""
+    """Return the lane after an impact, and its `Blow` by the coordinate's number, if stops limit
+    one coordinate and there is no contact friction. `landed`: for each stop, whether the step
+    landed on it; `at_event`: the state there."""
     machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
     blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
@@ -114,62 +113,61 @@ def strike_once(
     return lane, {k: blow}
 
 
-# Shares of the greatest speed of approach so far. Below the first a contact does not close: it is
-# rounding of the blows before. At the second the sequence is replaced by its limit, in which those
-# contacts come to rest that were struck and move no faster than `_ALIKE` times the fastest.
-# All three are choices; how many blows they take in known cases is in docs/internals/step.md.
+# Shares of the greatest speed of approach so far. Below the first a contact does not close: its
+# speed is rounding of the blows before. At the second the sequence is replaced by its limit, in
+# which those contacts come to rest that were struck and move no faster than `_ALIKE` times the
+# fastest. All three are choices; docs/internals/step.md lists the numbers of blows in known cases.
 _NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
 
-# Speeds that differ by no more than this share are the same: a choice, far above rounding.
+# Speeds whose relative difference is smaller are equal: a choice, far above rounding.
 _EQUAL = 1e-9
 
-# Contacts that share less than this of each other's velocity are struck each by itself: a choice.
+# Contacts that share less than this of each other's velocity are struck separately: a choice.
 _APART = 1e-6
 
-# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314
-# (π times the root of the ratio): this is enough for a body 1.7 million times heavier.
+# A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314 (π
+# times the root of the ratio): this is enough for a body 1.7 million times heavier.
 _ROUNDS = 4096.0
 
 
 class _Round(NamedTuple):
-    """A sequence of impacts between two of them."""
+    """A sequence of impacts, between two of them."""
 
     lane: Lane
     struck: dict[int, Scalar]
-    """By coordinate, as in `Blow`."""
+    """For each coordinate, as in `Blow`."""
     approach: dict[int, Scalar]
     most: Scalar
-    """The greatest speed of approach that there was."""
+    """The greatest speed of approach so far."""
     goes_on: Scalar
     rounds: Scalar
 
 
 class _Instant(NamedTuple):
-    """What is known of an instant before its impacts, and stays the same in all of them."""
+    """The data of an instant before its impacts; they stay the same in all of them."""
 
     plan: Plan
     taken: Flag
     s: Scalar
     met: Flag
-    """Whether any stop is landed upon."""
+    """True if the step landed on any stop."""
     at_event: State
-    """The state before."""
+    """The state before the impacts."""
     bodies: dict[int, Coordinate]
-    """The coordinates that stops limit, by their numbers, as all that follows but stops."""
+    """The coordinates that stops limit, by number, like all that follows except for stops."""
     before: dict[int, Scalar]
-    """Their velocities before."""
+    """Their velocities before the impacts."""
     gains: list[list[Scalar]]
-    """What they gain by each other's force (see `machine.contacts`)."""
+    """Their changes by each other's unit impulse (see `machine.contacts`)."""
     landed: dict[int, Flag]
     touches: dict[int, Flag]
-    """Of each stop, whether its contact is closed."""
+    """For each stop, true if its contact is closed."""
     coupled: dict[int, Flag]
-    """Whether one of those landed upon acts on it, through contacts that are closed."""
+    """For each coordinate, true if an impact acts on it, through closed contacts."""
     slow: dict[int, Scalar | float]
-    """How much of its velocity is rounding."""
+    """Bounds of the rounding errors of the velocities."""
 
     def forces(self, on: dict[int, Flag], wanted: dict[int, Scalar]) -> dict[int, Scalar]:
-        """`forces` of the machine's contacts, by coordinate."""
         found = forces(self.gains, list(on.values()), list(wanted.values()))
         return dict(zip(self.bodies, found, strict=True))
 
@@ -177,18 +175,18 @@ class _Instant(NamedTuple):
 def strike_in_turn(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, Blow]]:
-    """As `strike_once`, where stops limit several coordinates, or something rubs.
+    """Return as `strike_once`, if stops limit several coordinates, or with contact friction.
 
-    Where bodies touch, a blow on one contact brings the next one together at the same instant. The
-    contact that closes fastest is struck first, those that close equally fast together, so that
-    what is symmetrical stays so; then the next, until none closes. A sequence that gets weaker
-    without an end (several balls without restitution) goes to its limit: the contacts that are
-    still being struck come to rest against each other.
+    If bodies touch, an impact on one contact closes the next one at the same instant. The contact
+    that closes fastest is struck first; contacts that close equally fast are struck together, which
+    preserves symmetry; then the next, until none closes. A sequence that gets weaker without an end
+    (several balls without restitution) is replaced by its limit: the contacts that are still being
+    struck come to rest against each other.
     """
     instant = _before_impacts(plan, taken, lane, landed, at_event)
     zero = jnp.zeros_like(lane.s)
     nothing = dict.fromkeys(instant.bodies, zero)
-    # One that is landed upon without any speed, as of bodies let go of together, may come to rest.
+    # A contact without any speed, as between bodies released together, may come to rest.
     touched = dict(nothing)
     for number, stop in enumerate(stops_of(plan.machine)):
         k = stop.coordinate
@@ -237,13 +235,13 @@ def _before_impacts(
 def _coupled(
     plan: Plan, gains: list[list[Scalar]], touches: dict[int, Flag], landed: dict[int, Flag]
 ) -> dict[int, Flag]:
-    """Of each coordinate, whether a blow on one of those `landed` upon is felt by it through closed
-    contacts. `gains` are from `shares`; `touches` is of each stop whether its contact is closed."""
+    """Return for each coordinate whether a blow on one of those `landed` acts on it through closed
+    contacts. `gains` are from `shares`; `touches`: for each stop, whether its contact is closed."""
     closes = dict.fromkeys(landed, jnp.zeros((), bool))
     for number, stop in enumerate(stops_of(plan.machine)):
         closes[stop.coordinate] = closes[stop.coordinate] | touches[number]
     closed, coupled, size = list(closes.values()), list(landed.values()), len(landed)
-    # There and back takes each mark two contacts further, whatever their numbers.
+    # A pass in both directions carries each mark two contacts further, for any numbering.
     for _ in range(max(1, size // 2)):
         for i in (*range(size), *reversed(range(size - 1))):
             for j in range(size):
@@ -254,7 +252,7 @@ def _coupled(
 
 
 def _struck(instant: _Instant, x: _Round) -> _Round:
-    """The sequence after its next impacts: those of the contacts that close fastest."""
+    """Return the sequence after its next impacts: those of the contacts that close fastest."""
     plan, lane = instant.plan, x.lane
     stops, state = stops_of(plan.machine), lane.state
     velocities = {k: body.velocity(state) for k, body in instant.bodies.items()}
@@ -273,7 +271,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     found = jnp.zeros_like(goes_on)
     for number, hit in hits.items():
         hits[number], found = hit & ~(alone & found), found | hit
-    # In the limit what is still being struck comes to rest.
+    # In the limit the contacts that are still being struck come to rest.
     slow = {
         k: weak & (x.struck[k] > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
         for k, V in velocities.items()
@@ -299,9 +297,9 @@ def _each_by_itself(
     instant: _Instant, velocities: dict[int, Scalar], hits: dict[int, Flag],
     rebounds: dict[int, Scalar],
 ) -> Flag:  # fmt: skip
-    """Whether contacts that close equally fast are struck one after the other all the same, in
-    their order: with friction, where one would have to pull, and where laws that differ would gain
-    energy together."""
+    """Return whether contacts that close equally fast are nevertheless struck one after the other,
+    in their order: with friction, if one of them would have to pull, or if different laws would
+    gain energy together."""
     if has_contact_friction(instant.plan.machine):
         return jnp.ones((), bool)
     on = dict.fromkeys(velocities, jnp.zeros((), bool))
@@ -327,10 +325,10 @@ def _pushed_state(
     instant: _Instant, state: State, velocities: dict[int, Scalar], slow: dict[int, Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
 ) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
-    """The state after the next impacts, and by how much each coordinate's velocity was pushed.
+    """Return the state after the next impacts, and the push of each coordinate's velocity.
 
-    **Arguments:** `slow`, which coordinates come to rest; of each stop, by its number, in `hits`
-    whether it is hit, in `rebounds` the velocity after that.
+    **Arguments:** `slow`, which coordinates come to rest; for each stop, by its number, `hits`,
+    whether it is hit, and `rebounds`, the velocity after that.
     """
     machine, stops = instant.plan.machine, stops_of(instant.plan.machine)
     on, wanted, places = dict(slow), {k: -V for k, V in velocities.items()}, {}
@@ -362,9 +360,9 @@ def _pushed_state(
 
 
 def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dict[int, Scalar]:
-    """Of each stop the speed of approach, if it may be hit next; else a negative number. Two bodies
-    that meet their stops at one instant, of which neither feels the other, are two instants to
-    derivatives: only what a blow brought together, or acts on what is landed upon, takes part."""
+    """Return for each stop the speed of approach, if it may be hit next; else a negative number.
+    Impacts that coincide without acting on each other are two instants for derivatives. Therefore
+    only contacts take part that a blow changed, or that act on those of `landed`."""
     found = {}
     for number, stop in enumerate(stops_of(instant.plan.machine)):
         k = stop.coordinate
@@ -379,8 +377,8 @@ def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dic
 def _with_losses(
     instant: _Instant, lane: Lane, before: State, pushed: list[tuple[Coordinate, Scalar]]
 ) -> Lane:
-    """With the energy that the impacts have lost: the work of each force at the mean velocity of
-    its contact. A law that gains some ends the lane."""
+    """Return the lane with the energy lost in impacts: the work of each impulse at its contact's
+    mean velocity. A law that gains energy ends the lane."""
     lost, size = jnp.zeros_like(lane.s), jnp.zeros_like(lane.s)
     for body, amount in pushed:
         V, left = body.velocity(before), body.velocity(lane.state)
@@ -395,17 +393,17 @@ def _with_losses(
     return lane.ended(instant.met, wrong, "bad_impact")
 
 
-# How much of a chatter may be left when it is completed, as a share of the longest step, in double
-# and in single precision. Choices: the error is of second order, 6e-11 of that step in the former.
+# Longest remaining chatter that is completed, as a share of the longest step, in double and in
+# single precision. Choices: the error is of second order, 6e-11 of that step in double.
 _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 
-# A contact whose bodies leave each other with less than this share of the speed with which they
-# came stays closed while it is looked at what presses on it: a choice, far above rounding.
+# A contact whose bodies separate with less than this share of their speed of approach stays closed
+# while the forces on it are computed: a choice, far above rounding.
 _CLOSED = 1e-9
 
 
 def settle(at: Situation, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Lane:
-    """The lane at rest on those stops whose impacts were the last ones; `lane` is behind the
+    """Return the lane at rest on those stops whose impacts were the last ones. `lane` is after the
     impacts, `at_event` the state before them, `met` whether there were any."""
     if lane.contact is None:
         return lane
@@ -429,8 +427,8 @@ def _held(
     plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], blows: dict[int, Blow],
     waits: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
-    """The lane when the impacts that never end are over, with those bodies held that come to rest.
-    Of each coordinate `rests` is whether it does, `waits` how long it takes (in s)."""
+    """Return the lane after the infinitely many last impacts, with those bodies held that come to
+    rest. By coordinate, `rests` is whether it does, `waits` the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
@@ -440,7 +438,7 @@ def _held(
         contact = in_place(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
     walls, modes = {k: blow.struck for k, blow in blows.items()}, lane.modes
     if has_contact_friction(plan.machine):
-        # Which way a body slips is known behind its impact.
+        # The direction of slip is known after the impact.
         modes = struck_modes(plan.machine, s, state, modes, contact=contact)
         slowed, rubbed_away = _without_rebounds(plan, s, state, modes, rests, walls)
         still, lost = stilled(plan, s, slowed, rests, walls)
@@ -452,7 +450,7 @@ def _held(
     resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     later, still, passed = flow.drifted(pin(wait))
-    if len(rests) > 1:  # another body may come upon this one before its impacts are over
+    if len(rests) > 1:  # another body may reach this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
@@ -476,9 +474,9 @@ def _without_rebounds(
     plan: Plan, s: Scalar, state: State, modes: Scalars, rests: dict[int, Flag],
     walls: dict[int, Scalar],
 ) -> tuple[State, Scalar]:  # fmt: skip
-    """The state without the rebounds of those bodies that come to rest, and without the friction
-    that went with them: the weight of the hops that are left out rubs instead, while the body is
-    held. And the energy that goes with the rebounds. `modes` are those behind the impacts."""
+    """Return the state without the rebounds of bodies that come to rest, and the energy of these.
+    The friction impulse of the rebounds is left out too: during the omitted hops friction acts on
+    the held body instead. `modes` are those after the impacts."""
     machine, zero = plan.machine, jnp.zeros_like(modes[0])
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
@@ -501,8 +499,8 @@ def _without_rebounds(
 def stilled(
     plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
 ) -> tuple[State, Scalar]:
-    """The state with those coordinates put on their stops (`walls`, as in `Lane.contact`) that
-    rest, without velocity, all at once; and the energy that goes with it."""
+    """Return the state with those coordinates that rest put on their stops (`walls`, as in
+    `Lane.contact`), without velocity, all at once; and the energy lost."""
     bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
     slower, shifts = [-V for V in velocities], []
@@ -529,21 +527,21 @@ def _ends(
     plan: Plan, free: SmoothMachine, k: int, blow: Blow, speed: Scalar, lane: Lane,
     growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
-    """Whether an impact is one of the endless last ones before rest, and the time they take.
+    """Return whether an impact is one of the endless last ones before rest, and the time they take.
 
-    **Arguments:** `free`, the machine with this body free; `speed`, by s, of its rebound; `lane`,
-    at the impact; `growth`, how fast the force on the body grows, where that is known.
+    **Arguments:** `free`, the machine with this body free; `speed` of its rebound with respect to
+    s; `lane` at the impact; `growth`, the rate of the force on the body, if known.
     """
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.wall(k, blow.struck)
-    # What presses a body at rest on: with its velocity goes its damping.
+    # The force on a body at rest, which has no damping by its velocity.
     rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
     pressing = sign * rates(free.field, body.position, s, rested).a
     force = pressing * (1 - blow.share)
     ends = force > 0
     left = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
     limit = stop_gradient(jnp.asarray(plan.machine.step_limit(s, state), s.dtype))
-    # Hops no higher than rounding cannot be followed, however long they last.
+    # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     if growth is None:  # another blow of this instant may have changed it
         growth = force_rate(free, body.position, free, s, rested)
@@ -563,9 +561,9 @@ def _ends(
 def _before_it_presses(
     rebound: Scalar, pressing: Scalar, growth: Scalar
 ) -> tuple[Flag, Scalar, Scalar]:
-    """Whether a body is not pressed on yet but will be, since its force grows; then how long its
-    next hop lasts at most, and the time until it is pressed on. A hop that begins against a force
-    f, growing at the rate j, is over within 3 |f|/j + √(6 v/j)."""
+    """Return whether a body is not pressed on yet but will be, since its force grows; then an upper
+    bound of the time of its next hop, and the time until it is pressed on. A hop that begins
+    against a force f, growing at the rate j, is over within 3 |f|/j + √(6 v/j)."""
     v, pull, grows = stop_gradient((rebound, -pressing, growth))
     not_yet = (pull >= 0) & (grows > 0)
     rate = jnp.where(not_yet, grows, 1.0)
@@ -574,8 +572,8 @@ def _before_it_presses(
 
 
 def _broken(plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Scalars:
-    """`Lane.contact` without those contacts that were struck or pulled apart by the impacts;
-    `at_event` is the state before them."""
+    """Return `Lane.contact` without those contacts that the impacts struck or pulled apart;
+    `at_event`: the state before them."""
     assert lane.contact is not None
     contact = list(lane.contact)
     for k, blow in blows.items():
@@ -590,9 +588,9 @@ def _broken(plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int,
 def _together(
     plan: Plan, lane: Lane, blows: dict[int, Blow]
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
-    """Of each coordinate that was struck, whether it comes to rest, and the time that takes. What
-    presses on a body may be another one that comes to rest on it at the same instant: which of them
-    do is found by trying, those that rest being held while the others are looked at."""
+    """Return for each coordinate that was struck whether it comes to rest, and the time until then.
+    A body may be pressed on by another that comes to rest at the same instant. Therefore each is
+    tested while the others that rest so far are held, until none changes."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)
