@@ -1,4 +1,4 @@
-"""What `simulate` was asked, checked and put in the form in which the loop needs it."""
+"""Arguments of `simulate`, checked, and the plan of its loop."""
 
 import dataclasses
 import functools
@@ -62,10 +62,10 @@ _FIXED = [
 @functools.partial(jax.tree_util.register_dataclass, data_fields=_NUMBERS, meta_fields=_FIXED)
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RunOptions:
-    """The options of a run, each as `simulate` describes it, with the same default.
+    """The options of a run, with the meanings and defaults of `simulate`.
 
-    A pytree: `settle` and the numbers of `method` may be traced, so that others are not another
-    program; all else is a part of the program.
+    It is a pytree. `settle` and the numbers of `method` may be traced, so that other values do not
+    compile again. All other options are compile-time constants.
     """
 
     settle: Any = 0
@@ -79,18 +79,18 @@ class RunOptions:
     max_impacts: int = 1000
     max_steps: int | None = None
     begin: Any = None
-    """Clock of the start, where that is not on the section."""
+    """Clock of the start, if it is not on the section."""
     until: Any = None
-    """The clock at which the one cycle of the run ends; the machine's own by default. Neither is
-    for a machine whose cycles an event ends."""
+    """Clock at which the only cycle of the run ends; by default the machine's own. Neither is
+    allowed for a machine whose cycles an event ends."""
     stop: Any = None
-    """Ends a lane early, at a record point: `stop(machine, state, record, first)`, a flag, or
-    `None` where it cannot tell; `first`, whether recording begins there. A pytree."""
+    """A condition that ends a lane early, at a record point: `stop(machine, state, record, first)`
+    returns a flag, or `None` if it cannot decide; `first`: recording begins there. A pytree."""
 
     def checked(self, machine: AbstractMachine | None) -> "RunOptions":
-        """The same options once each is known to be one, with the method that they choose for the
-        machine (`None` if it is not known yet). **Raises:** `TypeError` or `ValueError` that names
-        the option."""
+        """Return the options after validation, with the method that they choose for the machine
+        (`None` if it is not known yet). **Raises:** `TypeError` or `ValueError` that names the
+        option."""
         most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
         return dataclasses.replace(
             self,
@@ -103,7 +103,7 @@ class RunOptions:
         )
 
     def check_limits(self, dtype: object) -> None:
-        """**Raises:** `ValueError` for a limit beyond which numbers of this type do not count."""
+        """**Raises:** `ValueError` for a limit above the largest count in numbers of this type."""
         for name in ("max_impacts", "max_steps"):
             value = getattr(self, name)
             if value is not None and value > largest_count(dtype):
@@ -114,15 +114,15 @@ class RunOptions:
 
 
 def largest_count(dtype: object) -> int:
-    """The number up to which floating-point numbers of this type, in which the loop counts, do."""
+    """Return the largest integer up to which floating-point numbers of this type can count."""
     return round(2 / float(jnp.finfo(dtype).eps))
 
 
 def planned(
     machine: AbstractMachine, start: State, cycles: int | Int[Array, ""], options: RunOptions
 ) -> tuple[Plan, State]:
-    """What `simulate` was asked, checked and put in the form in which the loop needs it: the plan,
-    and the start as this machine has it. **Raises:** as `simulate`."""
+    """Check the arguments of `simulate`. Returns the plan of the loop, and the start as a state of
+    this machine. **Raises:** as `simulate`."""
     machine = machine_of(machine)
     start = machine.start() if start is None else start
     check_parts(machine)
@@ -151,7 +151,7 @@ def planned(
     machine, start = of_one_type(machine, start)
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
-    quantity_names(machine, start)  # what is none is refused
+    quantity_names(machine, start)  # invalid quantities are refused
     columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -185,8 +185,8 @@ def planned(
 
 
 def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> Any:
-    """The machine's own modes of a start, as the loop needs them; `None` if it says nothing of
-    them. **Raises:** `ValueError` unless they are as many as the machine's."""
+    """Return the machine's own modes of a start as arrays; `None` if it does not contain them.
+    **Raises:** `ValueError` unless there are as many as the machine has."""
     if own is None:
         return None
     wanted = jax.eval_shape(lambda x: modes_at_start(machine, jnp.zeros((), dtype), x), start)
@@ -203,15 +203,15 @@ def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
 
 
 def machine_of(machine: Machine) -> AbstractMachine:
-    """The machine as every verb takes it, so that other numbers are not another program: each
-    number that is a `float` is an array. **Raises:** `TypeError` for anything else."""
+    """Return the machine with arrays instead of `float`s, so that other numbers do not compile
+    again. **Raises:** `TypeError` for anything else."""
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     return jtu.tree_map(strongly_typed, machine)
 
 
 def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
-    """`settle` as the loop needs it: NaN, with which no lane starts, if it is traced and no number
-    of cycles that can be counted. **Raises:** `ValueError` if it is known and cannot be counted."""
+    """Return `settle` as an array. It is NaN, with which no lane starts, if it is traced and no
+    valid number of cycles. **Raises:** `ValueError` if it is known and too large."""
     most = largest_count(dtype) // parts
     if concrete(settle) is not None:
         if settle + cycles > most:
@@ -226,15 +226,14 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
 
 
 def as_floats(machine: AbstractMachine, state: State) -> State:
-    """`state` in arrays of the one floating-point type that it and the machine ask for."""
+    """Return `state` in arrays of the common floating-point type of it and the machine."""
     dtype = _type_of(machine, state)
     return jtu.tree_map(lambda x: jnp.asarray(x, dtype), state)
 
 
 def of_one_type(machine: AbstractMachine, start: State) -> tuple[AbstractMachine, State]:
-    """Scene and start with all their floating-point numbers of one type, the widest among them;
-    numbers of a machine made before double precision was switched on are promoted, with a
-    warning."""
+    """Return machine and start with all floating-point numbers of one type, the widest among them.
+    Numbers of a machine made before double precision was enabled are promoted, with a warning."""
     dtype = _type_of(machine, start)
     for name, tree in {"machine": machine, "start": start}.items():
         found = [part for part, x in named_leaves(tree) if narrow(x)]
@@ -270,7 +269,8 @@ def _check_numbers(machine: AbstractMachine) -> None:
 
 
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
-    """**Raises:** `TypeError` for what is no state, where only the field says what one is."""
+    """**Raises:** `TypeError` for an invalid state of a machine without velocities, by evaluating
+    the field."""
     try:
         jax.eval_shape(
             lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x)), jnp.zeros(()), state
@@ -283,7 +283,7 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
 
 
 def check_leaves(argument: str, state: State) -> None:
-    """**Raises:** `ValueError` if an array in a state holds no number."""
+    """**Raises:** `ValueError` if an array in a state is empty."""
     for part, x in named_leaves(state):
         if 0 in jnp.shape(x):
             where = f"its {part}" if part else "it"
@@ -293,14 +293,14 @@ def check_leaves(argument: str, state: State) -> None:
 
 
 def check_reals(name: str, state: State) -> None:
-    """**Raises:** `TypeError` that names what is no real number in a state of any form."""
+    """**Raises:** `TypeError` that names the part of a state that is no real number."""
     for part, x in named_leaves(state):
         require_real(name, part, x)
 
 
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
-    """The shape of position and velocity in a state, `()` in one. **Raises:** `TypeError` for what
-    is no state of this machine."""
+    """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
+    `TypeError` for an invalid state of this machine."""
     check_reals(argument, state)
     try:
         shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
@@ -316,8 +316,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 
 
 def check_start(machine: AbstractMachine, start: State) -> None:
-    """Warn as `check_values` does. **Raises:** `ValueError` or `TypeError` if a concrete start
-    cannot be simulated."""
+    """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` if a concrete start cannot be
+    simulated."""
     shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(

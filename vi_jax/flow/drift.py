@@ -1,13 +1,12 @@
-"""The way from a step's end to an event close by: too short to matter, but for its derivatives.
+"""The motion from a step's end to a nearby event: negligible in value, but not in its derivatives.
 
-A step ends within 1e-9 of its event, so that in value little is left of the way. When the event
-is met, and how far the state has come then, depend on everything that came before, though: the
-derivatives of both are those of the flow and of the event's equation, and are given as such, to any
-order.
+A step ends within 1e-9 of its event, so that the remaining motion hardly changes the state. But the
+time of the event and the state there depend on all that came before. Their derivatives are those of
+the flow and of the event's equation, and are defined here, to any order.
 
-A rate is a function `(moving, fixed, rest)`: how fast `moving` changes, where `fixed` are numbers
-that derivatives may be taken by, and `rest` what has none. A guard is such a function too, and zero
-at the event.
+A rate is a function `(moving, fixed, rest)` that returns d(moving)/ds. `fixed` are numbers with
+respect to which derivatives may be taken; `rest` has no derivatives. A guard is such a function
+too, and is zero at the event.
 """
 
 from collections.abc import Callable
@@ -28,14 +27,14 @@ from .smooth import SmoothMachine, holding, rate_of_integrals
 
 
 def _numbers(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
-    """Which leaves have a tangent, and those tangents."""
+    """Return which leaves have a tangent, and those tangents."""
     slopes = jtu.tree_leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
     moves = tuple(not isinstance(x, SymbolicZero) for x in slopes)
     return moves, [x for x, m in zip(slopes, moves, strict=True) if m]
 
 
 def _along(function: Callable, at: tuple, moves: tuple[bool, ...], slopes: list) -> tuple[Any, Any]:
-    """Value and derivative of a function of trees, along those of their leaves that move."""
+    """Return value and derivative of a function of trees, along those of their leaves that move."""
     leaves, tree = jtu.tree_flatten(at)
 
     def of_moving(*changing):
@@ -56,15 +55,15 @@ def _with_zeros(tangents: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
-    """`moving` after a further `offset` of s: in value only to first order, which is enough for an
-    offset of 1e-9, but with the exact derivatives of the flow."""
+    """Return `moving` after a further `offset` of s. The value is of first order, which is accurate
+    enough for an offset of 1e-9; the derivatives are those of the exact flow."""
     return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
-    """`drifted` by an offset that is zero in value, but has derivatives: `moving` itself, with
-    those of the flow."""
+    """Return `drifted` for an offset that is zero in value, but has derivatives: `moving` itself,
+    with those of the flow."""
     return moving
 
 
@@ -74,7 +73,7 @@ def _carried_jvp(carried, rate, primals, tangents):
     slope = _with_zeros(tangents[1])
     moves, numbers = _numbers(tangents[2])
     if any(moves) or any(_numbers(tangents[1])[0]):
-        # What the derivative by the beginning becomes: it is carried along by the same flow.
+        # The same flow carries the derivative with respect to the start.
         all_move = (True,) * len(jtu.tree_leaves(moving)) + moves
 
         def both(pair, fixed_pair, rest):
@@ -97,7 +96,7 @@ unmoved.defjvp(partial(_carried_jvp, unmoved), symbolic_zeros=True)
 def met_after(
     rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
 ) -> Scalar:
-    """When the motion comes to the zero of a guard: `offset` itself, which must be that to
+    """Return the offset in s to the zero of a guard: `offset` itself, which must be accurate to
     rounding, with the derivatives of the implicit function."""
     return offset
 
@@ -133,9 +132,9 @@ def height_of_turn(
     fixed: Any,
     rest: Any,
 ) -> Scalar:
-    """The height of a turning point of `place`, which is a function like the rate: `height` itself,
-    with its derivatives, if the motion `turns` after a further `offset` of s; else with those of
-    the position in `moving`."""
+    """Return `height`, the height of a turning point of `place`, which is a function like the rate.
+    If the motion `turns` after a further `offset` of s, its derivatives are those of the turning
+    point; else those of the position in `moving`."""
     return height
 
 
@@ -167,9 +166,9 @@ height_of_turn.defjvp(_height_of_turn_jvp, symbolic_zeros=True)
 class FlowToEvent:
     """The motion close to an event, from `moving` on.
 
-    Its rate, and guards, positions and forces along it, are functions of `(moving, fixed, rest)`:
-    `moving` is s, the state, and the integrals beside it, `fixed` what may have a derivative
-    besides, `rest` the arrays that have none. They close over no number, so that JAX can
+    Its rate, and guards, positions and forces along it, are functions of `(moving, fixed, rest)`.
+    `moving` is s, the state and the integrals; `fixed` are other numbers that may have a
+    derivative; `rest` are arrays without. The functions close over no number, so that JAX can
     differentiate them again.
 
     **Arguments:** `smooth`, the machine in its modes; `part`, the index of the interval within its
@@ -180,37 +179,38 @@ class FlowToEvent:
         self._moving = moving
         self._fixed, others = eqx.partition((smooth, plan.end(part)), eqx.is_inexact_array)
         self._rest, self._static = eqx.partition(others, eqx.is_array)
-        # What the functions close over, which may have a derivative too.
+        # Numbers that the functions close over, which may have a derivative too.
         self._around: list[Any] = []
         self._pure_rate = self._pure(self._rate)
 
     def drifted(self, offset: Scalar, moving: tuple | None = None) -> Any:
-        """s, state and integrals after a further `offset`, by default from where it begins."""
+        """Return s, state and integrals after a further `offset`, by default from the begin."""
         return drifted(self._pure_rate, offset, *self._given(moving))
 
     def unmoved(self, offset: Scalar) -> Any:
-        """The same for an offset that is zero in value, but has derivatives."""
+        """Return the same for an offset that is zero in value, but has derivatives."""
         return unmoved(self._pure_rate, offset, *self._given())
 
     def met_after(self, guard: Callable, offset: Scalar) -> Scalar:
-        """`offset`, to where a guard or a force is zero, with its derivatives."""
+        """Return `offset`, to the zero of a guard or a force, with its derivatives."""
         guard = self._pure(guard)
         return met_after(self._pure_rate, guard, offset, *self._given())
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
-        """`height`, of coordinate number k, with its derivatives; see `drift.height_of_turn`."""
+        """Return `height`, of coordinate number k, with its derivatives; see
+        `drift.height_of_turn`."""
         place = self._pure(self._position_of(k))
         return height_of_turn(self._pure_rate, place, height, turns, offset, *self._given())
 
     def guard(self, number: int) -> Callable:
-        """The guard of the machine's event of this number, as a function of where the motion is."""
+        """Return the guard of the machine's event of this number, as a function of the motion."""
 
         def event(moving, fixed, rest):
             (smooth, bound), (s, state, _) = self._whole(fixed, rest), moving
             machine = smooth.machine
             clocked = clock_of(machine, state) is not None
             if clocked and number == section_number(machine):
-                return clock_of(machine, state) - bound  # which may be that of a part of a cycle
+                return clock_of(machine, state) - bound  # which may end a part of a cycle
             return guard_of(machine, number, s, state, smooth.modes, smooth.contact)
 
         return event
@@ -223,8 +223,8 @@ class FlowToEvent:
         return coordinate
 
     def force(self, k: int) -> Callable:
-        """The acceleration that coordinate number k would have if it were not held; the body is
-        released where that turns away from the stop."""
+        """Return the acceleration that coordinate number k would have if it were free; the body is
+        released when that changes sign."""
 
         def acceleration(moving, fixed, rest):
             (smooth, _), (s, state, _) = self._whole(fixed, rest), moving
@@ -245,7 +245,7 @@ class FlowToEvent:
         return eqx.combine(fixed, rest, self._static)
 
     def _pure(self, function: Callable) -> Callable:
-        # A machine may be written as a function of numbers around it.
+        # A machine's functions may close over numbers.
         written, found = jax.closure_convert(function, self._moving, self._fixed, self._rest)
         here = slice(len(self._around), len(self._around) + len(found))
         self._around.extend(found)

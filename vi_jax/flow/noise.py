@@ -1,4 +1,4 @@
-"""White noise on accelerations, as impulses at equal instants of a cycle."""
+"""White noise on accelerations, as impulses at equal intervals of a cycle."""
 
 import dataclasses
 from collections.abc import Callable
@@ -34,7 +34,8 @@ _PARITY = 0x1BD11BDA
 
 
 def threefry(key: Array, first: Array, second: Array) -> tuple[Array, Array]:
-    """Threefry-2x32 with 20 rounds: two words from a key of two words and a counter of two."""
+    """Threefry-2x32 with 20 rounds: return two words from a key of two words and a counter of
+    two."""
     keys = key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY)
     x, y = first + keys[0], second + keys[1]
     for group in range(5):
@@ -47,10 +48,10 @@ def threefry(key: Array, first: Array, second: Array) -> tuple[Array, Array]:
 
 
 def normal_pair(key: Array, first: Array, second: Array, dtype) -> tuple[Array, Array]:
-    """Two independent numbers of the standard normal distribution, by Box and Muller; at most 6.8
-    in magnitude, as each comes from 32 bits."""
+    """Return two independent standard normal numbers, by Box and Muller; at most 6.8 in magnitude,
+    as each comes from 32 bits."""
     x, y = threefry(key, first, second)
-    # In the middle of each of 2³² equal parts of (0, 1).
+    # The middle of one of 2³² equal parts of (0, 1).
     u = (x.astype(dtype) + jnp.asarray(0.5, dtype)) * jnp.asarray(2.0**-32, dtype)
     angle = y.astype(dtype) * jnp.asarray(2 * jnp.pi * 2.0**-32, dtype)
     # In single precision the sum may round up to 1.
@@ -61,41 +62,42 @@ def normal_pair(key: Array, first: Array, second: Array, dtype) -> tuple[Array, 
 class WhiteNoise(eqx.Module):
     """White noise on accelerations: dV = … dt + σ dW for the velocities that are named.
 
-    It acts as impulses. At `impulses` instants of each cycle, evenly spaced, the last at its end, a
-    velocity jumps by σ √h N(0, 1), with h the time between two instants and an independent number
-    for each instant and component. The motion between impulses has no noise, so impacts, extremes
-    and derivatives along the path hold as without it. The mean gain of energy is exact. Other
-    errors fall with h, so results from two numbers of impulses can be extrapolated.
+    It acts as impulses at `impulses` evenly spaced instants of each cycle, the last at its end. At
+    each, a velocity jumps by σ √h N(0, 1). Here h is the time between two instants, and N(0, 1) is
+    an independent number for each instant and component. The motion between impulses has no noise,
+    so impacts, extremes and derivatives along the path are computed as without noise. The mean gain
+    of energy is exact. Other errors decrease with h, so results from two numbers of impulses can be
+    extrapolated.
 
-    For machines whose cycles end with their drive's: at equal readings of the clock that counts
-    them. If these are not at equal times (a motor), h is the time since the last impulse. A machine
-    without a drive is shaken as `machine.observed_every(interval)`. Machines with resets or
-    user-defined events are refused. An impulse may free a body that rests or sticks; the logs of
-    events list no impulses.
+    It is for driven machines, whose cycles end with those of their drive. The instants are equally
+    spaced on the clock that counts the cycles. If they are not equally spaced in time (a motor), h
+    is the time since the last impulse. Use `machine.observed_every(interval)` for a machine without
+    a drive. Machines with resets or user-defined events are refused. An impulse may free a body
+    that rests or sticks; the logs of events list no impulses.
 
     States on record points are those after their impulses; `samples` of a run must divide
-    `impulses`. Each lane of a batch has another key (`jax.random.split`). A lane's numbers depend
-    on its key and the cycle and instant alone, not on the batch, the method or `samples`; cycles
-    are counted from the start, those of `settle` too. A run that continues another one takes
-    another key (`jax.random.fold_in`).
+    `impulses`. Each lane of a batch has another key (`jax.random.split`). A lane's random numbers
+    depend on its key, the cycle and the instant alone, not on the batch, the method or `samples`.
+    Cycles are counted from the start, including those of `settle`. A run that continues another one
+    needs another key (`jax.random.fold_in`).
 
     **Arguments:**
 
     - `amplitudes`: σ of each velocity by its name in the state, as `{"V": 0.5}`, in the units of
       velocity over √time. Each entry of an array gets independent numbers. A function of the state
-      gives σ just before an impulse: dV = … dt + σ(state) dW in Itô's sense. It is part of the
-      program: define it once.
-    - `impulses`: impulses in a cycle, at least 1; static.
+      returns σ just before an impulse: dV = … dt + σ(state) dW in Itô's sense. It is a compile-time
+      constant: define it once.
+    - `impulses`: number of impulses in a cycle, at least 1; static.
 
     **Raises:** `TypeError` or `ValueError` for amplitudes that are not real, not finite or
-    negative, and for other numbers of impulses.
+    negative, and for invalid numbers of impulses.
     """
 
     amplitudes: dict[str, Any]
-    """Those that are numbers."""
+    """The amplitudes that are numbers."""
     impulses: int = eqx.field(static=True)
     functions: tuple[tuple[str, Callable], ...] = eqx.field(static=True, init=False)
-    """Those that are functions of the state, by name."""
+    """The amplitudes that are functions of the state, by name."""
 
     def __init__(self, amplitudes: Any, *, impulses: Any = 64):
         if not isinstance(amplitudes, dict) or not amplitudes:
@@ -120,8 +122,8 @@ class WhiteNoise(eqx.Module):
 
 
 def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> Plan:
-    """The plan of a run with its noise. **Raises:** `TypeError` or `ValueError` as `simulate` for
-    noise, key or samples that do not fit together or do not fit the machine."""
+    """Return the plan of a run with its noise. **Raises:** `TypeError` or `ValueError` as
+    `simulate` for noise, key or samples that do not fit together or do not fit the machine."""
     machine = plan.machine
     check_noise(machine, start, noise)
     if samples and noise.impulses % samples:
@@ -140,12 +142,12 @@ def with_noise(plan: Plan, start: State, noise: Any, key: Any, samples: int) -> 
 
 
 def in_modes_of(form: Prepared, noise: Impulses, start: State) -> Impulses:
-    """The noise of a machine that is followed in its natural modes: its impulses act on the
+    """Return the noise of a machine that is simulated in its natural modes: its impulses act on the
     machine's own velocities. `start` is a state of the machine itself."""
     leaves, tree = jtu.tree_flatten(start)
 
     def matrix(i: int) -> Array:
-        """Of what the modes take over from array number i, which they are linear in."""
+        """The linear map from array number i of the state to the modes."""
         put = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
         return jax.jacfwd(lambda x: jtu.tree_leaves(form.inward(put(x)))[i])(leaves[i])
 
@@ -178,18 +180,19 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
 
 
 def _real(amplitude: Any) -> Array:
-    """What a function gives as amplitude. **Raises:** `TypeError` for what is no real number."""
+    """Return the amplitude from a function. **Raises:** `TypeError` if it is no real number."""
     require_real("noise", "amplitude by a function", amplitude)
     return jnp.asarray(amplitude)
 
 
 def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
-    """The time that every cycle takes; `None` if it is not known beforehand."""
+    """Return the duration of each cycle; `None` if it is not known in advance."""
     if has_fixed_cycle(machine, start):
         return cycle_time(machine)
     if not ticks(machine, start):
         return None
-    # The independent variable is in proportion to time if its pace needs neither it nor the state.
+    # The independent variable is proportional to time if `pace` depends neither on it nor on the
+    # state.
     zero = jnp.zeros_like(machine.position(start))
     traced = jax.make_jaxpr(machine.pace)(zero, start).jaxpr
     if any(dependent_results(traced, [True] * len(traced.invars), smooth=False)):
@@ -214,8 +217,8 @@ def _check_machine(machine: AbstractMachine, start: State) -> None:
 
 
 def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """The amplitude of each array of the state, `None` where it has none and 1 where a function
-    gives it; and these functions, `None` where there is none."""
+    """Return the amplitude of each array of the state, `None` without noise and 1 if a function
+    returns it; and these functions, or `None`."""
     functions = dict(noise.functions)
     amplitudes = {**noise.amplitudes, **dict.fromkeys(functions, 1.0)}
     names = leaf_names(start)
@@ -238,7 +241,8 @@ def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[An
 
 
 def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple) -> None:
-    """**Raises:** `ValueError` where noise moves what a stop limits, and not only its velocity."""
+    """**Raises:** `ValueError` if noise moves a coordinate that a stop limits, and not only its
+    velocity."""
     leaves, tree = jtu.tree_flatten(start)
     along = [
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
@@ -255,12 +259,14 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
 
 
 def lane_key(key: UInt32[Array, "2"], number: UInt32[Array, ""]) -> UInt32[Array, "2"]:
-    """The words of the key of lane `number`, of the words of a key: `jax.random.fold_in`."""
+    """Return the words of the key of lane `number`, from the words of a key:
+    `jax.random.fold_in`."""
     return jnp.stack(threefry(key, jnp.uint32(0), number))
 
 
 def words_of(key: Any) -> UInt32[Array, "2"]:
-    """The two words of a JAX key. **Raises:** `TypeError` or `ValueError` for anything else."""
+    """Return the two words of a JAX key. **Raises:** `TypeError` or `ValueError` for anything
+    else."""
     what = "one key of JAX's Threefry generator, as `jax.random.key(0)` makes it"
     if key is None:
         raise TypeError(f"Argument `key` must be {what}, where there is noise.")
@@ -278,11 +284,11 @@ def with_impulse(
     noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State,
     elapsed: Scalar | None,
 ) -> State:  # fmt: skip
-    """The state behind the impulse of an instant, `when` there is one.
+    """Return the state after the impulse of an instant, if `when` is true.
 
-    **Arguments:** the `cycle`, counted from the start of the run with those that settle, and the
-    number of the `instant` in it; the time `elapsed` since the last impulse, `None` where it is
-    known beforehand.
+    **Arguments:** `cycle`, counted from the start of the run, `settle` included; `instant`, its
+    number in the cycle; `elapsed`, the time since the last impulse, `None` if it is known in
+    advance.
     """
     leaves, tree = jtu.tree_flatten(state)
     sizes = [0 if x is None else leaf.size for x, leaf in zip(noise.scales, leaves, strict=True)]

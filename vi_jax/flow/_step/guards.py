@@ -513,5 +513,5 @@ def furthest_landing(x: Scalar) -> float:
 
 
 def turn_tolerance(x: Scalar) -> float:
-    """Return the largest accepted offset from a turning point; its height's error is cubic in it."""
+    """Return the largest accepted offset from a turn; the error of its height is cubic in it."""
     return 1e-5 if x.dtype == jnp.float64 else 1e-2
