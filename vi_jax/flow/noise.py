@@ -34,8 +34,7 @@ _PARITY = 0x1BD11BDA
 
 
 def threefry(key: Array, first: Array, second: Array) -> tuple[Array, Array]:
-    """Threefry-2x32 with 20 rounds: return two words from a key of two words and a counter of
-    two."""
+    """Return two words from a key of two words and a counter of two: Threefry-2x32, 20 rounds."""
     keys = key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY)
     x, y = first + keys[0], second + keys[1]
     for group in range(5):
@@ -191,8 +190,7 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
         return cycle_time(machine)
     if not ticks(machine, start):
         return None
-    # The independent variable is proportional to time if `pace` depends neither on it nor on the
-    # state.
+    # s is proportional to time if the pace depends neither on s nor on the state.
     zero = jnp.zeros_like(machine.position(start))
     traced = jax.make_jaxpr(machine.pace)(zero, start).jaxpr
     if any(dependent_results(traced, [True] * len(traced.invars), smooth=False)):
@@ -241,8 +239,7 @@ def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[An
 
 
 def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple) -> None:
-    """**Raises:** `ValueError` if noise moves a coordinate that a stop limits, and not only its
-    velocity."""
+    """**Raises:** `ValueError` if noise changes more of what a stop limits than its velocity."""
     leaves, tree = jtu.tree_flatten(start)
     along = [
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
@@ -259,14 +256,12 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
 
 
 def lane_key(key: UInt32[Array, "2"], number: UInt32[Array, ""]) -> UInt32[Array, "2"]:
-    """Return the words of the key of lane `number`, from the words of a key:
-    `jax.random.fold_in`."""
+    """Return the words of the key of lane `number` (`jax.random.fold_in`), from those of `key`."""
     return jnp.stack(threefry(key, jnp.uint32(0), number))
 
 
 def words_of(key: Any) -> UInt32[Array, "2"]:
-    """Return the two words of a JAX key. **Raises:** `TypeError` or `ValueError` for anything
-    else."""
+    """Return the two words of a JAX key. **Raises:** `TypeError` or `ValueError` without one."""
     what = "one key of JAX's Threefry generator, as `jax.random.key(0)` makes it"
     if key is None:
         raise TypeError(f"Argument `key` must be {what}, where there is noise.")

@@ -1,4 +1,4 @@
-"""`suggest_method`: the fastest method for an error, measured on the user's own machine."""
+"""`suggest_method`: the fastest method for an error, measured on the user's own computer."""
 
 import contextlib
 import time
@@ -26,14 +26,14 @@ from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, V
 
 QUANTITIES = ("state", "extremes", "impacts", "derivative")
 
-# What is tried: steps in a cycle, each a tenth to a third more than the last; decades of
-# tolerances. Of so many rounds the median time counts. All are choices.
+# Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
+# Times are medians of this many rounds. All are choices.
 _STEPS = (5, 6, 7, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 _TOLERANCES = tuple(10.0**-n for n in range(3, 15))
 _ROUNDS = 5
 
-# Stiff is a machine in which what fades fastest asks for steps so many times shorter than its
-# motion; from where on implicit methods are tried. A choice.
+# A machine is stiff if its fastest decay needs steps this many times shorter than its motion; then
+# implicit methods are tried. A choice.
 _STIFF = 20.0
 
 
@@ -44,7 +44,7 @@ class Tried(NamedTuple):
     name: str
     error: float
     seconds: float
-    """For all lanes; NaN where the error ruled it out and it was not timed."""
+    """Run time of all lanes; NaN if the error was too large and the method was not timed."""
 
 
 class Suggestion(NamedTuple):
@@ -53,7 +53,7 @@ class Suggestion(NamedTuple):
     method: AbstractMethod
     """The fastest method within the error, or the most accurate if none is."""
     reached: bool
-    """Whether its error is small enough."""
+    """True if its error is small enough."""
     error: float
     """The error of that method, as measured in the calibration."""
     tried: tuple[Tried, ...]
@@ -80,8 +80,8 @@ def suggest_method(
 ) -> Suggestion:
     """Find the fastest method within an error, by a short calibration on the machine itself.
 
-    Takes a few seconds, most of it compiling. A few methods of each kind are compared with
-    `ExactFlight`, or else with `Adaptive` at its tightest, and those within the error are timed, on
+    It takes a few seconds, mainly for compiling. Methods of each kind are compared with
+    `ExactFlight`, or else with `Adaptive` at its tightest. Those within the error are timed, on
     lanes that differ in their first velocity. If the machine is stiff, implicit methods replace
     those of fixed steps.
 
@@ -89,17 +89,18 @@ def suggest_method(
 
     - `machine`: the machine; its parameters may not be traced.
     - `error`: the largest error allowed, relative to the size of each number, for 95 of 100 lanes.
-    - `quantity`: the quantity of which the error is meant: `"state"` (on the last section),
+    - `quantity`: the quantity to which the error refers: `"state"` (on the last section),
       `"extremes"` (in each cycle), `"impacts"` (phase and speed of the first 32 in each cycle; a
-      missed one is an infinite error) or `"derivative"` (of the last section state by the first
-      velocity).
-    - `start`: the first state; by default the machine's own.
+      missed one is an infinite error) or `"derivative"` (of the last section state with respect to
+      the first velocity).
+    - `start`: the first state; by default `machine.start()`.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
-    - `lanes`: lanes of a batch such as it will be used in; 1 for a single motion.
+    - `lanes`: the size of the batches for which the method is needed; 1 for a single motion.
 
-    **Returns:** a `Suggestion`; its `method` is what the verbs take, and it prints what was tried.
+    **Returns:** a `Suggestion`. Pass its `method` to other functions; print it for all
+    measurements.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments.
     """
     if not isinstance(error, int | float | np.floating):
         raise TypeError(f"Argument `error` must be a number, but got {error!r}.")
@@ -139,7 +140,7 @@ def suggest_method(
         tried = [] if stiff else _fixed(bench, error)
         tried += _until(bench, error, _adaptive(Verner9()))
         tried += _until(bench, error, _adaptive(diffrax.Kvaerno5())) if stiff else []
-        with contextlib.suppress(NotImplementedError):  # the field uses what has no recursion
+        with contextlib.suppress(NotImplementedError):  # a primitive has no recursion
             tried += _until(bench, error, _series(error))
     good = [t for t in tried if t.error <= error]
     timed = bench.race(good)
@@ -152,14 +153,14 @@ def suggest_method(
 
 
 def _is_stiff(machine: AbstractMachine, start: State) -> bool:
-    """Whether something fades much faster than the motion goes, at its start."""
+    """Return whether something decays much faster than the motion, at its start."""
     s = jnp.zeros(())
     fading = machine.relaxation(s, start)
     return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
 
 
 def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMethod]]) -> list[Tried]:
-    """Methods from loose to tight, up to the first that keeps to the error."""
+    """Try methods from loose to tight, up to the first whose error is small enough."""
     tried: list[Tried] = []
     for name, method in methods:
         tried.append(bench.tried(method, name))
@@ -174,14 +175,15 @@ def _adaptive(solver: diffrax.AbstractSolver) -> list[tuple[str, AbstractMethod]
 
 
 def _series(error: float) -> list[tuple[str, AbstractMethod]]:
-    """Taylor series of an order for the error: another tolerance is no other program."""
+    """Return Taylor methods of an order for the error; another tolerance does not compile again."""
     order = int(np.clip(round(1.2 * -np.log10(error)), 6, 20))
     tolerances = np.clip(np.array([100.0, 10.0, 1.0, 0.1]) * error, 1e-15, 0.1).tolist()
     return [(f"Taylor({order}, rtol={x:.0e})", Taylor(order, rtol=x)) for x in tolerances]
 
 
 def _fixed(bench: "_Bench", error: float) -> list[Tried]:
-    """The fewest fixed steps that keep to the error, by bisection: each number is a program."""
+    """Find the fewest fixed steps within the error, by bisection, since each number compiles a
+    program."""
     tried, low, high = [], 0, len(_STEPS) - 1
     while low <= high:
         middle = (low + high) // 2
@@ -196,7 +198,7 @@ def _fixed(bench: "_Bench", error: float) -> list[Tried]:
 
 
 class _Bench:
-    """The run that methods are compared on, of lanes that differ in their first velocity."""
+    """The run by which methods are compared, for lanes that differ in their first velocity."""
 
     truth: np.ndarray
     sizes: np.ndarray
@@ -207,21 +209,21 @@ class _Bench:
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
         row, unravel = ravel_pytree(bare(start))
         sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(row))))
-        # Nothing but the velocity is free of stops.
+        # Stops limit everything except velocities.
         self.speed = size_of(machine.coordinates[0].velocity, bare(start), sizes)
         self.nudges = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
     def lane(self, method: AbstractMethod, nudge: Scalar) -> tuple[Array, Array]:
-        """What is compared of the lane whose first velocity differs by `nudge`, as one vector, and
-        the size of each of its numbers; the first one is infinite if the lane failed."""
+        """Return the compared numbers, as one vector, of the lane whose first velocity differs by
+        `nudge`, and their sizes. The first number is infinite if the lane failed."""
         machine = self.machine
 
         def looked_at(nudge):
             body = machine.coordinates[0]
             velocity = body.velocity(self.start) + nudge
             start = body.placed(self.start, body.position(self.start), velocity)
-            # As users run it: with nothing but sections recorded the steps are others.
+            # As users run it: if only sections are recorded, steps are different.
             log = 32 if self.quantity == "impacts" else 0
             run = simulate(machine, start, self.cycles, method=method, impact_log=log)
             if self.quantity == "extremes":
@@ -243,12 +245,12 @@ class _Bench:
             sizes = sizes / self.speed
         else:
             found, (sizes, good) = looked_at(nudge)
-        # The first number tells a failed lane; NaN elsewhere is where there was no impact.
+        # The first number marks a failed lane; NaN elsewhere means that there was no impact.
         ended = jnp.where(good, jnp.zeros_like(nudge), jnp.inf)
         return jnp.append(ended, found), jnp.append(jnp.ones_like(nudge), sizes)
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:
-        """All lanes under a method; other tolerances are no other program."""
+        """Return a function that runs all lanes; other tolerances do not compile again."""
         numbers, rest = eqx.partition(method, lambda x: isinstance(x, np.ndarray))
         key = jtu.tree_structure(rest), tuple(map(repr, jtu.tree_leaves(rest)))
         if key not in self.compiled:
@@ -262,12 +264,12 @@ class _Bench:
         return lambda: jax.block_until_ready(run(numbers, self.nudges))
 
     def follow(self, truth: AbstractMethod) -> None:
-        """Compare with this method from now on."""
+        """Set the method with which others are compared."""
         self.truth, sizes = map(np.asarray, self.program(truth)())
         self.sizes = np.where(sizes > 0, sizes, 1.0).max(axis=0)
 
     def tried(self, method: AbstractMethod, name: str) -> Tried:
-        """A method with its error."""
+        """Return a method with its error."""
         found, truth = np.asarray(self.program(method)()[0]), self.truth
         apart = np.abs(found - truth) / (self.sizes + np.abs(truth))
         apart = np.where(np.isnan(found) & np.isnan(truth), 0.0, apart)
@@ -275,7 +277,7 @@ class _Bench:
         return Tried(method, name, float(np.quantile(worst, 0.95, method="higher")), np.nan)
 
     def race(self, tried: list[Tried]) -> dict[str, Tried]:
-        """These with their times, in interleaved rounds."""
+        """Return these methods with their times, measured in interleaved rounds."""
         runs = [self.program(t.method) for t in tried]
         times: list[list[float]] = [[] for _ in runs]
         for _ in range(_ROUNDS):
