@@ -133,8 +133,8 @@ class Lane(NamedTuple):
     steps."""
 
     def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
-        """Return the lane, ended with `reason` (a name in `RESULTS` or its number) where `where &
-        when`; `where`: the event happened; `when`: it ends the lane, or `None` if it never does."""
+        """Return the lane, ended with `reason` (a name in `RESULTS` or its number) if both flags
+        are true: `where`, the event happened; `when`, it ends the lane (`None`: it never does)."""
         if when is None:
             return self
         number = code(reason) if isinstance(reason, str) else reason

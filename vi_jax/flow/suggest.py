@@ -80,10 +80,9 @@ def suggest_method(
 ) -> Suggestion:
     """Find the fastest method within an error, by a short calibration on the machine itself.
 
-    It takes a few seconds, mainly for compiling. Methods of each kind are compared with
-    `ExactFlight`, or else with `Adaptive` at its tightest. Those within the error are timed, on
-    lanes that differ in their first velocity. If the machine is stiff, implicit methods replace
-    those of fixed steps.
+    It takes a few seconds, mainly for compiling. A few methods of each kind are compared with
+    `ExactFlight`, or else with `Adaptive` at its tightest. Methods within the error are timed.
+    Lanes differ in their first velocity. For a stiff machine implicit methods replace fixed steps.
 
     **Arguments:**
 
@@ -97,8 +96,7 @@ def suggest_method(
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
     - `lanes`: the size of the batches for which the method is needed; 1 for a single motion.
 
-    **Returns:** a `Suggestion`. Pass its `method` to other functions; print it for all
-    measurements.
+    **Returns:** a `Suggestion`. Pass its `method` to other functions; print it for all timings.
 
     **Raises:** `ValueError` or `TypeError` for invalid arguments.
     """
@@ -182,8 +180,7 @@ def _series(error: float) -> list[tuple[str, AbstractMethod]]:
 
 
 def _fixed(bench: "_Bench", error: float) -> list[Tried]:
-    """Find the fewest fixed steps within the error, by bisection, since each number compiles a
-    program."""
+    """Find the fewest fixed steps within the error, by bisection: each number compiles anew."""
     tried, low, high = [], 0, len(_STEPS) - 1
     while low <= high:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""How a machine is carried over one step: Runge–Kutta, power series, closed form; which to take."""
+"""Methods of integration over one step: Runge–Kutta, power series, closed form; their choice."""
 
 from .base import AbstractMethod as AbstractMethod
 from .base import Foreseen as Foreseen

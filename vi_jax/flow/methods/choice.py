@@ -1,4 +1,4 @@
-"""Which method moves a machine: one that is given, a preset by its name, or the default."""
+"""The choice of a machine's method: a given one, a preset by its name, or the default."""
 
 from ..._checks import one_of
 from ...machine import AbstractMachine, scales_known
@@ -7,17 +7,17 @@ from .exact import ExactFlight, lack_of_closed_form
 from .runge_kutta import Adaptive, FixedStep
 
 MethodLike = AbstractMethod | str | None
-"""What an argument `method` takes: a method, the name of a preset, or `None` for the default."""
+"""The values of an argument `method`: a method, the name of a preset, or `None` for the default."""
 
-# Steps a cycle of a `Scene`, and the tolerance for a machine of one's own, whose time scales are
-# not known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
+# Steps in a cycle of a `Scene`, and the tolerance for other machines, whose time scales are not
+# known. Chosen from the front that `experiments/benchmarks/speed_accuracy.py` measures.
 _PRESETS = {"draft": (6, 1e-6), "standard": (10, 1e-9), "reference": (30, 1e-13)}
 
 
 def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractMethod:
-    """Return the method of this name for a machine; every argument `method` takes the name itself.
+    """Return the method of this name for a machine; every argument `method` accepts the name too.
 
-    **Arguments:** the machine (`None` if it is not known yet), and `"draft"`, `"standard"` or
+    **Arguments:** `machine`, or `None` if it is not known yet; `name`, `"draft"`, `"standard"` or
     `"reference"`.
 
     For an ideal drive with a `CosineCrank` every name returns `ExactFlight`, the fastest and most
@@ -25,17 +25,17 @@ def preset(machine: AbstractMachine | None, name: str = "standard") -> AbstractM
     Table 1's machine (d = 2, k = 0.8, κ from 0.5 to 1.9): 95 of 100 lanes that are not chaotic had
     a smaller error of the section state after 1,000 cycles.
 
-    - `"draft"`: 6 steps of `Verner9` a cycle, error 3e-7 (the median lane's: 8e-9), 0.7 of the
-      time of the next;
+    - `"draft"`: 6 steps of `Verner9` in a cycle, error 3e-7 (median 8e-9), in 0.7 of the time of
+      `"standard"`;
     - `"standard"`: 10 steps, error 2e-9 (5e-11);
-    - `"reference"`: 30 steps, error 6e-14 (2e-15), 2.8 times the time of the one before.
-      `Taylor(20, rtol=1e-13)` is as exact in 0.75 of that, for fields that have a series.
+    - `"reference"`: 30 steps, error 6e-14 (2e-15), in 2.8 times the time of `"standard"`.
+      `Taylor(20, rtol=1e-13)` is as accurate in 0.75 of that, for fields that have a series.
 
-    No settled motion of 1,024 got a wrong regime under any of the first two.
+    No settled motion of 1,024 got a wrong regime under either of the first two.
 
-    Shorter steps where damping is strong (ξ > 0.5) or the motor (τ0 > 1) keep the errors small
-    there too. A machine of your own, whose time scales are not known, gets `Adaptive` with the
-    tolerances 1e-6, 1e-9 and 1e-13, the last with at least ten steps a cycle instead of five.
+    Strong damping (ξ > 0.5) or a strong motor (τ0 > 1) shortens the steps, which keeps the errors
+    small. Other machines, whose time scales are not known, get `Adaptive` with the tolerances 1e-6,
+    1e-9 and 1e-13, the last with at least ten steps in a cycle instead of five.
 
     **Raises:** `ValueError` for another name.
     """
@@ -58,11 +58,11 @@ def chosen(
     *,
     argument: str = "method",
 ) -> AbstractMethod:
-    """The method given, or of the name given; if that is `None`, `ExactFlight` where it applies,
-    else `otherwise`, by default the `"standard"` preset.
+    """Return the given method, or the preset of the given name. For `None`, return `ExactFlight` if
+    it applies, else `otherwise`, by default the `"standard"` preset.
 
-    **Raises:** `TypeError` for what is no method, `ValueError` for a name that is no preset's.
-    Whether the method can move the machine is not looked at: `AbstractMethod.check` says so.
+    **Raises:** `TypeError` for an invalid method, `ValueError` for a name that is no preset's. It
+    does not check whether the method can integrate the machine; `AbstractMethod.check` does.
     """
     if method is None:
         if otherwise is None or (machine is not None and lack_of_closed_form(machine) is None):

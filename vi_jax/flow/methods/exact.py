@@ -1,4 +1,4 @@
-"""Flight in closed form: the ideally driven oscillator, and linear machines, between impacts."""
+"""Closed forms between impacts: the oscillator with an ideal drive, and linear machines."""
 
 from collections.abc import Callable
 from math import factorial
@@ -34,20 +34,20 @@ from ...machine import (
 from ..smooth import Integrals, SmoothMachine, limited_of, rate_of_integrals
 from .base import AbstractMethod
 
-# The series of a matrix exponential is summed over lengths in which things change by twice
-# themselves at most, until its terms are below this share of a rounding: that is 24 of them, with
-# half the work of 18 terms over lengths half as long.
+# The series of a matrix exponential is summed over lengths in which the state changes at most by
+# this multiple of its size. It ends when terms are below this share of a rounding error. Its 24
+# terms are half the work of 18 terms over lengths half as long.
 _LONGEST, _LAST = 2.0, 0.005
 
-# A mode adds to a contact's distance what rounding does if its amplitude there is below so many
-# roundings of the sum of all.
+# A mode is negligible at a contact if its amplitude there is below this many rounding errors of the
+# sum of all.
 _MATTERS = 4
 
-# By so much bounds are wider than what they bound, for rounding.
+# Factor that widens bounds to cover rounding.
 _WIDER = 1.001
 
-# Steps in the shortest period, of one mode and of several: a sum of modes may leave a stop, come
-# back and leave again in a fifth of it, which the ends of a step do not show (one of some 150
+# Steps in the shortest period, of one mode and of several. A sum of modes may leave a stop, return
+# and leave again in a fifth of the period. The ends of such a step do not show it (one of some 150
 # cycles of random machines of up to eight modes; none with ten steps).
 _ALONE, _SEVERAL = 5, 10
 
@@ -58,9 +58,9 @@ _BEND = tuple((-1) ** n * n / factorial(2 * n + 1) for n in range(1, 10))
 def modal_flight(
     machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State
 ) -> Any:
-    """The state a time h after that at s, exact to rounding for any h. Free flight of uncoupled
-    modes is the closed form of each. All else is a matrix exponential: modes coupled by damping,
-    bodies at rest on stops (`contact`), a force in resonance with a mode."""
+    """Return the state a time h after that at s, exact to rounding for any h. Free flight of
+    uncoupled modes is the closed form of each. A matrix exponential is used for modes coupled by
+    damping, resting bodies (`contact`), and a force in resonance with a mode."""
     free = machine.plain > 0
     for rests in contact:
         free = free & (rests == 0)
@@ -71,9 +71,9 @@ def modal_flight(
 
 
 def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
-    """A tenth of the period of the fastest mode that matters, or of the force; a fifth where there
-    is but one mode. A mode matters if its free motion moves a contact by more than rounding: others
-    cannot make or hide an event. Those that have faded away so cost no steps."""
+    """Return a tenth of the period of the fastest mode that matters, or of the force; a fifth for a
+    single mode. A mode matters if its free motion moves a contact by more than rounding. Others
+    cannot make or hide an event. Decayed modes thus cost no steps."""
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
     pace = machine.pace_of
@@ -88,10 +88,10 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
 
 
 def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
-    """How long no stop can be met in free flight from here; 0 where that is not known. A mode that
-    swings and fades stays within its amplitude a, and is accelerated by κa at most; so the distance
-    to a stop is at least what a parabola leaves of it, and infinite where the sum of all amplitudes
-    does not reach."""
+    """Return a time of free flight in which no stop can be met; 0 if it is not known. A decaying
+    mode stays within its amplitude a, and its acceleration within κa. So a parabola bounds the
+    distance to a stop from below. The time is infinite if the sum of all amplitudes does not reach
+    it."""
     machine, s, state = stop_gradient((machine, s, state))  # a length has no derivative
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
@@ -110,7 +110,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
             reach, pull = reach + swing, pull + machine.frequency**2 * swing
         room, speed = -stop.beyond(jnp.dot(row, q)), stop.sign * jnp.dot(row, p)
         root = jnp.sqrt(speed * speed + 2 * pull * jnp.maximum(room, 0.0))
-        # Of two forms the one that does not cancel.
+        # The form without cancellation, of two equivalent ones.
         towards = 2 * room / jnp.where(speed + root > 0, speed + root, 1.0)
         away = (root - speed) / jnp.where(pull > 0, pull, 1.0)
         until = jnp.where(speed > 0, towards, away)
@@ -129,7 +129,7 @@ def _steady_response(machine: ModalMachine, s: Scalar) -> tuple[Any, Any]:
 
 
 def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -> tuple[Any, Any]:
-    """Each mode by itself: q'' + c q' + κ q = f."""
+    """Return the flight of each mode by itself: q'' + c q' + κ q = f."""
     half = 0.5 * machine.damping
     square = machine.stiffness - half * half
     known = machine.swing, machine.swing_time, machine.oscillates
@@ -147,20 +147,20 @@ def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -
 
 @jax.custom_jvp
 def _pair(known: tuple, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
-    """e^(-at) cos(wt) and e^(-at) sin(wt)/w for w² (`square`) of any sign, and a (`half`); `known`
-    are `swing`, `swing_time` and `oscillates` of the machine."""
+    """Return e^(-at) cos(wt) and e^(-at) sin(wt)/w for w² (`square`) of any sign, and a (`half`);
+    `known` are `swing`, `swing_time` and `oscillates` of the machine."""
     swing, swing_time, oscillates = known
     fade = jnp.exp(-half * h)
     pair = fade * jnp.cos(swing * h), fade * (swing_time * jnp.sin(swing * h))
-    # Overdamped modes are rare: skipped where a lane has none.
+    # Overdamped modes are rare: skipped if a lane has none.
     return jax.lax.cond(oscillates > 0, lambda *x: x[0], _without_turns, pair, half, square, h)
 
 
 def _without_turns(pair: Any, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
-    """The same for modes that do not oscillate, the others as in `pair`."""
+    """Return `_pair` for modes that do not oscillate, and entries of `pair` for the others."""
     slow = square <= 0
     root = jnp.sqrt(jnp.where(slow, -square, 0.0))
-    # The slower rate a - r, of which the difference would cancel.
+    # The slower rate a - r, without the cancellation of a difference.
     gentle = (half * half + square) / jnp.where(slow & (half + root > 0), half + root, 1.0)
     gentle = jnp.where(half + root > 0, gentle, half - root)
     fade = jnp.exp(-jnp.where(slow, gentle, 0.0) * h)
@@ -197,8 +197,8 @@ _pair.defjvp(_pair_jvp, symbolic_zeros=True)
 def _by_series(
     machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State, wanted: Flag
 ) -> tuple[Any, Any]:
-    """The matrix exponential by its series, in parts so short that it converges at once; of none
-    where it is not wanted. The force turns with the motion, as two numbers more."""
+    """Return the state by the series of the matrix exponential, in parts so short that it converges
+    quickly; by none unless `wanted`. The force rotates with the motion, as two more numbers."""
     length = stop_gradient(jnp.abs(h)) * machine.fastest
     count = stop_gradient(jnp.where(wanted, jnp.maximum(jnp.ceil(length / _LONGEST), 1.0), 0.0))
     part, change = h / jnp.maximum(count, 1.0), length / jnp.maximum(count, 1.0)
@@ -230,8 +230,8 @@ def _by_series(
 
 
 def _holding(machine: ModalMachine, contact: Scalars) -> Any:
-    """What is left of an acceleration where bodies rest on stops: as much of each contact's push as
-    keeps its velocity is added."""
+    """Return a function that removes from an acceleration the part that resting contacts cancel:
+    each contact's push keeps its velocity constant."""
     limited = limited_of(machine) if contact else []
     if not limited:
         return lambda pull: pull
@@ -239,7 +239,7 @@ def _holding(machine: ModalMachine, contact: Scalars) -> Any:
     acting = [contact[k] > 0 for k in limited]
     gains = [[jnp.dot(row, push) for push in pushes] for row in rows]
     units = [[jnp.asarray(float(i == j)) for j in range(len(rows))] for i in range(len(rows))]
-    # Of each contact, how much of every push changes its velocity, and no other one's, by one.
+    # For each contact, the combination of pushes that changes its velocity by one, and no other's.
     changes = [
         sum(amount * push for amount, push in zip(forces(gains, acting, unit), pushes, strict=True))
         for unit in units
@@ -265,24 +265,24 @@ _EXP_SLOPE = tuple(1 / factorial(n + 1) for n in range(10))
 # inverse, would cancel against the free one; the response from rest is summed instead.
 _NEAR = 1e-2
 
-# Gauss–Legendre nodes and weights on [0, 1] for averages along an arc: of a fourth power of the
-# state, which turns by 5 radians at most on it, they leave 1e-15.
+# Gauss–Legendre nodes and weights on [0, 1] for averages along an arc. For a fourth power of the
+# state, whose phase changes by at most 5 radians in it, their error is 1e-15.
 _NODES, _WEIGHTS = (0.5 * (x + shift) for x, shift in zip(leggauss(10), (1.0, 0.0), strict=True))
 
 
 class ExactFlight(AbstractMethod):
-    """The closed form of Y'' + 2ξY' + Y = cos φ between impacts, and of M x'' + C x' + K x = f of a
-    linear machine (`vi.machines.Structure`); only impact times need a root.
+    """The closed form of Y'' + 2ξY' + Y = cos φ between impacts, and of M x'' + C x' + K x = f for
+    a linear machine (`vi.machines.Structure`). Only impact times need a root.
 
-    Holds for every ξ ≥ 0 (under-, critically and over-damped) and every ζ > 0, including ζ = 1 with
-    ξ = 0 (the secular case), for ideal drives with a `CosineCrank`. The motion is followed in arcs
-    of at most a fifth of the shorter period, each ended at the next turning point, so an impact is
-    missed only if it is shallower than rounding. Arcs of a linear machine of several modes are a
-    tenth of the period of the fastest one that moves a contact by more than rounding. Modes coupled
-    by damping, resonance and bodies at rest use a matrix exponential by its series.
+    It holds for ideal drives with a `CosineCrank`, for every ξ ≥ 0 (under-, critically and
+    over-damped) and every ζ > 0, also ζ = 1 with ξ = 0 (the secular case). The motion is divided in
+    arcs of at most a fifth of the shorter period, each ended at the next turning point. So an
+    impact is missed only if it is shallower than rounding. Arcs of a linear machine of several
+    modes are a tenth of the period of the fastest one that moves a contact by more than rounding.
+    Modes coupled by damping, resonance and bodies at rest use the series of a matrix exponential.
 
-    **Arguments:** `steps_per_cycle`, arcs in a turn (default 5, the fewest). More of them change
-    nothing but the rounding.
+    **Arguments:** `steps_per_cycle`, the number of arcs in a turn (at least 5, the default). More
+    of them change only rounding.
 
     **Raises:** `ValueError` for fewer than 5 arcs.
     """
@@ -293,17 +293,17 @@ class ExactFlight(AbstractMethod):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
 
     def tighter(self):
-        """Twice as many arcs: the difference is accumulated rounding."""
+        """Return the method with twice as many arcs: the difference is accumulated rounding."""
         return ExactFlight(2 * self.steps_per_cycle)
 
     def holds(self, machine):
-        """A resting coordinate of a linear machine is held; another machine does not move while it
-        rests."""
+        """Return whether the machine is linear, so that its resting coordinates are held; another
+        machine does not move while it rests."""
         return isinstance(machine, LinearMachine | ModalMachine)
 
     def resolves(self, machine):
-        """True of several modes, of which steps are a tenth of the fastest one's period: of 12,000
-        random structures pressed on stops none was off by more than 1e-5."""
+        """Return whether the machine is in its modes. Steps of several modes are a tenth of the
+        fastest period: of 12,000 random structures pressed on stops none was off by over 1e-5."""
         return isinstance(machine, ModalMachine)
 
     def check(self, machine):
@@ -312,19 +312,19 @@ class ExactFlight(AbstractMethod):
             raise ValueError(f"Method `ExactFlight` needs a {lack}. Use `Adaptive` or `FixedStep`.")
 
     def longest(self, machine, s, state):
-        """The longest step from here; of a linear machine by the modes that matter there."""
+        """Return the longest step; for a linear machine by the modes that matter there."""
         if not isinstance(machine, ModalMachine):
             return super().longest(machine, s, state)
         return longest(machine, s, state) * (5 / self.steps_per_cycle)
 
     def clear(self, machine, s, state):
-        """A bound from the amplitudes of all modes, limited to a fixed part of a cycle."""
+        """Return a bound from the amplitudes of all modes, limited to a fixed part of a cycle."""
         if not isinstance(machine, ModalMachine):
             return None
         return jnp.minimum(clear(machine, s, state), machine.cycle / self.steps_per_cycle)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The flight from `s0` to `s1`, exact to rounding; averages by quadrature along it."""
+        """Return the flight from `s0` to `s1`, exact to rounding, with averages by quadrature."""
         machine = smooth.machine
         if isinstance(machine, LinearMachine | ModalMachine):
             return _linear(smooth, s0, s1, state, beside)
@@ -344,7 +344,7 @@ class ExactFlight(AbstractMethod):
 def _linear(
     smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
 ) -> tuple[State, Integrals, Scalar]:
-    """The flight of a linear machine, in its modes or to be taken there; as `ExactFlight.step`."""
+    """Return the flight of a linear machine, as `ExactFlight.step`, in natural modes."""
     machine, h = smooth.machine, s1 - s0
     if isinstance(machine, LinearMachine):
         form = machine.prepared_modes()
@@ -364,8 +364,8 @@ def _linear(
 def _integrated(
     smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Integrals
 ) -> Integrals:
-    """Integrals beside a flight from `s0` to `s1`, by quadrature; a body that is held stays where
-    it is in `state`, and `along` is the state of the flight at a share of its length."""
+    """Return the integrals of a flight from `s0` to `s1`, by quadrature. A held body stays as in
+    `state`; `along` returns the state of the flight at a share of its length."""
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         there = along(float(node))
@@ -379,8 +379,8 @@ def _integrated(
 
 
 def lack_of_closed_form(machine: AbstractMachine) -> str | None:
-    """What a machine should be for its flight to be the closed form, and what it is instead, in
-    words; `None` if it is that."""
+    """Return what the closed form needs of a machine and what the machine has instead, as text;
+    `None` if it has a closed form."""
     if isinstance(machine, LinearMachine | ModalMachine):
         return _lack_of_linear(machine)
     if not isinstance(machine, Scene) or not isinstance(machine.drive, IdealDrive):
@@ -406,10 +406,10 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
 
 
 def _lack_of_linear(machine: AbstractMachine) -> str | None:
-    """As `lack_of_closed_form`, of a machine that is linear but for what a subclass changes."""
+    """Return `lack_of_closed_form` for a linear machine, whose subclass may differ."""
     name = type(machine).__name__
     if isinstance(machine, LinearMachine):
-        # What rests is held by the rows of the matrices' own coordinates.
+        # Resting bodies are held by the rows of the matrices' own coordinates.
         own = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
         if own is not None:
             return f"linear machine as its matrices say, but a `{name}` has another `{own}`"
@@ -419,7 +419,7 @@ def _lack_of_linear(machine: AbstractMachine) -> str | None:
 
 
 def _numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
-    """ζ, ξ and whether the machine is in the phase clock."""
+    """Return ζ, ξ and whether the machine is in the phase clock."""
     assert isinstance(machine, Scene) and isinstance(machine.drive, IdealDrive)
     return machine.drive.frequency_ratio, machine.damping_ratio, machine.clock_name == "phase"
 
@@ -427,15 +427,15 @@ def _numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
 def flight(
     zeta: Scalar, xi: Scalar, phase: Scalar, Y: Scalar, V: Scalar, tau: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Y and V after a time τ of free flight from (Y, V) at crank angle `phase`; zeta and xi are ζ
-    and ξ.
+    """Return Y and V after a time τ of free flight from (Y, V) at crank angle `phase`; zeta and xi
+    are ζ and ξ.
 
-    Dimensionless scalars; |τ| up to a fifth of the shorter of the periods 2π and 2π/ζ, less under
-    strong damping (|ξτ| ≤ 0.4π). Paper, Eq. 14, here with damping. Changes are summed, each of the
-    order of τ. So the rounding of a short flight is small beside its length, also where a body
-    leaves the stop by less than the rounding of its position.
+    All are dimensionless scalars; |τ| is at most a fifth of the shorter of the periods 2π and 2π/ζ,
+    less under strong damping (|ξτ| ≤ 0.4π). The solution is Eq. 14 of the paper, with damping.
+    Changes of the order of τ are summed. So the rounding error of a short flight is small compared
+    with its length, also if a body leaves the stop by less than the rounding error of its position.
     """
-    # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², whatever its sign.
+    # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², for either sign.
     square = (1 - xi * xi) * tau * tau
     bend, S = square * horner(_COS[1:], square), tau * horner(_SINC, square)
     loss = _less_one(-xi * tau)
@@ -464,7 +464,7 @@ def flight(
 
 
 def _less_one(x: Scalar) -> Scalar:
-    """e^x - 1 for |x| up to 1.3, without its cancellation."""
+    """Return e^x - 1 for |x| up to 1.3, without cancellation."""
     part = 0.125 * x * horner(_EXP_SLOPE, 0.125 * x)
     for _ in range(3):
         part = part * (part + 2)
@@ -472,7 +472,7 @@ def _less_one(x: Scalar) -> Scalar:
 
 
 def _turned(sine: Scalar, cosine: Scalar, half: Scalar) -> tuple[Scalar, Scalar]:
-    """Changes of a phase's cosine and sine, in this order, over twice the angle `half`."""
+    """Return the changes of a phase's cosine and sine, in this order, over the angle 2·`half`."""
     s, c = sincos(half)
     return -2 * s * (sine * c + cosine * s), 2 * s * (cosine * c - sine * s)
 
@@ -486,8 +486,8 @@ def _minus(a, b):
 
 
 def _from_rest(zeta, xi, begin, turn, tau):
-    """Y and V at a time `tau` after a start from rest, near resonance only; `begin` are cosine and
-    sine of the phase at the start, `turn` their changes since.
+    """Return Y and V at a time `tau` after a start from rest, near resonance only; `begin` are
+    cosine and sine of the phase at the start, `turn` their changes since.
 
     With p = -ξ + iω_d it is Re{[τ e^{pτ} E(w) e^{iφ0} - (e^{iφ1} - e^{p̄τ} e^{iφ0})/(iζ - p̄)] /
     (2iω_d)}, w = (iζ - p)τ, where E(w) = (e^w - 1)/w stays smooth through resonance. Complex
@@ -510,7 +510,7 @@ def _from_rest(zeta, xi, begin, turn, tau):
     inverse = (other[0] * scale, -other[1] * scale)
     lag = _times((change[0], -change[1]), begin)
     z = _minus(resonant, _times(_minus(turn, lag), inverse))
-    # d/dτ of each part, from its definition; what both hold of the beginning cancels.
+    # d/dτ of each part, from its definition; the common part of both at the begin cancels.
     p, p_bar = (-xi, omega), (-xi, -omega)
     i_zeta = (jnp.zeros_like(zeta), zeta)
     rate_resonant = _times(p, resonant)

@@ -1,4 +1,4 @@
-"""Steps by a diffrax Runge–Kutta solver, sized by its error or of fixed number."""
+"""Methods with steps of a diffrax Runge–Kutta solver, sized by their error or of fixed number."""
 
 import dataclasses
 import functools
@@ -25,7 +25,7 @@ from .verner import Verner9
 
 Vector = Float[Array, " n"]
 
-# Newton's steps after which a stage is given up, so that the step is tried again shorter: a choice.
+# Newton's iterations until a stage fails, so that the step is repeated shorter: a choice.
 _MOST = 12
 
 
@@ -38,13 +38,13 @@ def implicit_stages(
     tolerance: Scalar | float,
     sizes: Vector,
 ) -> tuple[list[Vector], Scalar]:
-    """The slopes of all stages, and what the last steps of Newton's method still changed, of a step
-    of length h from `y0`, flattened.
+    """Return the slopes of all stages of a step of length h from `y0`, flattened, and the last
+    change by Newton's method.
 
     All stages share one matrix 1 - hγJ, with the Jacobian at the start of the step (Kværnø, BIT
-    Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to `sizes` + |y|; where
-    that fails what is left is infinite. Derivatives are those of the solution, by the implicit
-    function theorem.
+    Numerical Mathematics 44, 2004). Each is solved to `tolerance` relative to `sizes` + |y|; if
+    that fails, the returned change is infinite. Derivatives are those of the solution, by the
+    implicit function theorem.
     """
     gamma = float(tableau.a_diagonal[-1])
     still = stop_gradient((s0, y0))
@@ -80,13 +80,13 @@ def implicit_stages(
 
 
 def change_of(change: Vector, y: Vector, sizes: Vector) -> Scalar:
-    """The largest component of a change, relative to `sizes` + |y|; infinite if there is a NaN."""
+    """Return the largest component of a change relative to `sizes` + |y|; infinite for NaN."""
     size = jnp.max(jnp.abs(change) / (sizes + jnp.abs(y)))
     return jnp.where(jnp.isfinite(size), size, jnp.inf)
 
 
 def weighted(weights: np.ndarray, stages: list, base: object = None) -> Any:
-    """base + Σ weight·stage, leaf by leaf, without the zero weights."""
+    """Return base + Σ weight·stage, leaf by leaf, without the zero weights."""
     used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
 
     def leaf(*leaves: jax.Array) -> jax.Array:
@@ -97,12 +97,12 @@ def weighted(weights: np.ndarray, stages: list, base: object = None) -> Any:
 
 
 def dot(matrix: Float[Array, "n n"], vector: Vector) -> Vector:
-    """The product of a small matrix and a vector, written out number by number."""
+    """Return the product of a small matrix and a vector, as elementwise operations and a sum."""
     return jnp.sum(matrix * vector, axis=1)
 
 
 def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a small matrix, by elimination written out with row pivots."""
+    """Return the inverse of a small matrix, by unrolled elimination with row pivots."""
     n = matrix.shape[0]
     rows = [jnp.concatenate([matrix[i], jnp.eye(n, dtype=matrix.dtype)[i]]) for i in range(n)]
     for i in range(n):
@@ -117,29 +117,29 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _tangent(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
-    """The solution of a linear equation, the function given and the right side: how `custom_root`
-    carries derivatives over."""
+    """Return the solution of a linear equation, from its function and right side, as `custom_root`
+    needs for derivatives."""
     unit = jnp.eye(right.size, dtype=right.dtype)
     columns = jnp.stack([linear(unit[i]) for i in range(right.size)], axis=1)
     return dot(inverse_of(columns), right)
 
 
 class Unrolled(diffrax.AbstractSolver):
-    """Any explicit or diagonally implicit diffrax Runge–Kutta solver, its stages written out.
+    """Any explicit or diagonally implicit diffrax Runge–Kutta solver, with its stages unrolled.
 
     diffrax keeps the stages in a buffer filled by an inner loop, which XLA cannot fuse. This solver
-    has the same tableau, error estimate and interpolant, and can be used anywhere a diffrax solver
-    can. The stages of an implicit one are solved by Newton's method with one matrix for all of a
-    step; its own `root_finder` is not used.
+    has the same tableau, error estimate and interpolant, and can replace a diffrax solver anywhere.
+    The stages of an implicit solver are solved by Newton's method with one matrix for all stages of
+    a step; its own `root_finder` is not used.
 
     **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
-    `tolerance`, to which stages are solved, relative to `sizes` + |y| (by default 1e-12); `sizes`,
-    a number for each array of y (by default 1).
+    `tolerance` of the stages, relative to `sizes` + |y| (default 1e-12); `sizes`, a number for each
+    array of y (default 1).
 
     **Raises:** `TypeError` if `solver` is not one.
     """
 
-    solver: Any  # not yet known to be a solver when it is checked below
+    solver: Any  # not checked to be a solver before `__check_init__`
     tolerance: Any = eqx.field(kw_only=True, default=None)
     sizes: Any = eqx.field(kw_only=True, default=None)
     term_structure: ClassVar[Any] = diffrax.AbstractTerm
@@ -153,7 +153,7 @@ class Unrolled(diffrax.AbstractSolver):
 
     @property
     def implicit(self) -> bool:
-        """Whether its stages are equations to be solved."""
+        """True if its stages are equations to be solved."""
         return isinstance(self.solver, diffrax.AbstractESDIRK)
 
     @property
@@ -164,7 +164,7 @@ class Unrolled(diffrax.AbstractSolver):
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        """No hidden state: the first stage is evaluated anew in each step."""
+        """Return `None`: the first stage is evaluated anew in each step."""
         return None
 
     def func(self, terms, t0, y0, args):
@@ -178,8 +178,8 @@ class Unrolled(diffrax.AbstractSolver):
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
     def step_with_stages(self, terms, t0, t1, y0, args):
-        """Return the end of a step over [t0, t1], its error, the slope of each stage, and share
-        of the step, t, y and weight in the error of each."""
+        """Return the end of a step over [t0, t1], its error, the slope of each stage, and for each
+        stage its share of the step, t, y and weight in the error."""
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         if self.implicit:
@@ -202,12 +202,12 @@ class Unrolled(diffrax.AbstractSolver):
         return y1, error, slopes, _with_error_weights(tableau, places)
 
     def error(self, slopes: list[Any], control: Any) -> Any:
-        """The error of a step from the slopes of its stages and its length."""
+        """Return the error of a step from the slopes of its stages and its length."""
         change = weighted(_tableau(self.solver).b_error, slopes)
         return jtu.tree_map(lambda x: control * x, change)
 
     def _implicit(self, terms, t0, t1, y0, args, control):
-        """The step of an implicit solver; its error is infinite where a stage was not solved."""
+        """Return a step with implicit stages; its error is infinite if one was not solved."""
         tableau = _tableau(self.solver)
         flat, unravel = ravel_pytree(y0)
         tolerance = 1e-12 if self.tolerance is None else self.tolerance
@@ -244,12 +244,12 @@ def _tableau(solver: Any) -> diffrax.ButcherTableau:
 
 
 # A fixed step is unstable if its error is larger than this share of the state, before it or after
-# it. Of x' = -a x that of each of diffrax's explicit solvers is, from the limit of stability on: at
-# least 0.46 (`Tsit5`).
+# it. For x' = -a x, diffrax's explicit solvers have larger errors beyond their limit of stability:
+# at least 0.46 (`Tsit5`).
 _UNSTABLE = 0.4
 
-# How well a guard has to be known that acts on nothing. A choice: of 300 thresholds that move by
-# three harmonics none was stepped over with this, and steps are twice as long as with 1e-9.
+# The tolerance of a guard that is no force. A choice: of 300 thresholds that move by three
+# harmonics none was stepped over with this, and steps are twice as long as with 1e-9.
 _VISIBLE = 1e-6
 
 
@@ -258,15 +258,15 @@ def _unrolled(solver: object) -> Unrolled:
 
 
 def _within(solver: Unrolled, tolerance: Any, sizes: Any, beside: Integrals) -> Unrolled:
-    """An implicit solver of a state of these sizes, and of what is integrated `beside` it."""
+    """Return an implicit solver for a state of these sizes, and for the integrals `beside` it."""
     if sizes is not None:
         sizes = sizes, jtu.tree_map(jnp.ones_like, beside)
     return Unrolled(solver.solver, tolerance=tolerance, sizes=sizes)
 
 
 def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
-    """Return what a step of the solver leads to: the state, what is integrated `beside` it, the
-    errors of both, the slopes at the stages, and these."""
+    """Return the results of a step of the solver: the state, the integrals `beside` it, the errors
+    of both, the slopes at the stages, and the stages."""
 
     def field(s, y, args):
         state, beside = y
@@ -279,7 +279,7 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
 
 
 def _sized_by(state: State, beside: Integrals) -> tuple[State, Integrals]:
-    """What the size of a step is chosen by: the state and the integrals, but not the elapsed
+    """Return the numbers that determine the size of a step: state and integrals without elapsed
     time."""
     return state, {name: x for name, x in beside.items() if name != TIME}
 
@@ -303,27 +303,27 @@ class _RungeKutta(AbstractMethod):
 class Adaptive(_RungeKutta):
     """A diffrax Runge–Kutta solver with steps sized by its error estimate.
 
-    An implicit one (`diffrax.Kvaerno5()`) is for machines of which a part fades much faster than
-    the rest moves, such as a strong motor: its steps need not follow what has faded.
+    Use an implicit solver (`diffrax.Kvaerno5()`) for stiff machines, in which a part decays much
+    faster than the rest moves, such as a strong motor. Its steps need not resolve that decay.
 
-    **Arguments:** `solver` (default `Verner9()`, the fastest measured from 1e-7 on); `rtol` and
-    `atol`, tolerances relative to each state component and absolute; `atol` defaults to `rtol`,
-    reduced in proportion for components that are smaller than 1; `steps_per_cycle`, the fewest
-    steps in a cycle (at least 5, the default).
+    **Arguments:** `solver` (default `Verner9()`, the fastest measured at 1e-7 and below);
+    `rtol` and `atol`, tolerances relative to each state component and absolute; `atol` defaults to
+    `rtol`, reduced in proportion for components that are smaller than 1; `steps_per_cycle`, the
+    fewest steps in a cycle (at least 5, the default).
 
     **Raises:** `TypeError` if the solver is neither explicit nor diagonally implicit Runge–Kutta,
     `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
     """
 
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
-    # Arrays, so that another tolerance is not another program.
+    # Arrays, so that another tolerance does not compile again.
     rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
     atol: Any = eqx.field(
         kw_only=True, default=None, converter=lambda x: x if x is None else _number(x)
     )
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
-    """How large the numbers of the state are, as `with_sizes` sets it."""
+    """The sizes of the state's numbers, set by `with_sizes`."""
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
@@ -337,21 +337,21 @@ class Adaptive(_RungeKutta):
 
     @property
     def wander(self):
-        """Within the tolerances, by which each step is sized anew."""
+        """The greater tolerance, since each step is sized anew."""
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     def with_sizes(self, sizes):
-        """With errors judged by these sizes, unless an absolute tolerance is given."""
+        """Return the method with errors relative to these sizes, unless `atol` is given."""
         return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
 
     @property
     def follows_fading(self):
-        """Not with an implicit solver."""
+        """True for an explicit solver."""
         return not self.solver.implicit
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, its error norm (root mean square over the components of the state
-        and the integrals of averages), and its stages."""
+        """Return the results of one Runge–Kutta step, its error norm (root mean square over the
+        components of the state and the integrals of averages), and its stages."""
         rtol, atol, floor = self._tolerances(s0)
         solver = self.solver
         if solver.implicit:
@@ -371,16 +371,16 @@ class Adaptive(_RungeKutta):
         return new, after, norm, stages
 
     def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
-        """Return rtol, atol and the smallest value of both: below rounding a tolerance would only
-        be rejected for ever."""
+        """Return rtol, atol and the least value of both: below rounding, steps would be rejected
+        for ever."""
         floor = 8 * float(jnp.finfo(like.dtype).eps)
         rtol = jnp.maximum(jnp.asarray(self.rtol, like.dtype), floor)
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, like.dtype), floor)
         return rtol, atol, floor
 
     def guard_error(self, stages, values, h, longest, *, acts, size):
-        """The error of a component whose rate is the guard, such as the impulse of a force that
-        holds a body. A guard that is not such a force has the tolerance 1e-6."""
+        """Return the error of a component whose rate is the guard, such as the impulse of a force
+        that holds a body. A guard that is not such a force has the tolerance 1e-6."""
         rtol, atol, _ = self._tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
@@ -392,12 +392,12 @@ class Adaptive(_RungeKutta):
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):
-        """A hundredth of the tolerances, and steps at most half as long."""
+        """Return the method with a hundredth of the tolerances, and steps at most half as long."""
         steps, atol = 2 * self.steps_per_cycle, None if self.atol is None else self.atol / 100
         return Adaptive(self.solver, rtol=self.rtol / 100, atol=atol, steps_per_cycle=steps)
 
     def resize(self, error):
-        """0.9 · error^(-1/order), between 0.2 and 5."""
+        """Return 0.9 · error^(-1/order), between 0.2 and 5."""
         # A step length needs no double precision, and single precision powers vectorise.
         order = self.solver.order(None) or 1
         small = jnp.clip(error, 1e-20, 1e20).astype(jnp.float32)
@@ -408,11 +408,11 @@ class Adaptive(_RungeKutta):
 class FixedStep(_RungeKutta):
     """An explicit diffrax Runge–Kutta solver with a fixed number of steps in a cycle.
 
-    Under `vmap` this is the faster choice: no lane waits for another's rejected steps. A step that
-    meets a stop is split there. The step is the smaller of a share of the drive cycle and of a
-    natural period of the body, so the error does not depend on ζ. Strong damping or a strong motor
-    makes it shorter. Lanes of a machine that does not define its `relaxation` end as `unstable` at
-    a step whose error is about as large as the state.
+    It is faster under `vmap`, since no lane waits for another's rejected steps. A step that meets a
+    stop is split there. The step is the smaller of cycle/n and natural period/n, so the error does
+    not depend on ζ. Strong damping or a strong motor makes it shorter. Lanes of a machine that does
+    not define its `relaxation` end as `unstable` at a step whose error is about as large as the
+    state.
 
     **Arguments:** `solver` (default `Verner9()`), `steps_per_cycle` (at least 5, default 10;
     `preset` has its measured error).
@@ -426,7 +426,7 @@ class FixedStep(_RungeKutta):
     steps_per_cycle: int = eqx.field(static=True, default=10)  # pyright: ignore
 
     takes_implicit: ClassVar[bool] = False
-    """Whether the solver may be implicit."""
+    """True if the solver may be implicit."""
 
     def __check_init__(self):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
@@ -437,11 +437,11 @@ class FixedStep(_RungeKutta):
             )
 
     def may_be_unstable(self, machine, s, state):
-        """True if the fastest decay of the machine is unknown."""
+        """Return whether the fastest decay of the machine is unknown."""
         return self.follows_fading and not fading_is_known(machine, s, state)
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, whether it is unstable, and its stages."""
+        """Return the results of one Runge–Kutta step, whether it is unstable, and its stages."""
         new, after, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
@@ -453,48 +453,48 @@ class FixedStep(_RungeKutta):
     def _unstable(
         self, ends: tuple[State, State], slopes: list[State], h: Scalar, unit: Scalar | float
     ) -> Scalar:
-        """More than 1 if a step is unstable, else 0, by the state at both `ends` and its slopes at
-        each stage; `unit` as `unit_of` the machine."""
-        # Of bodies at rest in zero all that is left is rounding.
+        """Return a number above 1 if a step is unstable, else 0, from the state at both `ends` and
+        its slopes at each stage; `unit` is `unit_of` the machine."""
+        # For bodies at rest in zero only rounding is left.
         rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
         before, after = (jnp.maximum(_size(x), rounding) for x in ends)
-        if not isinstance(unit, float):  # of other units of time rates are much larger, or smaller
+        if not isinstance(unit, float):  # in other units of time rates are much larger, or smaller
             after = jnp.maximum(after, jnp.where(unit == 1, 0.0, unit * _size(slopes[0])))
 
         def judged(size, h, slopes):
             apart = _size(self.solver.error(slopes, h))
             return jnp.where(apart > _UNSTABLE * size, 2.0, jnp.zeros_like(h))
 
-        # A step over less than what changes the state by itself is stable, and its error not asked.
+        # A step too short to change the state by its own size is stable without a test.
         given = jax.lax.stop_gradient((jnp.maximum(before, after), h, slopes))
         long = given[1] * _size(slopes[0]) > before
         return jax.lax.cond(long, judged, lambda size, h, slopes: jnp.zeros_like(h), *given)
 
     def tighter(self):
-        """The same solver with twice as many steps a cycle."""
+        """Return the method with twice as many steps in a cycle."""
         return FixedStep(self.solver, 2 * self.steps_per_cycle)
 
 
 class ImplicitSteps(FixedStep):
-    """An implicit solver with a fixed number of steps in a cycle, however fast something fades: by
-    these the branch of a stiff machine is followed. Where the stages of a step have no solution its
-    end is not a number."""
+    """An implicit solver with a fixed number of steps in a cycle, however fast the decay. It is
+    used to follow the branch of a stiff machine. If the stages of a step have no solution, its end
+    is NaN."""
 
     takes_implicit = True
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
-    """How large the numbers of the state are, as `with_sizes` sets it."""
+    """The sizes of the state's numbers, set by `with_sizes`."""
 
     def with_sizes(self, sizes):
-        """With stages solved to these sizes."""
+        """Return the method with stages solved relative to these sizes."""
         return dataclasses.replace(self, sizes=sizes)
 
     @property
     def follows_fading(self):
-        """Never, as with `Adaptive` and such a solver."""
+        """False, as for `Adaptive` with such a solver."""
         return False
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
-        """One Runge–Kutta step, and the stages of the solver; its error is not asked for."""
+        """Return the results of one Runge–Kutta step, an error of 0, and its stages."""
         solver = _within(self.solver, 8 * jnp.finfo(s0.dtype).eps, self.sizes, beside)
         new, beside, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))
@@ -502,5 +502,5 @@ class ImplicitSteps(FixedStep):
         return new, beside, jnp.zeros_like(s0), stages
 
     def tighter(self):
-        """The same solver with twice as many steps a cycle."""
+        """Return the method with twice as many steps in a cycle."""
         return ImplicitSteps(self.solver, 2 * self.steps_per_cycle)

@@ -1,8 +1,8 @@
-"""A Taylor method: each step is a power series, which also says where in it an event lies.
+"""A Taylor method: each step is a power series, in which events are located directly.
 
-Its coefficients come by recursion over the field's own jaxpr. With the first n of every quantity
-known, each equation gives the next one of its result: a sum, a convolution, or a recurrence of the
-kind e' = a' e.
+The coefficients are computed by recursion over the field's own jaxpr. From the first n coefficients
+of every variable, each equation gives the next one of its result: by a sum, a convolution, or a
+recurrence such as e' = a' e.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,49 +33,49 @@ Series = list[Coefficient]
 
 
 class NoSeries(Exception):
-    """A field without a recursion; the argument is the primitive's name."""
+    """A field without a recursion; the argument is the name of the primitive."""
 
 
 class NotSmooth(Exception):
-    """A field with a kink or a jump where the state says; the argument is what makes it."""
+    """A field with a kink or jump that depends on the state; the argument is its function's name."""
 
 
 def nth(series: Series, n: int) -> Coefficient:
-    """The n-th coefficient, zero beyond those known."""
+    """Return the n-th coefficient, zero beyond those known."""
     return series[n] if n < len(series) else None
 
 
 def plus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """The sum a + b of two power series."""
+    """Return the sum a + b of two coefficients."""
     if a is None or b is None:
         return b if a is None else a
     return a + b
 
 
 def minus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """The difference a - b of two power series."""
+    """Return the difference a - b of two coefficients."""
     if b is None:
         return a
     return -b if a is None else a - b
 
 
 def times(a: Coefficient, b: Coefficient) -> Coefficient:
-    """The product a b of two power series, as far as both are known."""
+    """Return the product a b of two coefficients."""
     return None if a is None or b is None else a * b
 
 
 def scaled(c: float, a: Coefficient) -> Coefficient:
-    """The power series a times a number c."""
+    """Return the coefficient a times a number c."""
     return None if a is None else a if c == 1 else a * c
 
 
 def convolution(
     a: Series, b: Series, n: int, begin: int = 0, weight: Callable[[int], float] | None = None
 ) -> Coefficient:
-    """The n-th coefficient of a product of two series, or a part of that sum: Σ weight(j) a_j
-    b_{n-j} over j from `begin` to n."""
+    """Return the n-th coefficient of a product of two series, or a part of that sum: Σ weight(j)
+    a_j b_{n-j} over j from `begin` to n."""
     terms = []
-    # What is known longest comes first: only the last products wait for the newest coefficients.
+    # The oldest coefficients come first: only the last products wait for the newest ones.
     for j in sorted(range(begin, n + 1), key=lambda j: max(j, n - j)):
         term = times(nth(a, j), nth(b, n - j))
         terms.append(term if weight is None else scaled(weight(j), term))
@@ -83,7 +83,7 @@ def convolution(
 
 
 def sum_of(terms: list[Coefficient]) -> Coefficient:
-    """Their sum, by two chains of additions that do not wait for each other."""
+    """Return the sum of terms, by two independent chains of additions."""
     chains: list[Coefficient] = [None, None]
     for i, term in enumerate(t for t in terms if t is not None):
         chains[i % 2] = plus(chains[i % 2], term)
@@ -91,29 +91,30 @@ def sum_of(terms: list[Coefficient]) -> Coefficient:
 
 
 def square(a: Series, n: int) -> Coefficient:
-    """Of a series with itself: each mixed product once."""
+    """Return the n-th coefficient of a series squared; each mixed product is computed once."""
     pairs = [times(nth(a, j), nth(a, n - j)) for j in reversed(range((n + 1) // 2))]
     total = scaled(2.0, sum_of(pairs))
     return plus(total, times(nth(a, n // 2), nth(a, n // 2))) if n % 2 == 0 else total
 
 
-# What acts on each coefficient by itself.
+# Primitives that act on each coefficient separately.
 _LINEAR = (
     "neg", "convert_element_type", "stop_gradient", "copy", "copy_p", "pin", "reshape",
     "broadcast_in_dim", "squeeze", "expand_dims", "transpose", "slice", "rev", "reduce_sum",
     "cumsum", "split", "tile", "unstack",
 )  # fmt: skip
 
-# What is linear in several operands at once: those in these places, or all; the others are places
-# in arrays, known where the step begins.
+# Primitives that are linear in several operands together: those at these positions, or all. The
+# others are indices, known at the begin of the step.
 _JOINED = {
     "concatenate": None, "stack": None, "pad": None, "dynamic_slice": (0,), "gather": (0,),
     "dynamic_update_slice": (0, 1), "scatter": (0, 2), "scatter-add": (0, 2),
 }  # fmt: skip
 
 
-# What is not smooth in some of its operands: how a field writes it, and these. A series goes on as
-# the step begins. Comparisons count where something is chosen by them.
+# Primitives that are not smooth in some of their operands: the function's name for users, and the
+# operands' positions. A series continues the branch at the begin of the step. Comparisons count if
+# something is selected by them.
 KINKS = {
     "abs": ("abs", slice(None)),
     "max": ("maximum", slice(None)),
@@ -130,7 +131,7 @@ KINKS = {
     "scatter-add": ("an index", slice(1, 2)),
 }
 
-# What is decided by the value where the step begins.
+# Primitives whose result is constant within a step: it depends on the value at the begin.
 _DECIDED = (
     "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite", "iota", "abs",
     "max", "min", "sign", "round", "floor", "ceil",
@@ -140,13 +141,13 @@ _DECIDED = (
 def _bound(eqn: Any, *values: Any) -> Any:
     if any(isinstance(v, Tracer) for v in values):
         return eqn.primitive.bind(*values, **eqn.params)
-    with jax.ensure_compile_time_eval():  # what is known, such as an exponent, stays known
+    with jax.ensure_compile_time_eval():  # known values, such as an exponent, stay known
         return eqn.primitive.bind(*values, **eqn.params)
 
 
-# Each rule returns the n-th coefficient of an equation's result, or a list of them where it has
-# several results, from the equation of a jaxpr; n; the series of its operands, known up to n; those
-# of its results, known before n; and a dictionary that it keeps from one n to the next.
+# Each rule returns the n-th coefficient of an equation's result, or a list of them for several
+# results. Its arguments are the equation of a jaxpr; n; the series of its operands, known up to n;
+# those of its results, known before n; and a dictionary that it keeps from one n to the next.
 
 
 def _linear(eqn, n, operands, results, extra):
@@ -208,8 +209,8 @@ def _quotient(eqn, n, operands, results, extra):
 
 
 def _power(series: Series, own: Series, p: float, n: int, first: Any, extra: dict) -> Coefficient:
-    """The n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}; `own` are those
-    before it, `first` gives a^p of a number."""
+    """Return the n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}. `own` are
+    the previous ones, `first` returns a^p of a number."""
     if n == 0:
         return first(series[0])
     total = convolution(series, own, n, 1, lambda j: (p * j - (n - j)) / n)
@@ -233,7 +234,7 @@ def _integer_power(eqn, n, operands, results, extra):
 
 
 def _multiplied(a: Series, y: int, n: int, extra: dict) -> Coefficient:
-    """The n-th coefficient of a^y by squares and products, whose series are kept."""
+    """Return the n-th coefficient of a^y by squares and products, whose series are kept."""
     if y == 1:
         return nth(a, n)
     own: Series = extra.setdefault(y, [])
@@ -291,7 +292,7 @@ def _log(eqn, n, operands, results, extra):
 
 
 def _pair(n: int, a: Series, sine: Series, cosine: Series) -> tuple[Coefficient, Coefficient]:
-    """Next coefficients of sine and cosine, each other's derivatives."""
+    """Return the next coefficients of sine and cosine, each other's derivatives."""
     s = convolution(a, cosine, n, 1, _derivative_weight(n))
     return s, minus(None, convolution(a, sine, n, 1, _derivative_weight(n)))
 
@@ -315,7 +316,7 @@ def _one_of_pair(which: int):
 
 
 def _saturating(slope: Callable[[Any], Any], next_slope: Callable[[Series, int], Coefficient]):
-    """Of functions whose derivative is a polynomial of themselves: y' = slope(y) a'."""
+    """Return a rule for a function whose derivative is a polynomial of itself: y' = slope(y) a'."""
 
     def rule(eqn, n, operands, results, extra):
         rates: Series = extra.setdefault("slope", [])
@@ -359,10 +360,10 @@ RULES: dict[str, Callable] = {
 def expand(
     field: Callable[[Scalar, State], State], s: Scalar, state: State, order: int
 ) -> tuple[Any, list[Series]]:
-    """Coefficients of the solution of d(state)/ds = field(s, state) in powers of s - s0, up to one:
-    their tree, and those of each leaf, each a list of `order + 1` (`None` for zero). **Raises:**
-    `NoSeries` if the field has a primitive without a recursion, `NotSmooth` if one that is not
-    smooth acts on what moves."""
+    """Return the solution of d(state)/ds = field(s, state) in powers of s - s0: its tree, and for
+    each leaf a list of `order + 1` coefficients (`None` for zero). **Raises:** `NoSeries` if the
+    field has a primitive without a recursion, `NotSmooth` if a primitive that is not smooth acts on
+    a variable."""
     leaves, treedef = jtu.tree_flatten(state)
 
     def flat(s, *leaves):
@@ -379,7 +380,7 @@ def expand(
 
 
 def along(function: Callable[[State], Scalar], treedef: object, series: list[Series]) -> "Along":
-    """A scalar function of the state along a motion, as a power series; as from `expand`."""
+    """Return a scalar function of the state along a motion, as a power series; as from `expand`."""
 
     def flat(*leaves):
         return jtu.tree_leaves(function(jtu.tree_unflatten(treedef, leaves)))
@@ -408,8 +409,8 @@ class Along(NamedTuple):
     series: Series
 
     def without_flutter(self, shortest: Scalar) -> "Along":
-        """The same, but for a body that has just been let go without the speed and acceleration
-        that rounding has left, if its jerk outweighs both within the time `shortest`."""
+        """Return the series without speed and acceleration of a body that has just been released,
+        if its jerk outweighs both within the time `shortest`: they are rounding errors."""
         if len(self.series) < 4 or any(x is None for x in self.series[1:4]):
             return self
         x, v, a, j, *rest = self.series
@@ -419,7 +420,7 @@ class Along(NamedTuple):
         return Along([x, v, a, j, *rest])
 
     def ends(self, h: Scalar) -> tuple[Rates, Rates]:
-        """Its rates at both ends of a step of this length."""
+        """Return its rates at both ends of a step of this length."""
         slope, zero = _slope(self.series), jnp.zeros_like(h)
         each = self.series, slope, _slope(slope)
 
@@ -429,7 +430,7 @@ class Along(NamedTuple):
         return rates(lambda c: c[0]), rates(lambda c: _sum_series(c, h))
 
     def over(self, h: Scalar, factor: int = 1, offset: Scalar | None = None) -> Scalars:
-        """Coefficients of factor·x - offset in θ, which goes from 0 to 1 along such a step."""
+        """Return the coefficients of factor·x - offset in θ, from 0 to 1 along such a step."""
         found, power = [], None
         for c in self.series:
             found.append(jnp.zeros_like(h) if c is None else c if power is None else c * power)
@@ -440,19 +441,19 @@ class Along(NamedTuple):
 
 
 class _Flow:
-    """A jaxpr evaluated coefficient by coefficient: each of its equations keeps the series of its
-    operands and results."""
+    """A jaxpr evaluated coefficient by coefficient; each equation keeps the series of its operands
+    and results."""
 
     def __init__(self, closed: ClosedJaxpr, inputs: list[Series]):
         self.env: dict[Any, Series] = {}
         self.equations: list[tuple[Any, list[Any], list[Any]]] = []
         self.extra: list[dict[str, Series]] = []
-        # By their identity the series that move; all others are numbers that stay what they are.
+        # The series that vary, by their identity; all others are constant.
         self.moving = {id(x) for x in inputs}
         self.outs = self._inline(closed.jaxpr, list(closed.consts), inputs)
 
     def _inline(self, jaxpr: Jaxpr, consts: list, args: list[Series]) -> list[Series]:
-        """The equations of a jaxpr and all that it calls, with a series for each variable."""
+        """Add the equations of a jaxpr and all that it calls, with a series for each variable."""
         names: dict[Any, Series] = {}
         for var, const in zip(jaxpr.constvars, consts, strict=True):
             names[var] = [const]
@@ -486,7 +487,7 @@ class _Flow:
         return [read(a) for a in jaxpr.outvars]
 
     def next(self, n: int) -> list[Coefficient]:
-        """The n-th coefficients of the results, from all operands' up to the n-th."""
+        """Return the n-th coefficients of the results, from all operands' up to the n-th."""
         for (eqn, operands, results), extra in zip(self.equations, self.extra, strict=True):
             if results[0] is not None and len(results[0]) > n:
                 continue
@@ -498,7 +499,7 @@ class _Flow:
 
 @contextmanager
 def _in_words() -> Iterator[None]:
-    """**Raises:** `NotImplementedError` for what has no series, by name and with a remedy."""
+    """**Raises:** `NotImplementedError` with a remedy for primitives without a series."""
     where = "in the machine's field, averages or coordinates"
     try:
         yield
@@ -519,26 +520,26 @@ class Expansion(NamedTuple):
     """A motion about a point, in powers of s - s0."""
 
     treedef: Any
-    """Of the state and what is integrated beside it."""
+    """The structure of the state and the integrals."""
     series: list[Series]
     tolerance: np.ndarray | float | None
-    """By which its reach is measured; `None` of one that reaches as far as it is asked to."""
+    """The tolerance that determines its reach; `None` without a limit."""
     rarely: bool = False
-    """Few steps are shortened by it; static."""
+    """True if it shortens few steps; static."""
 
     def at(self, h: Scalar) -> tuple[State, Integrals]:
-        """State, and what is integrated beside it, a length h away."""
+        """Return the state and the integrals after a length h."""
         return jtu.tree_unflatten(self.treedef, [_sum_series(x, h) for x in self.series])
 
     def of(self, function: Callable[[State], Any]) -> Along:
-        """A scalar function of the state along it, a constant for differentiation."""
+        """Return a function of the state along the motion, a constant for differentiation."""
         still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
         with _in_words():
             return along(lambda y: function(y[0]), self.treedef, still)
 
     def reach(self, limit: Scalar) -> Scalar:
-        """The length at which the last two terms are as small as the tolerance, relative to the
-        state (Jorba and Zou, Experimental Mathematics 14, 2005), up to this limit."""
+        """Return the length at which the last two terms are as small as the tolerance, relative to
+        the state (Jorba and Zou, Experimental Mathematics 14, 2005), at most `limit`."""
         if self.tolerance is None:
             return limit
         floor = 8 * jnp.finfo(limit.dtype).eps
@@ -564,15 +565,15 @@ class Expansion(NamedTuple):
 
 
 class Taylor(AbstractMethod):
-    """Power series of the motion, their coefficients by recursion over the machine's own field.
+    """Power series of the motion, with coefficients by recursion over the machine's own field.
 
-    The series gives the motion within a step, so that an event is located directly. The method of
-    choice for smooth fields at small errors; `NotImplementedError` names the operation of a field
-    that has no recursion, or that is not smooth in the state (`jnp.where`, `jnp.abs`).
+    The series gives the motion within a step, so that an event is located directly. It is
+    recommended for smooth fields at small errors. `NotImplementedError` names the operation of a
+    field that has no recursion, or that is not smooth in the state (`jnp.where`, `jnp.abs`).
 
     **Arguments:** `order` of the series (at least 4, default 16); `steps_per_cycle` (at least 5,
-    default 8), as for `FixedStep`, and the fewest: a step is shortened where its series would
-    diverge; `rtol`, if given, sizes each step by its last terms instead.
+    default 8), as for `FixedStep`, and the fewest, since a step is shortened if its series would
+    diverge; `rtol`, a tolerance by which each step is sized from its last terms instead.
 
     **Raises:** `ValueError` for numbers out of range, and for a `SoftStop` with an exponent other
     than 1, whose force has no series at first touch.
@@ -592,11 +593,11 @@ class Taylor(AbstractMethod):
 
     @property
     def wander(self):
-        """By how much a motion that repeats may differ: the tolerance; 0 of fixed steps."""
+        """The greatest difference between two periods: the tolerance; 0 for fixed steps."""
         return 0.0 if self.rtol is None else self.rtol
 
     def tighter(self):
-        """Twice the steps, and a hundredth of the tolerance if there is one."""
+        """Return the method with twice the steps, and a hundredth of the tolerance, if any."""
         steps = 2 * self.steps_per_cycle
         if self.rtol is None:
             return Taylor(self.order, steps)
@@ -620,7 +621,7 @@ class Taylor(AbstractMethod):
     def foresee(
         self, smooth: SmoothMachine, s: Scalar, state: State, beside: Integrals
     ) -> Expansion:
-        """The motion as a power series about (s, state), with the integrals."""
+        """Return the motion as a power series about (s, state), with the integrals."""
 
         def field(s, y):
             state, beside = y
@@ -635,12 +636,12 @@ class Taylor(AbstractMethod):
 
     @property
     def _coarsest(self) -> float:
-        """The last term, relative to the state, of a motion with four periods in a natural one or
-        a cycle: fixed steps are shortened where theirs is larger, as under strong damping that the
-        machine does not define (`relaxation`), since the series would diverge."""
+        """The last term, relative to the state, of a motion with four periods in a natural period
+        or a cycle. Fixed steps with a larger term are shortened, since their series would diverge,
+        as under strong damping that the machine does not define (`relaxation`)."""
         return min((8 * pi / self.steps_per_cycle) ** self.order / factorial(self.order), 0.1)
 
     def step(self, smooth, s0, s1, state, beside):
-        """The sum of the series at `s1`."""
+        """Return the sum of the series at `s1`."""
         new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)

@@ -12,7 +12,7 @@ import diffrax
 import numpy as np
 
 # fmt: off
-# Nodes of the stages after the first, and what each takes of those before it.
+# Nodes of the stages after the first, and the weights of the earlier stages in each.
 _C = (
     0.04, 0.09648736013787361, 0.1447310402068104, 0.576, 0.2272326564618766, 0.5407673435381234,
     0.64, 0.48, 0.06754, 0.25, 0.6770920153543243, 0.8115, 0.906, 1.0, 1.0,
@@ -59,7 +59,7 @@ _A = (
         1.5215530950085394, 0, 0,
     ),
 )
-# Weights of the solution, of order 9, and of the one of order 8 beside it.
+# Weights of the solution, of order 9, and of the embedded one, of order 8.
 _B = (
     0.014588852784055396, 0, 0, 0, 0, 0, 0, 0.0020241978878893325, 0.21780470845697167,
     0.12748953408543898, 0.2244617745463132, 0.1787254491259903, 0.07594344758096558,
@@ -78,7 +78,7 @@ class Verner9(diffrax.AbstractERK):
     estimate; for `FixedStep`, `Adaptive`, or diffrax itself.
 
     8 steps a cycle are as accurate as 12 of `diffrax.Dopri8` for the paper's motor (error 4e-10),
-    and 20 as 36 (7e-14). Samples end steps here; diffrax's interpolation between steps is cubic.
+    and 20 as 36 (7e-14). Steps end on samples here; diffrax's own interpolation is cubic.
     """
 
     tableau: ClassVar[Any] = diffrax.ButcherTableau(
