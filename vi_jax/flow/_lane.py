@@ -126,7 +126,7 @@ class Lane(NamedTuple):
     """Steps tried in the current interval."""
     rejected: Scalar
     last_impulse: Scalar | None = None
-    """Time since the begin of the interval at the last impulse of noise; `None` if the impulses
+    """Time since the start of the interval at the last impulse of noise; `None` if the impulses
     come at times known in advance."""
     completed: Flag | None = None
     """True if the interval is complete, while the events of a step are applied; `None` between
@@ -325,7 +325,7 @@ class Plan(eqx.Module):
         return cycle * (part + 1) / self.instants if self.instants > 1 else cycle
 
     def first_part(self, done: Scalar) -> Scalar:
-        """Return `Lane.part` at the begin of a cycle, after `done` intervals. Without noise, a
+        """Return `Lane.part` at the start of a cycle, after `done` intervals. Without noise, a
         cycle that is not recorded is a single interval, the last of the cycle; else this is 0."""
         if self.noise is not None:
             return jnp.zeros_like(done)

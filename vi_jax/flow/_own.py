@@ -1,5 +1,5 @@
-"""Checks of a machine written by a user, with errors that name it; and the names of its own
-quantities: functions of its state, and averages over a cycle."""
+"""Checks of a machine written by a user, with errors that name it; and the names of quantities that
+it defines: functions of its state, and averages over a cycle."""
 
 import contextlib
 import dataclasses
@@ -240,8 +240,8 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
-    """Return the place in a cycle where a slip changes most, the range of its values, and its
-    change there between two of many instants and between two that are far closer."""
+    """Return the place in a cycle where a slip changes most, and the range of its values. Also
+    return its changes there between two of many instants, and between two far closer ones."""
     friction: Any = switches_of(machine)[number]
     slip = lambda s: jnp.asarray(friction.speed_of_slip(machine, s, start), float)
     s = jnp.asarray(machine.cycle, float) * (np.arange(_SLIPS) / _SLIPS)
@@ -262,7 +262,7 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """Return the cycle; the field at its begin, within it and at its end, if `s` `ticks`; for each
+    """Return the cycle; the field at its start, within it and at its end, if `s` `ticks`; for each
     guard, whether it is negative in any state around the start. `zero` is an argument, since JAX
     evaluates what depends on constants alone separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))

@@ -184,7 +184,7 @@ class FlowToEvent:
         self._pure_rate = self._pure(self._rate)
 
     def drifted(self, offset: Scalar, moving: tuple | None = None) -> Any:
-        """Return s, state and integrals after a further `offset`, by default from the begin."""
+        """Return s, state and integrals after a further `offset`, by default from the start."""
         return drifted(self._pure_rate, offset, *self._given(moving))
 
     def unmoved(self, offset: Scalar) -> Any:

@@ -98,9 +98,9 @@ def slope(c: Scalars) -> Scalars:
 
 
 def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
-    """Return the θ in [0, 1] at which a polynomial that ends positive first rises through zero, by
+    """Return the θ in [0, 1] where a polynomial that ends positive first rises through zero, by
     Newton's method inside a bracket. If the polynomial starts at zero and falls (the body leaves
-    the stop), the root comes later. Where it falls at a greater value, the root lies before."""
+    the stop), its root comes later. If it falls at a value above that, its root lies before."""
     derivative = slope(c)[:-1]
     low, high = jnp.zeros_like(c[0]), jnp.ones_like(c[0])
     end, end_rate = sum(c[1:], c[0]), sum(derivative[1:], derivative[0])

@@ -74,7 +74,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     along a motion. It is 1 for an angle, for a number that is zero to rounding, and for a machine
     whose numbers are about 1 by definition. States are compared relative to these sizes.
 
-    **Arguments:** `start`, the state at the begin; `rows`, other states of it, (..., states).
+    **Arguments:** `start`, the initial state; `rows`, other states of the motion, (..., states).
     """
     state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), bare(start))  # integers too
     row, unravel = ravel_pytree(stop_gradient(state))
@@ -170,7 +170,7 @@ def _small(size: Array) -> Array:
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
-    """Return the lane at the begin of its loop, in the state `start`. A lane that cannot be
+    """Return the lane at the first step of its loop, in the state `start`. A lane that cannot be
     simulated, or is not `wanted`, has ended already."""
     machine = plan.machine
     Y = machine.position(start)
@@ -265,9 +265,9 @@ class Ends(NamedTuple):
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
     """Run a lane to its end in one flat loop; in a batch no lane waits for another at a section.
 
-    **Returns:** its ends; states and records of the recorded intervals, with leading axis
-    `plan.kept + 1`. The first is the state in which recording begins, with an empty record. States
-    of a machine with modes of its own are `HybridState`s.
+    **Returns:** its `Ends`; states and records of the recorded intervals, with leading axis
+    `plan.kept + 1`. The first is the state in which recording begins, with an empty record. The
+    states are `HybridState`s if the machine has its own modes.
     """
     form = prepared(plan.machine)
     own = form.machine is plan.machine

@@ -38,7 +38,7 @@ _SHORTEST, _SHORTEST_SINGLE, _SHORTEST_DIP = 1e-6, 1e-3, 1e-3
 def _corner(
     begin: tuple[Scalar, Scalar], end: tuple[Scalar, Scalar], h: Scalar, bent: Flag
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the place, from the begin of a step, where the tangents at both ends meet, and their
+    """Return the place, from the start of a step, where the tangents at both ends meet, and their
     height there, which no curve bent one way exceeds; and the place of the maximum if the slope
     changes linearly. `begin` and `end` are value and slope at the ends."""
     (x0, v0), (x1, v1) = begin, end
@@ -258,7 +258,7 @@ def first_event(
         # The chord is accurate enough to find the first event: a landing that lies beyond another
         # event is not accepted.
         begin, end = guard.begin.x, guard.end.x
-        # An event that lies behind a step of length zero is met at its begin.
+        # An event that lies behind a step of length zero is met at its start.
         rise = jnp.where(end > begin, end - begin, 1.0)
         place = jnp.where(over, jnp.maximum(-begin, 0.0) / rise, jnp.inf)
         if guard.above is not None:  # before any turn
@@ -296,7 +296,7 @@ def first_event(
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
     """Return the earliest event of a step: its target, the curve that rises through zero there, and
-    whether it lies at the begin of the step (`None` if it cannot).
+    whether it lies at the start of the step (`None` if it cannot).
 
     **Arguments:** `found`, for each event its place, then these three. The place is infinite if the
     event was not met, and negative if it comes before any other.

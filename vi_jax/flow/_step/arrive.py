@@ -55,8 +55,8 @@ def happened(
 ) -> Lane:
     """Return the lane after the events that are no impacts, and after all that they trigger.
 
-    Of events at one instant the first listed comes first. The jumps of guards decide which events
-    come next: an event happens if its guard jumps from below zero to above, or was near zero and
+    Simultaneous events happen in the order of the machine's list. The jumps of guards trigger
+    others: an event happens next if its guard jumps from below zero to above, or was near zero and
     jumps away from it. No event triggers itself.
 
     **Arguments:** `due` and `near`, flags by the numbers of events: those that are due, and those

@@ -195,7 +195,7 @@ def may_be_above(
     at both ends, and of its values at stages.
 
     The top of a parabola between two places exceeds both by at most an eighth of its fall to the
-    next place; a half of that fall is allowed here. If the function falls at the begin of the step,
+    next place; a half of that fall is allowed here. If the function falls at the start of the step,
     or rises at its end, it has no top there.
     """
     (x0, v0), (x1, v1) = begin, end
@@ -207,7 +207,7 @@ def may_be_above(
 
 def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scalar) -> Flag:
     """Return whether a body may turn twice within a step and touch a stop in between, like one that
-    has just left it: it is slow at the begin of the step, moves the same way at the end, and at
+    has just left it: it is slow at the start of the step, moves the same way at the end, and at
     both could get to the stop in this time."""
     begin, end = ends
     slow = (jnp.abs(begin.v) <= jnp.abs(begin.a) * h) & (lane.direction[k] * end.v >= 0)
@@ -270,7 +270,7 @@ class Crossing(NamedTuple):
     """A step may begin or end beyond the event by this rounding error; `None` if positions on it
     are exact."""
     above: Flag | None = None
-    """True if the guard has jumped above zero at the begin of the step, for example with the clock
+    """True if the guard has jumped above zero at the start of the step, for example with the clock
     of a new cycle; `None` for a stop."""
     offset: Any = None
     """δ from the step's end to the event."""
@@ -319,7 +319,7 @@ def crossings(
 
 
 def _jumped(guard: Crossing) -> Crossing:
-    """Set `above` of an event: its guard is above zero at the begin of the step, by more than
+    """Set `above` of an event: its guard is above zero at the start of the step, by more than
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
     return guard._replace(above=x > JUMPED * jnp.abs(x) + guard_rounding(guard.scale))
@@ -331,7 +331,7 @@ def guard_rounding(scale: Scalar) -> Scalar:
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
-    """Return the stops in a step, from the rates of each coordinate at its begin and end."""
+    """Return the stops in a step, from the rates of each coordinate at its start and end."""
     found = []
     for i, stop in enumerate(stops_of(plan.machine)):
         begin, end = (x.scaled(stop.sign, stop.gap) for x in ends[stop.coordinate])
@@ -409,7 +409,7 @@ def _others(
 
 
 def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
-    """Return the rates of a guard at the begin of a step, without a rise by rounding. After an
+    """Return the rates of a guard at the start of a step, without a rise by rounding. After an
     event the guard and its slope may both be zero, as the velocity of a body that begins to slip;
     its second derivative then makes it fall."""
     x, v, a = stop_gradient(begin)

@@ -127,7 +127,7 @@ def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
 
 
 def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
-    """Return the lane at the begin of its next interval, if one was `completed`; and of its next
+    """Return the lane at the start of its next interval, if one was `completed`; and of its next
     cycle, if that was the cycle's last. The step `reached` the end of a piece of its cycle."""
     turned, part, state = reached, arrived.part, arrived.state
     if plan.instants > 1:
@@ -149,7 +149,7 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
 
 
 def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
-    """Return the lane with its modes after a jump of a slip at the begin of a cycle: by `renewed`,
+    """Return the lane with its modes after a jump of a slip at the start of a cycle: by `renewed`,
     or since the clock of a moving surface begins anew."""
     machine, renewed = plan.machine, new.state is not old.state
     dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]

@@ -428,7 +428,7 @@ def _held(
     waits: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
-    rest. By coordinate, `rests` is whether it does, `waits` the time until then (in s)."""
+    rest. For each coordinate: `rests`, whether it does; `waits`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)

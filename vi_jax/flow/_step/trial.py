@@ -70,7 +70,7 @@ def release(
     near = jnp.abs(stop_gradient(offset)) <= close
     aimed = held & (lane.target == to_release(k))
     met = rising & aimed & (h <= 2 * straight) & near
-    # At the begin of so short a step the force was all rounding, and may still be: for example that
+    # At the start of so short a step the force was all rounding, and may still be: for example that
     # of a stack released as one, whose bodies separate by what comes later.
     landed = met | aimed & (h <= close)
     left = rising & (after > 0) & ~landed

@@ -133,8 +133,8 @@ class AbstractMethod(eqx.Module):
     def step_with_stages(
         self, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
     ) -> tuple[State, Integrals, Scalar, list[Stage]]:
-        """Return the results of `step`, and the stages of the step: states within it, for guards
-        that its ends do not resolve. By default these are three places to step to."""
+        """Return the results of `step` and its stages: states within the step, for guards that its
+        ends do not resolve; by default three places to step to."""
         new, beside, error = self.step(smooth, s0, s1, state, beside)
         if not self.holds(smooth.machine):
             return new, beside, error, []

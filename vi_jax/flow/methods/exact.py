@@ -510,7 +510,7 @@ def _from_rest(zeta, xi, begin, turn, tau):
     inverse = (other[0] * scale, -other[1] * scale)
     lag = _times((change[0], -change[1]), begin)
     z = _minus(resonant, _times(_minus(turn, lag), inverse))
-    # d/dτ of each part, from its definition; the common part of both at the begin cancels.
+    # d/dτ of each part, from its definition; the common part of both at the start cancels.
     p, p_bar = (-xi, omega), (-xi, -omega)
     i_zeta = (jnp.zeros_like(zeta), zeta)
     rate_resonant = _times(p, resonant)

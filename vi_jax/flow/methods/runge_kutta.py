@@ -178,8 +178,8 @@ class Unrolled(diffrax.AbstractSolver):
         return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
     def step_with_stages(self, terms, t0, t1, y0, args):
-        """Return the end of a step over [t0, t1], its error, the slope of each stage, and for each
-        stage its share of the step, t, y and weight in the error."""
+        """Return the end of a step over [t0, t1], its error, and the slopes of its stages; and for
+        each stage its share of the step, t, y and weight in the error."""
         tableau = _tableau(self.solver)
         control = terms.contr(t0, t1)
         if self.implicit:

@@ -37,7 +37,7 @@ class NoSeries(Exception):
 
 
 class NotSmooth(Exception):
-    """A field with a kink or jump that depends on the state; the argument is its function's name."""
+    """A field with a kink or jump that depends on the state; the argument names its function."""
 
 
 def nth(series: Series, n: int) -> Coefficient:
@@ -105,7 +105,7 @@ _LINEAR = (
 )  # fmt: skip
 
 # Primitives that are linear in several operands together: those at these positions, or all. The
-# others are indices, known at the begin of the step.
+# others are indices, known at the start of the step.
 _JOINED = {
     "concatenate": None, "stack": None, "pad": None, "dynamic_slice": (0,), "gather": (0,),
     "dynamic_update_slice": (0, 1), "scatter": (0, 2), "scatter-add": (0, 2),
@@ -113,7 +113,7 @@ _JOINED = {
 
 
 # Primitives that are not smooth in some of their operands: the function's name for users, and the
-# operands' positions. A series continues the branch at the begin of the step. Comparisons count if
+# operands' positions. A series continues the branch at the start of the step. Comparisons count if
 # something is selected by them.
 KINKS = {
     "abs": ("abs", slice(None)),
@@ -131,7 +131,7 @@ KINKS = {
     "scatter-add": ("an index", slice(1, 2)),
 }
 
-# Primitives whose result is constant within a step: it depends on the value at the begin.
+# Primitives whose result is constant within a step: it depends on the value at the start.
 _DECIDED = (
     "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite", "iota", "abs",
     "max", "min", "sign", "round", "floor", "ceil",
