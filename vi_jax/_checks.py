@@ -1,4 +1,4 @@
-"""Checks and conversions of what a user passes in. Concrete numbers are checked; tracers pass."""
+"""Checks and conversions of a user's arguments. Concrete numbers are checked, tracers are not."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ from ._messages import warn
 
 
 class Range(NamedTuple):
-    """Finite numbers between two bounds, which are in it unless they are open."""
+    """An interval of finite numbers. Its bounds belong to it unless they are open."""
 
     low: float = -np.inf
     high: float = np.inf
@@ -30,7 +30,7 @@ class Range(NamedTuple):
     open_high: bool = False
 
     def holds(self, numbers: Any) -> Any:
-        """Whether each of these is in it; of traced numbers a traced truth."""
+        """Return whether each number is in the interval; a traced array for traced numbers."""
         fits = jnp.isfinite(numbers) if isinstance(numbers, jax.Array) else np.isfinite(numbers)
         fits = fits & (numbers > self.low if self.open_low else numbers >= self.low)
         return fits & (numbers < self.high if self.open_high else numbers <= self.high)
@@ -45,9 +45,8 @@ REAL, POSITIVE, NOT_NEGATIVE, SHARE = Range(), Range(0.0, open_low=True), Range(
 
 
 def require(name: str, value: object, **bounds: Any) -> None:
-    """Raise a `ValueError` unless every concrete number in `value` is finite and in range, the
-    `Range` of these bounds. **Raises:** `TypeError` for what is no real number; placeholders and
-    tracers pass."""
+    """Raise a `ValueError` unless each concrete number in `value` is in the `Range` of `bounds`, or
+    a `TypeError` if it is no real number. Placeholders and tracers are not checked."""
     numbers, range_ = _real(name, value), Range(**bounds)
     if numbers is None:
         return
@@ -59,20 +58,20 @@ def require(name: str, value: object, **bounds: Any) -> None:
 
 @lru_cache(maxsize=256)
 def fields_with(kind: type, about: str) -> dict[str, Any]:
-    """What the fields of a class have in their metadata under this name: `"range"` or `"unit"`."""
+    """Return the metadata `about` (`"range"` or `"unit"`) of the fields of a class that have it."""
     found = {x.name: x.metadata[about] for x in dataclasses.fields(kind) if about in x.metadata}
     return found | (getattr(kind, "ranges", {}) if about == "range" else {})
 
 
 def require_ranges(part: Any) -> None:
-    """`require` for every number of a module whose field has a range."""
+    """Apply `require` to each number of a module whose field has a range."""
     for name, range_, value in _ranged(part):
         require(name, value, **range_._asdict())
 
 
 def in_range(tree: object) -> Bool[Array, ""]:
-    """Whether all numbers of all modules in a tree are in their ranges, traced ones too: what is
-    put into a module by `eqx.tree_at`, or is being traced, has passed no other check."""
+    """Return whether all numbers of all modules in a tree are in their ranges, traced ones
+    included. Numbers that are traced or inserted by `eqx.tree_at` have passed no other check."""
     good = jnp.asarray(True)
     for part in {id(part): part for part in _modules(tree)}.values():
         for _, range_, value in _ranged(part):
@@ -98,8 +97,8 @@ def _modules(node: object) -> Iterator[eqx.Module]:
 
 
 def count(name: str, value: object, *, least: int = 0, most: int = 2**31 - 1) -> int:
-    """A Python integer from `least` to `most`, or an error that says what came. A known integer of
-    JAX's or NumPy's, such as an orbit's `cycles`, is one."""
+    """Return an integer from `least` to `most` as a Python integer. Concrete integers of JAX and
+    NumPy, such as an orbit's `cycles`, are allowed. **Raises:** `TypeError` or `ValueError`."""
     if isinstance(value, Tracer):
         raise TypeError(f"Argument `{name}` must be an integer that is known, but is being traced.")
     if isinstance(value, jax.Array | np.ndarray) and not value.ndim:
@@ -114,7 +113,7 @@ def count(name: str, value: object, *, least: int = 0, most: int = 2**31 - 1) ->
 
 
 def unwritable(folder: str | Path) -> str | None:
-    """Why nothing can be written into this folder, or `None`; makes the folder."""
+    """Create a folder. Return why no file can be written into it, or `None`."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -126,7 +125,7 @@ def unwritable(folder: str | Path) -> str | None:
 
 
 def one_of(name: str, value: object, allowed: tuple[str, ...]) -> str:
-    """One of a few words, or an error that lists them."""
+    """Return `value` if it is an allowed word. **Raises:** `ValueError` that lists these."""
     if not isinstance(value, str) or value not in allowed:
         words = ", ".join(repr(word) for word in allowed)
         raise ValueError(f"Argument `{name}` must be one of {words}, but got {value!r}.")
@@ -138,7 +137,7 @@ def _is_real(kind: Any) -> bool:
 
 
 def _real(name: str, value: object) -> np.ndarray | None:
-    """The numbers behind `value`, or `None` for tracers and placeholders."""
+    """Return the numbers of `value`, or `None` for tracers and placeholders."""
     numbers = concrete(value)
     wrong = isinstance(value, bool | str | bytes | complex | list | tuple | set | dict)
     if wrong or (numbers is not None and not _is_real(numbers.dtype)):
@@ -147,7 +146,7 @@ def _real(name: str, value: object) -> np.ndarray | None:
 
 
 def given_number(name: str, value: object, **limits: Any) -> float:
-    """One finite real number that is known, in the limits of `require`."""
+    """Return one concrete, finite real number within the limits of `require`."""
     numbers = _real(name, value)
     if numbers is None or numbers.ndim:
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.")
@@ -156,7 +155,7 @@ def given_number(name: str, value: object, **limits: Any) -> float:
 
 
 def interval(name: str, value: Any) -> tuple[float, float]:
-    """Two finite numbers, the lower one first."""
+    """Return two finite numbers, the lower one first. **Raises:** `ValueError` for other values."""
     try:
         low, high = (given_number(name, x) for x in value)
         if low < high:
@@ -169,8 +168,8 @@ def interval(name: str, value: Any) -> tuple[float, float]:
 
 
 def _row_of_numbers(values: object) -> np.ndarray | None:
-    """Finite real numbers in one row, one at least, or `None` for other values. Texts, truth
-    values, dates and complex numbers are no real numbers, even where NumPy takes them."""
+    """Return a non-empty list of finite real numbers as an array; `None` for other values. Strings,
+    booleans, dates and complex numbers are refused, even those that NumPy converts."""
     if isinstance(values, list | tuple) and any(isinstance(x, bool | np.bool_) for x in values):
         return None
     try:
@@ -184,8 +183,8 @@ def _row_of_numbers(values: object) -> np.ndarray | None:
 
 
 def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.ndarray]:
-    """The axes as rows of numbers. **Raises:** `ValueError` that names the axis, or `TypeError` for
-    what is no mapping."""
+    """Return the axes as arrays of numbers. **Raises:** `ValueError` that names the wrong axis;
+    `TypeError` if `axes` is no mapping or is empty."""
     if not isinstance(axes, Mapping) or not axes:
         raise TypeError(
             f"Argument `{argument}` must map names of numbers to rows of values, such as "
@@ -204,14 +203,14 @@ def axes_of(axes: Mapping[str, Any], argument: str = "axes") -> dict[str, np.nda
 
 
 def flag(name: str, value: object) -> bool:
-    """A flag as Python's own. **Raises:** `TypeError` unless it is `True` or `False`."""
+    """Return a flag as a Python `bool`. **Raises:** `TypeError` for values that are no booleans."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"Argument `{name}` must be True or False, but got {value!r}.")
     return bool(value)
 
 
 def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
-    """A tuple of things of this kind."""
+    """Return a tuple whose items are instances of `kind`. **Raises:** `TypeError` for others."""
     try:
         if isinstance(value, str):
             raise TypeError
@@ -227,12 +226,12 @@ def tuple_of(name: str, value: Any, kind: type) -> tuple[Any, ...]:
 
 
 def tuple_of_names(name: str, value: object) -> tuple[str, ...]:
-    """A tuple of names, of which there may be one alone, as a string."""
+    """Return a tuple of names. A single name may be given as a string."""
     return (value,) if isinstance(value, str) else tuple_of(name, value, str)
 
 
 def instance_of(name: str, value: object, kind: type | tuple[type, ...], described: str) -> None:
-    """**Raises:** `TypeError` if `value` is none of this kind, which is `described`."""
+    """Raise a `TypeError` unless `value` is an instance of `kind`, which `described` names."""
     if isinstance(value, kind):
         return
     got = short(value)
@@ -242,24 +241,24 @@ def instance_of(name: str, value: object, kind: type | tuple[type, ...], describ
 
 
 def short(value: object) -> str:
-    """What came, in one line."""
+    """Return the first line of the value's `repr`, with an ellipsis if there are more."""
     first, *more = repr(value).splitlines() or [""]
     return first + " …" * bool(more)
 
 
 def state_of_numbers(name: str, state: object) -> Any:
-    """`state`, each part of which is a real number or an array of them. **Raises:** `TypeError`
-    that names any other part."""
+    """Return `state` if each part of it is a real number or an array of them. **Raises:**
+    `TypeError` that names a part that is not."""
     for part, value in vars(state).items():
         require_real(name, part, value)
     return state
 
 
 def require_real(name: str, part: str, value: object) -> None:
-    """**Raises:** `TypeError` if this part of an argument, or with `""` the whole of it, is neither
-    a real number nor an array of them, traced or not."""
+    """Raise a `TypeError` unless a value is a real number or an array of them, traced or not. The
+    text names `part` as the value's place in the argument; `""` stands for the whole argument."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
-    if isinstance(value, jax.Array | np.ndarray | np.generic):  # tracers are among the first
+    if isinstance(value, jax.Array | np.ndarray | np.generic):  # tracers are JAX arrays
         real = _is_real(value.dtype)
     if not real:
         got = f"its {part} is {value!r}" if part else f"got {value!r}"
@@ -267,18 +266,18 @@ def require_real(name: str, part: str, value: object) -> None:
 
 
 def named_leaves(tree: object) -> list[tuple[str, Any]]:
-    """The leaves of a tree with their names; "" for a tree that is one."""
+    """Return the leaves of a tree with their names; "" is the name of a tree that is a leaf."""
     return [(jtu.keystr(path).lstrip("."), x) for path, x in jtu.tree_leaves_with_path(tree)]
 
 
 def fits_records(name: str, records: int, numbers: int) -> None:
-    """**Raises:** `ValueError` if so many records of so many numbers cannot be held."""
+    """Raise a `ValueError` if so many records of `numbers` numbers each cannot be stored."""
     count(name, records, most=2**31 - 2)
     fits_memory(name, 8.0 * records * numbers)
 
 
 def fits_memory(name: str, size: int | float) -> None:
-    """**Raises:** `ValueError` if so many bytes are more than this machine's memory."""
+    """Raise a `ValueError` if `size` bytes are more than this machine's memory."""
     try:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -291,9 +290,9 @@ def fits_memory(name: str, size: int | float) -> None:
 
 
 def number(name: str, value: object) -> jax.Array:
-    """A real number or array of numbers as a floating-point JAX array; what is no tracer stays a
-    known number inside of `jit` too, so that it can be checked there. **Raises:** `TypeError` if
-    `value` is not real-valued."""
+    """Return a real number or an array of them as a floating-point JAX array. A concrete number
+    stays concrete within `jit`, so that it can be checked there. **Raises:** `TypeError` if `value`
+    is not real-valued."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         return _floating(name, value)
     if isinstance(value, bool | str) or value is None:
@@ -309,15 +308,15 @@ def number(name: str, value: object) -> jax.Array:
 
 
 def _type_of(value: object) -> tuple[Any, ...]:
-    """The type of the array that holds it, where it is not its own: a `float` of Python's would
-    make an array of no certain type, for which a program is compiled apart from that for others."""
+    """Return the data type for an array of `value` as a tuple, empty to keep the value's own. A
+    Python `float` would become a weakly typed array, for which JAX compiles a separate program."""
     own = isinstance(value, np.generic) or not isinstance(value, float)
     return () if own else (jnp.result_type(float),)
 
 
 def strongly_typed(value: object) -> Any:
-    """A number as an array of a certain type; all else, whole numbers and rows among it, as it is.
-    What is no tracer stays a known number inside of `jit` too."""
+    """Return a number as a strongly typed array, concrete even within `jit`. Other values, such as
+    integers and rows of numbers, are returned unchanged."""
     if isinstance(value, jax.Array):
         return value.astype(value.dtype) if value.weak_type else value
     if isinstance(value, float | np.floating) or (
@@ -329,17 +328,17 @@ def strongly_typed(value: object) -> Any:
 
 
 def real(name: str) -> Callable[[Any], jax.Array]:
-    """The converter of a field that holds real numbers."""
+    """Return the converter of a field that holds real numbers."""
     return partial(number, name)
 
 
 def optional_real(name: str) -> Callable[[Any], jax.Array | None]:
-    """The converter of a field that holds real numbers or `None`."""
+    """Return the converter of a field that holds real numbers or `None`."""
     return lambda value: None if value is None else number(name, value)
 
 
 def real_or_law(name: str) -> Callable[[Any], Any]:
-    """The converter of a field that holds a real number, or a function that gives one."""
+    """Return the converter of a field that holds a real number, or a function that returns one."""
     return lambda value: value if callable(value) else number(name, value)
 
 
@@ -356,20 +355,19 @@ def _floating(name: str, array: jax.Array) -> jax.Array:
 
 
 def narrow(value: object) -> bool:
-    """Whether these are floating-point numbers of less than the session's precision."""
+    """Return whether a value holds floating-point numbers below the session's precision."""
     return _bits(value) < 0
 
 
 def _bits(value: Any) -> int:
-    """By how many bits a floating-point JAX array is wider than the session's numbers."""
     if not (eqx.is_inexact_array(value) and jnp.issubdtype(value.dtype, jnp.floating)):
         return 0
     return jnp.finfo(value.dtype).bits - jnp.finfo(jnp.result_type(float)).bits
 
 
 def require_session(name: str, tree: object) -> None:
-    """**Raises:** `TypeError` for JAX arrays of double precision in a session of single precision,
-    in which operations on them are not defined."""
+    """Raise a `TypeError` for JAX arrays of double precision in a session of single precision. JAX
+    does not define operations on them there."""
     wide = [part for part, x in named_leaves(tree) if _bits(x) > 0]
     if wide:
         raise TypeError(
@@ -380,7 +378,7 @@ def require_session(name: str, tree: object) -> None:
 
 
 def warn_of_narrow(what: str) -> None:
-    """Say that numbers came in less than the session's precision, which nothing gives back."""
+    """Warn that numbers have less than the session's precision; no conversion restores it."""
     eps = float(jnp.finfo(jnp.float32).eps)
     warn(
         f"{what} of less than double precision, known to {eps:.0e} only, in a session of double "
@@ -389,9 +387,9 @@ def warn_of_narrow(what: str) -> None:
 
 
 def concrete(value: object) -> np.ndarray | None:
-    """The numbers behind `value`, or `None` while they are being traced."""
+    """Return the numbers of `value` as an array, or `None` for tracers and placeholders."""
     if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
-        return None  # a placeholder (a spec, a tangent's None), which holds no number to check
+        return None  # a placeholder, such as a spec or a tangent `None`
     if isinstance(value, Tracer):
         return None
     return np.asarray(value)

@@ -1,4 +1,4 @@
-"""Messages to the user: progress bars, warnings, and the error that keeps partial results."""
+"""Messages to the user: progress bars, warnings, and the exception that holds partial results."""
 
 import functools
 import sys
@@ -16,21 +16,21 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 Tell = Callable[[int], Any]
-"""Receives how many more units of work are done."""
+"""A function of the number of further units of work that are done."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised by a long function on Ctrl-C when there are partial results.
+    """The exception that a long function raises on Ctrl-C if it has partial results.
 
-    Before that it is a plain `KeyboardInterrupt`.
+    Before there are results, it raises a plain `KeyboardInterrupt`.
     """
 
     partial: Any
-    """What was computed, of the kind that the function returns: a `Sweep` of the values that were
-    done, a `Branch`, a `Boundary` or a `Manifold` that ends where it was interrupted, the
-    `Lyapunov` exponents of the cycles that were observed, an `EdgeState` without its orbit, the
-    `MinimalKick` found so far, an `AllOrbits` of the periods that were searched, a `Grazing`
-    without the simulated motions; of `scan`, `basins` and `integrity_profile` the data set."""
+    """The partial result, of the same type as the function's result. A `Sweep` has the finished
+    values. A `Branch`, `Boundary` or `Manifold` ends at the interruption. `Lyapunov` exponents are
+    those of the observed cycles. An `EdgeState` lacks its orbit. A `MinimalKick` is the smallest
+    found so far, and `AllOrbits` has the searched periods. A `Grazing` lacks the simulated motions.
+    `scan`, `basins` and `integrity_profile` return the data set."""
 
     def __init__(
         self, what: str, partial: object, where: str = "what was computed is in `.partial`"
@@ -53,18 +53,19 @@ def at_work(
     total: int | None = None,
     done: int = 0,
 ) -> Iterator[Tell]:
-    """Show a progress bar during a long part of a function, and keep its results on Ctrl-C. Gives a
-    function that is called with the units that were done; it also raises an interrupt that Python
-    dropped.
+    """Show a progress bar during a long part of a function, and keep its results on Ctrl-C.
 
-    **Arguments:** `what`, the word before the bar; `kept`, called on Ctrl-C, returns an
-    `Interrupted` with what was computed, or `None` if there is nothing to keep yet; `progress`,
-    whether a bar is shown (only in a terminal or a notebook); the `total` of units, if known; those
-    `done` already.
+    Yield a function of the number of units done since its last call. It updates the bar, and raises
+    an interrupt that Python dropped.
 
-    **Raises:** what `kept` returns, on Ctrl-C; else the `KeyboardInterrupt` itself.
+    **Arguments:** `what`, the word before the bar; `kept`, a function called on Ctrl-C that returns
+    an `Interrupted` with the partial results, or `None` without such; `progress`, whether to
+    show a bar (only in a terminal or a notebook); `unit`, its name; `total`, the number of units,
+    if known; `done`, the units done before.
+
+    **Raises:** on Ctrl-C the result of `kept`, or the `KeyboardInterrupt` itself.
     """
-    from .lanes import interrupts_heard, raise_dropped  # not at once: it loads JAX
+    from .lanes import interrupts_heard, raise_dropped  # here, since it loads JAX
 
     def tell(done: int) -> None:
         bar.update(done)
@@ -91,11 +92,11 @@ def in_parts(
     joined: Callable[[Any, list[Any]], R],
     **options: Any,
 ) -> R:
-    """Do a long computation (`what`) piece by piece, so that an interrupt loses one of them.
+    """Run a long computation piece by piece, so that an interrupt loses at most one piece.
 
-    **Arguments:** `step(carry, piece)` returns the next carry and a part of the result; `pieces`
-    with their sizes; `joined(carry, parts)` makes the result, also the partial one of an
-    `Interrupted`; `options` as for `at_work`.
+    **Arguments:** `what`, a noun for the computation; `step(carry, piece)`, which returns the next
+    carry and a part of the result; `pieces`, pairs of a size and a piece; `joined(carry, parts)`,
+    which returns the result, also the partial one of an `Interrupted`; `options` of `at_work`.
     """
     import jax
 
@@ -112,7 +113,7 @@ def in_parts(
     return joined(carry, parts)
 
 
-# The warnings that were given in the user's call under way.
+# Warnings already given during the user's current call.
 _GIVEN: ContextVar[set[str] | None] = ContextVar("given", default=None)
 
 # Packages whose frames are skipped to find the user's line.
@@ -123,8 +124,8 @@ _SKIPPED = {
 
 
 def warning_once(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: within one call each warning is given once, however often JAX traces, and no
-    interrupt is lost."""
+    """Decorator: give each warning once in a call, even if JAX traces several times. Interrupts
+    that Python drops are raised (`interrupts_heard`)."""
 
     @functools.wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -142,7 +143,7 @@ def warning_once(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def warn(words: str) -> None:
-    """Warn at the user's line that called this package."""
+    """Give a warning at the user's line that called this package."""
     given = _GIVEN.get()
     if given is not None:
         if words in given:
@@ -155,7 +156,7 @@ def warn(words: str) -> None:
 
 
 def so_many(number: int | np.integer, noun: str) -> str:
-    """Return a number with its noun, which takes an s."""
+    """Return a number with its noun, in the plural unless the number is 1."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 

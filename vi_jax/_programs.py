@@ -1,7 +1,7 @@
-"""The compiled functions of this package, and the memory maps that Linux grants a process.
+"""Compiled functions of this package, and the number of memory maps that Linux grants a process.
 
-A program takes some hundreds of memory maps; where a process has none left, the compiler dies with
-a segmentation fault. JAX keeps every program, so that a long script gets there.
+A compiled program takes some hundreds of memory maps. If a process has none left, the compiler ends
+with a segmentation fault. JAX keeps every program, so a long script reaches that limit.
 """
 
 import contextlib
@@ -21,25 +21,25 @@ from jax.core import Tracer
 
 from .lanes import Unsupported, current_backend, interrupts_heard, vector_only
 
-# With these XLA compiles two to three times faster. What runs for long is in the lanes, whose code
-# is not XLA's. For programs that do much else, `PLAIN` alone saves half of that and costs nothing
-# at run time.
+# With these options XLA compiles two to three times faster. Most of the run time is spent in the
+# lanes, whose code XLA does not compile. `PLAIN` alone saves half of the compile time and costs no
+# run time. It is meant for programs that compute much outside the lanes.
 PLAIN = {"xla_cpu_use_fusion_emitters": False}
 _QUICK = {**PLAIN, "xla_backend_optimization_level": 0}
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
-# Parts of the maps beyond which programs are dropped, and down to which. Both are choices: they
-# leave room for what else takes maps, and make dropping rare.
+# Shares of the granted maps. Programs are dropped above `_FULL`, until `_ROOM` is reached. Both are
+# choices: they leave maps for other libraries and make dropping rare.
 _FULL, _ROOM = 0.6, 0.4
 
-# To count the maps takes up to a tenth of a second. So it is done at most once in `_SELDOM` times
-# the time that it took, and once in `_PAUSE` seconds.
+# Counting the maps takes up to a tenth of a second. The time between two counts is at least
+# `_SELDOM` times the duration of a count, and at least `_PAUSE` seconds.
 _SELDOM, _PAUSE = 50, 0.5
 
 
 class _Watch:
-    """The compiled functions, the least recently called first, and when to count the maps next."""
+    """The compiled functions, least recently called first, and the time to count the maps next."""
 
     def __init__(self):
         self.lock = threading.Lock()
@@ -47,7 +47,7 @@ class _Watch:
         self.next_look = 0.0
 
     def called(self, program: "CompiledFunction") -> None:
-        """Note a call, and drop programs if the maps run out (see `_look`)."""
+        """Record a call. Drop programs if few maps are left."""
         if time.monotonic() < self.next_look and next(reversed(self.programs), None) is program:
             return
         with self.lock:
@@ -86,7 +86,7 @@ class _Watch:
 
 
 def maps_used() -> int | None:
-    """The number of memory maps of this process, or `None` where it cannot be known."""
+    """Return the number of memory maps of this process, or `None` if it is unknown."""
     try:
         return _MAPS.read_bytes().count(b"\n")
     except OSError:
@@ -94,7 +94,8 @@ def maps_used() -> int | None:
 
 
 def maps_granted() -> int | None:
-    """The most that it may have, or `None` where that cannot be known."""
+    """Return the greatest number of memory maps that a process may have, or `None` if it is
+    unknown."""
     try:
         return int(_MOST.read_text())
     except (OSError, ValueError):
@@ -105,11 +106,10 @@ _watch = _Watch()
 
 
 class CompiledFunction:
-    """A function that is compiled as by `eqx.filter_jit`, and whose programs can be dropped. (A
-    `LaneProgram` is another thing: the loop of a lane within such a function.)
+    """A function compiled with `eqx.filter_jit` whose compiled programs can be dropped.
 
-    **Arguments:** the function; XLA's compiler options where its lanes are vector code (`quick`);
-    further arguments of `eqx.filter_jit` for where they run on XLA's backend.
+    **Arguments:** the function; XLA's compiler options for calls whose lanes are vector code
+    (`quick`); further arguments of `eqx.filter_jit` for calls whose lanes run on XLA's backend.
     """
 
     def __init__(
@@ -118,8 +118,8 @@ class CompiledFunction:
         functools.update_wrapper(self, function)
         self._function, self._quick_options = _uncollected(function), quick
         self._compiled = eqx.filter_jit(self._function, **options)
-        # The structures of arguments whose lanes are no vector code, so that XLA's loops would be
-        # slow by quick options.
+        # Structures of arguments whose lanes cannot be vector code. With the quick options XLA's
+        # loops would be slow.
         self._never_quick: set[Any] = set()
 
     @functools.cached_property
@@ -128,17 +128,17 @@ class CompiledFunction:
         return eqx.filter_jit(self._function, **options)
 
     def drop(self) -> None:
-        """Drop what was compiled; it is compiled again when it is called again."""
-        # Equinox (0.13.8) has no public way to JAX's `clear_cache`, and to drop the wrapper is not
-        # enough, since JAX keeps the programs (`tests/lanes/test_jax.py` notes a change).
+        """Drop the compiled programs. The next call compiles again."""
+        # Equinox (0.13.8) has no public way to JAX's `clear_cache`. Dropping the wrapper is not
+        # enough, since JAX keeps the programs (`tests/lanes/test_jax.py` detects a change).
         for made in (self._compiled, vars(self).get("_quick")):
             if made is not None:
                 cached = getattr(made, "_cached", None)
                 getattr(cached, "clear_cache", jax.clear_caches)()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """What the function returns, by its compiled program. **Raises:** `KeyboardInterrupt` also
-        for an interrupt that Python dropped meanwhile."""
+        """Return the function's result, computed by its compiled program. **Raises:**
+        `KeyboardInterrupt`, also for an interrupt during the call that Python dropped."""
         with interrupts_heard():
             return self._called(arguments, keywords)
 
@@ -153,16 +153,17 @@ class CompiledFunction:
             except Unsupported:
                 self._never_quick.add(kind)
             except ValueError as error:
-                # Within another program, which `is_outermost` does not see where an argument's
-                # function closes over what is differentiated, JAX (0.10.2) refuses compiler options
-                # with a plain `ValueError` (its text: `tests/lanes/test_jax.py`).
+                # JAX (0.10.2) refuses compiler options within another program, with a plain
+                # `ValueError` (`tests/lanes/test_jax.py` tests its text). `is_outermost` does not
+                # detect this case if an argument is a function that closes over a tracer.
                 if "compiler_options" not in str(error):
                     raise
         return self._compiled(*arguments, **keywords)
 
 
 def _kind_of(*arguments: Any) -> Any:
-    """What decides, besides shapes, which program a call gets; `None` if that has no hash."""
+    """Return a key of the properties besides shapes that select a program; `None` if it has no
+    hash."""
     leaves, structure = jtu.tree_flatten(arguments)
     kind = structure, tuple(x for x in leaves if not eqx.is_array(x))
     try:
@@ -173,8 +174,8 @@ def _kind_of(*arguments: Any) -> Any:
 
 
 def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function without garbage collection while it runs, which is only to be traced: tracing
-    makes hardly any garbage, and its many objects would make the collector run again and again."""
+    """Return the function without garbage collection while it is traced. Tracing leaves little
+    garbage but creates so many objects that the collector would run again and again."""
 
     @functools.wraps(function)
     def traced(*arguments: Any, **keywords: Any) -> Any:
@@ -190,14 +191,13 @@ def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def is_outermost(*arguments: Any) -> bool:
-    """Whether a call is not a part of another program: only then JAX takes compiler options."""
+    """Return whether a call is outside any other program. Only then JAX takes compiler options."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves(arguments)):
         return False
     return not isinstance(jax.lax.full((1,), 0.0), Tracer)
 
 
 def _known(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the options that this XLA knows."""
     if jax.default_backend() != "cpu":
         return {}
     return {name: value for name, value in options.items() if _is_known(name, value)}
@@ -212,5 +212,5 @@ def _is_known(name: str, value: object) -> bool:
 
 
 def compiled(function: Callable[..., Any]) -> CompiledFunction:
-    """Decorator: the function, compiled, its programs dropped if the room for them runs out."""
+    """Decorator: compile a function. Its programs are dropped if memory maps run short."""
     return CompiledFunction(function)

@@ -12,12 +12,12 @@ Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
 """One truth value of one lane."""
 Scalars = tuple[Scalar, ...]
-"""Several such numbers, as one for each mode or for each coordinate."""
+"""Several numbers of one lane, such as one per mode or per coordinate."""
 Vector = Float[Array, " _"]
-"""A state as one row of numbers."""
+"""A state as a one-dimensional array."""
 State = Any
-"""The state of a machine: a pytree of numbers (or arrays, which not every verb takes) whose
-structure the machine chooses. What changes it, as its rate, has the same structure."""
+"""The state of a machine: a pytree of numbers whose structure the machine defines. Some functions
+also take arrays as its leaves. Its rate and other changes of it have the same structure."""
 
 
 def _lazy(name: str) -> ModuleType:
@@ -42,6 +42,6 @@ if TYPE_CHECKING:
     from .machine import AbstractMachine as Machine
 else:
     xr, zarr = _lazy("xarray"), _lazy("zarr")
-    Machine = Any  # `AbstractMachine`'s own module imports this one
-    Number = Any  # wrong values are refused with our own messages, not by a check of types
+    Machine = Any  # the module of `AbstractMachine` imports this one
+    Number = Any  # our own checks refuse wrong values, with clearer messages
     """One number as a user passes it: Python's, NumPy's or JAX's, which may be traced."""

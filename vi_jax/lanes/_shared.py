@@ -1,4 +1,4 @@
-"""What threads share: the values used last, values made once; and what one keeps to itself."""
+"""Caches that threads share, and settings of one thread or task."""
 
 import functools
 import threading
@@ -24,12 +24,12 @@ class Recent(Generic[K, V]):
         return len(self._values)
 
     def clear(self) -> None:
-        """Forget all values that are kept."""
+        """Remove all values."""
         with self._lock:
             self._values.clear()
 
     def get(self, key: K) -> V | None:
-        """The value of a key, or `None`."""
+        """Return the value of a key, or `None`."""
         with self._lock:
             value = self._values.get(key)
             if value is not None:
@@ -37,7 +37,7 @@ class Recent(Generic[K, V]):
         return value
 
     def put(self, key: K, value: V) -> None:
-        """Keep a value, and drop the one used longest ago if there are more than `most`."""
+        """Store a value. If there are more than `most`, drop the least recently used one."""
         with self._lock:
             self._values[key] = value
             self._values.move_to_end(key)
@@ -46,10 +46,10 @@ class Recent(Generic[K, V]):
 
 
 def made_once(make: Callable[[], V]) -> Callable[[], V]:
-    """Decorator: the function is called once, whichever thread asks first, and its value kept.
+    """Decorator: call the function once, in the first thread that needs it, and keep its value.
 
-    `functools.cache` would let two threads that ask at the same time both call it, and drop one of
-    the values although it may be in use.
+    With `functools.cache` two concurrent calls could both run the function. One of the two values
+    would be dropped although it may be in use.
     """
     lock, kept = threading.Lock(), functools.cache(make)
 
@@ -63,7 +63,7 @@ def made_once(make: Callable[[], V]) -> Callable[[], V]:
 
 @contextmanager
 def within(setting: ContextVar, value: object) -> Iterator[None]:
-    """`setting` has this value within this context, in this thread and task alone."""
+    """Set `setting` to a value within this context, for this thread and task only."""
     token = setting.set(value)
     try:
         yield
