@@ -1,4 +1,4 @@
-"""What each JAX primitive becomes that works number by number: arithmetic, flags, conversions."""
+"""Rules of JAX primitives that act on single numbers: arithmetic, flags, conversions."""
 
 import functools
 import operator
@@ -12,7 +12,7 @@ from ._text import KINDS, Text, Value, is_float
 
 
 def known(t: Text, a: Value, b: Value, operation: str) -> Value | None:
-    """The result for two known integers small enough not to run over; places in arrays are such."""
+    """Return the result for two constant integers below 2¹⁵, such as indices of arrays."""
     if a.number is None or b.number is None or a.kind == "i1":
         return None
     x, y = int(a.number), int(b.number)
@@ -23,7 +23,7 @@ def known(t: Text, a: Value, b: Value, operation: str) -> Value | None:
 
 
 def compare(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
-    """Whether a is `"lt"`, `"le"`, `"eq"`, … b; false where either is NaN, but for `"ne"`."""
+    """Return whether a is `"lt"`, `"le"`, `"eq"`, … b. If either is NaN, only `"ne"` is true."""
     if is_float(a.kind):
         order = {"eq": "oeq", "ne": "une"}.get(how, "o" + how)
         return t.binary(f"fcmp {order}", a, b, "i1")
@@ -34,9 +34,9 @@ def compare(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
 
 
 def of_integers(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value:
-    """Quotient (`"div"`) or remainder (`"rem"`) of integers as XLA has them where a processor would
-    trap: by zero -1 and the dividend; by -1, which may overflow, -a and 0. A slot of a group in
-    which there is no lane holds zeros."""
+    """Return a quotient (`"div"`) or remainder (`"rem"`) of integers where a processor would trap.
+    As in XLA, division by 0 gives -1 and remainder a. Division by -1, which may overflow, gives -a
+    and remainder 0. A slot without a lane holds zeros."""
     operation = ("u" if unsigned else "s") + what
     if b.number is not None and b.number not in (0, -1):
         return t.binary(operation, a, b)
@@ -54,7 +54,7 @@ def of_integers(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value
 
 
 def in_total_order(t: Text, a: Value) -> Value:
-    """An integer for each floating-point number, in IEEE's total order of them."""
+    """Return an integer for each floating-point number, ordered as in IEEE's total order."""
     if not is_float(a.kind):
         return a
     kind, bits = ("i64", 63) if a.kind == "double" else ("i32", 31)
@@ -69,7 +69,7 @@ ELEMENTWISE: dict[str, Rule] = {}
 
 @functools.cache
 def kind_of(dtype: Any) -> str:
-    """**Raises:** `KeyError` for types that lanes do not have (complex, half precision, keys)."""
+    """Return LLVM's type. **Raises:** `KeyError` for complex numbers, half precision and keys."""
     return KINDS[np.dtype(dtype).name]
 
 
@@ -81,9 +81,9 @@ def register(table: dict[str, Rule], *names: str) -> Callable[[Rule], Rule]:
     """Decorator: put a rule into a table under these names of primitives.
 
     A rule of `ELEMENTWISE` has the arguments `t`, the `Text`; `p`, the parameters of the equation;
-    `d`, the types of its arguments; and a `Value` for each argument. It returns a `Value`, or a
-    tuple of them. It must give the same bits in any slot, and not trap on any number, since slots
-    whose lane does not need it compute it too.
+    `d`, the types of its arguments; and a `Value` for each argument. It returns a `Value` or a
+    tuple of them. Its bits must not depend on the slot. It must not trap on any number, since it
+    also runs in slots whose lane does not need it.
     """
 
     def put(rule: Rule) -> Rule:
@@ -108,8 +108,8 @@ def mul(t: Text, a: Value, b: Value) -> Value:
 
 
 def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str) -> Value:
-    """A sum or product: by `real` for floating-point numbers, none if one is `neutral`; by `whole`
-    for integers."""
+    """Return a sum or product by `real` (floating-point) or `whole` (integers). A floating-point
+    operand that is `neutral` is left out."""
     if not is_float(a.kind):
         return known(t, a, b, whole) or t.binary(whole, a, b)
     if a.number == neutral:
@@ -138,7 +138,7 @@ def neg(t: Text, a: Value) -> Value:
 
 
 def weighted(t: Text, weight: Value, product: Value) -> Value:
-    """A product or quotient with a cotangent: zero where that is, whatever the other number is."""
+    """Return `product` (or quotient) with the cotangent `weight`; zero if that is zero."""
     return t.select(compare(t, "eq", weight, t.zero(weight.kind), False), weight, product)
 
 
@@ -154,7 +154,7 @@ ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, is_unsigned(d[0]))
 SAME = "stop_gradient copy copy_p name pvary reshard pin".split()
-"""What leaves its argument as it is."""
+"""Primitives that return their argument."""
 for _name in SAME:
     ELEMENTWISE[_name] = lambda t, p, d, a: a
 ELEMENTWISE["square"] = lambda t, p, d, a: mul(t, a, a)
@@ -188,7 +188,7 @@ def _(t, p, d, a):
 
 @elementwise("reduce_precision")
 def _(t, p, d, a):
-    """Rounded to fewer bits, ties to even; beyond the smaller range infinite, or zero."""
+    """Round to fewer bits, ties to even; infinite or zero beyond the smaller range."""
     digits, most = p["mantissa_bits"], 2 ** (p["exponent_bits"] - 1) - 1
     own = np.finfo(d[0])
     if digits >= own.nmant and most >= own.maxexp - 1:
@@ -220,14 +220,14 @@ for _name, _how in {"max": "gt", "min": "lt"}.items():
 
 
 def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
-    """The larger (`"gt"`) or smaller (`"lt"`) of two; NaN if either is."""
+    """Return the larger (`"gt"`) or smaller (`"lt"`) of two values; NaN if either is NaN."""
     if a.kind == "i1":
         return t.binary("or" if how == "gt" else "and", a, b)
     if b.number is None and a.number is not None:
         a, b = b, a
     if not is_float(a.kind):
         return t.select(compare(t, how, a, b, unsigned), a, b)
-    # What is not a number wins: true for such an a, and asked for in b unless that is known.
+    # NaN wins. The unordered comparison chooses a if it is NaN; b is tested unless it is constant.
     best = t.select(t.binary(f"fcmp u{how}", a, b, "i1"), a, b)
     return best if b.number is not None else t.select(t.binary("fcmp uno", b, b, "i1"), b, best)
 
@@ -268,7 +268,7 @@ def _(t, p, d, a, b):
     if b.kind != a.kind:
         b = convert(t, b, a.kind, False)
     if b.number in (0.5, 1.5, -0.5):
-        # A root but for two corners: powers of -∞ are infinite, those of -0 those of 0.
+        # A root, except that powers of -∞ are infinite, and powers of -0 are those of 0.
         infinity = t.constant(float("inf"), a.kind)
         root = t.intrinsic("sqrt", t.binary("fadd", a, t.zero(a.kind)))
         lowest = t.binary("fcmp oeq", a, t.constant(-float("inf"), a.kind), "i1")
@@ -277,7 +277,8 @@ def _(t, p, d, a, b):
             return div(t, t.constant(1, a.kind), root)
         return root if b.number == 0.5 else mul(t, t.intrinsic("fabs", a), root)
     if a.kind == "float" and b.number is not None and b.number != round(b.number):
-        # No negative base has such a power, and double precision leaves single to rounding.
+        # Negative bases have no such power. In double precision its error is far below the
+        # rounding to single precision.
         wide = t.cast("fpext", a, "double")
         exponent = mul(t, LIBRARY["log"](t, wide), t.constant(b.number, "double"))
         return t.cast("fptrunc", LIBRARY["exp"](t, exponent), "float")
@@ -317,7 +318,7 @@ def _(t, p, d, a, b):
 ELEMENTWISE["xor"] = lambda t, p, d, a, b: t.binary("xor", a, b)
 
 
-# Beyond the last bit LLVM leaves a shift undefined.
+# LLVM leaves shifts by more than the last bit undefined.
 for _name, _how in {"shift_left": "shl", "shift_right_logical": "lshr"}.items():
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: _shifted(t, how, a, b)
 
@@ -343,8 +344,8 @@ def _(t, p, d, a):
 
 
 def convert(t: Text, a: Value, kind: str, unsigned: bool, *, to_unsigned: bool = False) -> Value:
-    """A value in another type, as JAX converts it; `unsigned` says how its own is meant,
-    `to_unsigned` how the new one is."""
+    """Return a value in another type, converted as JAX does. `unsigned` describes integers of the
+    old type, `to_unsigned` those of the new one."""
     if a.kind == kind:
         return a
     if a.number is not None:

@@ -1,4 +1,4 @@
-"""What lanes run: a loop of one lane's numbers, traced once; which of its parts depend on which."""
+"""The program of a lane, traced once as a loop, and the dependence of its parts on its inputs."""
 
 import functools
 import math
@@ -15,11 +15,11 @@ from .elementary import horner
 
 
 class LaneProgram(eqx.Module):
-    """A lane's loop as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
+    """The loop of a lane as jaxprs of flat arguments; hashable, as a primitive's parameter must be.
 
-    `begin(inputs)` and `step(inputs, carry)` give the carry, whether the lane goes on, whether a
-    row is complete, and the row; `end(inputs, carry)` gives the results. `rows` is how many rows a
-    lane has room for. The shapes are those of one lane, without axes of a batch.
+    `begin(inputs)` and `step(inputs, carry)` return the carry, whether the lane continues, whether
+    a row is complete, and the row. `end(inputs, carry)` returns the results. `rows` is the greatest
+    number of rows of a lane. Shapes are those of one lane, without batch axes.
     """
 
     begin: ClosedJaxpr = eqx.field(static=True)
@@ -28,61 +28,57 @@ class LaneProgram(eqx.Module):
     rows: int = eqx.field(static=True)
 
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())
-    """Which inputs are tangents. How long a lane goes on must not depend on them."""
+    """Flags of the inputs that are tangents. The number of iterations must not depend on them."""
 
     varied: tuple[bool, ...] = eqx.field(static=True, default=())
-    """Of a program of values and derivatives, which inputs of `base` its last tangents are of; none
-    if they are in several directions."""
+    """In a program of values and derivatives: flags of the inputs of `base` to which its last
+    tangents belong. Empty if they are in several directions."""
 
     base: "LaneProgram | None" = eqx.field(static=True, default=None)
-    """Of a program of values and derivatives, that of the values alone. Its inputs come first."""
+    """In a program of values and derivatives: the program of the values alone. Its inputs come
+    first."""
 
     widening: "Widening | None" = eqx.field(static=True, default=None)
-    """Of a program that carries several values of some inputs, how it was made."""
+    """In a program that carries several values of some inputs: how it was made."""
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
     @property
     def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
-        """`begin`, `step` and `end`, in this order."""
         return self.begin, self.step, self.end
 
     @property
     def in_avals(self) -> list[Any]:
-        """Shapes and types of one lane's inputs."""
         return self.begin.in_avals
 
     @property
     def carry_avals(self) -> list[Any]:
-        """Shapes and types of one lane's carry."""
         return self.step.in_avals[len(self.in_avals) :]
 
     @property
     def out_avals(self) -> list[Any]:
-        """Shapes and types of one lane's results."""
         return self.end.out_avals
 
     @property
     def row_avals(self) -> list[Any]:
-        """Shapes and types of a row."""
         return self.begin.out_avals[len(self.carry_avals) + 2 :]
 
     @property
     def result_avals(self) -> list[Any]:
-        """Shapes and types of one lane's results, and then of all of its rows."""
+        """Shapes and types of one lane's results, then of its rows, stacked."""
         rows = [jax.ShapeDtypeStruct((self.rows, *a.shape), a.dtype) for a in self.row_avals]
         return [*self.out_avals, *rows]
 
     def values_without(
         self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
     ) -> "tuple[LaneProgram, list[bool]] | None":
-        """The program of the values that can be computed without some of the tangents.
+        """Return the program of the values that can be computed without some of the tangents.
 
-        **Arguments:** which inputs are missing, and the shapes of all, axes of a batch included.
+        **Arguments:** flags of the missing inputs; the shapes of all inputs, including batch axes.
 
-        **Returns:** that program, and which results and rows of this one it gives, in their order;
-        `None` if there is none.
+        **Returns:** that program, and flags of the results and rows of this program that it
+        returns; `None` if no such program exists.
         """
         found, base = [True] * len(self.result_avals), self.base
         program, batch = self, batch_of(self, shapes)
@@ -99,12 +95,11 @@ class LaneProgram(eqx.Module):
 
 
 def shape_of(x: Any) -> jax.ShapeDtypeStruct:
-    """The shape and type of an array or of an aval."""
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
 
 
 def batch_of(program: Any, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """The axes that inputs of these shapes have beyond those of one lane of a program."""
+    """Return the batch axes of inputs of these shapes."""
     for aval, shape in zip(program.in_avals, shapes, strict=True):
         if len(shape) > aval.ndim:
             return shape[: len(shape) - aval.ndim]
@@ -112,28 +107,29 @@ def batch_of(program: Any, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]
 
 
 class DependentParts(NamedTuple):
-    """Which parts of a program depend on some of its inputs, one truth value for each array."""
+    """Flags of the parts of a program that depend on given inputs, one for each array."""
 
     carry: tuple[bool, ...]
     control: bool
-    """Whether how long a lane goes on, or which rows it completes, depends on them."""
+    """True if the number of iterations of a lane, or the choice of its rows, depends on them."""
     rows: tuple[bool, ...]
     outs: tuple[bool, ...]
 
 
 class Widening(NamedTuple):
-    """How a program is made to carry several values of some of its inputs."""
+    """The construction of a program that carries several values of some of its inputs."""
 
     program: LaneProgram
     batched: tuple[bool, ...]
-    """Which inputs get a leading axis."""
+    """Flags of the inputs with a leading axis."""
     number: int
     """The length of that axis."""
     wide: "DependentParts"
-    """Which parts get that axis too."""
+    """Flags of the other parts with that axis."""
 
     def axes(self, name: str) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-        """Return which arguments and which results of `begin`, `step` or `end` have the axis."""
+        """Return flags of the arguments and of the results of `begin`, `step` or `end` with the
+        axis."""
         emitted = (*self.wide.carry, False, False, *self.wide.rows)
         if name == "begin":
             return self.batched, emitted
@@ -151,8 +147,8 @@ class Widening(NamedTuple):
 def dependent_parts(
     program: LaneProgram, sources: tuple[bool, ...], *, smooth: bool
 ) -> DependentParts:
-    """Which parts of a program depend on the inputs `sources`; if `smooth`, only dependence that
-    can have a derivative counts."""
+    """Return the parts of a program that depend on the inputs flagged in `sources`. If `smooth`,
+    only dependence that can have a derivative counts."""
     n = len(program.carry_avals)
     depends = functools.partial(dependent_results, smooth=smooth)
     begun = depends(program.begin.jaxpr, sources)
@@ -164,8 +160,8 @@ def dependent_parts(
     return DependentParts(tuple(carry), any(rest[:2]), tuple(rest[2:]), tuple(outs))
 
 
-# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.9.1 to 0.12 gives them these
-# names (`tests/lanes/test_jax.py` fails where a later one gives others).
+# Primitives that call a jaxpr, and the parameter that holds it. JAX 0.9.1 to 0.12 use these names
+# (`tests/lanes/test_jax.py` fails if they change).
 CALLS = {
     "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
@@ -177,19 +173,20 @@ CALLS = {
 _EXPANDED = "call_hi_primitive"
 
 
-# Primitives that JAX got with 0.12, by older ones.
+# Primitives new in JAX 0.12, in terms of older ones.
 _BY_OLDER = {
     "polynomial": lambda x, *coefficients, **unroll: horner(coefficients, x),
     "one_minus_square": lambda x: (1 - x) * (1 + x),
     "log2": lambda x, accuracy=None: jnp.log(x) / math.log(2),
 }
 
-# Calls with a derivative of their own, of which their bodies say nothing.
+# Calls with a derivative rule; the derivative cannot be read from their bodies.
 OWN_DERIVATIVE = ("custom_jvp_call", "custom_vjp_call", "custom_lin", _EXPANDED)
 
 
 def called(eqn: Any) -> ClosedJaxpr | Jaxpr | None:
-    """Return the jaxpr that an equation calls or stands for, or `None` if there is none."""
+    """Return the jaxpr that an equation calls or expands to, or `None` if there is no such
+    jaxpr."""
     name, params = eqn.primitive.name, eqn.params
     if name in CALLS:
         return params[CALLS[name]]
@@ -212,17 +209,17 @@ def _body(name: str, params: tuple, shapes: tuple[tuple[tuple[int, ...], Any], .
 
 
 def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
-    """A jaxpr without the constants of a closed one."""
+    """Return a jaxpr without the constants of a closed one."""
     return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
 
 
-# Calls without a derivative of their own, and without a say about what is kept for it.
+# Calls without a derivative rule and without a policy on which values to keep for derivatives.
 _INLINED = ("jit", "closed_call")
 
 
 def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
-    """The results of a jaxpr, its calls of other jaxprs taken into it: JAX would differentiate and
-    transpose each of them by itself, which takes several times as long."""
+    """Return the results of a jaxpr, with its calls inlined. JAX would differentiate and transpose
+    each call separately, which takes several times as long."""
     jaxpr, known = inner(closed), {}
 
     def read(atom: object) -> Any:
@@ -247,9 +244,9 @@ def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
 
 @functools.lru_cache(maxsize=256)
 def rewritten(closed: ClosedJaxpr, one: Callable[[Any], Any]) -> ClosedJaxpr:
-    """A jaxpr with `one` of each of its equations in that one's place, in inner jaxprs too; but
-    what has a derivative of its own stays as it is."""
-    # What is one jaxpr in several equations stays one, which JAX then differentiates once.
+    """Return a jaxpr with each equation replaced by `one` of it, in inner jaxprs too. Bodies of
+    calls with a derivative rule are not changed."""
+    # The cache keeps a jaxpr that several equations share one object, differentiated once.
     return closed.replace(jaxpr=_rewritten(closed.jaxpr, one))
 
 
@@ -274,13 +271,13 @@ def _parameter(value: object, one: Callable[[Any], Any]) -> Any:
 
 
 def bodies(eqn: Any) -> list[Jaxpr]:
-    """The jaxprs in the parameters of an equation."""
+    """Return the jaxprs in the parameters of an equation."""
     values = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
     return [inner(x) for x in values if isinstance(x, Jaxpr | ClosedJaxpr)]
 
 
 def size_of(jaxpr: Jaxpr) -> int:
-    """The number of operations, those of inner jaxprs once."""
+    """Return the number of operations; those of an inner jaxpr count once."""
     return sum(1 + sum(map(size_of, bodies(eqn))) for eqn in jaxpr.eqns)
 
 
@@ -294,11 +291,11 @@ def walked(
     rule: Callable[[Any, list[bool]], list[bool]],
     visit: Callable[[Any, list[bool], list[bool]], None] = lambda *_: None,
 ) -> list[bool]:
-    """Carry marks from the arguments of a jaxpr through its equations to its results.
+    """Propagate marks from the arguments of a jaxpr through its equations to its results.
 
-    **Arguments:** `marks`, which arguments are marked; `rule`, which results of an equation are, by
-    the equation and its marked arguments, if there are any; `visit`, called with each equation and
-    the marks of its arguments and results.
+    **Arguments:** `marks`, flags of the marked arguments; `rule(equation, marks)`, which returns
+    the marks of an equation's results if any of its arguments is marked; `visit`, called with each
+    equation, the marks of its arguments and those of its results.
     """
     found = {v for v, mark in zip(jaxpr.invars, marks, strict=True) if mark}
     marked = lambda atoms: [not isinstance(a, Literal) and a in found for a in atoms]
@@ -311,19 +308,19 @@ def walked(
 
 
 def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) -> list[bool]:
-    """Which results of a jaxpr may depend on its arguments `sources`; if `smooth`, only dependence
-    that can have a derivative counts."""
+    """Return flags of the results of a jaxpr that may depend on the arguments flagged in `sources`.
+    If `smooth`, only dependence that can have a derivative counts."""
     return list(_dependent_results(jaxpr, tuple(sources), smooth))
 
 
-# A step calls the field, one jaxpr, some sixty times, and loops are gone through again and again.
+# Cached: a step calls the jaxpr of the field some sixty times, and loops are analysed repeatedly.
 @functools.lru_cache(maxsize=1024)
 def _dependent_results(jaxpr: Jaxpr, sources: tuple[bool, ...], smooth: bool) -> list[bool]:
     return walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=smooth))
 
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
-    """Which results of an equation depend on the arguments `args`, some of which hold."""
+    """Return flags of the results of an equation that depend on the arguments flagged in `args`."""
     if smooth and eqn.primitive.name in _ZERO_DERIVATIVE:
         return [False] * len(eqn.outvars)
     found = zip(_dependent(eqn, args, smooth=smooth), eqn.outvars, strict=True)
@@ -354,15 +351,16 @@ def _dependent(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
 
 
 def dependent_in_scan(eqn: Any, args: list[bool]) -> list[bool]:
-    """Which arguments of the body of a `scan` depend in any turn on its own `args`."""
+    """Return flags of the arguments of a `scan`'s body that depend, in any iteration, on those
+    flagged in `args`, arguments of the `scan`."""
     outs = dependent_of_equation(eqn, args, smooth=False)
     n, m = scan_counts(eqn.params)
     return [*args[:n], *outs[:m], *args[n + m :]]
 
 
 def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
-    """Whether a `while` of a jaxpr, or of one that it calls, has results with a derivative with
-    respect to the arguments `sources`."""
+    """Return whether a `while` of a jaxpr, or of one that it calls, has a result with a derivative
+    with respect to the arguments flagged in `sources`."""
     found = []
 
     def visit(eqn: Any, args: list[bool], outs: list[bool]) -> None:
@@ -378,19 +376,20 @@ def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
 
 
 def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
-    """How many arguments of a `scan` with these parameters are the same in each turn, and how many
-    are carried from turn to turn."""
+    """Return how many arguments of a `scan` with these parameters are constant, and how many are
+    carried."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
-    fixed, carry, _ = params["ft_in"].unpack()  # since JAX 0.12: what it was given, as trees
+    fixed, carry, _ = params["ft_in"].unpack()  # since JAX 0.12: the arguments as trees
     return len(fixed), len(carry)
 
 
 def fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
-    """What one turn of a loop gives, carry first, once no more of the carry depends.
+    """Return flags of a loop body's results that depend on given inputs, carry first, at
+    convergence.
 
-    **Arguments:** which results of a turn depend where these parts of the carry do; those that do
-    before the first turn.
+    **Arguments:** `turn`, which maps flags of the carry to flags of a body's results; the flags of
+    the carry before the first iteration.
     """
     while True:
         outs = turn(carry)

@@ -1,4 +1,4 @@
-"""Vector code as LLVM's text: values, operations on them, and blocks."""
+"""Writing vector code as LLVM's text: values, operations on them, and blocks."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -10,19 +10,19 @@ import numpy as np
 
 
 class Arena:
-    """Which places of a kernel's memory are in use while its text is written.
+    """The allocation of a kernel's memory while its text is written.
 
-    Places are counted in vectors of eight-byte numbers, one for each lane of a group. What is let
-    go of is given out again, lowest first, so that a step's arrays stay near each other.
+    Memory is counted in vectors of eight-byte numbers, one for each lane of a group. A free place
+    is reused, lowest first, so that the arrays of a step stay close together.
     """
 
     def __init__(self) -> None:
         self.size = 0
-        """The places that the kernel needs in all."""
-        self._free: list[tuple[int, int]] = []  # from, to; in order, apart from each other
+        """The number of vectors that the kernel needs in all."""
+        self._free: list[tuple[int, int]] = []  # begin, end; sorted and disjoint
 
     def take(self, numbers: int) -> "Block":
-        """Room for so many numbers of every lane, until nothing refers to the block any more."""
+        """Reserve so many numbers of each lane, until no reference to the block is left."""
         for i, (begin, end) in enumerate(self._free):
             if end - begin >= numbers:
                 rest = [(begin + numbers, end)] if end - begin > numbers else []
@@ -35,7 +35,7 @@ class Arena:
         return Block(self, begin, numbers)
 
     def give_back(self, begin: int, end: int) -> None:
-        """What `Block` calls as it goes."""
+        """Free a range of places."""
         kept = []
         for a, b in self._free:
             if b == begin:
@@ -49,7 +49,7 @@ class Arena:
 
 @dataclass(eq=False)
 class Block:
-    """Places of an arena, in use as long as this object is."""
+    """A range of places in an arena, reserved during the lifetime of this object."""
 
     arena: Arena = field(repr=False)
     start: int
@@ -61,13 +61,13 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One number of every lane of a group: an SSA name or a constant, and its type."""
+    """One number of each lane of a group: an SSA name or a constant, and its type."""
 
     text: str
     kind: str
     """LLVM's type: `double`, `float`, `i1`, `i8` … `i64`."""
     number: float | int | bool | None = None
-    """The number of a constant; else `None`."""
+    """The number of a constant, else `None`."""
 
 
 KINDS = {
@@ -77,13 +77,13 @@ KINDS = {
 }  # fmt: skip
 
 
-# The weights of a branch that `Text.fork` marks as rare. Without them LLVM takes both ways for
-# equally likely, and spills what every step needs for what few steps do (a tenth of the time).
+# The weights of a branch that `Text.fork` marks as rare. Without them LLVM takes both sides for
+# equally likely. It then spills registers that each step needs, which cost a tenth of the time.
 RARE = '!0 = !{!"branch_weights", i32 1, i32 200}'
 
 
 def attributes(bits: int) -> str:
-    """The attributes of a kernel's functions, for registers of so many bits."""
+    """Return the attributes of a kernel's functions, for registers of so many bits."""
     widths = f'"min-legal-vector-width"="{bits}" "prefer-vector-width"="{bits}"'
     return f"attributes #0 = {{ nounwind {widths} }}"
 
@@ -93,7 +93,7 @@ def is_float(kind: str) -> bool:
 
 
 def literal(number: Any, kind: str) -> str:
-    """A number as LLVM's text."""
+    """Return a number as LLVM's text."""
     if is_float(kind):
         return "0x" + struct.pack(">d", float(number)).hex().upper()
     return str(bool(number)).lower() if kind == "i1" else str(int(number))
@@ -102,8 +102,8 @@ def literal(number: Any, kind: str) -> str:
 class Text:
     """The body of a function while it is written, with equal operations merged.
 
-    A value may be used only in blocks that its own dominates. Scopes keep account of that: see
-    `open`, `close` and `follow`, and `docs/internals/lanes.md`. `width` is the lanes of a group.
+    A value may be used only in blocks that its own block dominates. Scopes ensure this: see `open`,
+    `close`, `follow` and `docs/internals/lanes.md`. `width` is the number of lanes of a group.
     """
 
     def __init__(self, width: int):
@@ -112,24 +112,24 @@ class Text:
         self.declared: dict[str, str] = {}
         self.block = "entry"
         self.arena = Arena()
-        # Of a loop's counter, and of places counted from it, the least and the greatest number.
+        # The least and the greatest number of loop counters and of indices computed from them.
         self.ranges: dict[str, tuple[int, int]] = {}
         self._stores = 0
         self._names = 0
-        # Operations written in blocks that dominate the current one, a table for each open scope.
+        # The operations in blocks that dominate the current one, a table for each open scope.
         self._seen: list[dict[tuple, Value]] = [{}]
 
     def vector(self, kind: str) -> str:
-        """LLVM's type of one number of every lane."""
+        """Return LLVM's type of a vector with one number of each lane."""
         return f"<{self.width} x {kind}>"
 
     def fresh(self) -> str:
-        """A new name of a value."""
+        """Return a new name of a value."""
         self._names += 1
         return f"%v{self._names}"
 
     def constant(self, number: Any, kind: str) -> Value:
-        """The same number in every lane."""
+        """Return a value that is the same number in each lane."""
         if is_float(kind):
             number = float(np.float32(number)) if kind == "float" else float(number)
         else:
@@ -144,14 +144,14 @@ class Text:
         self.lines.append("  " + text)
 
     def raw(self, operation: str) -> str:
-        """Append an instruction; the name of its result. For results that are no vectors of the
-        group, and what must not be merged."""
+        """Append an instruction, and return its result's name. It is not merged, and its result
+        need not be a vector of the group."""
         name = self.fresh()
         self.line(f"{name} = {operation}")
         return name
 
     def once(self, operation: str) -> str:
-        """The name of a scalar's operation, merged as `value` is."""
+        """Append a scalar operation, merged as in `value`, and return its result's name."""
         return self.value(operation, "scalar").text
 
     def load(self, operation: str, kind: str) -> Value:
@@ -171,10 +171,9 @@ class Text:
         self.line(operation)
 
     def value(self, operation: str, kind: str, *, merge: bool = True) -> Value:
-        """Append an operation on vectors, unless an equal one was written in a block that dominates
-        this one.
+        """Append an operation on vectors, or reuse an equal one from a dominating block.
 
-        **Arguments:** the operation in LLVM's words; the type of its result's numbers.
+        **Arguments:** the operation in LLVM's syntax; the type of the result's numbers.
         """
         key = (operation, kind)
         if merge:
@@ -187,29 +186,29 @@ class Text:
         return result
 
     def ordered(self, a: Value, b: Value) -> tuple[Value, Value]:
-        """In one order, so that a·b and b·a are merged; a constant last."""
+        """Return operands in a fixed order, constants last, so that a·b and b·a are merged."""
         first = a.number is not None, a.text
         return (a, b) if first <= (b.number is not None, b.text) else (b, a)
 
     def opaque(self, a: Value) -> Value:
-        """A value that comes out of a condition or a turn of a loop (see `FixedText`)."""
+        """Return the value of a result of a condition or a loop iteration (see `FixedText`)."""
         return a
 
     def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
-        """An operation on two values of one type; `kind` is its result's type if another."""
+        """Append an operation on two values of one type; `kind` is the result's, if another."""
         return self.value(f"{operation} {self.vector(a.kind)} {a.text}, {b.text}", kind or a.kind)
 
     def negative(self, a: Value) -> Value:
-        """A floating-point number with the other sign."""
+        """Append the negation of a floating-point number."""
         return self.value(f"fneg {self.vector(a.kind)} {a.text}", a.kind)
 
     def cast(self, operation: str, a: Value, kind: str) -> Value:
-        """A conversion (`fpext`, `zext`, `bitcast` …) to another type."""
+        """Append a conversion (`fpext`, `zext`, `bitcast` …) to another type."""
         old, new = self.vector(a.kind), self.vector(kind)
         return self.value(f"{operation} {old} {a.text} to {new}", kind)
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
-        """a where the condition holds, else b."""
+        """Return a in lanes where the condition holds, else b."""
         if a == b:
             return a
         if condition.number is not None:
@@ -219,11 +218,11 @@ class Text:
         return self.value(f"select {flags}, {v} {a.text}, {v} {b.text}", a.kind)
 
     def suffix(self, kind: str) -> str:
-        """The vector type as in the names of intrinsics: `v8f64`."""
+        """Return the vector type as the suffix of an intrinsic's name, such as `v8f64`."""
         return f"v{self.width}" + {"double": "f64", "float": "f32"}.get(kind, kind)
 
     def intrinsic(self, name: str, *args: Value, kind: str | None = None) -> Value:
-        """An intrinsic of LLVM on values of one type, such as `sqrt`; `kind` as in `binary`."""
+        """Call an intrinsic of LLVM on values of one type, such as `sqrt`; `kind` as in `binary`."""
         own = args[0].kind
         function = f"@llvm.{name}.{self.suffix(own)}"
         result = kind or own
@@ -233,7 +232,7 @@ class Text:
         return self.value(f"call {self.vector(result)} {function}({call})", result)
 
     def each(self, name: str, *args: Value) -> Value:
-        """A function of the C library, lane by lane, in double precision."""
+        """Call a function of the C library for each lane, in double precision."""
         wide = [self.cast("fpext", a, "double") if a.kind == "float" else a for a in args]
         types = ", ".join("double" for _ in args)
         attributes = "nounwind willreturn memory(none)"
@@ -251,7 +250,7 @@ class Text:
     # Flags
 
     def both(self, a: Value, b: Value) -> Value:
-        """Whether both flags hold, lane by lane."""
+        """Return the conjunction of two flags, per lane."""
         if a.number is not None:
             return b if a.number else a
         if b.number is not None:
@@ -259,32 +258,32 @@ class Text:
         return self.binary("and", a, b)
 
     def inverse(self, a: Value) -> Value:
-        """Whether a flag does not hold, lane by lane."""
+        """Return the negation of a flag, per lane."""
         return self.binary("xor", a, self.constant(True, "i1"))
 
     def any(self, a: Value) -> str:
-        """Whether a flag holds in any lane: the name of an `i1`."""
+        """Return the name of an `i1` that is true if a flag holds in any lane."""
         bits = self.raw(f"bitcast {self.vector('i1')} {a.text} to i{self.width}")
         return self.raw(f"icmp ne i{self.width} {bits}, 0")
 
     # Blocks
 
     def open(self, label: str) -> None:
-        """Begin a block that the current one dominates, in a scope that lasts until `close`."""
+        """Begin a block that the current block dominates, in a scope that lasts until `close`."""
         self.follow(label)
         self._seen.append({})
 
     def close(self) -> None:
-        """End the last scope: the blocks that follow do not see what was computed in it."""
+        """End the innermost scope. Following blocks do not use values from it."""
         self._seen.pop()
 
     def fork(self, condition: str, yes: str, no: str, *, rare: bool = False) -> None:
-        """End the block: go on at one of two labels. If `yes` is `rare`, `no` is kept fast."""
+        """End the block with a branch to a label; `rare` if `yes` seldom happens."""
         self.line(f"br i1 {condition}, label %{yes}, label %{no}{', !prof !0' if rare else ''}")
 
     @contextmanager
     def skipped_unless(self, mask: Value, *, rare: bool = False) -> "Iterator[Skipped]":
-        """Blocks that are skipped where the mask holds in no lane; `rare` as in `fork`."""
+        """Write blocks that are skipped if the mask holds in no lane; `rare` as in `fork`."""
         inside, after = self.label(), self.label()
         way = Skipped(self, self.block)
         self.fork(self.any(mask), inside, after, rare=rare)
@@ -296,18 +295,18 @@ class Text:
         self.follow(after)
 
     def follow(self, label: str) -> None:
-        """Begin a block that the blocks of all open scopes dominate, without a scope of its own."""
+        """Begin a block that the blocks of all open scopes dominate, without opening a scope."""
         self.lines.append(f"{label}:")
         self.block = label
-        self._stores += 1  # what is in memory may have changed on the way to this block
+        self._stores += 1  # other blocks that lead here may have stored
 
     def label(self) -> str:
-        """A new name of a block."""
+        """Return a new name of a block."""
         self._names += 1
         return f"b{self._names}"
 
     def phi(self, kind: str, *ways: tuple[str, str]) -> Value:
-        """The value that came with the block it was reached from."""
+        """Return the value that belongs to the block from which this block was entered."""
         return self.value(self._phi(kind, ways), kind, merge=False)
 
     def join(
@@ -315,9 +314,9 @@ class Text:
     ) -> None:
         """Define names by phi instructions.
 
-        **Arguments:** the names; for each block from which this one is reached, the values that
-        come from there, and its label; the line where the phis are to stand, if not here. A loop's
-        head is written before its body, so that its phis are put there afterwards.
+        **Arguments:** the names; for each predecessor of this block, the incoming values and its
+        label; the line at which to insert the phis, by default the current one. The phis of a
+        loop's head are inserted later, since the head is written before the loop's body.
         """
         lines = []
         for name, *values in zip(names, *(values for values, _ in ways), strict=True):
@@ -333,43 +332,44 @@ class Text:
 
 @dataclass
 class Skipped:
-    """Blocks that are skipped, or not."""
+    """Blocks that run only if a condition holds."""
 
     text: Text
     before: str
     """The block from which they are skipped."""
     end: str = ""
-    """The last of the blocks that may be skipped."""
+    """The last of the blocks."""
 
     def joined(self, a: Value, b: Value) -> Value:
-        """a, which was computed in these blocks; b where they were skipped."""
+        """Return a, computed in these blocks, or b if they were skipped."""
         return self.text.phi(a.kind, (a.text, self.end), (b.text, self.before))
 
 
-# Text whose arithmetic has one meaning: equal operations give equal bits in any function.
+# Text whose arithmetic is reproducible: equal operations give equal bits in any function.
 #
-# With the flag `contract` LLVM fuses a product with a sum where it sees fit, which depends on what
-# else is done with the product. A value that is computed again on the way back must decide about an
-# event as it did on the way there, so that there the fusing is done as the text is written.
+# With the flag `contract`, LLVM may fuse a product and a sum, depending on other uses of the
+# product. A value computed again in the reverse pass must decide about an event as in the forward
+# pass. The text itself fixes the fusing there.
 
 _CONTRACT = " contract"
 
 
 class FixedText(Text):
-    """A `Text` that fuses by a rule: the first operand of a sum or difference if that is a product,
-    else the second. (LLVM's `fmuladd` is one operation where the processor has it, else two.)"""
+    """A `Text` with a fixed rule of fusing. A sum or difference is fused with its first operand if
+    that is a product, else with its second. LLVM's `fmuladd` is one operation if the processor has
+    it, else two."""
 
     def __init__(self, width: int):
         super().__init__(width)
         self._products: dict[str, tuple[Value, Value]] = {}
 
     def ordered(self, a: Value, b: Value) -> tuple[Value, Value]:
-        """As they stand: names, by which they would be ordered, are others in each function."""
+        """Return the operands unsorted, since their names differ between functions."""
         return a, b
 
     def opaque(self, a: Value) -> Value:
-        """The same number, of which it is not known that it is a product: a branch may be skipped
-        in one function and be computed for all lanes in another."""
+        """Return the same number without the information that it is a product. A branch may be
+        skipped in one function and be computed for all lanes in another."""
         return self.cast("bitcast", a, a.kind) if is_float(a.kind) else a
 
     def binary(self, operation: str, a: Value, b: Value, kind: str | None = None) -> Value:
