@@ -1,8 +1,7 @@
-"""Rules of primitives that take whole arrays: numbers moved, asked for at places from the data,
-added up, multiplied.
+"""Rules of primitives that rearrange, index, reduce or multiply whole arrays.
 
-The rules return arrays of any kind. The caller puts few numbers into registers (`held`), which
-costs nothing: what moves them is done while the code is written.
+They return arrays of any kind. The caller puts small ones into registers (`held`). Rearranging
+registers costs nothing at run time, since it is done while the text is written.
 """
 
 import functools
@@ -59,24 +58,24 @@ from ._text import Text, Value
 
 STRUCTURAL: dict[str, Rule] = {}
 """Rules with the arguments `t`, the `Text`; `p`, the parameters of the equation; `avals`, the
-shapes and types of its results; an `Array` for each argument. They return an `Array`, or some."""
+shapes and types of its results; an `Array` for each argument. Results: one or more `Array`s."""
 
 PLACED: dict[str, Rule] = {}
-"""Rules that have the types of the arguments too, which say whether places are signed: with the
-arguments `t`, `p`, `avals`, `d`, and the arrays."""
+"""Rules that also take the types of the arguments, which tell signed indices from unsigned ones.
+The arguments are `t`, `p`, `avals`, `d` and the arrays."""
 
 structural = partial(register, STRUCTURAL)
 placed = partial(register, PLACED)
 
 
-# --- the same numbers at other places
+# --- views
 
 
 class _Along(NamedTuple):
-    """Where the numbers of an array lie along one of its axes, by their places in another shape."""
+    """The indices along one axis of an array, as a linear function of indices of another shape."""
 
     axis: int | None
-    """The axis of the new shape that goes along it; `None` if none does."""
+    """The corresponding axis of the new shape; `None` if the index is constant."""
     by: int = 1
     begin: int = 0
 
@@ -87,9 +86,9 @@ class _Along(NamedTuple):
 
 
 def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_Along]) -> Array:
-    """An array that shows the numbers of another one.
+    """Return a view of an array's numbers in another shape.
 
-    **Arguments:** the text; the array; the new shape; how it goes along each axis of the array.
+    **Arguments:** the text; the array; the new shape; the indices along each axis of the array.
     """
     cuts: dict[int, set[int]] = {}
     if any(along[a].by != 1 for a in x.cuts):
@@ -117,7 +116,7 @@ def _(t, p, avals, x):
 
 
 def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
-    """The numbers of an array in another shape, in the same order."""
+    """Return an array in another shape, with its numbers in the same order."""
     if isinstance(x, Registers):
         return Registers(x.values.reshape(shape), x.kind)
     mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
@@ -137,7 +136,6 @@ def _(t, p, avals, x):
 
 
 def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
-    """An array with its axes in another order."""
     order = list(order)
     along = [_Along(order.index(a)) for a in range(x.ndim)]
     return _moved(t, x, [x.shape[a] for a in order], along)
@@ -152,14 +150,14 @@ def _(t, p, avals, x):
 
 @structural("slice")
 def _(t, p, avals, x):
-    # JAX's transposes have NumPy's integers.
+    # The transposes of JAX have NumPy integers here.
     ways = zip(p["strides"] or [1] * x.ndim, p["start_indices"], strict=True)
     along = [_Along(a, int(by), int(begin)) for a, (by, begin) in enumerate(ways)]
     return _moved(t, x, avals[0].shape, along)
 
 
 def part_along(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
-    """The part of an array between two places of an axis."""
+    """Return the part of an array between two indices of an axis."""
     shape = [end - begin if a == axis else n for a, n in enumerate(x.shape)]
     return _moved(t, x, shape, [_Along(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
 
@@ -188,15 +186,15 @@ def _(t, p, avals, x, *sizes):
     size = int(np.prod(shape, dtype=int))
     if size > MOST_IN_REGISTERS:
         x = addressable(t, x)
-    if x.size < size:  # else nothing would be computed twice
+    if x.size < size:  # else each number is used once
         x = settled(t, x)
     pairs = zip(where, x.shape, strict=True)
     return _moved(t, x, shape, [_Along(a if n != 1 else None) for a, n in pairs])
 
 
 def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
-    """The first array where a flag holds, else the second, where they differ in a few places only,
-    as in a state of which one number was changed; else `None`."""
+    """Return the first array if a flag holds, else the second, by selecting the parts that differ,
+    such as one changed number of a state. Return `None` unless one axis, and only one, has cuts."""
     cuts = joined(a.cuts, b.cuts)
     if len(cuts) != 1:
         return None
@@ -210,8 +208,7 @@ def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
 
 
 def _piece(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
-    """What lies between two places of an axis; the numbers that it was put together from, if it
-    was."""
+    """Return a part of an axis, from the array that it was concatenated from if there is one."""
     first = 0
     for part in x.parts if isinstance(x, Pieces) and x.axis == axis else ():
         size = part.shape[axis]
@@ -221,7 +218,7 @@ def _piece(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
     return part_along(t, addressable(t, x), axis, begin, end)
 
 
-# --- arrays put together
+# --- concatenated arrays
 
 
 @structural("concatenate")
@@ -252,13 +249,13 @@ def _(t, p, avals, x, value):
         size = max(0, low) + x.shape[axis] + max(0, high)
         shape = tuple(size if a == axis else m for a, m in enumerate(x.shape))
         x = Pieces(shape, value.kind, axis, tuple(y for y in (before, x, after) if y.size))
-        if min(low, high) < 0:  # that much is cut off
+        if min(low, high) < 0:  # negative padding cuts off
             x = part_along(t, x, axis, max(0, -low), size + min(0, high))
     return x
 
 
 def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: Value) -> Array:
-    """An array with so many other numbers between its own along each axis."""
+    """Return an array with copies of `number` between its own numbers, as `config` states."""
     between = [int(inside) for _, _, inside in config]
     shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
     whole = uniform(shape, number)
@@ -279,11 +276,11 @@ def _(t, p, avals, *sizes):
     return Formula(tuple(p["shape"]), kind, number, cheap=True)
 
 
-# --- places that the data name
+# --- indices that depend on data
 
 
 def _within(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Value]:
-    """A place of this type moved to between 0 and the greatest, and whether it was there."""
+    """Return an index clipped to the range from 0 to `greatest`, and whether it was in it."""
     place = convert(t, given, "i64", is_unsigned(dtype))
     if place.number is not None:
         inside = 0 <= int(place.number) <= greatest
@@ -296,7 +293,7 @@ def _within(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Va
 
 
 def _starts(t: Text, starts, dtypes, sizes, shape) -> list[Index]:
-    """Where a block of `sizes` begins, moved so that it lies within the array."""
+    """Return the first indices of a block of `sizes`, clipped so that it lies in the array."""
     return [
         _within(t, s.at(t, ()), d, n - m)[0]
         for s, d, m, n in zip(starts, dtypes, sizes, shape, strict=True)
@@ -320,11 +317,11 @@ def _(t, p, avals, d, x, update, *starts):
 
 
 def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
-    """A large array with other numbers in a window, without a copy; `None` unless the window
-    leaves out something along one axis only.
+    """Return a large array with other numbers in a window, without a copy; `None` unless the window
+    covers all axes but one completely.
 
-    **Arguments:** the text; the array; of each axis where the window begins and its size; its
-    numbers by their index in it.
+    **Arguments:** the text; the array; the first index and the size of the window along each axis;
+    a function from an index in the window to the new number.
     """
     axes = [a for a, (_, n) in enumerate(window) if n != x.shape[a]]
     if len(axes) != 1 or isinstance(x, Registers):
@@ -339,29 +336,29 @@ def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable
 
 
 def _copy(t: Text, x: Array, in_memory: bool) -> Registers | Strided:
-    """A copy of an array that may be changed, in memory if it is large or that is asked for."""
+    """Return a copy that may be changed, in memory if `in_memory` or if the array is large."""
     if in_memory or not isinstance(x, Registers):
         return stored(t, x)
     return Registers(x.values.copy(), x.kind)
 
 
 class _Asked(NamedTuple):
-    """Where the data name blocks of an array."""
+    """Blocks of an array at indices that depend on data."""
 
     indices: Array
     dtype: Any
     axes: Sequence[int]
-    """The axes whose places the last axis of the indices names."""
+    """The axes for which the last axis of `indices` holds the index."""
     batched: Sequence[tuple[int, int]]
-    """Axes whose place is that of an axis of the indices."""
+    """Pairs of an axis of the array and an axis of `indices` that have the same index."""
     greatest: Sequence[int]
-    """The last place at which a block may begin, of each axis."""
+    """The greatest first index of a block, along each axis."""
     clipped: bool
-    """Whether a block that is not within the array is moved into it."""
+    """True if a block outside the array is moved into it."""
 
     def corner(self, t: Text, batch: Sequence[Index]) -> tuple[list[Index], Value]:
-        """Where the block begins that is named at a place of the indices, moved into the array; and
-        whether it counts: it was in it, or such blocks are moved."""
+        """Return the first indices of the block at `batch` in `indices`, clipped to the array, and
+        whether the block is valid: it was inside, or such blocks are clipped."""
         place: list[Index] = [0] * len(self.greatest)
         for a, b in self.batched:
             place[a] = batch[b]
@@ -397,7 +394,7 @@ def _(t, p, avals, d, x, indices):
 
 
 def _filling(given, dtype):
-    """What JAX takes for a number from outside an array."""
+    """Return JAX's value for a number from outside an array."""
     if given is not None:
         return given
     dtype = np.dtype(dtype)
@@ -409,8 +406,8 @@ def _filling(given, dtype):
 
 
 def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices, update) -> Array:
-    """An array with numbers put at places given by the data, or added, … (`how`); what lies outside
-    is left out, unless the mode says that places are moved inside."""
+    """Return an array with numbers written at indices that depend on data, or combined by the rule
+    `how`. Numbers outside the array are dropped, unless the mode is to clip."""
     d = p["dimension_numbers"]
     gone = (*d.inserted_window_dims, *d.operand_batching_dims)
     inner, axes = [a for a in range(x.ndim) if a not in gone], d.update_window_dims
@@ -428,12 +425,12 @@ def _with_blocks(
     t: Text, x: Array, update: Array, inner: Sequence[int], axes: Sequence[int],
     corner: Callable, combined: Callable[[Value, Value], Value] | None = None,
 ) -> Array:  # fmt: skip
-    """An array with blocks of other numbers.
+    """Return an array with blocks of other numbers.
 
     **Arguments:** the text; the array; the blocks; the axes of the array along which they extend,
-    and which axes of `update` these are; where a block begins by its place along the other axes of
-    `update`, and whether it counts; the new number by the old one and that of `update`, which
-    by default replaces it.
+    and the corresponding axes of `update`; `corner`, which maps indices along the other axes of
+    `update` to the first indices of a block and whether it is valid; `combined`, the new number
+    from the old one and that of `update`, which by default replaces it.
     """
     sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
     others = [n for o, n in enumerate(update.shape) if o not in axes]
@@ -469,10 +466,10 @@ def _with_blocks(
 
 
 def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callable) -> None:
-    """Change the number of an array at a place: in memory, or in registers at all places that
-    it may be.
+    """Change the number of an array at an index. Registers are changed at each index that it may
+    be.
 
-    **Arguments:** the text; the array; the place; the new number as a function of the old one.
+    **Arguments:** the text; the array; the index; the new number as a function of the old one.
     """
     if isinstance(x, Strided):
         return x.put(t, place, new(x.at(t, place)))
@@ -490,19 +487,19 @@ def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callabl
 
 PLACED["scatter"] = partial(_scatter, None)
 for _name in ("add", "mul", "sub", "min", "max"):
-    # JAX 0.10.2 spells some of them with an underscore.
+    # JAX 0.10.2 writes some of them with an underscore.
     for _dash in "-_":
         PLACED[f"scatter{_dash}{_name}"] = partial(_scatter, _name)
 
 
-# --- sums and the like
+# --- reductions
 
-# Sums at once of a long sum, each of which waits for itself: a fused multiply-add takes four cycles
-# and two begin in each.
+# The number of partial sums of a long sum. The additions of one partial sum wait for each other: a
+# fused multiply-add takes four cycles, and two begin in each cycle.
 _SUMS = 8
 
 
-# A bound on the length of what is written, and thereby on the time of compilation.
+# The greatest number of loops written in place. It bounds the text's length and its compile time.
 _FEW = 4
 
 
@@ -510,10 +507,10 @@ def reduced(
     t: Text, number: int, term: Callable[[Index], Value], how: Callable, empty: Value,
     *, in_order: bool = False,
 ) -> Value:  # fmt: skip
-    """All terms put together, several chains at once.
+    """Return a reduction of all terms, in several partial results.
 
-    **Arguments:** the text; how many terms; each by its number; of two values one; that of none;
-    whether the terms are written one after the other instead.
+    **Arguments:** the text; the number of terms; a function from an index to a term; the operation
+    on two values; the result for no terms; `in_order`, True to write all terms in sequence instead.
     """
     if number == 0:
         return empty
@@ -536,7 +533,7 @@ def reduced(
 
 
 def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
-    """Along some axes all numbers put together by the rule `how`; `empty` stands for none."""
+    """Reduce an array along some axes by the rule `how`; `empty` is the result for no numbers."""
     ((aval,), axes), in_order = (avals, tuple(map(int, p["axes"]))), isinstance(x, Registers)
     kind, both = kind_of(aval.dtype), partial(ELEMENTWISE[how], t, {}, [aval.dtype])
     x = _grouped(t, x, (*([a] for a in range(x.ndim) if a not in axes), axes))
@@ -547,13 +544,13 @@ def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
 
     if in_order:
         return Registers.of(aval.shape, kind, number)
-    # Each number is a loop. A few loops are written where the numbers are used.
+    # Each number is a loop. A few loops are written at the places of use.
     formula = Formula(tuple(aval.shape), kind, number)
     return formula if formula.size <= _FEW else stored(t, formula)
 
 
 def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
-    """An array with its axes in another order, each group of them made one."""
+    """Return an array with its axes reordered and each group of them merged."""
     x = stored(t, x) if x.cuts else x
     order = [a for group in groups for a in group]
     if order != list(range(x.ndim)):
@@ -564,7 +561,7 @@ def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
 
 
 def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
-    """Each number put together with all before it along an axis, by a rule's name."""
+    """Return the cumulative results of a rule along an axis."""
     how = partial(ELEMENTWISE[name], t, {}, [avals[0].dtype])
     if isinstance(x, Registers):
         out = np.moveaxis(x.values, p["axis"], 0).copy()
@@ -603,7 +600,7 @@ STRUCTURAL["reduce_or"] = partial(_reduce, "or", 0)
 
 
 def any_in(t: Text, x: Array) -> Value:
-    """Whether any flag of an array holds."""
+    """Return whether any flag of an array holds."""
     if not x.ndim:
         return x.at(t, ())
     axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)
@@ -614,13 +611,13 @@ def any_in(t: Text, x: Array) -> Value:
 
 
 def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Array:
-    """A product of arrays; `product` says what that of two numbers is."""
+    """Return a product of arrays with `product` as the product of two numbers."""
     (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     kind, groups = kind_of(avals[0].dtype), ((batch_a, free_a, over_a), (batch_b, free_b, over_b))
     in_order = avals[0].size <= MOST_IN_REGISTERS and all(isinstance(x, Registers) for x in (a, b))
-    # Of a product with a vector each number of the matrix is asked for once.
+    # In a product with a vector each number of the matrix is used once.
     once_a, once_b = (
         int(np.prod([x.shape[i] for i in free], dtype=int)) == 1
         for x, free in ((b, free_b), (a, free_a))
@@ -639,7 +636,7 @@ def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Arra
             t, length, partial(term, i), partial(add, t), t.zero(kind), in_order=True
         )
         found = Registers.of(shape, kind, number)
-    elif length == 1:  # nothing is added up
+    elif length == 1:  # no sum
         found = Formula(shape, kind, lambda i: t.opaque(term(i, 0)))
     else:
         found = _product(t, left, right, shape, kind, product)
@@ -647,8 +644,8 @@ def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Arra
 
 
 def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Callable) -> Array:
-    """(batch, n, k) times (batch, m, k): sums of several rows at once, so that none waits for
-    itself and a number of the other side is read once for all of them."""
+    """Multiply arrays of shapes (batch, n, k) and (batch, m, k), several rows at once. Their sums
+    do not wait for each other, and a number of the other factor is read once for all these rows."""
     batch, rows, columns = shape
     turned = columns > rows
     if turned:

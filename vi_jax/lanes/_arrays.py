@@ -1,8 +1,8 @@
-"""Arrays within a lane: in registers, in memory, or known by a formula.
+"""Arrays within a lane: in registers, in memory, or as formulas.
 
-An array of at most `MOST_IN_REGISTERS` numbers is held in registers. What is done with a larger one
-number by number stays a formula until it is needed, so that neighbouring operations become one loop
-and nothing is computed that is not asked for.
+An array of at most `MOST_IN_REGISTERS` numbers is in registers. Elementwise operations on a larger
+one stay a formula until its numbers are used. So consecutive operations become one loop, and unused
+numbers are not computed.
 """
 
 import hashlib
@@ -16,15 +16,15 @@ import numpy as np
 
 from ._text import Block, Text, Value, literal
 
-# --- places within an array: known while the code is written, the same for all lanes, or each
-# lane's own
+# --- indices
 
 Index = int | str | Value
-"""A number; the name of a scalar `i64`, the same for all lanes; or an `i64` of each lane."""
+"""An index within an array: a Python integer, known while the text is written; the name of a scalar
+`i64`, equal in all lanes; or an `i64` of each lane."""
 
 
 def splat(t: Text, scalar: str, kind: str) -> Value:
-    """A scalar of the kernel in every lane of the group."""
+    """Return a scalar of the kernel as a vector over the lanes."""
     v = t.vector(kind)
     one = t.raw(f"insertelement {v} poison, {kind} {scalar}, i32 0")
     mask = f"<{t.width} x i32> zeroinitializer"
@@ -32,14 +32,13 @@ def splat(t: Text, scalar: str, kind: str) -> Value:
 
 
 def in_lanes(t: Text, place: Index) -> Value:
-    """A place as an `i64` of each lane."""
+    """Return an index as an `i64` of each lane."""
     if isinstance(place, Value):
         return place
     return t.constant(place, "i64") if isinstance(place, int) else splat(t, place, "i64")
 
 
 def plus(t: Text, a: Index, b: Index) -> Index:
-    """The sum of two places."""
     if isinstance(a, int) and isinstance(b, int):
         return a + b
     if a == 0 or b == 0:
@@ -55,7 +54,6 @@ def plus(t: Text, a: Index, b: Index) -> Index:
 
 
 def times(t: Text, a: Index, number: int) -> Index:
-    """A place times a number."""
     if isinstance(a, int):
         return a * number
     if number in (0, 1):
@@ -66,7 +64,7 @@ def times(t: Text, a: Index, number: int) -> Index:
 
 
 def place_of(t: Text, index: Sequence[Index], strides: Sequence[int], offset: Index = 0) -> Index:
-    """The place of an element among an array's numbers."""
+    """Return the place of an element among an array's numbers."""
     total = offset
     for i, stride in zip(index, strides, strict=True):
         total = plus(t, total, times(t, i, stride))
@@ -74,7 +72,7 @@ def place_of(t: Text, index: Sequence[Index], strides: Sequence[int], offset: In
 
 
 def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
-    """The strides of an array whose numbers lie in order, the last axis fastest."""
+    """Return the strides of an array in row-major order."""
     return tuple(int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape)))
 
 
@@ -84,12 +82,12 @@ def counted(
     turn: Callable[[Index, list[Value]], list[Value]],
     first: list[Value],
 ) -> list[Value]:
-    """A loop of a known number of turns, with a scalar counter.
+    """Write a loop with a known number of iterations and a scalar counter.
 
-    **Arguments:** the text; the number; what a turn does with its number and what the turn before
-    gave; what the first one is given.
+    **Arguments:** the text; the number of iterations; the body, which maps the iteration's number
+    and the carry to the next carry; the initial carry.
 
-    **Returns:** what the last turn gave.
+    **Returns:** the final carry.
     """
     if number < 2:
         return turn(0, first) if number else first
@@ -114,7 +112,7 @@ def counted(
 
 
 Cuts = Mapping[int, frozenset[int]]
-"""Of some axes, the places at which an array's numbers begin to be known in another way."""
+"""For some axes, the indices at which an array's numbers change their representation."""
 
 NO_CUTS: Cuts = MappingProxyType({})
 
@@ -126,8 +124,8 @@ def over(
     cuts: Cuts = NO_CUTS,
     index: tuple[Index, ...] = (),
 ) -> None:
-    """Loops over all elements of an array of this shape, a loop for each part between `cuts`; of
-    those at an `index` along the first axes."""
+    """Write loops over all elements of an array of this shape, with a loop for each part between
+    `cuts`. `index` has the indices along the first axes, which are fixed."""
     axis = len(index)
     if axis == len(shape):
         return body(index)
@@ -141,22 +139,22 @@ def over(
 
 
 def range_of(t: Text, i: Index, size: int) -> tuple[int, int]:
-    """The least and the greatest number that a place along an axis of this size can be."""
+    """Return the least and the greatest value of an index along an axis of this size."""
     if isinstance(i, int):
         return i, i
     return t.ranges.get(i, (0, size - 1)) if isinstance(i, str) else (0, size - 1)
 
 
-# --- the kinds of arrays
+# --- kinds of arrays
 
-# Arrays of more numbers than this live in memory. A choice: the registers of AVX-512 are 32.
+# Larger arrays are in memory. A choice: AVX-512 has 32 registers.
 MOST_IN_REGISTERS = 16
 
 _BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
 
 
 class Array:
-    """An array of a lane, as a kernel holds it."""
+    """An array of each lane, as a kernel represents it."""
 
     shape: tuple[int, ...]
     kind: str
@@ -164,21 +162,21 @@ class Array:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """The number of its elements."""
         return int(np.prod(self.shape, dtype=int))
 
     @property
     def ndim(self) -> int:
-        """How many axes it has."""
+        """The number of its axes."""
         return len(self.shape)
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
-        """The number at a place of each axis, which must be within the array in every slot."""
+        """Return the number at an index, which must be within the array in every slot."""
         raise TypeError(type(self).__name__)
 
 
 class Registers(Array):
-    """An array whose numbers are in registers: at most `MOST_IN_REGISTERS` of them.
+    """An array in registers, with at most `MOST_IN_REGISTERS` numbers.
 
     **Arguments:** an object array of `Value`s; their type, by default that of the first.
     """
@@ -190,7 +188,7 @@ class Registers(Array):
 
     @classmethod
     def of(cls, shape: Sequence[int], kind: str, number: Callable[[tuple[int, ...]], Value]):
-        """An array of this shape with a number for each index."""
+        """Return an array of this shape with a number for each index."""
         values = np.empty(tuple(shape), object)
         for i in np.ndindex(values.shape):
             values[i] = number(i)
@@ -198,13 +196,13 @@ class Registers(Array):
 
     @classmethod
     def one(cls, value: Value) -> "Registers":
-        """An array without axes that holds one value."""
+        """Return an array without axes that holds one value."""
         values = np.empty((), object)
         values[()] = value
         return cls(values, value.kind)
 
     def item(self) -> Value:
-        """The value of an array without axes."""
+        """Return the value of an array without axes."""
         return self.values.item()
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
@@ -221,15 +219,15 @@ class Registers(Array):
 
 @dataclass(eq=False)
 class Formula(Array):
-    """An array whose numbers are computed where they are asked for."""
+    """An array whose numbers are computed at each use."""
 
     shape: tuple[int, ...]
     kind: str
     function: Callable[[tuple[Index, ...]], Value]
     cheap: bool = False
-    """Whether it may be computed again wherever it is asked for."""
+    """True if its numbers may be computed again at each use."""
     value: Value | None = None
-    """The number, if it is the same everywhere."""
+    """The number, if all are equal."""
     cuts: Cuts = field(default_factory=lambda: NO_CUTS)
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
@@ -237,13 +235,13 @@ class Formula(Array):
 
 
 def uniform(shape: Sequence[int], value: Value) -> Formula:
-    """An array of one number."""
+    """Return an array whose numbers are all equal."""
     return Formula(tuple(shape), value.kind, lambda index: value, True, value)
 
 
 @dataclass(eq=False)
 class Pieces(Array):
-    """Arrays one after the other along an axis."""
+    """Arrays concatenated along an axis."""
 
     shape: tuple[int, ...]
     kind: str
@@ -254,7 +252,7 @@ class Pieces(Array):
         cuts: dict[int, set[int]] = {self.axis: set()}
         for begin, part in zip(self._begins(), self.parts, strict=True):
             cuts[self.axis].add(begin)
-            if isinstance(part, Registers):  # its numbers are asked for one by one
+            if isinstance(part, Registers):  # numbers in registers are selected one by one
                 cuts[self.axis].update(range(begin, begin + part.shape[self.axis]))
                 continue
             for axis, places in part.cuts.items():
@@ -292,36 +290,36 @@ def _clamped(t: Text, place: Index, last: int) -> Value:
 
 
 def joined(*cuts: Cuts) -> Cuts:
-    """The cuts of several arrays of one shape together."""
+    """Return the union of the cuts of several arrays of one shape."""
     axes = {axis for c in cuts for axis in c}
     return {a: frozenset().union(*(c.get(a, frozenset()) for c in cuts)) for a in axes}
 
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers that all lanes share, by the name of a pointer to them."""
+    """Constant numbers that all lanes share, at the address of a pointer's name."""
 
     pointer: str
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
-        """The number at a place, in every lane."""
+        """Return the number at a place, in every lane."""
         stored = stored_kind(kind)
         if isinstance(place, Value):
             return gathered(t, self.pointer, place, kind)
         where = t.once(f"getelementptr {stored}, ptr {self.pointer}, i64 {place}")
-        number = t.once(f"load {stored}, ptr {where}")  # nothing is ever stored there
+        number = t.once(f"load {stored}, ptr {where}")  # merged, since no store changes it
         return _flag_if(t, splat(t, number, stored), kind)
 
 
 @dataclass(frozen=True)
 class Memory:
-    """Numbers of every lane, in a block of the kernel's memory, or at a place given to it."""
+    """Numbers of every lane, in a block of the kernel's memory or at another address."""
 
     block: Block | tuple[str, int]
-    """The block; or the name of a pointer, and the bytes from there."""
+    """The block, or the name of a pointer and an offset in bytes."""
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
-        """Each lane's number at a place."""
+        """Return each lane's number at a place."""
         if isinstance(place, Value):
             return gathered(t, self._base(t), self._of_slots(t, place), kind)
         stored = stored_kind(kind)
@@ -331,7 +329,7 @@ class Memory:
         return _flag_if(t, value, kind)
 
     def store(self, t: Text, place: Index, value: Value) -> None:
-        """Put each lane's number at a place."""
+        """Store each lane's number at a place."""
         if isinstance(place, Value):
             return scattered(t, self._base(t), self._of_slots(t, place), value)
         value = _as_stored(t, value)
@@ -356,7 +354,7 @@ class Memory:
         return min(64, t.width * _BYTES[kind]) if isinstance(self.block, Block) else 8
 
     def _of_slots(self, t: Text, place: Value) -> Value:
-        """Of each slot, the number of its own among all those of the block."""
+        """Return the index of each slot's number among those of all slots."""
         slots = ", ".join(f"i64 {i}" for i in range(t.width))
         own = Value(f"<{slots}>", "i64")
         return t.binary("add", t.binary("mul", place, t.constant(t.width, "i64")), own)
@@ -364,7 +362,7 @@ class Memory:
 
 @dataclass(eq=False)
 class Strided(Array):
-    """An array whose numbers lie at regular places of a block or of a table."""
+    """An array in memory or in a table, with a stride along each axis."""
 
     shape: tuple[int, ...]
     kind: str
@@ -376,22 +374,22 @@ class Strided(Array):
         return self.source.load(t, place_of(t, index, self.strides, self.offset), self.kind)
 
     def put(self, t: Text, index: Sequence[Index], value: Value) -> None:
-        """Store the number at a place of each axis."""
+        """Store the number at an index."""
         assert isinstance(self.source, Memory)
         self.source.store(t, place_of(t, index, self.strides, self.offset), value)
 
     def viewed(
         self, t: Text, shape: Sequence[int], strides: Sequence[int], more: Index = 0
     ) -> "Strided":
-        """Other numbers of the same block or table."""
+        """Return a view of the same memory or table."""
         offset = plus(t, self.offset, more)
         return Strided(tuple(shape), self.kind, self.source, tuple(strides), offset)
 
 
 @dataclass(eq=False)
 class Masked(Array):
-    """An array that is zero but in the lanes of a mask: numbers in memory to which nothing is
-    written where the mask has no lane."""
+    """An array that is zero except in the lanes of a mask. Nothing is written to its memory if no
+    lane is in the mask."""
 
     shape: tuple[int, ...]
     kind: str
@@ -403,7 +401,7 @@ class Masked(Array):
 
 
 def stored_kind(kind: str) -> str:
-    return "i8" if kind == "i1" else kind  # XLA keeps truth values in bytes
+    return "i8" if kind == "i1" else kind  # XLA stores booleans as bytes
 
 
 def _as_stored(t: Text, value: Value) -> Value:
@@ -419,7 +417,7 @@ def _addresses(t: Text, pointer: str, place: Value, kind: str) -> str:
 
 
 def gathered(t: Text, pointer: str, place: Value, kind: str, mask: Value | None = None) -> Value:
-    """The number at a place of each slot behind a pointer, zero where `mask` does not hold."""
+    """Return each slot's number at a place behind a pointer, or zero where `mask` is false."""
     stored, mask = stored_kind(kind), t.constant(True, "i1") if mask is None else mask
     where = _addresses(t, pointer, place, stored)
     v, p, flags = t.vector(stored), f"<{t.width} x ptr>", t.vector("i1")
@@ -430,7 +428,7 @@ def gathered(t: Text, pointer: str, place: Value, kind: str, mask: Value | None 
 
 
 def scattered(t: Text, pointer: str, place: Value, value: Value, mask: Value | None = None) -> None:
-    """Store a number at a place of each slot behind a pointer, where `mask` holds."""
+    """Store a number at a place behind a pointer, for each slot where `mask` holds."""
     value, mask = _as_stored(t, value), t.constant(True, "i1") if mask is None else mask
     where = _addresses(t, pointer, place, value.kind)
     v, p, flags = t.vector(value.kind), f"<{t.width} x ptr>", t.vector("i1")
@@ -440,27 +438,27 @@ def scattered(t: Text, pointer: str, place: Value, value: Value, mask: Value | N
     t.store(f"call void {name}({call})")
 
 
-# --- arrays computed, stored, chosen, replaced
+# --- arrays computed, stored, selected, replaced
 
 
 def addressable(t: Text, x: Array) -> Array:
-    """An array that can be asked for numbers at places known only at run time."""
+    """Return an array that can be indexed with values known only at run time."""
     if not isinstance(x, Registers):
         return x
     return uniform(x.shape, x.item()) if x.size == 1 else stored(t, x)
 
 
 def held(t: Text, x: Array) -> Any:
-    """An array as a kernel holds one of its size."""
+    """Return an array in registers if it is small enough, else unchanged."""
     if isinstance(x, Registers) or x.size > MOST_IN_REGISTERS:
         return x
     return Registers.of(x.shape, x.kind, lambda i: x.at(t, i))
 
 
 def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | None = None) -> Any:
-    """A function of numbers, number by number, of arrays of one shape.
+    """Apply a function of numbers elementwise to arrays of one shape.
 
-    **Arguments:** `kind`, the type of its result, if another than that of the first array.
+    **Arguments:** `kind`, the type of its result, by default that of the first array.
     """
     first, kind = arrays[0], kind or arrays[0].kind
     if not first.shape:
@@ -475,7 +473,7 @@ def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | 
 
 
 def over_all(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> None:
-    """All elements of an array: one after the other if it is in registers, else in loops."""
+    """Write `body` for each element: in sequence if the array is in registers, else in loops."""
     if isinstance(x, Registers):
         for i in np.ndindex(x.shape):
             body(i)
@@ -484,49 +482,49 @@ def over_all(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> No
 
 
 def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
-    """An array in memory whose numbers are still to be stored."""
+    """Allocate an array in memory. Its numbers must be stored before use."""
     numbers = int(np.prod(shape, dtype=int))
     source = Memory(t.arena.take(max(1, numbers)))
     return Strided(tuple(shape), kind, source, contiguous(shape))
 
 
 def fill(t: Text, out: Strided, x: Array) -> None:
-    """Store the numbers of an array in memory for them."""
+    """Store the numbers of an array in allocated memory."""
     over_all(t, x, lambda i: out.put(t, i, x.at(t, i)))
 
 
 def stored(t: Text, x: Array) -> Strided:
-    """A copy of an array in memory."""
+    """Return a copy of an array in memory."""
     out = room(t, x.shape, x.kind)
     fill(t, out, x)
     return out
 
 
 def settled(t: Text, x: Array) -> Array:
-    """An array whose numbers are computed: what is a formula is stored."""
+    """Return an array whose numbers are computed; a formula that is not cheap is stored."""
     return x if is_cheap(x) else stored(t, x)
 
 
 def in_one(t: Text, x: Array) -> Array:
-    """An array that is asked for at places of which no more is known than that they are in it."""
+    """Return an array without cuts, for indices known only at run time."""
     return stored(t, x) if x.cuts else settled(t, x)
 
 
 def is_cheap(x: Array) -> bool:
-    """Whether the numbers of an array need not be stored to be asked for again."""
+    """Return whether repeated use of the numbers of an array does not need a store."""
     if isinstance(x, Pieces):
         return all(map(is_cheap, x.parts))
     return not isinstance(x, Formula) or x.cheap
 
 
 def selected(t: Text, mask: Value, a: Array, b: Array) -> Any:
-    """The first array where `mask` holds, else the second."""
+    """Return the first array where `mask` holds, else the second."""
     return mapped(t, lambda x, y: t.select(mask, x, y), a, b)
 
 
 def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | None = None) -> None:
-    """Store large arrays over those that they replace, where `mask` holds. The new ones may depend
-    on any of the old ones; arrays in registers are left out."""
+    """Overwrite large old arrays by new ones where `mask` holds. The new ones may depend on any of
+    the old ones. Arrays in registers are ignored."""
     pairs = [
         (a, b) for a, b in zip(old, new, strict=True) if isinstance(a, Strided) and not same(a, b)
     ]
@@ -543,7 +541,7 @@ def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | N
 
 
 def same(a: Array, b: Array) -> bool:
-    """Whether two large arrays are the same numbers of the same memory."""
+    """Return whether two large arrays are the same view of the same memory."""
     if a is b:
         return True
     if not (isinstance(a, Strided) and isinstance(b, Strided)):
@@ -554,7 +552,7 @@ def same(a: Array, b: Array) -> bool:
 
 
 def table(t: Text, array: object, kind: str) -> Array:
-    """A large array known while the code is written, as constants in the module's text."""
+    """Return a large constant array, stored in the module's text."""
     array = np.asarray(array)
     numbers = array.reshape(-1)
     word = stored_kind(kind)

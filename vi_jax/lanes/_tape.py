@@ -1,19 +1,19 @@
-"""A program forward and then backward, as one machine function with the arguments of `_kernel.py`.
+"""A program's forward and reverse pass as one machine function, with the arguments of `_kernel.py`.
 
-A thread takes a group of lanes at a time. All of them go forward until the last has ended, and the
-group's carry is kept of every iteration, on the *tape*. Then it goes back: through `end`, through
-the iterations from the last to the first, through `begin`. A lane takes part in the iterations that
-it had. The driver is scalar code (`DRIVER`); it calls these functions, each of which reads and
-writes the group's *frame*, and is written by the method of its name:
+A thread takes one group of lanes at a time. The forward pass runs until the last lane has ended,
+and stores the carry of each iteration on the *tape*. The reverse pass goes through `end`, the
+iterations from last to first, and `begin`. A lane takes part only in its own iterations. The driver
+is scalar code (`DRIVER`). It calls these functions, which share the group's *frame* in memory; each
+is written by the method of its name:
 
-    begin       takes up new lanes: their inputs, their first carry
-    step        one iteration of the lanes that have not ended
-    end_back    from the cotangents of the results to those of the carry and the inputs
-    step_back   the same through one iteration, and through the rows that were completed in it
-    begin_back  the same through `begin`; stores the cotangents of the inputs
+    begin       loads new lanes: their inputs, their first carry
+    step        advances the lanes that have not ended by one iteration
+    end_back    maps cotangents of the results to those of the carry and the inputs
+    step_back   does the same for one iteration and the rows completed in it
+    begin_back  does the same for `begin`, and stores the cotangents of the inputs
 
-A full tape is copied into twice the memory, up to `MOST_BYTES` a thread. Beyond that the call ends
-with an error.
+A full tape is copied into twice the memory, up to `MOST_BYTES` per thread. Beyond that the call
+ends with an error.
 """
 
 from typing import Any
@@ -46,17 +46,17 @@ from ._vector import write
 
 # The scalar code that drives a group of lanes forward and back, as LLVM's text.
 #
-# The blocks, of which `docs/internals/lanes.md` has the picture:
+# The blocks (`docs/internals/lanes.md` has the picture):
 #
-#     take     a group's lanes, as long as there are any; begin
-#     forward  as long as a lane goes on: keep the carry (a full tape grows), step
-#     turn     all have ended: through `end`, then back through the iterations
-#     finish   through `begin`
+#     take     take a group's lanes, as long as there are any; begin
+#     forward  while a lane continues: store the carry (a full tape grows), step
+#     turn     all lanes have ended: back through `end` and the iterations
+#     finish   back through `begin`
 
-# What a kernel stores in `stop` where it gets no memory, or where a tape would outgrow its limit.
+# The value of `stop` after a failed allocation, or if a tape would exceed its limit.
 OUT_OF_MEMORY = 2
 
-# Memory lies on multiples of 64 bytes, so that no vector is part of two lines of the cache.
+# Memory is aligned to 64 bytes, so that no vector crosses a cache line.
 DRIVER = """\
 declare ptr @malloc(i64)
 declare void @free(ptr)
@@ -168,12 +168,12 @@ leave:
 }}"""
 
 
-# Bytes of a thread's tape at most, and its entries at first. The paper's motor takes 1.1 kB an
-# iteration in groups of eight, so that 250,000 cycles of 15 steps have room.
+# The greatest size of a thread's tape in bytes, and its initial number of entries. The paper's
+# motor takes 1.1 kB per iteration in groups of eight, so 250,000 cycles of 15 steps fit.
 MOST_BYTES = 4 << 30
 _FIRST_ENTRIES = 64
 
-# How many iterations a lane has that has not ended yet.
+# The iteration count of a lane that has not ended yet.
 _NO_END = (1 << 63) - 1
 
 
@@ -186,15 +186,15 @@ def reverse_text(
     entries: int = _FIRST_ENTRIES,
     most: int = MOST_BYTES,
 ) -> str:
-    """LLVM's text of a program forward and backward.
+    """Return LLVM's text of a program forward and backward.
 
     **Arguments:** the program; the lanes of a group; the width of the registers that LLVM may use;
-    as for `_kernel.kernel_text`; the entries of a tape at first; its bytes at most.
+    `one_for_all` as for `_kernel.kernel_text`; the initial entries of a tape; its greatest size.
     """
     return _Writer(program, width, one_for_all).text(bits, entries, most)
 
 
-# The types of a lane's number, and of what is counted for a lane; of a truth value.
+# Types: of a lane's number and of its counters; of a boolean.
 _LANE, _FLAG = np.zeros((), np.int64), np.zeros((), bool)
 
 _ARGUMENTS = "ptr %inputs, ptr %strides, ptr %outputs, ptr %frame"
@@ -219,21 +219,21 @@ class _Writer:
             a for a, here in zip(program.carry_avals, program.carried, strict=True) if here
         ]
         parts = {
-            # An entry of the tape: the carry, and how many rows were complete before the iteration.
+            # An entry of the tape: the carry, and the number of rows complete before the iteration.
             "carry": program.carry_avals,
             "rows": [_LANE],
             "lane": [_LANE],  # its number; -1 for a slot without one
             "count": [_LANE],  # its iterations
-            # Those of which each lane has its own, or that are small.
+            # Inputs that differ between lanes, or that are small.
             "inputs": [x for x, here in zip(self.inputs, self.shared, strict=True) if not here],
-            "undefined": [_FLAG],  # whether a cotangent that was given makes all others NaN
+            "undefined": [_FLAG],  # True if a given cotangent makes all results NaN
             "to_inputs": self.varied,  # cotangents so far
             "to_carry": self.carried,
         }
         self.frame = Frame(parts, width)
 
     def text(self, bits: int, entries: int, most: int) -> str:
-        """LLVM's text of the module: forward sweep, backward sweep, and the driver of both."""
+        """Return LLVM's text of the module: forward pass, reverse pass, and the driver of both."""
         functions = [
             self._begin(), self._step(), self._end_back(), self._step_back(), self._begin_back(),
         ]  # fmt: skip
@@ -244,17 +244,17 @@ class _Writer:
         return "\n".join([*self.declared.values(), *functions, driver, attributes(bits), RARE, ""])
 
     def _function(self, kind: str, name: str, more: str, t: Text, result: str) -> str:
-        """A function around what was written; `more` are arguments of its own."""
+        """Return a function with the written body. `more` are arguments after the common ones."""
         self.declared.update(t.declared)
         self.arena = max(self.arena, t.arena.size * self.width * 8)
         head = f"define internal {kind} @{name}({_ARGUMENTS}{more}) noinline #0 {{\nentry:"
         arena = f"  %arena = getelementptr i8, ptr %frame, i64 {self.frame.size}"
         return "\n".join([head, arena, *t.lines, f"  ret {result}", "}"])
 
-    # What the functions share
+    # Code common to the functions
 
     def _load_inputs(self, t: Text) -> list[Array]:
-        """The inputs: large ones that all lanes share where XLA keeps them."""
+        """Return the inputs. Large ones that all lanes share are read from XLA's array."""
         own = iter(self.frame.load(t, "inputs"))
         return [
             shared(load_pointer(t, "inputs", i), aval) if here else next(own)
@@ -262,17 +262,17 @@ class _Writer:
         ]
 
     def _lanes(self, t: Text) -> tuple[Value, Value]:
-        """The number of each slot's lane, and which slots have one."""
+        """Return the number of each slot's lane, and the mask of the slots that have one."""
         lane = self.frame.number(t, "lane")
         return lane, t.binary("icmp sge", lane, t.zero("i64"), "i1")
 
     def _weights(
         self, t: Text, first: int, avals: list[Any], lane: Value, place: Value | None, mask: Value
     ) -> list[Array]:
-        """Cotangents that were given, zero where `mask` does not hold.
+        """Return given cotangents, zero where `mask` does not hold.
 
-        **Arguments:** the number of the first of them; shapes and types of them; each slot's lane;
-        the number of the row, if they are a row's; which lanes have any.
+        **Arguments:** the number of the first of them; their shapes and types; each slot's lane;
+        the number of the row, for cotangents of rows; the lanes that have any.
         """
         arrays = []
         for i, aval in enumerate(avals, len(self.inputs) + first):
@@ -285,8 +285,8 @@ class _Writer:
         return arrays
 
     def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
-        """The cotangents of the rows number `place`, of the lanes that have `complete`d one; not
-        read if there are none."""
+        """Return the cotangents of row `place`, for the lanes that have `complete`d it. Small ones
+        are not read if no lane has."""
         avals = self.program.weight_avals[self.results :]
         none = zeros(t, avals)
         if not avals:
@@ -306,7 +306,7 @@ class _Writer:
         return [mapped(t, fork.joined, a, b) for a, b in zip(found, none, strict=True)]
 
     def _undefine_by_weights(self, t: Text, arrays: list[Array]) -> None:
-        """NaN and infinity as a cotangent: 0 times it is NaN."""
+        """Mark lanes with NaN or infinity as a cotangent, since 0 times it is NaN."""
 
         def is_no_number(x: Value) -> Value:
             return compare(t, "ne", t.binary("fsub", x, x), t.zero(x.kind), False)
@@ -314,14 +314,15 @@ class _Writer:
         self._undefine(t, [mapped(t, is_no_number, x, kind="i1") for x in arrays])
 
     def _undefine(self, t: Text, flags: list[Array]) -> None:
-        """The lanes in which one of these flags holds have no derivative."""
+        """Mark lanes in which any of these flags holds: their derivatives become NaN."""
         undefined = self.frame.number(t, "undefined")
         for x in flags:
             undefined = t.binary("or", undefined, any_in(t, x))
         self.frame.store_number(t, "undefined", undefined)
 
     def _undefine_by_missing_rows(self, t: Text, lane: Value, rows: Value, present: Value) -> None:
-        """Rows that a lane did not come to are NaN, so that none of them may have a weight."""
+        """Mark lanes with a nonzero cotangent of a row that they did not reach. Such rows are
+        NaN."""
         avals = self.program.weight_avals[self.results :]
         if not avals:
             return
@@ -336,8 +337,8 @@ class _Writer:
     def _back(
         self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value
     ) -> tuple[list[Array], list[Array]]:
-        """The cotangents of inputs and carry that the way back gives, zero where `mask` does not
-        hold."""
+        """Return the cotangents of inputs and carry from one reverse step; zero where `mask` is
+        false."""
         out = only_in(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
         return out[: len(self.varied)], out[len(self.varied) :]
 
@@ -369,8 +370,8 @@ class _Writer:
         return self._function("i1", "begin", ", i64 %first, i64 %lanes", t, f"i1 {t.any(going)}")
 
     def _step(self) -> str:
-        """The lanes that take part are those with more iterations than this one's number; the
-        function gives whether any has still more."""
+        """Advance the lanes whose iteration count exceeds `number`. Return whether any lane
+        continues."""
         t = FixedText(self.width)
         number, count = splat(t, "%number", "i64"), self.frame.number(t, "count")
         mask = t.binary("icmp slt", number, count, "i1")
@@ -405,8 +406,8 @@ class _Writer:
         return self._function("void", "end_back", "", t, "void")
 
     def _step_back(self) -> str:
-        """Through iteration `number`, before which the carry was that of an `entry` of the tape.
-        The rows of the frame are those complete after it, and then those complete before it."""
+        """Reverse iteration `number`, whose initial carry is in an `entry` of the tape. The frame's
+        row count changes from that after the iteration to that before it."""
         t = FixedText(self.width)
         lane, count = self.frame.number(t, "lane"), self.frame.number(t, "count")
         mask = t.binary("icmp slt", splat(t, "%number", "i64"), count, "i1")
@@ -442,49 +443,50 @@ class _Writer:
         return self._function("void", "begin_back", "", t, "void")
 
 
-# --- whole arrays of a group of lanes: kept in memory and read again, chosen between, added
+# --- whole arrays of a group of lanes: kept in memory, selected, added
 
 
 def only_in(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:
-    """The arrays in the lanes where the flag holds, else zeros; what is zero outside of some lanes
-    must be so outside of these."""
+    """Return the arrays in lanes where the flag holds, else zeros. `Masked` arrays are returned as
+    they are; their masks must imply the flag."""
     chosen = select_all(t, flag, arrays, zeros(t, avals))
     return [x if isinstance(x, Masked) else y for x, y in zip(arrays, chosen, strict=True)]
 
 
 def select_all(t: Text, flag: Value, a: list[Array], b: list[Array]) -> list[Array]:
-    """The arrays `a` in the lanes where the flag holds, else `b`."""
+    """Return the arrays `a` in the lanes where the flag holds, else `b`."""
     return [selected(t, flag, x, y) for x, y in zip(a, b, strict=True)]
 
 
 def add_all(t: Text, a: list[Array], b: list[Array]) -> list[Array]:
-    """The sums of two lists of arrays."""
+    """Return the sums of two lists of arrays."""
     return [mapped(t, lambda x, y: add(t, x, y), x, y) for x, y in zip(a, b, strict=True)]
 
 
 def zeros(t: Text, avals: list[Any]) -> list[Array]:
-    """Zeros of the given shapes and kinds."""
+    """Return zeros of the given shapes and types."""
     return [held(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
 
 
 class Frame:
-    """What a group of lanes keeps from one function of a kernel to the next, behind `%frame`.
+    """Memory of a group of lanes at `%frame`, kept between the functions of a kernel.
 
-    **Arguments:** the parts by name, each arrays of these shapes and types; the lanes of a group.
+    **Arguments:** the parts by name, each with shapes and types of its arrays; the lanes of a
+    group.
     """
 
     def __init__(self, parts: dict[str, list[Any]], width: int):
         self._parts, self.places, size = parts, {}, 0
-        """Where each part begins, in bytes."""
+        """The offset of each part, in bytes."""
         for name, avals in parts.items():
             self.places[name] = size
             size += sum(a.size for a in avals) * 8 * width
-        # What is behind it begins on a line of the cache, as the frame does.
+        # The memory after the frame begins on a cache line, as the frame does.
         self.size = -(-size // 64) * 64
-        """Bytes of the frame."""
+        """The size of the frame in bytes."""
 
     def _arrays(self, t: Text, part: str, pointer: str = "%frame") -> list[Strided]:
-        """The arrays of a part, one after the other; numbers lie `8 * width` bytes apart."""
+        """Return the arrays of a part. Each number has `8 * width` bytes of room."""
         found, place = [], self.places[part]
         for aval in self._parts[part]:
             memory, shape = Memory((pointer, place)), tuple(aval.shape)
@@ -493,19 +495,19 @@ class Frame:
         return found
 
     def load(self, t: Text, part: str, pointer: str = "%frame") -> list[Any]:
-        """The arrays of a part, of the frame or of what was copied from it; large ones stay where
-        they are."""
+        """Return the arrays of a part, from the frame or from a copy of it. Large ones are not
+        copied."""
         return [held(t, x) for x in self._arrays(t, part, pointer)]
 
     def store(self, t: Text, part: str, arrays: list[Array]) -> None:
-        """Write the arrays of a part."""
-        # What is computed from what is overwritten is computed first.
+        """Store the arrays of a part."""
+        # Large arrays may depend on those that are overwritten, so they are computed first.
         arrays = [x if isinstance(x, Registers) else stored(t, x) for x in arrays]
         for place, x in zip(self._arrays(t, part), arrays, strict=True):
             fill(t, place, x)
 
     def add(self, t: Text, part: str, arrays: list[Array]) -> None:
-        """Add arrays to those of a part, of which they are no functions."""
+        """Add arrays to those of a part. They must not depend on these."""
         places = self._arrays(t, part)
         rare: dict[Value, list[tuple[Strided, Array]]] = {}
         sums = add_all(t, [held(t, x) for x in places], arrays)
@@ -514,16 +516,16 @@ class Frame:
                 rare.setdefault(more.mask, []).append((place, new))
             else:
                 fill(t, place, new)
-        # The weights of a law matter in the iterations with an impact.
+        # The cotangents of a law's weights are nonzero only in iterations with an impact.
         for mask, pairs in rare.items():
             with t.skipped_unless(mask, rare=True):
                 for place, new in pairs:
                     fill(t, place, new)
 
     def number(self, t: Text, part: str, pointer: str = "%frame") -> Value:
-        """The one number of a part."""
+        """Return the single number of a part."""
         return self.load(t, part, pointer)[0].item()
 
     def store_number(self, t: Text, part: str, value: Value) -> None:
-        """Write the one number of a part."""
+        """Store the single number of a part."""
         self.store(t, part, [Registers.one(value)])

@@ -222,7 +222,7 @@ class Text:
         return f"v{self.width}" + {"double": "f64", "float": "f32"}.get(kind, kind)
 
     def intrinsic(self, name: str, *args: Value, kind: str | None = None) -> Value:
-        """Call an intrinsic of LLVM on values of one type, such as `sqrt`; `kind` as in `binary`."""
+        """Call an LLVM intrinsic, such as `sqrt`, on values of one type; `kind` as in `binary`."""
         own = args[0].kind
         function = f"@llvm.{name}.{self.suffix(own)}"
         result = kind or own

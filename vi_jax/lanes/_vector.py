@@ -1,4 +1,4 @@
-"""A jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
+"""Writing a jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 import functools
 from collections.abc import Callable
@@ -44,12 +44,12 @@ from ._text import Text, Value
 
 
 class Unsupported(Exception):
-    """A program that has no vector form; the argument says what stopped it."""
+    """The error for a program without a vector form; its argument names the reason."""
 
 
 def check(jaxpr: Jaxpr) -> None:
-    """**Raises:** `Unsupported` naming the first primitive, or type, that has no vector form;
-    `TypeError` for a function that has no forward derivative."""
+    """Raise `Unsupported` with the first primitive or type that has no vector form, or `TypeError`
+    for a function without a forward derivative."""
     needed = _needed_equations(jaxpr)
     for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in needed for v in e.outvars)):
         dtype = getattr(var.aval, "dtype", None)
@@ -71,7 +71,7 @@ def check(jaxpr: Jaxpr) -> None:
 
 
 def _bodies(eqn: Any) -> list[Jaxpr]:
-    """The jaxprs that are written where an equation calls, chooses or repeats them."""
+    """Return the bodies of an equation's calls, branches and loops that are written for it."""
     name, params = eqn.primitive.name, eqn.params
     if (body := called(eqn)) is not None:
         return [inner(body)]
@@ -85,7 +85,7 @@ def _bodies(eqn: Any) -> list[Jaxpr]:
 
 
 def constants(t: Text, array: object) -> Array:
-    """A known array, the same in every lane."""
+    """Return a constant array, the same in every lane."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
     if array.size > MOST_IN_REGISTERS:
@@ -96,10 +96,11 @@ def constants(t: Text, array: object) -> Array:
 def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
     """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes.
 
-    **Arguments:** the text; the jaxpr; its arguments, as `Array`s of their shapes; which lanes
-    need the results: what none of them needs may be skipped, and the others get any numbers.
+    **Arguments:** the text; the jaxpr; its arguments, as `Array`s of their shapes; the mask of the
+    lanes that need the results. Code that none of them needs may be skipped. Results of other lanes
+    are arbitrary.
 
-    **Returns:** its results, likewise.
+    **Returns:** the jaxpr's results, as `Array`s.
     """
     jaxpr, env = inner(closed), {}
     needed = _needed_equations(jaxpr)
@@ -113,20 +114,20 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
 
     def put(variables: list[Any], values: list[Any]) -> None:
         for var, value in zip(variables, values, strict=True):
-            # What is asked for more than once is computed once.
+            # A value used more than once is computed once.
             env[var] = settled(t, value) if uses.get(var, 0) > 1 else value
 
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
         put(eqn.outvars, _write_equation(t, eqn, [read(a) for a in eqn.invars], mask))
-        for var in last.get(number, ()):  # so that its memory serves again
+        for var in last.get(number, ()):  # so that its memory is reused
             env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
 
 
 def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, list[Any]]]:
-    """How often each variable is asked for; which ones are not asked for after an equation."""
+    """Return the number of uses of each variable, and the variables last used by each equation."""
     uses, at_last = {}, {}
     for number, atoms in enumerate([*(eqn.invars for eqn in needed), jaxpr.outvars]):
         for atom in atoms:
@@ -175,8 +176,8 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
 
 
 def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
-    """The results of a rule of `ELEMENTWISE`: number by number of arrays in registers. Of larger
-    ones they are formulas; several results, which are computed together, are stored."""
+    """Return the results of a rule of `ELEMENTWISE`: in registers for small arrays, as a formula
+    for larger ones. Several large results, which one call of the rule computes, are stored."""
     several, shape, kinds = len(avals) > 1, avals[0].shape, [kind_of(a.dtype) for a in avals]
 
     def results(*numbers: Value) -> tuple[Value, ...]:
@@ -198,7 +199,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
         return args[:1]
 
     def results_at(index: tuple) -> tuple[Value, ...]:
-        # JAX lets numbers, and axes of one number, stand for arrays.
+        # JAX broadcasts scalars and axes of length one.
         return results(*(
             x.at(t, [i if n != 1 else 0 for i, n in zip(index, x.shape, strict=False)])
             for x in args
@@ -214,7 +215,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
                 return [found]
     if not several:
         cuts = joined(*(x.cuts for x in args if x.ndim))
-        # Whether it is stored before it is used must not decide how it is rounded.
+        # Rounding must not depend on whether the result is stored before use.
         return [Formula(shape, kinds[0], lambda i: t.opaque(results_at(i)[0]), cuts=cuts)]
     outs = [room(t, shape, kind) for kind in kinds]
 
@@ -234,16 +235,16 @@ def _only_number(x: Array) -> Value | None:
 
 # --- conditions and loops: jaxprs that are skipped or repeated
 
-# The most operations of a loop of known length, all turns together, that are written one after the
-# other. A bound on the time of compilation.
+# The most operations, all iterations together, of an unrolled loop. It bounds the compile time.
 _MOST_UNROLLED = 256
 
-# A branch of no more operations than this is computed whether any lane needs it or not.
+# A branch with at most so many operations may be computed even if no lane needs it.
 _CHEAP = 4
 
 
 def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """Each branch is skipped where no lane of the group takes it, but for a cheap one.
+    """Write the branches. Each is skipped if no lane of the group takes it, except a cheap first
+    one.
 
     **Arguments:** as for `CONTROL`.
     """
@@ -257,7 +258,7 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
         else:
             flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
         taken.append(flag)
-    # The cheapest comes first: the results of the others replace its own in their lanes.
+    # The smallest branch comes first. The others replace its results in their own lanes.
     order = sorted(range(len(branches)), key=lambda i: size_of(inner(branches[i])))
     result: list[Any] | None = None
     for i in order:
@@ -270,8 +271,8 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
 
 def _is_cheap(jaxpr: Jaxpr) -> bool:
-    """Whether a branch is not worth skipping: few operations, or constants however many, such as
-    the zeros that are the cotangents of what a branch does not need."""
+    """Return whether skipping a branch does not pay: it has few operations, or only constants.
+    Zeros as cotangents of unused arguments are such constants."""
     constant = (
         eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
         for eqn in jaxpr.eqns
@@ -280,10 +281,10 @@ def _is_cheap(jaxpr: Jaxpr) -> bool:
 
 
 def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
-    """The results of a jaxpr in the lanes of `mask`, and `otherwise` (or anything, if that is
-    `None`) in the others; skipped if `mask` has no lane."""
+    """Return the results of a jaxpr in the lanes of `mask`, and `otherwise` in the others
+    (arbitrary if `None`). The jaxpr is skipped if `mask` has no lane."""
     inside, skip, after = t.label(), t.label(), t.label()
-    # What is large lies in the same memory whichever way was taken.
+    # A large result has one address, whether or not the branch is skipped.
     avals: list[Any] = [v.aval for v in inner(jaxpr).outvars]
     rooms = [
         room(t, a.shape, kind_of(a.dtype)) if a.size > MOST_IN_REGISTERS else None for a in avals
@@ -327,12 +328,11 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
 def _branch_result(
     t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value
 ) -> Array:
-    """A branch's large result in the lanes of `mask`, and that of the others in theirs. Nothing is
-    copied that need not be: a derivative's branches hand on whole matrices, or zeros in their
-    place.
+    """Return a large result: `x` in the lanes of `mask`, `y` in the others. Copies are avoided,
+    since branches of a derivative often return an argument unchanged, or zeros.
 
-    **Arguments:** the text; the result `x`; the others', or `None` if it may be anything; memory
-    for what has to be stored; the branch's arguments; its lanes.
+    **Arguments:** the text; the branch's result `x`; the other lanes' `y`, or `None` if they are
+    arbitrary; memory for a stored result; the branch's arguments; its lanes.
     """
     mine, other = (a.value if isinstance(a, Formula) else None for a in (x, y))
     if mine is not None and mine.number is not None and (y is None or mine == other):
@@ -349,12 +349,12 @@ def _branch_result(
 
 
 def _opaque(t: Text, x: Array) -> Array:
-    """What comes out of a condition or a turn of a loop (see `Text.opaque`)."""
+    """Apply `Text.opaque` to a result of a condition or of a loop iteration."""
     return mapped(t, t.opaque, x) if isinstance(x, Registers) else x
 
 
 def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """Until no lane of `mask` goes on; a lane that has ended keeps its carry."""
+    """Write a loop until no lane of `mask` continues. Lanes that have ended keep their carry."""
     n, m = params["cond_nconsts"], params["body_nconsts"]
     cond_args, body_args, first = args[:n], args[n : n + m], args[n + m :]
     first = [x if isinstance(x, Registers) else stored(t, x) for x in first]
@@ -368,7 +368,7 @@ def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
         for x in first
     ]
     live = Value(t.fresh(), "i1")
-    # Under `vmap` within a lane several loops are one, as long as any of them goes on.
+    # `vmap` within a lane merges loops into one, which runs as long as one of them continues.
     asked = settled(t, write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0])
     going = t.both(live, any_in(t, asked))
     t.fork(t.any(going), inside, after)
@@ -392,24 +392,24 @@ def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
 
 def _chosen_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
-    """The first array where a flag of its leading axes holds, else the second."""
+    """Return the first array where a flag of its leading axes holds, else the second."""
     number = lambda i: t.select(flags.at(t, i[: flags.ndim]), a.at(t, i), b.at(t, i))
     return held(t, Formula(a.shape, a.kind, number, cuts=joined(a.cuts, b.cuts)))
 
 
 def _flat(arrays: list[Any]) -> list[Value]:
-    """The numbers of those arrays that are in registers."""
+    """Return the numbers of those arrays that are in registers."""
     return [v for x in arrays if isinstance(x, Registers) for v in x.values.flat]
 
 
 def _unflat(t: Text, arrays: list[Any], values: list[Value]) -> list[Any]:
-    """Arrays like those given, with other numbers in registers."""
+    """Return arrays like the given ones, with other numbers in registers."""
     left = iter(values)
     return [mapped(t, lambda _: next(left), x) if isinstance(x, Registers) else x for x in arrays]
 
 
 def _scan(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """A loop of known length: its turns one after the other, unless they are many."""
+    """Write a loop of known length: unrolled if it is short."""
     body, length = inner(params["jaxpr"]), params["length"]
     n, m = scan_counts(params)
     if length and size_of(body) * length > _MOST_UNROLLED:
@@ -435,7 +435,7 @@ def _row_of(t: Text, x: Array, i: Index) -> Array:
 
 
 def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """A loop of known length with a scalar counter; its rows lie in memory."""
+    """Write a loop of known length with a scalar counter. Its rows are in memory."""
     (n, m), length = scan_counts(params), params["length"]
     fixed, rows = args[:n], [addressable(t, in_one(t, x)) for x in args[n + m :]]
     first = [x if isinstance(x, Registers) else stored(t, x) for x in args[n : n + m]]
@@ -458,15 +458,15 @@ def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[A
 
 
 CONTROL: dict[str, Callable[..., list[Any]]] = {"cond": _cond, "while": _while, "scan": _scan}
-"""By the primitive's name, functions of the text, the equation's parameters, its arguments, none of
-them a formula that is dear, and which lanes need the results. They return those."""
+"""Functions by the primitive's name. Their arguments are the text, the equation's parameters, its
+arguments without costly formulas, and the lanes that need the results. They return the results."""
 
 
-# --- primitives written in JAX: factorisations of small matrices, sorting, arguments of extremes
+# --- primitives written in JAX: factorizations of small matrices, sorting, argmin and argmax
 
 
 def _lu(a):
-    """A = P⁻¹LU with the largest pivot of each column, of matrices (…, n, m)."""
+    """Return the LU factorization A = P⁻¹LU with column pivoting, of matrices (…, n, m)."""
     n, m = a.shape[-2:]
     rows = jnp.arange(n)
     order = jnp.broadcast_to(rows, a.shape[:-1])
@@ -479,7 +479,7 @@ def _lu(a):
         here = rows == pivot
 
         def exchanged(x, here=here, k=k):
-            """Row k and the pivot's, each in the other's place."""
+            """Return `x` with row k and the pivot's row exchanged."""
             wide = here.reshape(*here.shape, *(1,) * (x.ndim - here.ndim))
             first = x[..., k : k + 1, :] if x.ndim > here.ndim else x[..., k : k + 1]
             other = jnp.sum(jnp.where(wide, x, 0), axis=here.ndim - 1, keepdims=True)
@@ -489,7 +489,7 @@ def _lu(a):
 
         a, order = exchanged(a), exchanged(order)
         largest = a[..., k : k + 1, k : k + 1]
-        # A column of zeros stays one: the matrix is singular.
+        # A column of zeros remains zero: the matrix is singular.
         factor = a[..., k : k + 1] / jnp.where(largest == 0, 1, largest)
         below, right = (rows > k)[:, None], jnp.arange(m) > k
         a = jnp.where(below & (jnp.arange(m) == k), factor, a)
@@ -499,8 +499,8 @@ def _lu(a):
 
 
 def _triangular_solve(a, b, *, left_side, lower, transpose_a, unit_diagonal, **_):
-    """X of A X = B or X A = B with a triangular A."""
-    if not left_side:  # the same equation transposed
+    """Solve A X = B or X A = B with a triangular A."""
+    if not left_side:  # the transposed equation
         a, b = jnp.swapaxes(a, -1, -2), jnp.swapaxes(b, -1, -2)
         lower = not lower
     if transpose_a:
@@ -517,7 +517,7 @@ def _triangular_solve(a, b, *, left_side, lower, transpose_a, unit_diagonal, **_
 
 
 def _cholesky(a, **_):
-    """L of A = L Lᵀ; not a number where A is not positive definite."""
+    """Return L of A = L Lᵀ; NaN if A is not positive definite."""
     n = a.shape[-1]
     out = jnp.zeros_like(a)
     for k in range(n):
@@ -529,7 +529,7 @@ def _cholesky(a, **_):
 
 
 def _sort(*xs, dimension, num_keys, **_):
-    """Arrays in the order of the first, or of several; equal ones keep theirs."""
+    """Sort arrays by the first `num_keys` of them. The sort is stable."""
     xs = [jnp.moveaxis(x, dimension, -1) for x in xs]
     n = xs[0].shape[-1]
     places = jnp.arange(n)
@@ -537,7 +537,7 @@ def _sort(*xs, dimension, num_keys, **_):
     for x in xs[:num_keys][::-1]:
         one, other = x[..., :, None], x[..., None, :]
         one, other = jnp.broadcast_arrays(one, other)
-        # What is not a number comes last, and is as great as any other such.
+        # NaN is greater than all numbers and equal to NaN.
         less, same = other < one, one == other
         if _is_float(x):
             less, same = (
@@ -552,7 +552,7 @@ def _sort(*xs, dimension, num_keys, **_):
         found = jnp.sum(jnp.where(there, x[..., None, :], 0), axis=-1, dtype=x.dtype)
         if not _is_float(x):
             return found
-        # A sum has lost the sign of -0.
+        # The sum loses the sign of -0.
         negative = jnp.any(there & (1 / x < 0)[..., None, :], axis=-1)
         return jnp.where((found == 0) & negative, -0.0, found)
 
@@ -590,9 +590,9 @@ DERIVED: dict[str, Callable[..., Any]] = {
     "argmin": functools.partial(_first_extreme, jnp.min),
     "argmax": functools.partial(_first_extreme, jnp.max),
 }
-"""Functions of a primitive's arguments and parameters that give its results."""
+"""Functions of a primitive's arguments and parameters that return its results."""
 
 
 def derived(name: str, avals: list[Any], params: dict[str, Any]) -> ClosedJaxpr:
-    """What a primitive does, as a jaxpr of others."""
+    """Return a primitive as a jaxpr of other primitives."""
     return jax.make_jaxpr(lambda *args: DERIVED[name](*args, **params))(*map(shape_of, avals))
