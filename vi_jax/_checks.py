@@ -360,6 +360,7 @@ def narrow(value: object) -> bool:
 
 
 def _bits(value: Any) -> int:
+    """Return how many bits a floating-point JAX array is wider than the session's numbers."""
     if not (eqx.is_inexact_array(value) and jnp.issubdtype(value.dtype, jnp.floating)):
         return 0
     return jnp.finfo(value.dtype).bits - jnp.finfo(jnp.result_type(float)).bits

@@ -94,8 +94,7 @@ def maps_used() -> int | None:
 
 
 def maps_granted() -> int | None:
-    """Return the greatest number of memory maps that a process may have, or `None` if it is
-    unknown."""
+    """Return the number of memory maps that a process may have, or `None` if it is unknown."""
     try:
         return int(_MOST.read_text())
     except (OSError, ValueError):
@@ -162,8 +161,7 @@ class CompiledFunction:
 
 
 def _kind_of(*arguments: Any) -> Any:
-    """Return a key of the properties besides shapes that select a program; `None` if it has no
-    hash."""
+    """Return a key of the properties besides shapes that select a program; `None` without hash."""
     leaves, structure = jtu.tree_flatten(arguments)
     kind = structure, tuple(x for x in leaves if not eqx.is_array(x))
     try:

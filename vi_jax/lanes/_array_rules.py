@@ -466,8 +466,7 @@ def _with_blocks(
 
 
 def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callable) -> None:
-    """Change the number of an array at an index. Registers are changed at each index that it may
-    be.
+    """Change the number of an array at an index; in registers, by `select` at all possible ones.
 
     **Arguments:** the text; the array; the index; the new number as a function of the old one.
     """

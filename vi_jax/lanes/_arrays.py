@@ -297,7 +297,7 @@ def joined(*cuts: Cuts) -> Cuts:
 
 @dataclass(frozen=True)
 class Table:
-    """Constant numbers that all lanes share, at the address of a pointer's name."""
+    """Read-only numbers that all lanes share; `pointer` is the name of their address."""
 
     pointer: str
 
@@ -511,7 +511,7 @@ def in_one(t: Text, x: Array) -> Array:
 
 
 def is_cheap(x: Array) -> bool:
-    """Return whether repeated use of the numbers of an array does not need a store."""
+    """Return whether the numbers of an array may be used repeatedly without storing them."""
     if isinstance(x, Pieces):
         return all(map(is_cheap, x.parts))
     return not isinstance(x, Formula) or x.cheap

@@ -1,12 +1,11 @@
-"""Reverse mode: the transpose of `lanes`, and the primitive `lanes_backward` for that by a tape.
+"""Reverse mode: the transpose of `lanes`, and the primitive `lanes_backward`, which uses a tape.
 
-`lanes_backward` gives Jᵀc: J is the Jacobian of a program's results and rows by some of its inputs,
-c their cotangents. On a CPU it is a kernel that goes forward and then backward (`_tape.py`), else
-columns. Its own derivatives need no other code: with D, the program of values y and derivatives Jv,
+`lanes_backward` computes Jᵀc, with the Jacobian J of a program's results and rows with respect to
+some of its inputs, and their cotangents c. On a CPU it is a kernel with a forward and a reverse
+pass (`_tape.py`), else it goes by columns. Its derivatives use the same code. D is the program of
+the values y and the derivatives Jv. Run backward with the cotangents dc of y and c of Jv, it gives
 
-    d(Jᵀc) = Jᵀ dc + ∂(cᵀJv)/∂x,
-
-which are the cotangents of x by D backward, dc being that of y, and c that of Jv.
+    d(Jᵀc) = Jᵀ dc + ∂(cᵀJv)/∂x.
 """
 
 import functools
@@ -37,25 +36,26 @@ def by_columns(
     weights: Mapping[int, Any],
     batch: tuple[int, ...],
 ) -> dict[int, Any]:
-    """The program is run forward along every number that is differentiated, `DIRECTIONS` of them
-    with one motion, and each derivative is weighted with the cotangents.
+    """Run the program forward along each number, and weight the derivatives with the cotangents.
 
-    **Arguments:** a program that is linear in some inputs; its backend; its arguments, `None` for
-    these inputs; the cotangents of its results, by their places; the axes of the batch.
+    Up to `DIRECTIONS` numbers share one motion.
 
-    **Returns:** the cotangents of these inputs, by their places, each with the axes of the batch.
+    **Arguments:** a program that is linear in some inputs; its backend; its arguments, with `None`
+    for these inputs; a dictionary from places of results to their cotangents; the batch axes.
+
+    **Returns:** a dictionary from places of these inputs to their cotangents, with the batch axes.
     """
-    places: dict[int, slice] = {}  # of each such input among the numbers of all
+    places: dict[int, slice] = {}  # the range of each such input among the numbers of all
     number = 0
     for i, (x, aval) in enumerate(zip(args, program.in_avals, strict=True)):
         if x is None:
             places[i] = slice(number, number + aval.size)
             number += aval.size
-    if not number:  # arrays without one
+    if not number:  # only empty arrays
         avals = {i: program.in_avals[i] for i in places}
         return {i: jnp.zeros((*batch, *x.shape), x.dtype) for i, x in avals.items()}
     size = min(number, DIRECTIONS)
-    units = jnp.eye(-(-number // size) * size, number)  # filled up: one program for all
+    units = jnp.eye(-(-number // size) * size, number)  # padded, so that one program serves all
     along = jax.vmap(
         functools.partial(lanes_p.bind, program=program, backend=backend),
         [0 if i in places else None for i in range(len(args))],
@@ -80,23 +80,22 @@ def by_columns(
 
 
 def _weighted(column, weight, kept: int):
-    """The weighted sum over all but the first `kept` axes. A value of weight 0 may be NaN, as
+    """Return the weighted sum over all but the first `kept` axes. Values of weight 0 may be NaN, as
     after a failure."""
     product = jnp.where(weight == 0, 0.0, column * weight)
     return jnp.sum(product, axis=tuple(range(kept, product.ndim)))
 
 
-# Up to so many numbers go by columns. Simulations of the motor that a gradient takes (64 lanes, 50
-# cycles, one thread), by 1, 2, 4, 8, 11 numbers: columns 2.1, 2.5, 3.3, 6.7, 9.7; a tape 3.2, 3.3,
-# 3.5, 4.5, 4.5. They are compiled in about the same time.
+# Up to so many numbers go by columns. Measured: a gradient through 64 motors for 50 cycles on one
+# thread, with respect to 1, 2, 4, 8, 11 numbers. In units of one simulation, columns took 2.1, 2.5,
+# 3.3, 6.7, 9.7; a tape took 3.2, 3.3, 3.5, 4.5, 4.5. Both compile in about the same time.
 _BY_COLUMNS = 4
 
-# Where a step is longer than so many equations, more numbers go by columns, by the square of how
-# much longer it is: a tape takes some 1.5 ms an equation to trace, columns a third. A motor's step
-# has 3,600.
+# For steps longer than so many equations the limit grows with the square of the step's length. A
+# tape takes some 1.5 ms per equation to trace, columns a third of that. A motor's step has 3,600.
 _SHORT = 4_000
 
-# One cotangent by a tape takes as long as so many columns (the same measurement as `_BY_COLUMNS`).
+# The cost of one cotangent by a tape, in columns (from the measurement of `_BY_COLUMNS`).
 _COLUMNS_EACH = 4
 
 lanes_backward_p = primitive_of_programs("lanes_backward")
@@ -106,7 +105,7 @@ lanes_backward_p = primitive_of_programs("lanes_backward")
 
 
 def _transposed(cotangents, *args, program: LaneProgram, backend: str):
-    """Reverse mode: by a tape for many numbers, where that can be; else by columns."""
+    """Transpose a program: by a tape for many numbers, if possible, else by columns."""
     linear = [ad.is_undefined_primal(x) for x in args]
     shapes = [x.aval.shape if u else jnp.shape(x) for x, u in zip(args, linear, strict=True)]
     batch = batch_of(program, shapes)
@@ -126,24 +125,21 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
 
 @functools.lru_cache(maxsize=64)
 def _length(program: LaneProgram) -> int:
-    """The equations of a step of its values."""
+    """Return the number of equations in a step of the values' program."""
     return size_of((program.base or program).step.jaxpr)
 
 
 def _for_argument(x, own, aval):
-    """The cotangent of an argument from those of all lanes: the sum, if it is one for all.
-
-    **Arguments:** the cotangents with the axes of a batch; the shapes of one lane's and of the
-    argument.
-    """
+    """Return the cotangent of an argument: the sum over lanes, if all share it. Arguments: the
+    cotangents with batch axes; the aval of one lane; the aval of the argument."""
     if aval.ndim == own.ndim:
         x = jnp.sum(x, axis=tuple(range(x.ndim - own.ndim)))
     return x.reshape(aval.shape).astype(aval.dtype)
 
 
 def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[int, Any] | None:
-    """The cotangents of the tangents `linear` of a program of values and derivatives, by their
-    places; `None` if it is no such program, or if something in it has no transpose."""
+    """Return cotangents by the places of their tangents, which are flagged in `linear`. Return
+    `None` if it is no program of values and derivatives, or if a part of it has no transpose."""
     base = program.base
     if base is None or not program.varied or any(linear[: len(base.in_avals)]):
         return None
@@ -164,7 +160,7 @@ def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[in
 
 
 def _tangent_places(program: LaneProgram) -> dict[int, int]:
-    """Of the inputs of a program's base, where the program has their tangents."""
+    """Return a dictionary from inputs of a program's base to the places of their tangents."""
     assert program.base is not None
     moved = [i for i, here in enumerate(program.varied) if here]
     return {i: len(program.base.in_avals) + n for n, i in enumerate(moved)}
@@ -177,7 +173,7 @@ ad.primitive_transposes[lanes_p] = _transposed
 
 
 def _columns(*args, program: ReverseProgram) -> list[Any]:
-    """What `lanes_backward` gives, by columns."""
+    """Return the results of `lanes_backward`, computed by columns."""
     base, varied = program.program, program.varied
     n, batch = len(base.in_avals), batch_of(program, [x.shape for x in args])
     inputs, given = list(args[:n]), args[n:]
@@ -192,8 +188,8 @@ def _columns(*args, program: ReverseProgram) -> list[Any]:
 
 
 def _batched(args, dims, *, program: ReverseProgram):
-    """An axis of `jax.vmap` becomes one of lanes; but many cotangents of the same motions, as
-    `jax.jacrev` has them, share columns."""
+    """Make an axis of `jax.vmap` one of lanes. But many cotangents of the same motions, as in
+    `jax.jacrev`, go by columns, which share the motions."""
     args = [jnp.asarray(x) for x in args]
     n, (size, inner) = len(program.program.in_avals), axes_of(program, args, dims)
     number = sum(a.size for a in program.result_avals)
@@ -207,7 +203,7 @@ def _batched(args, dims, *, program: ReverseProgram):
 
 
 def _jvp(primals, tangents, *, program: ReverseProgram):
-    """Jᵀc and its derivative (see above)."""
+    """Return Jᵀc and its derivative (see the module's docstring)."""
     values = lanes_backward_p.bind(*primals, program=program)
     base, n = program.program, len(program.program.in_avals)
     moved = tuple(type(x) is not ad.Zero for x in tangents[:n])
@@ -235,14 +231,15 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
 
 
 def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, Any]:
-    """The cotangents that there are, by the places of their results and parts of a row."""
+    """Return the cotangents that exist by the places of their results or row parts."""
     places = [k for k, here in enumerate(program.given) if here]
     return {k: x for k, x in zip(places, cotangents, strict=True) if x is not None}
 
 
 def _transposed_back(cotangents, *args, program: ReverseProgram):
-    """Reverse over reverse. Jᵀc is linear in c, and its transpose is J. What `_jvp` gives is linear
-    in dc and v, and by the symmetry of second derivatives its transpose in v is of its own kind:
+    """Transpose `lanes_backward`. Jᵀc is linear in c, and its transpose is J. The result of `_jvp`
+    is linear in dc and v. Since second derivatives are symmetric, both transposes are of the same
+    kind:
 
         along w:   J w for dc,   ∂(cᵀJw)/∂x for v.
     """
@@ -295,7 +292,7 @@ _columns_lowered = mlir.lower_fun(_columns, multiple_results=True)
 
 
 def _lowered(ctx, *args, program: ReverseProgram):
-    """On a CPU: a call of the reverse kernel; else columns, as on all other devices."""
+    """Lower to a call of the reverse kernel on a CPU, or to columns if there can be no kernel."""
     otherwise = functools.partial(_columns_lowered, ctx, *args, program=program)
     return lower_to_kernel(ctx, args, program, otherwise)
 

@@ -1,4 +1,4 @@
-"""From LLVM's text to machine code, on a thread of its own; kept in files between processes."""
+"""Compilation of LLVM's text to machine code on a separate thread, with a cache in files."""
 
 import functools
 import hashlib
@@ -17,7 +17,7 @@ _FOLDER = "vi_jax_lanes"
 
 @functools.cache
 def llvm() -> Any:
-    """llvmlite's binding, ready for this processor. **Raises:** `Unsupported` without it."""
+    """Return llvmlite's binding, initialized. **Raises:** `Unsupported` without llvmlite."""
     try:
         import llvmlite.binding as binding
     except ImportError as error:
@@ -25,7 +25,7 @@ def llvm() -> Any:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     try:
-        # A first compilation, so that programs can take the other backend if this one fails.
+        # A trial compilation: if it fails, programs take the other backend.
         _engine_with(binding, object_code(binding, "define void @kernel() { ret void }", None))
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from None
@@ -33,33 +33,33 @@ def llvm() -> Any:
 
 
 def engine_of(text: str) -> Any:
-    """The machine code of a text, in memory as long as what is returned."""
+    """Return an engine with the machine code of a text, which lives as long as the engine."""
     return _engine_with(llvm(), object_code(llvm(), text, None))
 
 
 def compile_in_background(text: str, cpu: str | None) -> Future:
-    """The machine code of a kernel's text, as a future.
+    """Compile a kernel's text on another thread.
 
-    **Arguments:** the text, which defines `kernel`; the processor in LLVM's words, `None` for
-    this one.
+    **Arguments:** the text, which defines `kernel`; the processor's name in LLVM, `None` for this
+    one.
 
-    **Returns:** the future of the engine, which holds the code in memory, and of the address of
-    `kernel`. Its result **raises** `RuntimeError` where LLVM could not compile the text.
+    **Returns:** a future of the engine, which holds the code in memory, and the address of
+    `kernel`. Its result **raises** `RuntimeError` if LLVM could not compile the text.
     """
     return _worker().submit(_load_or_compile, llvm(), text, cpu, _level(), _cache_folder())
 
 
 @functools.cache
 def _worker() -> ThreadPoolExecutor:
-    # One thread: llvmlite holds a lock of its own while LLVM works, but not Python's (0.50).
+    # One thread is enough: llvmlite (0.50) holds its own lock during compilation, but not Python's.
     return ThreadPoolExecutor(1, "vi_jax-llvm")
 
 
 def _load_or_compile(
     binding: Any, text: str, cpu: str | None, level: int, store: Path | None
 ) -> tuple[Any, int]:
-    """The engine with a text's code, from a file in the folder `store` if it has one, and the
-    address of `kernel`."""
+    """Return an engine with a text's code and the address of `kernel`. The code is read from the
+    folder `store` if it is there, else compiled and stored."""
     words = (text, cpu, level, *_host(binding), binding.llvm_version_info)
     name = f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)
@@ -72,7 +72,7 @@ def _load_or_compile(
 
 
 def _level() -> int:
-    """LLVM's level of optimisation: less where JAX is told to take little time for it."""
+    """Return LLVM's optimization level: lower if JAX is set to skip most optimizations."""
     return 0 if jax.config.read("jax_disable_most_optimizations") else 1
 
 
@@ -81,10 +81,9 @@ def _host(binding: Any) -> tuple[str, str]:
 
 
 def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> bytes:
-    """Object code of a text, for a processor in LLVM's words or for this one (`None`), at a level
-    of optimisation.
+    """Return the object code of a text for a processor (LLVM's name, or `None` for this one).
 
-    LLVM vectorises nothing here, since the text is vector code, and unrolls no loops.
+    LLVM does not vectorize, since the text is vector code already, and does not unroll loops.
 
     **Raises:** `RuntimeError` if the text is not valid, or LLVM cannot compile it.
     """
@@ -93,7 +92,7 @@ def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> byt
     machine = target.create_target_machine(cpu=name, features=features, opt=level)
     try:
         module = binding.parse_assembly(text)
-        module.verify()  # types, dominance: 0.1 to 1 ms, of the 100 to 600 ms that the rest takes
+        module.verify()  # checks types and dominance in 0.1 to 1 ms; the rest takes 100 to 600 ms
     except RuntimeError as error:
         message = f"the code written for a loop is not valid, which is a fault of vi_jax: {error}"
         raise RuntimeError(message) from None
@@ -116,7 +115,7 @@ def _engine_with(binding: Any, code: bytes) -> Any:
 
 
 def _cache_folder() -> Path | None:
-    """A folder in JAX's own cache of compiled programs, if that is on this machine's disk."""
+    """Return a folder within JAX's compilation cache if that is on a local disk, else `None`."""
     config: Any = jax.config
     folder = config.jax_compilation_cache_dir
     if not folder or not config.jax_enable_compilation_cache or "://" in folder:
@@ -125,7 +124,7 @@ def _cache_folder() -> Path | None:
 
 
 def _read(place: Path) -> bytes | None:
-    """Code from a file; `None` if there is none, or if it is not what was written."""
+    """Return code from a file, or `None` if there is no file or its checksum is wrong."""
     try:
         content = place.read_bytes()
     except OSError:
@@ -135,7 +134,7 @@ def _read(place: Path) -> bytes | None:
 
 
 def _write(place: Path, code: bytes) -> None:
-    """Keep code for other processes, if the folder can be written to."""
+    """Store code for other processes, if the folder is writable."""
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=place.parent)
@@ -146,7 +145,7 @@ def _write(place: Path, code: bytes) -> None:
         pass
 
 
-# Bytes of a check sum: as many as of a commit of Git, by choice.
+# Bytes of a checksum. A choice: as many as of a Git commit.
 _DIGEST = 20
 
 

@@ -1,4 +1,4 @@
-"""The program that carries a lane and its forward derivative along together."""
+"""The program of a lane and its forward derivative."""
 
 import dataclasses
 import functools
@@ -14,22 +14,22 @@ from jax.interpreters import ad
 from ._program import DependentParts, LaneProgram, Widening, dependent_parts, rewritten, shape_of
 from .elementary import elementwise_primitive
 
-# Division whose derivative divides once, however many directions it is taken in.
+# Division with a derivative that divides once for all directions.
 #
-# JAX divides each tangent of the dividend by the divisor, and each of the divisor by its square.
-# Here each is multiplied by one reciprocal: in the derivatives of a machine's motion the divisions
-# would take most of the time.
+# JAX divides each tangent of the dividend by the divisor, and each tangent of the divisor by its
+# square. Here each is multiplied by one reciprocal. Otherwise divisions would take most of the time
+# in derivatives of a machine's motion.
 
 
 def _divided(eqn: Any) -> Any:
-    """An equation, with this derivative if it divides floating-point numbers."""
+    """Return the equation, with this derivative if it is a division of floating-point numbers."""
     if eqn.primitive.name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
     return eqn
 
 
 def with_quotients(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The same jaxpr, its divisions of floating-point numbers with this derivative."""
+    """Return the jaxpr with this derivative for its divisions of floating-point numbers."""
     return rewritten(closed, _divided)
 
 
@@ -49,20 +49,20 @@ quotient_p = elementwise_primitive("quotient", lambda x, y: x / y, _jvp)
 
 
 class Derived(NamedTuple):
-    """A program of values and derivatives. The tangents follow the inputs, the derivatives of the
+    """A program of values and derivatives. Its tangents follow the inputs. The derivatives of
     results follow the results, those of a row follow the row."""
 
     program: LaneProgram
     has: tuple[bool, ...]
-    """Which results of the values' program, and then which parts of a row, have a derivative."""
+    """Flags of the values' results, then of the parts of a row, that have a derivative."""
     values: tuple[int, ...]
-    """The places of those results and parts."""
+    """The places of the values' results and parts of a row."""
     slopes: dict[int, int]
-    """By their number, the places of their derivatives."""
+    """The places of their derivatives, by the number of the result or part."""
 
     @classmethod
     def of(cls, program: LaneProgram, has: tuple[bool, ...], results: int) -> "Derived":
-        """`results` of the values' program, which are followed by the parts of a row."""
+        """Return the places for `results` results, followed by the parts of a row."""
         values, slopes, place = [], {}, 0
         for part in (range(results), range(results, len(has))):
             values += range(place, place + len(part))
@@ -75,10 +75,10 @@ class Derived(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
-    """The program of value and forward derivative; what cannot depend on a varied input is not
-    differentiated.
+    """Return the program of values and forward derivatives. Parts that cannot depend on a varied
+    input are not differentiated.
 
-    **Arguments:** the program; which inputs have a tangent.
+    **Arguments:** the program; flags of the inputs with a tangent.
     """
     if program.widening is not None:
         return _widened_forward(program, program.widening, varied)
@@ -100,10 +100,10 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
 
 
 def _widened_forward(program: LaneProgram, widening: Widening, varied: tuple[bool, ...]) -> Derived:
-    """What `forward` returns for a widened program: its source is differentiated, then widened.
+    """Return the same for a widened program, by differentiating its source and widening the result.
 
-    JAX cannot do it the other way round: under `jax.vmap` within a branch, a result with its own
-    derivative gets an axis if its value has one, even where its derivative has one too.
+    JAX cannot do this in the other order. Under `jax.vmap` within a branch, a result with its own
+    derivative rule gets an axis if its value has one, even if its derivative has one too.
     """
     source, batched, number, wide = widening
     derived, has, *_ = forward(source, varied)
@@ -119,7 +119,7 @@ def _widened_forward(program: LaneProgram, widening: Widening, varied: tuple[boo
 
 
 def _with_its_derivatives(wide: tuple[bool, ...], has: tuple[bool, ...]) -> tuple[bool, ...]:
-    """A derivative has the axis where its value has it."""
+    """Return flags of results and derivatives. A derivative has the axis if its value has it."""
     return (*wide, *(w for w, here in zip(wide, has, strict=True) if here))
 
 
@@ -130,11 +130,11 @@ def _with_derivatives(
     groups: tuple[int, ...],
     split: int | None = None,
 ) -> ClosedJaxpr:
-    """A jaxpr of values and derivatives.
+    """Return a jaxpr of values and derivatives.
 
-    **Arguments:** the jaxpr; which arguments have a tangent, which results' derivatives are wanted;
-    the sizes of the groups of results, each of which is followed by its derivatives; the number of
-    arguments whose tangents come before the other arguments (none: all).
+    **Arguments:** the jaxpr; flags of the arguments with a tangent; flags of the results whose
+    derivatives are wanted; the sizes of the groups of results, each followed by its derivatives;
+    the number of arguments whose tangents precede the other arguments (`None`: all).
     """
     function = jaxpr_as_fun(with_quotients(closed))
     ends = [0, len(varied) if split is None else split, len(varied)]
@@ -168,10 +168,10 @@ def values_and_slopes(
     primals: Sequence[Any],
     tangents: Sequence[Any],
 ) -> tuple[Sequence[Any], Sequence[Any]]:
-    """The results of a function, and the derivatives of those that are `wanted`.
+    """Return the results of a function, and the derivatives of the `wanted` ones.
 
-    **Arguments:** the function; which of its arguments have a tangent; which derivatives are
-    wanted; the arguments; the tangents.
+    **Arguments:** the function; flags of its arguments with a tangent; flags of the wanted
+    derivatives; the arguments; the tangents.
     """
 
     def of_varied(*changing):
@@ -188,14 +188,13 @@ def values_and_slopes(
 def widened(
     program: LaneProgram, batched: tuple[bool, ...], number: int
 ) -> tuple[LaneProgram, DependentParts]:
-    """The program with `number` values of some of its inputs in one lane.
+    """Return the program with `number` values of some of its inputs in one lane.
 
-    All that does not depend on them is computed once, so that several directions of a derivative
-    share one motion.
+    Other parts are computed once, so that several directions of a derivative share one motion.
 
-    **Arguments:** the program; which inputs have a leading axis of that length.
+    **Arguments:** the program; flags of the inputs with a leading axis of that length.
 
-    **Returns:** the widened program, and which of its parts have such an axis.
+    **Returns:** the widened program, and flags of its parts with such an axis.
     """
     depend = dependent_parts(program, batched, smooth=False)
     return _widened(Widening(program, batched, number, depend)), depend

@@ -1,12 +1,11 @@
-"""Ctrl-C while lanes run, on whatever thread XLA runs them.
+"""Ctrl-C while lanes run on any of XLA's threads.
 
-Python handles a signal only in its main thread, between two instructions of its own
-(https://docs.python.org/3/library/signal.html#execution-of-python-signal-handlers): not while that
-thread waits within XLA, nor on XLA's threads; and an exception that leaves a function which C has
-called through `ctypes` is printed and lost. So two functions of machine code are put between:
-`count_interrupt`, the process's handler of the signal, counts interrupts and calls the handler that
-was there before; `call_handler`, which XLA calls, calls the Python function until that has stored a
-result.
+Python handles a signal only in its main thread, between two Python instructions
+(https://docs.python.org/3/library/signal.html#execution-of-python-signal-handlers). So signals
+wait while that thread is within XLA, and XLA's threads get none. Also, an exception that leaves a
+`ctypes` function called from C is printed and lost. So there are two functions of machine code.
+`count_interrupt` is the process's signal handler: it counts interrupts and calls the previous
+handler. XLA calls `call_handler`, which calls a Python function until that has stored a result.
 """
 
 import atexit
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 from ._code import engine_of
 from ._shared import Recent, made_once
 
-# The answer of a handler that has no error to report; `call_handler` below compares with it.
+# The answer of a handler without an error; `call_handler` below compares with it.
 SUCCESS = 1
 
 _TEXT = """
@@ -68,17 +67,17 @@ end:
 }
 """
 
-# Seconds between two looks of `Watch`'s thread at the count, and until it ends without calls.
+# Seconds between two checks of the count in `Watch`'s thread, and until an idle thread ends.
 _POLL, _LINGER = 0.05, 1.0
 
 
 class HandlerResult(ctypes.Structure):
-    """What the function behind `guard` stores for `call_handler`, whose `%out` it is."""
+    """The output of the function behind `guard`: `%out` in `call_handler`."""
 
     _fields_ = [
-        ("answer", ctypes.c_void_p),  # null: none yet; SUCCESS; or the address of XLA's error
-        ("signal", ctypes.c_int64),  # to be raised again, or 0
-        ("lost", ctypes.c_int64),  # 1 if the function was called before and left without an answer
+        ("answer", ctypes.c_void_p),  # null: no answer yet; SUCCESS; or the address of XLA's error
+        ("signal", ctypes.c_int64),  # a signal to raise again, or 0
+        ("lost", ctypes.c_int64),  # 1 if an earlier call of the function left no answer
     ]
 
 
@@ -87,19 +86,19 @@ class _Native(NamedTuple):
 
     engine: Any
     count: Any
-    """How many interrupts there were."""
+    """The number of interrupts so far."""
     previous: Any
-    """The address of the handler that was there before."""
+    """The address of the previous handler."""
     count_interrupt: int
-    """The address of the function that counts."""
+    """The address of the counting function."""
     get: Any
     """`PyOS_getsig(number)`: the address of a signal's handler."""
     put: Any
     """`PyOS_setsig(number, address)`."""
 
 
-# Programs are lowered on several threads. Of two engines the first would be dropped, although XLA
-# may have the address of its code.
+# Programs are lowered on several threads. With two engines, the first would be freed while XLA may
+# have the address of its code.
 @made_once
 def _native() -> _Native:
     engine = engine_of(_TEXT)
@@ -115,12 +114,11 @@ def _native() -> _Native:
 
 
 def guard(handler: object) -> int:
-    """The address of a handler for XLA that calls this function until it has an answer.
+    """Return the address of a handler for XLA that calls a function until it has an answer.
 
-    **Arguments:** `handler(frame, out)`, made by `ctypes`, which stores into `out`, a
-    `HandlerResult`, the answer, and a signal that it took, which is then raised again. An exception
-    that leaves it, such as a signal's between two instructions, leaves no answer: then it is called
-    again, with `out.lost`.
+    **Arguments:** `handler(frame, out)`, made by `ctypes`. It stores into `out`, a `HandlerResult`,
+    its answer and a signal that it caught, which is then raised again. An exception that leaves it,
+    such as one raised by a signal, leaves no answer. Then it is called again, with `out.lost` set.
     """
     engine = _native().engine
     for name, function in {
@@ -132,9 +130,9 @@ def guard(handler: object) -> int:
 
 
 def install_counter() -> None:
-    """Count interrupts from now on; the handler that is there is called as before.
+    """Count interrupts from now on, and keep calling the previous handler.
 
-    Nothing is done where a program has a handler of its own, which may want the lanes to go on.
+    If a program has its own handler, nothing is installed: it may want the lanes to continue.
     """
     if not interrupt_raises():
         return
@@ -149,31 +147,31 @@ def install_counter() -> None:
 
 
 def _remove_counter() -> None:
-    """At exit, when the machine code's memory is freed before the process ends."""
+    """Restore the handler at exit, since the machine code is freed before the process ends."""
     native = _native()
     if native.get(signal.SIGINT) == native.count_interrupt:
         native.put(signal.SIGINT, native.previous.value)
 
 
 def interrupt_count() -> int:
-    """How many interrupts there have been since `install_counter`."""
+    """Return the number of interrupts since `install_counter`."""
     return _native().count.value
 
 
 def interrupt_raises() -> bool:
-    """Whether Ctrl-C raises `KeyboardInterrupt`, which ends what the main thread does."""
+    """Return whether Ctrl-C raises `KeyboardInterrupt` in the main thread."""
     return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-# The count when each of XLA's runs came to its first lanes, by the run's number: an interrupt
-# between two calls of one run is meant for those that follow.
+# The count at the first lanes of each of XLA's runs, by the run's number. An interrupt between two
+# calls of one run stops the later calls.
 _counts_at_start: "Recent[int, int]" = Recent(256)
 
 
 class Watch:
-    """Stops lanes at Ctrl-C that run on threads to which Python brings no signals.
+    """Stops lanes at Ctrl-C that run on threads to which Python delivers no signals.
 
-    One thread looks at the count as long as there are such calls.
+    One thread checks the count during such calls.
     """
 
     def __init__(self):
@@ -183,8 +181,8 @@ class Watch:
 
     @contextmanager
     def stopping(self, run: int, stop: Any) -> Iterator[None]:
-        """Within this context an interrupt sets `stop` to 1; at once if there was one since this
-        run of XLA's came to its first lanes.
+        """Set `stop` to 1 on an interrupt within this context; at once if there was one since the
+        first lanes of this run of XLA.
 
         **Arguments:** XLA's number of the run; the `ctypes` number that the kernel reads.
         """
@@ -228,19 +226,19 @@ class Watch:
 watch = Watch()
 
 
-# Not empty: an interrupt was dropped in the package's call under way.
+# Not empty if an interrupt was dropped during the package's current call.
 _dropped: list[bool] = []
 
 
 @contextmanager
 def interrupts_heard() -> Iterator[None]:
-    """Raise an interrupt that Python drops within this context, at its end at the latest, or one
-    that it dropped before within an outer one.
+    """Raise an interrupt that Python drops within this context, at its end at the latest. One
+    dropped earlier within an outer context is raised at the beginning.
 
     An exception in a callback of the garbage collector is printed and dropped, and JAX has such a
-    callback. Others that Python drops are shown as before.
+    callback. Other exceptions that Python drops are shown as before.
     """
-    if threading.current_thread() is not threading.main_thread():  # no other gets interrupts
+    if threading.current_thread() is not threading.main_thread():  # others get no interrupts
         yield
         return
     raise_dropped()
@@ -256,7 +254,7 @@ def interrupts_heard() -> Iterator[None]:
     try:
         yield
         raise_dropped()
-    except Exception:  # such as that of lanes that were ended
+    except Exception:  # such as the error of stopped lanes
         raise_dropped()
         raise
     finally:
@@ -266,12 +264,12 @@ def interrupts_heard() -> Iterator[None]:
 
 
 def raise_dropped() -> None:
-    """Raise the `KeyboardInterrupt` that Python dropped, if there is one."""
+    """Raise `KeyboardInterrupt` if Python dropped one."""
     if interrupt_dropped():
         _dropped.clear()
         raise KeyboardInterrupt
 
 
 def interrupt_dropped() -> bool:
-    """Whether Python dropped an interrupt that `raise_dropped` has not raised yet."""
+    """Return whether Python dropped an interrupt that `raise_dropped` has not raised yet."""
     return bool(_dropped)

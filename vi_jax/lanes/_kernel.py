@@ -1,11 +1,11 @@
-"""A program of lanes as one machine function: a loop over slots, each taking up lane after lane.
+"""The text of a kernel: a machine function that runs one lane after another in each slot.
 
     void kernel(ptr inputs, ptr strides, ptr outputs, i64 lanes, ptr next, ptr stop)
 
-`inputs` and `outputs` point to one array each per leaf; a stride of 0 shares an input between all
-lanes. `next` counts the lanes given out so far, by whichever thread; `stop` ends the call early.
+`inputs` and `outputs` are tables of pointers to arrays, one per leaf. A stride of 0 shares an input
+between all lanes. `next` counts the lanes that all threads have taken; `stop` ends the call early.
 
-The blocks, each written by the method of its name (`docs/internals/lanes.md` has the picture):
+The method of the same name writes each block (`docs/internals/lanes.md` has the picture):
 
     entry -> refill -> [begin ->] ready -> head -> look -> step -> head ...
                                                      look -> flush -> refill ...
@@ -44,7 +44,8 @@ from ._program import LaneProgram
 from ._text import RARE, Text, Value, attributes, is_float
 from ._vector import Unsupported, write
 
-# The most memory of a thread for arrays: a choice. What asks for more runs on XLA, with a warning.
+# The greatest memory for arrays per thread, a choice. Programs that need more run on XLA's backend,
+# with a warning.
 _MOST_BYTES = 4 << 30
 
 # Bytes of a cache line, and of the widest register.
@@ -59,28 +60,27 @@ entry:"""
 def kernel_text(
     program: LaneProgram, width: int, bits: int, one_for_all: tuple[bool, ...] = ()
 ) -> str:
-    """LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits.
+    """Return LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits.
 
-    **Arguments:** further, which inputs all lanes share; asked of large ones only, which are then
-    read where they are.
+    **Arguments:** `one_for_all`, flags of inputs that all lanes share. Large ones are not copied.
     """
     return _Writer(program, width, one_for_all).text(bits)
 
 
 class _Group(NamedTuple):
-    """What the slots of a group hold at one place of the kernel."""
+    """The values of a group's slots at one place of the kernel."""
 
     arrays: list[Any]
-    """The lanes' inputs, then their carry. Large ones are in memory, at one place throughout."""
+    """The lanes' inputs, then their carry. Large arrays have a fixed place in memory."""
     lane: Value
-    """The number of each slot's lane; -1 where there are no more."""
+    """The number of each slot's lane; -1 for a slot without a lane."""
     rows: Value
-    """How many rows the lane has completed."""
+    """The number of rows that the lane has completed."""
     active: Value
-    """Whether the lane goes on."""
+    """True while the lane continues."""
 
     def values(self) -> list[Value]:
-        """All numbers in one order."""
+        """Return all numbers in registers, in a fixed order."""
         numbers = (v for x in self.arrays if isinstance(x, Registers) for v in x.values.flat)
         return [*numbers, self.lane, self.rows, self.active]
 
@@ -94,7 +94,7 @@ class _Writer:
         self.one_for_all = one_for_all or (False,) * len(program.in_avals)
 
     def text(self, bits: int) -> str:
-        """The whole module. `bits` is the width of the registers that LLVM may use."""
+        """Return the whole module. `bits` is the width of the registers that LLVM may use."""
         t = self.t
         self._entry()
         head, place = self._head()
@@ -105,7 +105,7 @@ class _Writer:
         old, new = self._refill(head, flush_end)
         begun, begin_end = self._begin(old, new)
         ready = self._ready(old, begun, begin_end)
-        # The head was written before the two ways that lead to it.
+        # The head was written before the two blocks that lead to it.
         t.join(head.values(), (ready.values(), "ready"), (stepped.values(), step_end), at=place)
         if t.arena.size * t.width * 8 > _MOST_BYTES:
             raise Unsupported(f"{t.arena.size * t.width * 8 >> 30} GB for its arrays")
@@ -115,7 +115,7 @@ class _Writer:
         return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes(bits), RARE, ""])
 
     def _entry(self) -> None:
-        """Once per thread: the addresses of all arrays, and the strides."""
+        """Write the code that runs once per thread: addresses of all arrays, and strides."""
         t, program = self.t, self.program
         results = len(program.out_avals)
         self.inputs = [load_pointer(t, "inputs", i) for i in range(len(program.in_avals))]
@@ -133,7 +133,7 @@ class _Writer:
         t.line("br label %refill")
 
     def _names(self) -> _Group:
-        """New names for all that a group holds, to be defined by phi instructions."""
+        """Return new names for all values of a group, to be defined by phi instructions."""
         t, arrays = self.t, []
         avals = (*self.program.in_avals, *self.program.carry_avals)
         for aval, in_memory in zip(avals, self.large, strict=True):
@@ -144,16 +144,16 @@ class _Writer:
         return _Group(arrays, index, filled, Value(t.fresh(), "i1"))
 
     def _ended(self, group: _Group) -> tuple[Value, Value]:
-        """Which slots have a lane, and which have one that has ended."""
+        """Return the masks of slots with a lane, and of slots with a lane that has ended."""
         t = self.t
         present = t.binary("icmp sge", group.lane, t.zero("i64"), "i1")
         return present, t.both(present, t.inverse(group.active))
 
     def _head(self) -> tuple[_Group, int]:
-        """Head and look, every turn of the loop: leave it if asked to, then flush if a lane has
-        ended, else step. Both blocks stay open, since step and flush use what they compute.
+        """Write `head` and `look`, which run in every iteration. They exit on `stop`, flush if a
+        lane has ended, or step. Both blocks stay open, since `step` and `flush` use their values.
 
-        **Returns:** the names of what the group holds, and the line where their phis are to stand.
+        **Returns:** the names of the group's values, and the line at which to insert their phis.
         """
         t = self.t
         t.open("head")
@@ -167,7 +167,7 @@ class _Writer:
         return group, place
 
     def _step(self, group: _Group) -> tuple[_Group, str]:
-        """One step of all lanes, and their rows; what the group holds then, and the last block."""
+        """Advance all lanes and store their rows. Return the new group and the last block."""
         t = self.t
         t.open("step")
         active, n = group.active, len(self.inputs)
@@ -183,7 +183,7 @@ class _Writer:
         return _Group([*group.arrays[:n], *carry], group.lane, rows, going), end
 
     def _flush(self, group: _Group) -> str:
-        """The results of lanes that have ended, to their arrays; the last block."""
+        """Store the results of lanes that have ended. Return the last block."""
         t, end = self.t, self.program.end
         t.open("flush")
         present, ended = self._ended(group)
@@ -198,11 +198,11 @@ class _Writer:
         return block
 
     def _refill(self, head: _Group, flush_end: str) -> tuple[_Group, Value]:
-        """Slots without an active lane take up the next ones.
+        """Assign the next lanes to slots without an active lane.
 
-        **Arguments:** what the group held at the head, and the block from which it comes here.
+        **Arguments:** the group at the head; the last block of `flush`.
 
-        **Returns:** what the slots hold, with the numbers of their new lanes, and which are new.
+        **Returns:** the group with the numbers of its new lanes; the mask of slots with new lanes.
         """
         t = self.t
         t.open("refill")
@@ -227,7 +227,7 @@ class _Writer:
     def _flags_before(self, flag: Value) -> Value:
         t = self.t
         ones = t.cast("zext", flag, "i64")
-        # Shifted sums: 1, 2, 4, … slots.
+        # Prefix sums, by shifts of 1, 2, 4, … slots.
         v, shift, run = t.vector("i64"), 1, ones
         while shift < t.width:
             mask = ", ".join(f"i32 {i - shift if i >= shift else t.width}" for i in range(t.width))
@@ -238,8 +238,7 @@ class _Writer:
         return t.binary("sub", run, ones)
 
     def _begin(self, old: _Group, new: Value) -> tuple[_Group, str]:
-        """The first state of the lanes in the slots `new`; what the group holds then, and the last
-        block."""
+        """Initialize the lanes in the slots `new`. Return the group and the last block."""
         t = self.t
         t.open("begin")
         n = len(self.inputs)
@@ -270,7 +269,7 @@ class _Writer:
         return old
 
     def _ready(self, old: _Group, begun: _Group, begin_end: str) -> _Group:
-        """The group with and without new lanes; to the head if any slot has a lane, else out."""
+        """Merge the group with and without new lanes; exit if no slot has a lane."""
         t = self.t
         t.follow("ready")
 
@@ -289,7 +288,7 @@ class _Writer:
     def _run(
         self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value
     ) -> tuple[list[Any], Value, Value, list[Any]]:
-        """What `begin` or `step` gives: carry, whether the lane goes on, has a row, the row."""
+        """Return results of `begin` or `step`: carry, flags (lane continues, has a row), row."""
         out: list[Any] = write(self.t, jaxpr, args, mask)
         n = len(self.program.carry_avals)
         return out[:n], out[n].item(), out[n + 1].item(), out[n + 2 :]
@@ -297,9 +296,9 @@ class _Writer:
     # Rows
 
     def _store_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
-        """Store a row where `mask` holds and there is room for it; skipped if no lane has one.
+        """Store a row where `mask` holds and the lane has room for it.
 
-        **Arguments:** each slot's lane; which have completed a row; its number in the lane; it.
+        **Arguments:** each slot's lane; the mask of lanes with a row; the row's number; the row.
         """
         t, rows = self.t, self.program.rows
         if not row:
@@ -315,7 +314,7 @@ class _Writer:
             scatter(t, pointer, t.binary("mul", line, t.constant(x.size, "i64")), x, mask)
 
     def _fill(self, lane: Value, ended: Value, filled: Value) -> None:
-        """Rows from `filled` on, which a lane did not come to: NaN, or 0 for integers."""
+        """Fill the rows that a lane did not reach, from `filled` on, with NaN (0 for integers)."""
         t, program = self.t, self.program
         if not self.rows:
             return
@@ -329,26 +328,26 @@ class _Writer:
         )
 
 
-# --- loads and stores: where the numbers of a group's lanes lie in XLA's arrays
+# --- loads and stores of lanes' numbers in XLA's arrays
 
 
 def load_pointer(t: Text, table: str, i: int) -> str:
-    """Entry `i` of one of the kernel's tables of pointers, as a scalar."""
+    """Load entry `i` of one of the kernel's tables of pointers, as a scalar."""
     place = t.raw(f"getelementptr ptr, ptr %{table}, i64 {i}")
     return t.raw(f"load ptr, ptr {place}")
 
 
 def load_stride(t: Text, i: int) -> Value:
-    """How many numbers input `i` has per lane (0 for one that all lanes share), for every lane."""
+    """Return the numbers per lane of input `i` (0 for a shared one), as a vector over the lanes."""
     place = t.raw(f"getelementptr i64, ptr %strides, i64 {i}")
     return splat(t, t.raw(f"load i64, ptr {place}"), "i64")
 
 
 def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
-    """An array of each slot, read where it is asked for and `mask` holds, else zeros.
+    """Return an array of each slot, read at each use where `mask` holds, else zero.
 
-    **Arguments:** where the arrays of all lanes begin; of each slot the number of its first number
-    in them; the array's shape and type; which slots read.
+    **Arguments:** the address of all lanes' arrays; for each slot the index of its first number;
+    the array's shape and type; the mask of slots that read.
     """
     steps, kind = contiguous(aval.shape), kind_of(aval.dtype)
 
@@ -360,15 +359,15 @@ def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> For
 
 
 def shared(pointer: str, aval: Any) -> Strided:
-    """An input that all lanes share, where XLA keeps it."""
+    """Return an input that all lanes share, at its place in XLA's memory."""
     return Strided(aval.shape, kind_of(aval.dtype), Table(pointer), contiguous(aval.shape))
 
 
 def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
-    """Write `x` of the lanes in `mask`, the numbers of each from `base` on.
+    """Store `x` of the lanes in `mask`.
 
-    **Arguments:** where the output's array begins; of each lane, the number of its first number in
-    the array; the values; which slots write.
+    **Arguments:** the address of the output's array; for each lane, the index of its first number
+    there; the values; the mask of slots that store.
     """
 
     steps = contiguous(x.shape)
@@ -384,10 +383,10 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
 def over_rows(
     t: Text, first: Value, number: int, mask: Value, body: Callable[[Value, Value], None]
 ) -> None:
-    """Write a loop over the rows of each lane, from that lane's first row on.
+    """Write a loop over the rows of each lane, beginning at that lane's first row.
 
-    **Arguments:** each slot's first row; how many a lane has room for; which slots take part; what
-    is done with the row of each slot, and which slots have it.
+    **Arguments:** each slot's first row; the number of rows of a lane; the mask of slots; a
+    function that writes the body, from each slot's row and the mask of slots that have it.
     """
     head, inside, after, before = t.label(), t.label(), t.label(), t.block
     t.line(f"br label %{head}")
@@ -407,8 +406,7 @@ def over_rows(
 
 
 def claim(t: Text) -> tuple[list[str], list[str]]:
-    """What a kernel does to have memory for large arrays, aligned to a cache line, and to let go of
-    it."""
+    """Return the lines that allocate and free memory for large arrays, aligned to a cache line."""
     if not t.arena.size:
         return [], []
     t.declared["@malloc"] = "declare noalias ptr @malloc(i64)"

@@ -1,8 +1,8 @@
-"""Elementary functions without a hardware instruction, as code on whole vectors.
+"""Elementary functions that no instruction computes, as code on whole vectors.
 
-Each is written for double precision, and single precision goes by way of it. Errors are at most 2
-units in the last place, of `cbrt` 4 (`tests/lanes/test_library.py`). Subnormal results may be zero:
-the threads that run lanes take such numbers for zero.
+They are written for double precision; single precision is converted to it. Errors are at most 2
+units in the last place, 4 for `cbrt` (`tests/lanes/test_library.py`). Subnormal results may be
+zero, since the threads that run lanes treat such numbers as zero.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,21 +13,20 @@ from typing import Any
 
 from ._text import Text, Value
 
-# Terms from which on a polynomial is split; with all in one chain atan takes a seventh longer.
+# The least number of terms to split a polynomial. In one chain atan takes a seventh longer.
 _LONG = 9
 
 
 class Real:
-    """A number of every lane with Python's operators; products may be fused with sums.
+    """A number of every lane with Python's operators. Products may be fused with sums.
 
-    `plus` and `minus` round as they stand, where a later operation recovers what was rounded off.
+    `plus` and `minus` are not fused, for sums whose rounding errors are computed afterwards.
     """
 
     def __init__(self, t: Text, value: Value):
         self.t, self.value = t, value
 
     def of(self, other: "Real | float") -> "Real":
-        """A Python number as one of these."""
         if isinstance(other, Real):
             return other
         return Real(self.t, self.t.constant(other, "double"))
@@ -64,7 +63,7 @@ class Real:
     def minus(self, other):
         return self._two("fsub", other)
 
-    # Comparisons are false where either is NaN. They return flags for `choose`.
+    # Comparisons are false if either number is NaN. They return flags for `choose`.
 
     def __lt__(self, other):
         return self._two("fcmp olt", other, "i1").value
@@ -79,18 +78,18 @@ class Real:
         return self._two("fcmp uno", self, "i1").value
 
     def choose(self, flag: Value, other) -> "Real":
-        """This where the flag holds, else the other."""
+        """Return this number where the flag holds, else the other."""
         return Real(self.t, self.t.select(flag, self.value, self.of(other).value))
 
     def at_most(self, most: float) -> "Real":
-        """The smaller of this and `most`; NaN stays NaN."""
+        """Return the smaller of this number and `most`; NaN remains NaN."""
         return self.of(most).choose(self > most, self)
 
     def at_least(self, least: float) -> "Real":
         return self.of(least).choose(self < least, self)
 
     def call(self, name: str, *others) -> "Real":
-        """The intrinsic of LLVM of this name, of this and the others."""
+        """Call an intrinsic of LLVM on this number and the others."""
         return Real(self.t, self.t.intrinsic(name, self.value, *(self.of(o).value for o in others)))
 
     def size(self) -> "Real":
@@ -100,17 +99,17 @@ class Real:
         return self.call("copysign", other)
 
     def negative(self) -> Value:
-        """Whether the sign bit is set, as that of -0 is."""
+        """Return whether the sign bit is set, also for -0."""
         bits = self.t.cast("bitcast", self.value, "i64")
         return self.t.binary("icmp slt", bits, self.t.zero("i64"), "i1")
 
     def is_zero(self) -> Value:
-        """Whether this is zero without a sign; no subnormal number is, whatever the processor."""
+        """Return whether this is +0, by its bits: false for subnormal numbers on any processor."""
         bits = self.t.cast("bitcast", self.value, "i64")
         return self.t.binary("icmp eq", bits, self.t.zero("i64"), "i1")
 
     def split(self) -> "tuple[Real, Real]":
-        """For a normal positive number, m between √½ and √2 and a whole n: m 2^n."""
+        """Return m from √½ to √2 and an integer n: a normal positive number is m 2^n."""
         t = self.t
         bits = t.cast("bitcast", self.value, "i64")
         shifted = t.binary("sub", bits, t.constant(0x3FE6A09E667F3BCD, "i64"))
@@ -120,15 +119,15 @@ class Real:
         return Real(t, m), Real(t, t.cast("sitofp", power, "double"))
 
     def horner(self, coefficients: Sequence[float]) -> "Real":
-        """The polynomial with these coefficients, constant term first."""
+        """Return the polynomial with these coefficients, constant term first."""
         total = self.of(coefficients[-1])
         for coefficient in coefficients[-2::-1]:
             total = total * self + coefficient
         return total
 
     def polynomial(self, coefficients: Sequence[float], first: int = 2) -> "Real":
-        """The same; of a long one all but the `first` terms as two polynomials that do not wait for
-        each other, of the even powers and of the odd."""
+        """Return the same. In a long polynomial the terms after the `first` are two independent
+        chains, of even and of odd powers."""
         if len(coefficients) < _LONG:
             return self.horner(coefficients)
         square, rest = self * self, coefficients[first:]
@@ -139,46 +138,46 @@ class Real:
         return total
 
     def less(self, turns: "Real", parts: Sequence[float]) -> "Real":
-        """This less so many times the sum of `parts`."""
+        """Return this number minus `turns` times the sum of `parts`."""
         found = self
         for part in parts:
             found = found - turns * part
         return found
 
     def power_of_two(self) -> "Real":
-        """2 to this whole number, from -1022 to 1023; infinity at 1024."""
+        """Return 2 to this integer, from -1022 to 1023; infinity at 1024."""
         t = self.t
-        # The sum's last bits are the exponent with its bias.
+        # The last bits of the sum are the biased exponent.
         biased = t.cast("bitcast", self.plus(1.5 * 2.0**52 + 1023).value, "i64")
         bits = t.binary("shl", biased, t.constant(52, "i64"))
         return Real(t, t.cast("bitcast", bits, "double"))
 
 
 def two_sum(a: Real, b: Real) -> tuple[Real, Real]:
-    """a + b rounded, and what was rounded off."""
+    """Return a + b rounded, and the rounding error."""
     total = a.plus(b)
     part = total.minus(a)
     return total, a.minus(total.minus(part)).plus(b.minus(part))
 
 
 def fast_sum(a: Real, b: Real) -> tuple[Real, Real]:
-    """The same where |a| >= |b| or a is zero."""
+    """Return the same if |a| >= |b| or a is zero."""
     total = a.plus(b)
     return total, b.minus(total.minus(a))
 
 
 def significand(a: Real) -> tuple[Real, Real]:
-    """`Real.split` for any finite a >= 0; anything at zero."""
+    """Return `Real.split` for any finite a > 0; arbitrary numbers for zero."""
     small = a < 2.0**-1022
-    # The bits of a subnormal number are its multiple of 2^-1074.
+    # The bits of a subnormal number are an integer multiple of 2^-1074.
     whole = Real(a.t, a.t.cast("uitofp", a.t.cast("bitcast", a.value, "i64"), "double"))
     m, n = whole.choose(small, a).split()
     return m, (n - 1074.0).choose(small, n)
 
 
 def _parts_of(number: float, count: int) -> list[float]:
-    """`number` (to some hundred bits) as a sum of doubles whose products with small integers are
-    exact."""
+    """Return `number` (to some hundred bits) as a sum of doubles. Products of all but the last with
+    small integers are exact."""
     exact = {
         pi: Fraction(884279719003555, 281474976710656) + Fraction(1.2246467991473532e-16)
         + Fraction(-2.9947698097183397e-33),
@@ -196,20 +195,20 @@ def _parts_of(number: float, count: int) -> list[float]:
 _PI, _PI_LOW = pi, 1.2246467991473532e-16
 _PI_PARTS, _LN2 = _parts_of(pi, 3), _parts_of(ln(2), 2)
 
-# Those that a motion needs in each step: Taylor's series.
+# Taylor coefficients of the functions that a motion needs in each step.
 _SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(11))
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(12))
 _EXP = tuple(1 / factorial(n) for n in range(14))
 _ATANH = tuple(2 / (2 * n + 1) for n in range(12))
 
-# Beyond, a double does not tell where in a turn it is.
+# The spacing of larger doubles is at least one radian.
 _LARGEST_PHASE = 2.0**52
 
 
 def sincos(x: Real) -> tuple[Real, Real]:
-    """Sine and cosine of a phase, to rounding up to a million turns; any number beyond 2^52."""
+    """Return sine and cosine: exact to rounding up to a million turns, arbitrary beyond 2^52."""
     t, turns = x.t, (x * (1 / pi)).call("roundeven")
-    # What is too large, or no number, becomes any whole one.
+    # Too large numbers and NaN become arbitrary integers.
     whole = t.cast("fptosi", turns.value, "i64")
     whole = t.value(f"freeze {t.vector('i64')} {whole.text}", "i64")
     odd = t.binary("shl", whole, t.constant(63, "i64"))  # the sign bit of (-1)^turns
@@ -233,7 +232,7 @@ def cos(x: Real) -> Real:
 
 
 def _of_any_phase(x: Real, value: Real) -> Real:
-    """The sine or cosine of any x; not a number beyond 2^52, where x has no digits of a phase."""
+    """Return the sine or cosine `value`, but NaN beyond 2^52, where x has no digits of a phase."""
     return value.choose(x.size() < _LARGEST_PHASE, nan)
 
 
@@ -242,7 +241,7 @@ def exp(x: Real) -> Real:
     y = x.at_least(-760.0).at_most(720.0)
     n = (y * (1 / ln(2))).call("roundeven")
     value = y.less(n, _LN2).horner(_EXP)
-    # 2^n in two factors, so that neither leaves the range of exponents.
+    # 2^n as two factors, so that neither overflows nor underflows.
     finite = x.of(0.0).choose(x.is_no_number(), n)
     whole = t.cast("fptosi", finite.value, "i64")
     half = t.binary("ashr", whole, t.constant(1, "i64"))
@@ -268,11 +267,11 @@ def log(x: Real) -> Real:
 
 # Polynomials of elementary functions, constant term first.
 #
-# They are near-minimax: interpolated at Chebyshev points in 60 digits, then rounded to doubles. The
-# error stated is the largest of the rounded polynomial in exact arithmetic, relative to the
-# function.
+# They are near-minimax: interpolated at Chebyshev points with 60 digits, then rounded to doubles.
+# The stated error is the largest error of the rounded polynomial in exact arithmetic, relative to
+# the function.
 
-# (f(z) / z - 1) / z² as polynomials in z²: f completed by z + z³ p(z²) has an odd function's zero.
+# (f(z) / z - 1) / z² as polynomials p(z²): z + z³ p(z²) has the zero of the odd function f exactly.
 # tanh on |z| <= 0.55, error 5.1e-18.
 TANH = (
     -0.3333333333333333, 0.13333333333332714, -0.053968253967434016, 0.021869488493666944,
@@ -314,18 +313,18 @@ _EXP_REST = tuple(1 / factorial(n) for n in range(2, 14))
 _LOG = tuple(2 / (2 * n + 3) for n in range(10))
 
 _HALF_PI = [part / 2 for part in _parts_of(pi, 4)]
-# For |x| up to here n times each of the first three is exact.
+# For |x| up to this bound the products of n and the first three parts are exact.
 _TURNED = 2.0**20
 
 
 def _odd(x: Real, value: Real) -> Real:
-    """An odd function near x at zero, from its value at |x|; small x also where the processor takes
-    subnormal numbers for zero, as on XLA's threads."""
+    """Return an odd function near x at zero from its value at |x|. Small x are returned even if the
+    processor treats subnormal numbers as zero, as on XLA's threads."""
     return x.choose(x.size() < 2.0**-30, value.with_sign_of(x))
 
 
 def _split_exponent(x: Real) -> tuple[Real, Real, Real]:
-    """x as n ln(2) + r, |r| <= 0.35: n, r rounded, and e^r - 1 less that."""
+    """Return n, r rounded and e^r - 1 - r, with x = n ln(2) + r and |r| <= 0.35."""
     n = (x * (1 / ln(2))).call("roundeven")
     head = x - n * _LN2[0]  # exact
     r = head.minus(n * _LN2[1])
@@ -334,14 +333,14 @@ def _split_exponent(x: Real) -> tuple[Real, Real, Real]:
 
 
 def exp_parts(x: Real) -> tuple[Real, Real]:
-    """n, and e^x 2^-n - 1, which is from √½ - 1 to √2 - 1."""
+    """Return n and e^x 2^-n - 1, which lies between √½ - 1 and √2 - 1."""
     n, r, rest = _split_exponent(x)
     return n, r + rest
 
 
 def expm1(x: Real) -> Real:
     n, r, rest = _split_exponent(x.at_least(-60.0).at_most(709.9))
-    # 2^n (r + rest) + (2^n - 1), halved so that it stays finite until the end.
+    # 2^n (r + rest) + (2^n - 1), halved to stay finite until the end.
     half = (n - 1).power_of_two()
     high, low = fast_sum(half.minus(0.5), half * r)
     value = 2.0 * (high + (low + half * rest))
@@ -360,7 +359,7 @@ def tanh(x: Real) -> Real:
 
 
 def _half_exp(a: Real) -> Real:
-    """e^a / 2 for a >= 0; infinite only where that is."""
+    """Return e^a / 2 for a >= 0, infinite only if it overflows."""
     n, e = exp_parts(a.at_most(711.0))
     return (2.0 * e + 2.0) * (n - 2.0).power_of_two()
 
@@ -394,7 +393,7 @@ def log1p(x: Real) -> Real:
 
 def _arctangent(z: Real) -> Real:
     square = z * z
-    # Its terms alternate; with fewer in one chain their rounding adds up to 2.2 units near one.
+    # The terms alternate. Shorter chains have rounding errors up to 2.2 units near one.
     return z + z * square * square.polynomial(ATAN, 8)
 
 
@@ -413,7 +412,7 @@ def atan2(y: Real, x: Real) -> Real:
     ratio = less / more
     same = a.of(0.0).choose(a.equals(0.0), 1.0)
     angle = _arctangent(same.choose(a.equals(b), ratio))
-    # x < 0: π less the angle to the x axis; steep: π/2 less the angle to the y axis.
+    # x < 0: π minus the angle to the x axis; steep: π/2 minus the angle to the y axis.
     left = x.negative()
     angle = (-angle).choose(x.t.binary("xor", steep, left, "i1"), angle)
     quarters = x.of(1.0).choose(steep, x.of(2.0).choose(left, 0.0))
@@ -422,7 +421,7 @@ def atan2(y: Real, x: Real) -> Real:
 
 
 def _arcsine(a: Real) -> tuple[Value, Real, Real]:
-    """For a >= 0, whether a > 1/2; z = a, or then √((1 - a) / 2); asin(z) - z."""
+    """For a >= 0, return whether a > 1/2, z = √((1 - a) / 2) if so and else a, and asin(z) - z."""
     far = a > 0.5
     square = (0.5 - 0.5 * a).choose(far, a * a)
     z = square.call("sqrt").choose(far, a)
@@ -439,7 +438,7 @@ def asin(x: Real) -> Real:
 def acos(x: Real) -> Real:
     far, z, rest = _arcsine(x.size())
     left = x.negative()
-    # 2 asin(z) on the right, π less that on the left, π/2 less asin(x) between.
+    # 2 asin(z) for large x, π minus that for large -x, π/2 minus asin(x) between.
     factor = x.of(2.0).choose(far, 1.0)
     factor = factor.choose(x.t.binary("xor", far, left, "i1"), -factor)
     base = x.of(2.0).choose(left, 0.0).choose(far, 1.0)
@@ -449,7 +448,7 @@ def acos(x: Real) -> Real:
 
 def tan(x: Real) -> Real:
     n = (x * (2 / pi)).call("roundeven")
-    first = x - n * _HALF_PI[0]  # exact up to 2^20 quarter turns, as the next two products
+    first = x - n * _HALF_PI[0]  # exact up to 2^20 quarter turns, like the next two products
     second, off = two_sum(first, -(n * _HALF_PI[1]))
     third, more = two_sum(second, -(n * _HALF_PI[2]))
     r, low = fast_sum(third, (off + more) - n * _HALF_PI[3])
@@ -462,14 +461,14 @@ def tan(x: Real) -> Real:
     even = (2.0 * (0.5 * n).call("roundeven")).equals(n)
     a = x.size()
     near, far = value.choose(even, inverse).value, a > _TURNED
-    with x.t.skipped_unless(far, rare=True) as fork:  # which takes the C library's
+    with x.t.skipped_unless(far, rare=True) as fork:  # by the C library
         chosen = x.t.select(far, x.t.each("tan", x.value), near)
     value = Real(x.t, fork.joined(chosen, near))
     return x.choose(a < 2.0**-30, value)
 
 
 def rule(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of `Real`s, with one result or several, for values of either precision."""
+    """Return a function of `Real`s, with one or several results, as a rule for either precision."""
 
     def written(t: Text, *args: Value) -> Any:
         single = args[0].kind == "float"
@@ -482,7 +481,7 @@ def rule(function: Callable[..., Any]) -> Callable[..., Any]:
     return written
 
 
-# Those that machines rarely have are the C library's, lane by lane: two to four times slower.
+# Rarely used functions, called lane by lane in the C library, two to four times slower.
 _BY_LANE = ("asinh", "acosh", "atanh", "exp2", "cbrt", "erf", "erfc")
 
 LIBRARY = {
@@ -500,13 +499,13 @@ _LOG_TAIL = tuple(2 / (2 * n + 5) for n in range(11))
 
 
 def _product(a: Real, b: Real) -> tuple[Real, Real]:
-    """a b rounded, and what was rounded off."""
+    """Return a b rounded, and the rounding error."""
     product = a * b
     return product, a.call("fma", b, -product)
 
 
 def _logarithm(a: Real) -> tuple[Real, Real]:
-    """ln(a) for a finite a > 0, as a sum of two numbers."""
+    """Return ln(a) for a finite a > 0, as a sum of two numbers."""
     m, n = significand(a)
     f = m.minus(1.0)
     below, off = fast_sum(a.of(2.0), f)
@@ -520,7 +519,7 @@ def _logarithm(a: Real) -> tuple[Real, Real]:
     cube_low = cube_low + square * third_low + square_low * third
     rest, rest_low = _product(s, cube)
     rest_low = rest_low + s * cube_low + s_low * cube
-    # n ln(2) + 2s + rest: the first two parts of ln(2) times n are exact.
+    # n ln(2) + 2s + rest: the products of n and the first two parts of ln(2) are exact.
     high, off = fast_sum(n * _LN2_PARTS[0], 2.0 * s)
     high, more = two_sum(high, n * _LN2_PARTS[1])
     high, least = two_sum(high, rest)
@@ -530,12 +529,12 @@ def _logarithm(a: Real) -> tuple[Real, Real]:
 
 @rule
 def power(x: Real, y: Real) -> Real:
-    """x to the y as the C library has it, with its corners."""
+    """Return x to the power y as the C library defines it, including special cases."""
     t, a = x.t, x.size()
     high, low = _logarithm(a)
     high = x.of(-inf).choose(a.is_zero(), high.choose(a < inf, a))
     exponent = y * high
-    # Beyond the range of results, where also infinities are, only the sign of it matters.
+    # For results out of range, infinities included, only the sign of the exponent matters.
     off = (y.call("fma", high, -exponent) + y * low).choose(exponent.size() < 800.0, 0.0)
     n, s = exp_parts(exponent.at_least(-800.0).at_most(800.0))
     value = 1.0 + (s + (off + s * off))

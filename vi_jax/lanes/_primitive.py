@@ -1,6 +1,6 @@
-"""The JAX primitive behind `run`: batched, differentiated forward, lowered for either backend.
+"""The JAX primitive behind `run`: its batching, forward derivative and lowering for both backends.
 
-Its transpose, by which it is differentiated backward, is in `_backward.py`.
+Its transpose, used in reverse mode, is in `_backward.py`.
 """
 
 import functools
@@ -29,13 +29,13 @@ _vector_only: ContextVar[bool] = ContextVar("strict", default=False)
 
 
 def vector_only() -> AbstractContextManager:
-    """Within this context a program with lanes that cannot be vector code is not compiled: it
-    raises `Unsupported`."""
+    """Raise `Unsupported` within this context for programs whose lanes cannot be vector code,
+    instead of compiling them for XLA's backend."""
     return within(_vector_only, True)
 
 
 def primitive_of_programs(name: str) -> Primitive:
-    """A primitive that runs a batch of lanes of its parameter `program`."""
+    """Return a primitive that runs a batch of lanes of its parameter `program`."""
     primitive = Primitive(name)
     primitive.multiple_results = True
 
@@ -54,14 +54,14 @@ def primitive_of_programs(name: str) -> Primitive:
 
 lanes_p = primitive_of_programs("lanes")
 
-# The most directions of a derivative that one lane carries along. Six of them took 19 ms
-# so, and 48 ms as lanes of their own.
+# The most directions of a derivative within one lane. Six directions took 19 ms so, and 48 ms as
+# separate lanes.
 DIRECTIONS = 8
 
 
 def _batched(args, dims, *, program: LaneProgram, backend: str):
-    """An axis of `jax.vmap`, which becomes one of lanes; up to `DIRECTIONS` tangents of one lane
-    become directions instead."""
+    """Make an axis of `jax.vmap` one of lanes, or of directions within a lane: the latter if only
+    tangents have the axis and its length is at most `DIRECTIONS`."""
     args = [jnp.asarray(x) for x in args]
     (size, inner), many = axes_of(program, args, dims), tuple(d is not None for d in dims)
     tangents = program.tangents or (False,) * len(many)
@@ -71,7 +71,7 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     out = lanes_p.bind(*moved, program=program, backend=backend)
     depend = dependent_parts(program, many, smooth=False)
     wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
-    # What is the same in all lanes is one, as `vmap` has it for what does not depend on its axis.
+    # Results that are equal in all lanes get no axis, as in `vmap` itself.
     along = [w or size == 0 for w in wide]
     return [x if w else x[0] for x, w in zip(out, along, strict=True)], [
         0 if w else None for w in along
@@ -79,9 +79,9 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
 
 
 def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
-    """The length of an axis of `jax.vmap`, and the axes that the lanes have besides.
+    """Return the length of an axis of `jax.vmap`, and the other batch axes of the lanes.
 
-    **Arguments:** the program; the arrays; of each the place of that axis, or `None`.
+    **Arguments:** the program; the arrays; the place of that axis in each, or `None`.
     """
     pairs = [(x.shape, d) for x, d in zip(args, dims, strict=True)]
     size = next(shape[d] for shape, d in pairs if d is not None)
@@ -90,16 +90,16 @@ def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
 
 
 def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
-    """Arguments of a batch of lanes with an axis of `jax.vmap` before those that the lanes have.
+    """Return arguments of a batch of lanes, with an axis of `jax.vmap` before the other batch axes.
 
-    **Arguments:** the arrays; of each the place of the new axis, or `None`; the shapes of one lane;
-    the axes that the lanes have; the length of the new one.
+    **Arguments:** the arrays; the place of the new axis in each, or `None`; the shapes of one lane;
+    the other batch axes; the length of the new one.
     """
     moved = []
     for x, d, aval in zip(args, dims, avals, strict=True):
         own = x.ndim - (d is not None) == aval.ndim
         if d is None and own:
-            moved.append(x)  # one for all lanes
+            moved.append(x)  # shared by all lanes
             continue
         x = x[None] if d is None else jnp.moveaxis(x, d, 0)
         if own:
@@ -111,11 +111,11 @@ def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
 def _batched_directions(
     args, dims, inner: tuple, many, size: int, program: LaneProgram, backend: str
 ):
-    """Tangents in several directions are carried along with one motion (`widened`)."""
+    """Carry tangents in several directions along with one motion (`widened`)."""
     wide, depend = widened(program, many, size)
     axes, moved = len(inner), []
     for x, d, aval in zip(args, dims, program.in_avals, strict=True):
-        # Behind the axes of the lanes, before those of the number itself.
+        # After the batch axes, before the axes of one lane's array.
         own = 0 if d is None or x.ndim - 1 == aval.ndim else axes
         moved.append(x if d is None else jnp.moveaxis(x, d, own))
     out = lanes_p.bind(*moved, program=wide, backend=backend)
@@ -128,7 +128,7 @@ batching.primitive_batchers[lanes_p] = _batched
 
 
 def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
-    """Values and derivatives by one program (`forward`)."""
+    """Compute values and derivatives with one program (`forward`)."""
     varied = tuple(type(t) is not ad.Zero for t in tangents)
     derived = forward(program, varied)
     changes = [t for t in tangents if type(t) is not ad.Zero]
@@ -141,12 +141,12 @@ def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
 
 
 def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
-    """A rule for `jax.linearize` and `jax.grad`, where values are known and tangents are not yet.
+    """Evaluate partially for `jax.linearize` and `jax.grad`, where tangents are unknown.
 
-    JAX would leave the whole program for later, because some of its inputs are not known. Here the
-    values are computed at once by the program of the values alone, and that of both is left for
-    later. The tracers are those of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2);
-    `tests/lanes/test_jax.py` fails where they change.
+    JAX would postpone the whole program, since some of its inputs are unknown. Here the program of
+    the values runs at once, and that of values and derivatives is postponed. The tracers are those
+    of `JaxprTrace` in JAX's `interpreters/partial_eval.py` (0.10.2). `tests/lanes/test_jax.py`
+    fails if they change.
     """
     unknown = [not t.is_known() for t in tracers]
     alone = program.values_without(unknown, [t.aval.shape for t in tracers])
@@ -162,11 +162,11 @@ def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
 
 
 def _partially_known_equation(saveable, unknown, instantiated, equation):
-    """The same for an equation within `jax.checkpoint`, whose values are computed again along with
-    their derivatives, unless its policy saves them.
+    """Do the same for an equation within `jax.checkpoint`. The values are computed again along with
+    their derivatives, unless the policy saves them.
 
-    **Returns:** as JAX's `partial_eval_jaxpr_custom_rules` ask for: the equation that is computed
-    now, that which is computed later, which results of either are not known, and what is kept.
+    **Returns:** for JAX's `partial_eval_jaxpr_custom_rules`: the equation to compute now; that to
+    compute later; flags of the unknown results of both; the values to keep.
     """
     program, outs = equation.params["program"], len(equation.outvars)
     shapes = [x.aval.shape for x in equation.invars]
@@ -192,8 +192,8 @@ def _partially_known_equation(saveable, unknown, instantiated, equation):
 
 
 def _saved(policy: object) -> bool:
-    """Whether a policy of `jax.checkpoint` says to save a value: by `True`, or by an instance of
-    JAX's `SaveableType` (0.10.2), which no public module has."""
+    """Return whether a policy of `jax.checkpoint` saves a value. It returns `True`, or an instance
+    of JAX's `SaveableType` (0.10.2), which no public module contains."""
     return policy is True or type(policy).__name__.startswith("Saveable")
 
 
@@ -205,16 +205,16 @@ partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partially_known_equatio
 # --- XLA's backend: the same loop for any device and any primitive. All lanes of a batch advance
 # together, until the last has ended.
 
-# Steps between two questions whether any lane goes on: the answer travels from a GPU to the
-# processor, and asked at each step it took a sixth of the time of 10,000 lanes.
+# Steps between two checks whether any lane continues. The result travels from a GPU to the
+# processor; a check at each step took a sixth of the time of 10,000 lanes.
 _UNASKED = 8
 
 
 def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
-    """Results and rows of a batch of lanes: what the primitive gives.
+    """Return the results and rows of a batch of lanes, as the primitive does.
 
-    **Arguments:** the program; its inputs, each with the axes of the batch before its own, or
-    without them where all lanes share it.
+    **Arguments:** the program; its inputs, each with the batch axes first, or without them if all
+    lanes share it.
     """
     batch = batch_of(program, [x.shape for x in args])
     lanes = math.prod(batch)
@@ -235,9 +235,9 @@ def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
 def _run_together(
     program: LaneProgram, inputs: list, axes: list[int | None], lanes: int
 ) -> list[Any]:
-    """Results and rows of lanes with one leading axis.
+    """Return results and rows of lanes with one leading axis.
 
-    **Arguments:** `axes`, 0 for an input that has a value for each lane, else `None`.
+    **Arguments:** `axes`, 0 for an input with a value for each lane, else `None`.
     """
     n, index = len(program.carry_avals), jnp.arange(lanes)
     carried = [0] * n
@@ -246,9 +246,9 @@ def _run_together(
     end = jax.vmap(jaxpr_as_fun(program.end), in_axes=(*axes, *carried), axis_size=lanes)
 
     def stored(rows: list, filled: jax.Array, complete: jax.Array, row: list) -> list:
-        # A lane without a new row writes beyond the end, which is dropped; so no two lanes write to
-        # one place, and `rows` is not copied. Within `lax.cond` it was, at each step: two thirds of
-        # the time on a GPU (JAX 0.11.2).
+        # A lane without a new row writes beyond the end, which is dropped. So no two lanes write to
+        # one place, and `rows` is not copied. `lax.cond` copied it at each step, which took two
+        # thirds of the time on a GPU (JAX 0.11.2).
         at = jnp.where(complete, filled, program.rows)
         own = {"mode": "drop", "unique_indices": True, "indices_are_sorted": True}
         return [r.at[index, at].set(x, **own) for r, x in zip(rows, row, strict=True)]
@@ -256,7 +256,7 @@ def _run_together(
     def iteration(_: Any, state: tuple) -> tuple:
         carry, active, filled, rows = state
         out = step(*inputs, *carry)
-        # A lane that has ended keeps what it had.
+        # A lane that has ended keeps its carry.
         kept = lambda a, b: jnp.where(active.reshape(lanes, *(1,) * (a.ndim - 1)), a, b)
         carry = [kept(a, b) for a, b in zip(out[:n], carry, strict=True)]
         complete = active & out[n + 1]
@@ -288,8 +288,8 @@ _on_xla = mlir.lower_fun(
 
 
 def _lowered(ctx, *args, program: LaneProgram, backend: str):
-    """On a CPU: a call of the program's kernel; XLA's loop where that was asked for or there can be
-    no kernel."""
+    """Lower to a call of the program's kernel on a CPU. Use XLA's loop if the backend is `"xla"` or
+    if there can be no kernel."""
     otherwise = functools.partial(_on_xla, ctx, *args, program=program, backend=backend)
     if backend == "xla":
         if _vector_only.get():
@@ -299,10 +299,9 @@ def _lowered(ctx, *args, program: LaneProgram, backend: str):
 
 
 def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]):
-    """The call of a program's kernel; what `otherwise` gives, after a warning, where there can be
-    none.
+    """Lower to a call of a program's kernel. Without a kernel, warn and return `otherwise()`.
 
-    **Raises:** `Unsupported` instead within `vector_only`.
+    **Raises:** `Unsupported` within `vector_only`, instead of the warning.
     """
     try:
         avals = list(zip(ctx.avals_in, program.in_avals, strict=True))
@@ -314,13 +313,13 @@ def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]
             raise
         _warn(str(reason))
         return otherwise()
-    ctx.module_context.add_keepalive(kernel)  # as long as the compiled program lives
+    ctx.module_context.add_keepalive(kernel)  # kept as long as the compiled program
     call = functools.partial(kernel_call, target, kernel, program, ctx.avals_out)
     return mlir.lower_fun(call, multiple_results=True)(ctx, *args)
 
 
 def kernel_call(target: str, kernel, program: AnyProgram, avals, *args):
-    """The kernel as a foreign function of XLA's: results of the shapes `avals`."""
+    """Call the kernel as an XLA foreign function. Return results of the shapes `avals`."""
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)

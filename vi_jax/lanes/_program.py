@@ -185,8 +185,7 @@ OWN_DERIVATIVE = ("custom_jvp_call", "custom_vjp_call", "custom_lin", _EXPANDED)
 
 
 def called(eqn: Any) -> ClosedJaxpr | Jaxpr | None:
-    """Return the jaxpr that an equation calls or expands to, or `None` if there is no such
-    jaxpr."""
+    """Return the jaxpr that an equation calls or expands to, or `None` if it does neither."""
     name, params = eqn.primitive.name, eqn.params
     if name in CALLS:
         return params[CALLS[name]]
@@ -376,8 +375,7 @@ def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
 
 
 def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many arguments of a `scan` with these parameters are constant, and how many are
-    carried."""
+    """Return the numbers of constant and of carried arguments of a `scan`."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     fixed, carry, _ = params["ft_in"].unpack()  # since JAX 0.12: the arguments as trees
@@ -385,8 +383,7 @@ def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
-    """Return flags of a loop body's results that depend on given inputs, carry first, at
-    convergence.
+    """Return the flags of a loop body's results at their fixed point, carry first.
 
     **Arguments:** `turn`, which maps flags of the carry to flags of a body's results; the flags of
     the carry before the first iteration.

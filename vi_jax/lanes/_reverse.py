@@ -1,9 +1,9 @@
-"""A program's parts forward and backward: what the cotangents of its results make of its inputs'.
+"""Forward and reverse jaxprs of a program's parts.
 
 Each of the three functions of a `LaneProgram` is traced once together with its transposed
-derivative (`jax.vjp`), and that jaxpr is taken apart into the way there and the way back. So both
-hold the same equations for the values, in the same order, and where these are computed again for
-the way back they are the same bits (`FixedText` in `_text.py`).
+derivative, and that jaxpr is split into a forward and a backward jaxpr. So both contain the same
+equations for the values, in the same order. Values computed again in the reverse pass are then the
+same bits (`FixedText` in `_text.py`).
 """
 
 import functools
@@ -35,12 +35,11 @@ from ._program import (
 from ._vector import Unsupported, check
 from .elementary import elementwise_primitive
 
-# Products of a cotangent and a slope: zero where the cotangent is zero, whatever the slope is.
+# Products of a cotangent and a slope that are zero if the cotangent is zero, for any slope.
 #
-# Where a program chooses between two numbers, that which is not chosen has the cotangent 0. Its
-# slope may be infinite or no number there (√0, a quotient by 0), and 0·∞ would spoil the sum in
-# which the chosen one's share is too. Forward mode has no such products: what is not chosen is
-# dropped.
+# When a program selects one of two numbers, the other one has the cotangent 0. Its slope may be
+# infinite or NaN (√0, division by 0). Then 0·∞ would spoil the sum of both cotangents. Forward mode
+# has no such products, since the unselected tangent is dropped.
 
 weighted_p = elementwise_primitive(
     "weighted", lambda weight, slope: jnp.where(weight == 0, weight, weight * slope)
@@ -52,7 +51,7 @@ weighted_dot_p = Primitive("weighted_dot")
 
 
 def _dot(weight, slope, *, weight_first: bool, **params):
-    """XLA's product as it is: on its backend no program goes backward."""
+    """Return a plain product, used for its shape: on XLA's backend no program runs backward."""
     pair = (weight, slope) if weight_first else (slope, weight)
     return jax.lax.dot_general(*pair, **params)
 
@@ -66,8 +65,8 @@ def _(weight, slope, *, weight_first: bool, **params):
 
 
 def with_weights(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:
-    """The same jaxpr with these products where one factor, or the dividend, depends on one of the
-    arguments `weights`. Its results must be linear in these, or not depend on them."""
+    """Return the jaxpr with these products where a factor, or the dividend, depends on one of the
+    arguments flagged in `weights`. Its results must be linear in these, or not depend on them."""
     return closed.replace(jaxpr=_rewritten(closed.jaxpr, weights))
 
 
@@ -82,7 +81,7 @@ def _rewritten(jaxpr: Jaxpr, weights: Sequence[bool]) -> Jaxpr:
 
 
 def _equation(eqn: Any, args: list[bool]) -> Any:
-    """An equation some of whose arguments are weights."""
+    """Replace an equation that has weights among its arguments."""
     name, params = eqn.primitive.name, eqn.params
     if name == "mul":
         weight, slope = eqn.invars if args[0] else eqn.invars[::-1]
@@ -112,28 +111,27 @@ def _with(params: dict[str, Any], key: str, weights: Sequence[bool]) -> dict[str
 
 
 class BothWays(NamedTuple):
-    """One of a lane's functions. The arguments of either jaxpr are its own, then the cotangents of
-    what has one, of the carry before rows or results."""
+    """The two jaxprs of one of a lane's functions. Their arguments are the function's own, followed
+    by the given cotangents: first those of the carry, then those of rows or results."""
 
     forward: ClosedJaxpr
-    """Of `begin` and `step`: the carry, whether the lane goes on, whether a row is complete."""
+    """For `begin` and `step`: the carry, whether the lane continues, whether a row is complete."""
     backward: ClosedJaxpr
-    """The cotangents of the inputs that are asked for; of `step` and `end`, then of the carry."""
+    """The wanted cotangents of the inputs; for `step` and `end`, then those of the carry."""
 
 
 class ReverseProgram(eqx.Module):
-    """What a reverse kernel runs; hashable, as a primitive's parameter must be. Its inputs are
-    those of the program, then the cotangents that are given; its results the cotangents of the
-    inputs that are asked for."""
+    """The program of a reverse kernel; hashable, as a primitive's parameter must be. Its inputs are
+    those of `program`, then the given cotangents. Its results are the wanted cotangents."""
 
     program: LaneProgram = eqx.field(static=True)
     varied: tuple[bool, ...] = eqx.field(static=True)
-    """Which inputs' cotangents are asked for."""
+    """Flags of the inputs whose cotangents are wanted."""
     given: tuple[bool, ...] = eqx.field(static=True)
-    """Which results, and then which parts of a row, have a cotangent."""
+    """Flags of the results, then of the parts of a row, that have a cotangent."""
     carried: tuple[bool, ...] = eqx.field(static=True)
-    """Which parts of the carry have one: those that depend on such inputs, and that something
-    given depends on."""
+    """Flags of the parts of the carry that have one: they depend on a wanted input, and a result or
+    row with a cotangent depends on them."""
     begin: BothWays = eqx.field(static=True)
     step: BothWays = eqx.field(static=True)
     end: BothWays = eqx.field(static=True)
@@ -143,30 +141,27 @@ class ReverseProgram(eqx.Module):
 
     @property
     def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
-        """All jaxprs of a kernel."""
         begin, step, end = self.begin, self.step, self.end
         return begin.forward, step.forward, end.backward, step.backward, begin.backward
 
     @property
     def carry_avals(self) -> list[Any]:
-        """Shapes and types of one lane's carry."""
         return self.program.carry_avals
 
     @property
     def weight_avals(self) -> list[Any]:
-        """Shapes and types of the cotangents of one lane's results and of a row."""
         avals = (*self.program.out_avals, *self.program.row_avals)
         return [a for a, here in zip(avals, self.given, strict=True) if here]
 
     @property
     def in_avals(self) -> list[Any]:
-        """Shapes and types of one lane's inputs, the cotangents of all of its rows included."""
+        """Shapes and types of one lane's inputs, including the cotangents of all its rows."""
         weights = zip(self.program.result_avals, self.given, strict=True)
         return [*self.program.in_avals, *(a for a, here in weights if here)]
 
     @property
     def result_avals(self) -> list[Any]:
-        """Shapes and types of the cotangents asked for, of one lane."""
+        """Shapes and types of the wanted cotangents of one lane."""
         return [a for a, v in zip(self.program.in_avals, self.varied, strict=True) if v]
 
 
@@ -174,15 +169,15 @@ class ReverseProgram(eqx.Module):
 def reverse(
     program: LaneProgram, varied: tuple[bool, ...], given: tuple[bool, ...]
 ) -> ReverseProgram | None:
-    """The program backward; `None` if something in it has no transpose, or no vector form.
+    """Return the program backward; `None` if a part of it has no transpose or no vector form.
 
-    **Arguments:** the program; which inputs' cotangents are asked for; which results, and then
-    which parts of a row, have a cotangent (all of them must depend on such inputs).
+    **Arguments:** the program; flags of the inputs whose cotangents are wanted; flags of the
+    results, then of the parts of a row, with a cotangent (each must depend on a wanted input).
     """
     carried = _carried(program, varied, given)
     parts = (program.begin, varied), (program.step, (*varied, *carried))
     if any(loop_depends(jaxpr.jaxpr, which) for jaxpr, which in parts):
-        return None  # JAX has no transpose of a `while`; tracing would tell as much, later
+        return None  # JAX has no transpose of a `while`; tracing would fail later
     outs, flags = given[: len(program.out_avals)], (False, False)
     emitted = (*carried, *flags, *given[len(program.out_avals) :])
     try:
@@ -194,13 +189,13 @@ def reverse(
         )  # fmt: skip
         for jaxpr in found.jaxprs:
             check(jaxpr.jaxpr)
-    except (NotImplementedError, ValueError, Unsupported):  # as JAX says that there is no transpose
+    except (NotImplementedError, ValueError, Unsupported):  # JAX's errors for a missing transpose
         return None
     return found
 
 
 def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
-    """The parts of the carry that have a cotangent (see `ReverseProgram.carried`)."""
+    """Return the flags `ReverseProgram.carried`."""
     n, inputs = len(program.carry_avals), [False] * len(program.in_avals)
     depend = dependent_parts(program, varied, smooth=True)
     outs = given[: len(program.out_avals)]
@@ -227,12 +222,12 @@ def _both_ways(
     weighted: Sequence[bool],
     kept: int,
 ) -> BothWays:
-    """A jaxpr and its transposed derivative.
+    """Return the forward and the backward jaxpr of a function.
 
-    **Arguments:** the program, and which of its functions; which arguments are differentiated;
-    which results have a cotangent; how many results are needed on the way there.
+    **Arguments:** the program; the name of its function; flags of the arguments to differentiate;
+    flags of the results with a cotangent; the number of results that the forward pass needs.
 
-    **Raises:** `NotImplementedError` or `ValueError` if something has no transpose.
+    **Raises:** `NotImplementedError` or `ValueError` if an operation has no transpose.
     """
     closed, number = getattr(program, name), len(varied)
     along = _along(program, name, varied, weighted)
@@ -243,7 +238,8 @@ def _both_ways(
         values: list[Any] = []
 
         def slopes(*tangents):
-            # Not by `jax.vjp`, whose rule for each primitive takes three times as long to trace.
+            # `jax.vjp` would take three times as long to trace, because of its rule for each
+            # primitive.
             out = along(*primals, *tangents)
             values[:] = out[: len(closed.out_avals)]
             return out[len(closed.out_avals) :]
@@ -263,8 +259,8 @@ def _both_ways(
 def _along(
     program: LaneProgram, name: str, varied: Sequence[bool], weighted: Sequence[bool]
 ) -> Callable[..., list[Any]]:
-    """A function of a program's arguments and their tangents: its results, and the derivatives of
-    those that are `weighted`. What is widened is differentiated first (see `forward`)."""
+    """Return a function of a program's arguments and their tangents. It returns the results, then
+    the derivatives of the `weighted` ones. Widening comes after it (see `forward`)."""
     widening, number = program.widening, len(varied)
     source = program if widening is None else widening.program
     function = functools.partial(evaluated, with_quotients(getattr(source, name)))
@@ -283,6 +279,6 @@ def _along(
 
 
 def _pruned(closed: ClosedJaxpr, wanted: list[bool]) -> ClosedJaxpr:
-    """A jaxpr with some of its results, without what only the others need; of equal arguments."""
+    """Return a jaxpr with the wanted results, the equations that they need, and all arguments."""
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, wanted, instantiate=True)
     return closed.replace(jaxpr=jaxpr)

@@ -321,8 +321,7 @@ class _Writer:
         self.frame.store_number(t, "undefined", undefined)
 
     def _undefine_by_missing_rows(self, t: Text, lane: Value, rows: Value, present: Value) -> None:
-        """Mark lanes with a nonzero cotangent of a row that they did not reach. Such rows are
-        NaN."""
+        """Mark lanes with a nonzero cotangent of a row that they did not reach, a NaN."""
         avals = self.program.weight_avals[self.results :]
         if not avals:
             return
@@ -337,8 +336,7 @@ class _Writer:
     def _back(
         self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value
     ) -> tuple[list[Array], list[Array]]:
-        """Return the cotangents of inputs and carry from one reverse step; zero where `mask` is
-        false."""
+        """Return cotangents of inputs and carry after a reverse step, zero outside `mask`."""
         out = only_in(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
         return out[: len(self.varied)], out[len(self.varied) :]
 
@@ -370,8 +368,7 @@ class _Writer:
         return self._function("i1", "begin", ", i64 %first, i64 %lanes", t, f"i1 {t.any(going)}")
 
     def _step(self) -> str:
-        """Advance the lanes whose iteration count exceeds `number`. Return whether any lane
-        continues."""
+        """Advance the lanes with more than `number` iterations. Return whether any continues."""
         t = FixedText(self.width)
         number, count = splat(t, "%number", "i64"), self.frame.number(t, "count")
         mask = t.binary("icmp slt", number, count, "i1")

@@ -243,8 +243,7 @@ _CHEAP = 4
 
 
 def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """Write the branches. Each is skipped if no lane of the group takes it, except a cheap first
-    one.
+    """Write the branches. All but a cheap first one are skipped if no lane takes them.
 
     **Arguments:** as for `CONTROL`.
     """
@@ -271,8 +270,8 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
 
 def _is_cheap(jaxpr: Jaxpr) -> bool:
-    """Return whether skipping a branch does not pay: it has few operations, or only constants.
-    Zeros as cotangents of unused arguments are such constants."""
+    """Return whether skipping a branch does not pay: it has few operations, or only constants, such
+    as zero cotangents of unused arguments."""
     constant = (
         eqn.primitive.name == "broadcast_in_dim" and isinstance(eqn.invars[0], Literal)
         for eqn in jaxpr.eqns

@@ -1,11 +1,11 @@
-"""The way from a compiled XLA program into a kernel: a foreign-function handler made by ctypes.
+"""Calls of a kernel from a compiled XLA program, by a foreign-function handler made with ctypes.
 
-The structures are those of XLA's `xla/ffi/api/c_api.h`, version 0.3, as jaxlib 0.10.2 ships it in
-`jax.ffi.include_dir()`; the source is at
-https://github.com/openxla/xla/blob/main/xla/ffi/api/c_api.h. The handler states that version when
-XLA registers it, and XLA refuses versions that it does not support (it promises to support each for
-twelve months). It is also refused where XLA states other sizes for the structures that are read
-here. Programs then run on XLA's backend, after a warning.
+The structures are those of XLA's `xla/ffi/api/c_api.h`, version 0.3. jaxlib 0.10.2 has this header
+in `jax.ffi.include_dir()`; its source is
+https://github.com/openxla/xla/blob/main/xla/ffi/api/c_api.h. The handler states its version when
+XLA registers it. XLA promises to support each version for twelve months, and refuses unsupported
+ones. The handler also refuses an XLA that states other sizes of these structures. Programs then run
+on XLA's backend, after a warning.
 """
 
 import ctypes
@@ -31,7 +31,7 @@ _NO_ROOM = (
     "Simulate fewer cycles at once, or differentiate forward (`jax.jacfwd`)."
 )
 
-# The version of the interface whose structures follow.
+# The version of the interface that has these structures.
 _MAJOR, _MINOR = 0, 3
 
 # `XLA_FFI_Extension_Metadata`, `XLA_FFI_ExecutionStage_EXECUTE`, three of `XLA_FFI_Error_Code`.
@@ -40,8 +40,7 @@ _METADATA, _EXECUTE, _CANCELLED, _EXHAUSTED, _INTERNAL = 1, 3, 1, 8, 13
 
 @contextmanager
 def interruptible():
-    """Within this context XLA's error for lanes that were interrupted is raised as the
-    `KeyboardInterrupt` that it was."""
+    """Raise `KeyboardInterrupt` instead of XLA's error for interrupted lanes."""
     try:
         yield
     except (ValueError, RuntimeError) as error:
@@ -89,7 +88,7 @@ class _ErrorArguments(_Sized):
     _fields_ = [("message", c_char_p), ("code", c_int)]
 
 
-# Functions in `XLA_FFI_Api` between `XLA_FFI_Error_Create` and `XLA_FFI_RunId_Get`.
+# The number of functions in `XLA_FFI_Api` between `XLA_FFI_Error_Create` and `XLA_FFI_RunId_Get`.
 _BETWEEN = 15
 
 
@@ -116,27 +115,27 @@ class _Frame(Structure):
 
 
 def _error(frame: _Frame, message: str, code: int) -> int | None:
-    """The address of an error of XLA's, which XLA frees."""
+    """Return the address of a new XLA error, which XLA frees."""
     arguments = _ErrorArguments(
         ctypes.sizeof(_ErrorArguments), None, message.encode(errors="replace"), code
     )
     return frame.api.contents.error_create(ctypes.byref(arguments))
 
 
-# The calls that run, by the address of XLA's frame.
+# Running calls, by the address of XLA's call frame.
 _running: dict[int, KernelCall] = {}
 
 
 @ctypes.CFUNCTYPE(None, POINTER(_Frame), POINTER(HandlerResult))
 def _handler(frame, out):
-    """Called until it has stored an answer (see `guard`)."""
+    """Store the answer of a call. `call_handler` repeats it until there is one (see `guard`)."""
     out, frame = out.contents, frame.contents
-    # A signal before this assignment leaves no answer; after it, it is Python's own to raise.
+    # An exception of a signal before this assignment leaves no answer. After it, Python raises it.
     out.answer = _answer_without_exceptions(frame, out)
 
 
 def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
-    """What `_answer` gives, its exceptions as errors of XLA's, since none may pass through XLA."""
+    """Return the result of `_answer`, or its exception as an error of XLA."""
     try:
         if out.lost or interrupt_dropped():
             raise KeyboardInterrupt
@@ -144,7 +143,7 @@ def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
     except KeyboardInterrupt:
         _end_threads(frame)
         in_main = threading.current_thread() is threading.main_thread()
-        # One that was dropped is raised by the call under way, when it gets XLA's error.
+        # An interrupt that was dropped is raised by the current call, when it gets XLA's error.
         if in_main and interrupt_raises() and not interrupt_dropped():
             out.signal = signal.SIGINT
         return _error(frame, INTERRUPTED, _CANCELLED)
@@ -154,7 +153,7 @@ def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
 
 
 def _answer(frame: _Frame) -> int | None:
-    """To XLA's question for metadata the version; else the kernel runs."""
+    """Answer XLA's query for metadata with the version; else run the kernel."""
     extension = frame.extension
     while extension:
         if extension.contents.type == _METADATA:
@@ -168,7 +167,7 @@ def _answer(frame: _Frame) -> int | None:
 
 
 def _is_as_known(frame: _Frame) -> bool:
-    """Whether XLA states the sizes that are known here, but for what follows in the frame."""
+    """Return whether XLA states the expected sizes. Its frame may be longer."""
     size = ctypes.sizeof(_Buffers)
     sizes = frame.arguments.struct_size, frame.results.struct_size
     return frame.struct_size >= ctypes.sizeof(_Frame) and sizes == (size, size)
@@ -211,7 +210,7 @@ def _run_kernel(frame: _Frame) -> int | None:
 
 
 def _run_number(frame: _Frame) -> int:
-    """XLA's number of the run that a call is part of; 0 where this XLA does not give it."""
+    """Return XLA's number of the run with this call, or 0 if this XLA does not provide it."""
     api = frame.api.contents
     if api.struct_size < _Api.run_get.offset + ctypes.sizeof(c_void_p) or not api.run_get:
         return 0
@@ -222,9 +221,9 @@ def _run_number(frame: _Frame) -> int:
 
 @made_once
 def registered() -> str:
-    """The name by which XLA knows the handler; registered on first use, whichever thread's.
+    """Register the handler with XLA on first use, on any thread, and return its name.
 
-    **Raises:** `Unsupported` where this XLA refuses the handler's version.
+    **Raises:** `Unsupported` if this XLA refuses the handler's version.
     """
     handler = jax.ffi.pycapsule(ctypes.c_void_p(guard(_handler)))
     try:
@@ -235,7 +234,7 @@ def registered() -> str:
 
 
 def header(key: int, lanes: int, strides: list[int]) -> np.ndarray:
-    """The first argument of a call: the kernel's key, the number of lanes, and of each input how
-    many numbers it has per lane (0 if it is shared). Pairs of 32 bits, since JAX may be set to have
-    no integers of 64."""
+    """Return the first argument of a call: the kernel's key, the number of lanes, and the numbers
+    per lane of each input (0 for a shared one). Each is stored as two 32-bit integers, since JAX
+    may be set to use no 64-bit ones."""
     return np.asarray([key, lanes, *strides], np.int64).view(np.int32)

@@ -1,4 +1,4 @@
-"""Functions that either backend has its own best form of."""
+"""Functions whose best form differs between the backends."""
 
 import functools
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
-# On |x| <= pi/4 the first omitted terms are below 5e-17.
+# For |x| <= pi/4 the first omitted terms are below 5e-17.
 _SIN = tuple((-1) ** n / factorial(2 * n + 1) for n in range(8))
 _COS = tuple((-1) ** n / factorial(2 * n) for n in range(9))
 
 
 def horner(coefficients: tuple, x):
-    """The polynomial with these coefficients (constant term first) at `x`."""
+    """Return the polynomial with these coefficients (constant term first) at `x`."""
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
@@ -29,10 +29,10 @@ def horner(coefficients: tuple, x):
 def elementwise_primitive(
     name: str, function: Callable[..., Any], jvp: Callable[..., Any] | None = None, results: int = 1
 ) -> Primitive:
-    """A primitive of arrays of one shape, number by number, which runs outside of `jit` too.
+    """Return an elementwise primitive of arrays of one shape, which also runs outside `jit`.
 
-    **Arguments:** its name; a function that does the same; its rule of forward derivatives; the
-    number of its results, which have the type of the last array.
+    **Arguments:** its name; the function that it computes; its JVP rule; the number of its results,
+    which have the type of the last argument.
     """
     primitive = Primitive(name)
     primitive.multiple_results = several = results > 1
@@ -43,7 +43,7 @@ def elementwise_primitive(
 
     def shaped(*args, **params):
         weak = all(x.weak_type for x in args)
-        shape = jnp.broadcast_shapes(*(x.shape for x in args))  # a number may stand for an array
+        shape = jnp.broadcast_shapes(*(x.shape for x in args))  # scalars are broadcast
         aval = ShapedArray(shape, args[-1].dtype, weak_type=weak)
         return [aval] * results if several else aval
 
@@ -64,7 +64,7 @@ def elementwise_primitive(
 
 
 def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Sine and cosine of `phase` (radians, any shape; best within a few turns of zero).
+    """Return the sine and cosine of `phase` (radians, any shape; best within a few turns of zero).
 
     The absolute error is a few units of rounding. Differentiable to any order. XLA's CPU backend
     calls the scalar library for float64 `sin` and `cos`; these are polynomials on either backend.
@@ -74,16 +74,16 @@ def sincos(phase: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
 
 
 def _by_tangent(phase):
-    """Taylor series about zero on a quarter of the argument, then two angle doublings."""
+    """Sum Taylor series about zero at a quarter of the argument, then double the angle twice."""
     turns = jnp.round(phase * (0.5 / pi))
     quarter = 0.25 * (phase - (2 * pi) * turns)
     square = quarter * quarter
-    # XLA copies cheap producers into each of their consumers, but no division: through the tangent
-    # the polynomials are evaluated once.
+    # XLA copies cheap producers into each of their consumers, but not divisions. Because of the
+    # tangent the polynomials are evaluated once.
     tangent = quarter * horner(_SIN, square) / horner(_COS, square)
     share = 1 / (1 + tangent * tangent)
     sine, cosine = 2 * tangent * share, (1 - tangent * tangent) * share
-    # 1 - 2 sin^2 keeps the cosine's absolute error from growing with the doubling.
+    # 1 - 2 sin² keeps the cosine's absolute error from growing in the doubling.
     return 2 * sine * cosine, 1 - 2 * sine * sine
 
 
@@ -99,21 +99,21 @@ sincos_p = elementwise_primitive("sincos", _by_tangent, _sincos_jvp, results=2)
 
 
 def pin(tree: object) -> Any:
-    """The same values, which XLA's CPU backend computes once.
+    """Return the same values, which XLA's CPU backend computes only once.
 
-    When it fuses it copies cheap producers into each of their consumers, which multiplies the work
-    of a long step; it does not copy divisions. So on that backend this is a division by one.
+    Its fusion copies cheap producers into each of their consumers, which multiplies the work of a
+    long step. It does not copy divisions, so on that backend this is a division by one.
     """
     return jtu.tree_map(pin_p.bind, tree)
 
 
 def pin_flag(flag: Bool[Array, ""], like: Float[Array, ""]) -> Bool[Array, ""]:
-    """`pin` for a truth value, in the precision of `like`."""
+    """Apply `pin` to a boolean, in the precision of `like`."""
     return pin(jnp.where(flag, jnp.ones_like(like), 0.0)) > 0.5
 
 
 def _divided(x):
-    # Not a number would stay one whatever it is divided by; the compiler cannot know that.
+    # The compiler keeps this division, since it does not use that NaN / NaN is NaN.
     return x / jnp.where(x == x, jnp.ones_like(x), jnp.nan)
 
 

@@ -1,4 +1,4 @@
-"""`run`: one lane's loop, written as JAX; batched by `vmap` it runs as vector code.
+"""`run`: the loop of one lane, written in JAX. Batched by `vmap` it runs as vector code.
 
 The functions are traced as jaxprs of flat arguments, once for equal functions and inputs.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr
 
-from . import _backward as _backward  # how `lanes_p` is differentiated in reverse mode
+from . import _backward as _backward  # registers the reverse mode of `lanes_p`
 from ._primitive import lanes_p
 from ._program import LaneProgram, shape_of
 from ._shared import Recent, within
@@ -29,21 +29,20 @@ _backend: ContextVar[str] = ContextVar("backend", default="auto")
 
 
 class Emitted(NamedTuple):
-    """What `begin` and `step` return besides the carry."""
+    """The results of `begin` and `step` besides the carry."""
 
     active: Any
-    """Whether the lane goes on."""
+    """True while the lane continues."""
     complete: Any
-    """Whether a row is complete."""
+    """True if a row is complete."""
     row: Any
     """The row, a pytree."""
 
 
 def backend(name: str) -> AbstractContextManager:
-    """Trace lanes for `"xla"` within this context, or for the backend that suits the machine
-    (`"auto"`).
+    """Trace lanes for XLA (`"xla"`) within this context, or for the best backend here (`"auto"`).
 
-    Programs that are already compiled keep their backend.
+    Compiled programs keep their backend.
     """
     if name not in BACKENDS:
         raise ValueError(f"Argument `name` must be one of {BACKENDS}, but got {name!r}.")
@@ -51,7 +50,7 @@ def backend(name: str) -> AbstractContextManager:
 
 
 def current_backend() -> str:
-    """The backend that this context asks for."""
+    """Return the backend that this context sets."""
     return _backend.get()
 
 
@@ -64,23 +63,23 @@ def run(
     rows: int,
     backend: str | None = None,
 ) -> tuple[Any, Any]:
-    """One lane's loop to its end: begin, step while it is active, end.
+    """Run the loop of one lane: `begin`, then `step` while it is active, then `end`.
 
-    Batched by `vmap`, all lanes run together: on a CPU as vector code for groups of them, on all
-    cores that the process may use, each place of a group taking up the next lane when its own has
-    ended. Differentiable forward and in reverse, to any order (in reverse by a tape of the steps
-    taken, or by running forward along each number). The functions see scalars (and small arrays) of
-    one lane; what they close over is shared. Functions that close over nothing, but may have
-    constants bound by `functools.partial`, are traced once for inputs that are alike.
+    `vmap` batches it, and all lanes run together. On a CPU they run as vector code in groups, on
+    all cores that the process may use. A slot of a group takes the next lane when its lane has
+    ended. Differentiable forward and in reverse, to any order; in reverse by a tape of the steps,
+    or by running forward along each number. The functions get scalars and small arrays of one lane.
+    All lanes share the values over which they close. Functions without closures are traced once for
+    inputs of equal shapes and types; constants may be bound by `functools.partial`.
 
     **Arguments:**
 
-    - `begin(inputs)`, `step(inputs, carry)`: the next carry, and what they `Emitted`;
-    - `end(inputs, carry)`: the results;
+    - `begin(inputs)`, `step(inputs, carry)`: functions that return the next carry and an `Emitted`;
+    - `end(inputs, carry)`: a function that returns the results;
     - `inputs`: a pytree of arrays;
-    - `rows`: room for rows; they are stored in the order in which they are completed, and what a
-      lane does not come to is not a number (0 for integers);
-    - `backend`: `"xla"` or `"auto"`; by default what the context says.
+    - `rows`: the greatest number of rows. They are stored in the order of completion. Rows that a
+      lane does not reach are NaN (0 for integers);
+    - `backend`: `"xla"` or `"auto"`; by default that of the context.
 
     **Returns:** the results, and the rows with a leading axis of length `rows`.
     """
@@ -95,7 +94,7 @@ def run(
 
 
 def once(function: Callable[[Any], Any], inputs: object) -> Any:
-    """`function(inputs)` as vector code, without a loop; batched by `vmap` as `run` is.
+    """Run `function(inputs)` as vector code without a loop. `vmap` batches it like `run`.
 
     **Arguments:** a function of a pytree of scalars and small arrays; the pytree.
     """
@@ -126,11 +125,11 @@ class Functions(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """The program of a lane, and how its results are put together again."""
+    """The program of a lane, and the structure of its results."""
 
     program: LaneProgram
     consts: list[Any]
-    """Arrays that the functions close over, which are further inputs."""
+    """Arrays over which the functions close; they are further inputs."""
     out: Any
     """The structure of the results."""
     row: Any
@@ -141,10 +140,10 @@ _recent: "Recent[Any, Traced]" = Recent(64)
 
 
 def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: int) -> Traced:
-    """The program for inputs of one structure, and of their leaves' shapes and types.
+    """Return the program for inputs of this structure, and of these shapes and types.
 
-    **Arguments:** the functions; the structure and the leaves of the inputs of one lane; `rows` of
-    the `LaneProgram`.
+    **Arguments:** the functions; the structure and the leaves of one lane's inputs; `rows` of the
+    `LaneProgram`.
     """
     shapes = [shape_of(x) for x in leaves]
     try:
@@ -157,7 +156,7 @@ def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: i
             bool(jax.config.jax_enable_x64),  # pyright: ignore
         )
         found = _recent.get(key)
-    except (TypeError, ValueError):  # no hash, or whether two are equal is not known
+    except (TypeError, ValueError):  # without a hash, or equality is not defined
         return _traced(functions, treedef, shapes, rows)
     if found is None:
         found = _traced(functions, treedef, shapes, rows)
@@ -174,17 +173,17 @@ def _clear_with_jax(x: object) -> Any:
 
 
 def _function_key(function: Callable[..., Any]) -> tuple:
-    """A key that is equal only for functions that do the same, as long as they are pure.
+    """Return a key that is equal only for functions that compute the same if they are pure.
 
-    **Raises:** `TypeError` where that cannot be known.
+    **Raises:** `TypeError` if this cannot be decided.
     """
     if isinstance(function, functools.partial):
         if function.keywords:
             raise TypeError("no place in an order")
         return (_function_key(function.func), *map(_argument_key, function.args))
     if not isinstance(function, FunctionType) or function.__closure__ is not None:
-        # A decorated function closes over what it decorates, and a jitted one hides it. If it is
-        # that of its module, there is only one.
+        # A decorated function closes over the original one, and a jitted one hides its closure. A
+        # function that its module holds by its name exists only once.
         module = sys.modules.get(getattr(function, "__module__", ""))
         if getattr(module, getattr(function, "__qualname__", ""), None) is not function:
             raise TypeError("perhaps made for this call")
@@ -192,7 +191,7 @@ def _function_key(function: Callable[..., Any]) -> tuple:
 
 
 def _argument_key(x: object) -> tuple:
-    """The same for an argument that is bound by `functools.partial`: a function or a pytree."""
+    """Return such a key for an argument bound by `functools.partial`: a function or a pytree."""
     if isinstance(x, FunctionType | functools.partial):
         return _function_key(x)
     leaves, treedef = jtu.tree_flatten(x)
@@ -200,9 +199,9 @@ def _argument_key(x: object) -> tuple:
 
 
 def _constant_key(x: object) -> Any:
-    """A key that is equal only for equal constants: 1, 1.0 and True differ, and 0.0 and -0.0.
+    """Return a key that is equal only for equal constants: 1, 1.0, True differ, 0.0 and -0.0 too.
 
-    **Raises:** `TypeError` for what may vary.
+    **Raises:** `TypeError` for values that may change.
     """
     if isinstance(x, jax.Array):
         raise TypeError("no constant")
@@ -216,7 +215,7 @@ def _constant_key(x: object) -> Any:
 
 
 def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) -> Traced:
-    """As `traced`, without a look at what was traced before."""
+    """Return the result of `traced` without its cache."""
     n = len(leaves)
     structures: dict[str, Any] = {}
 
@@ -256,9 +255,9 @@ def _flag(x: object) -> Any:
 
 
 def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
-    """The leaves of what `step` gave, in the types that `begin` gave.
+    """Return the leaves that `step` returned, converted to the types from `begin`.
 
-    **Raises:** `TypeError` where structure or shapes differ.
+    **Raises:** `TypeError` if the structure or a shape differs.
     """
     leaves, other = jtu.tree_flatten(tree)
     if other != treedef:
@@ -272,8 +271,7 @@ def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
 
 
 def _consts_as_inputs(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJaxpr], list]:
-    """The jaxprs with the arrays that they close over as inputs behind the first `n`, and the
-    arrays."""
+    """Return the jaxprs with their constant arrays as inputs after the first `n`, and these."""
     consts: list[Any] = []
     for jaxpr in jaxprs:
         for x in jaxpr.consts:

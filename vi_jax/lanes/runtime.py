@@ -1,4 +1,4 @@
-"""Kernels for this processor: their width, which of them are kept, and their call on threads."""
+"""Kernels for this processor: their width, their cache, and their calls on threads."""
 
 import ctypes
 import functools
@@ -23,23 +23,23 @@ from ._shared import Recent, within
 from ._tape import reverse_text
 from ._vector import check
 
-# Kernels that are kept although no compiled program needs them any more: a choice, for notebooks
-# in which a cell is run again.
+# The number of kernels kept without a compiled program that uses them. A choice for notebooks, in
+# which cells are run again.
 _MOST_KERNELS = 64
 
-# Most numbers in a lane's inputs and carry with which groups go in twice the width, by the bits of
-# a register. Measured, not a count of registers: with AVX-512 (256 lanes on one core of an AMD
-# EPYC) the motor with extremes, 36 numbers, takes 20 % less, by time, 33, 10 %, with its log, 49,
-# 4 %, and with its derivative by one number as long. With AVX2 only up to 32 were measured.
+# The most numbers in a lane's inputs and carry for groups of twice the width, by the bits of a
+# register. Measured with AVX-512 (256 lanes on one core of an AMD EPYC). Savings for the motor:
+# with extremes (36 numbers) 20 % of the time, by time (33) 10 %, with its log (49) 4 %, with its
+# derivative with respect to one number none. With AVX2 only up to 32 numbers were measured.
 _MOST_NUMBERS = {512: 64, 256: 32}
 
-# More than any machine has cores; a process may not be granted so many threads.
+# More than the cores of any machine; a process may not be granted as many threads.
 _MOST_THREADS = 1024
 
-# Seconds between two looks at threads that are to stop.
+# Seconds between two checks whether stopped threads have ended.
 _POLL = 1e-3
 
-# What a kernel runs.
+# The program of a kernel.
 AnyProgram = LaneProgram | ReverseProgram
 
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
@@ -50,9 +50,9 @@ _cpu: ContextVar[str | None] = ContextVar("cpu", default=None)
 def threads(number: int) -> AbstractContextManager:
     """Run lanes on so many threads within this context (default: the cores of this process).
 
-    XLA runs larger programs on its threads, which belong to no context. Wait for their results
-    before you leave; if several of your threads have such a context, the one entered last holds for
-    all of them there.
+    XLA runs larger programs on its own threads, outside any context. Wait for their results before
+    you leave the context. If several of your threads have such a context, the one entered last
+    applies to XLA's threads.
 
     **Arguments:** `number` of threads, from 1 to 1,024.
 
@@ -76,13 +76,13 @@ def _threads_within(number: int) -> Iterator[None]:
 
 
 def processor(name: str) -> AbstractContextManager:
-    """Write machine code for this processor (in LLVM's words, such as `"x86-64-v3"`) within this
-    context; it must be one that this one can stand in for."""
+    """Compile kernels for this processor (LLVM's name, such as `"x86-64-v3"`) within this context.
+    The processor of this machine must be able to run its code."""
     return within(_cpu, name)
 
 
 def thread_count() -> int:
-    """Threads that lanes run on."""
+    """Return the number of threads that run lanes."""
     asked = _threads.get()
     if asked is None:
         asked = next(reversed(_entered), None)
@@ -90,7 +90,7 @@ def thread_count() -> int:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:
@@ -99,7 +99,7 @@ def cores() -> int:
 
 @functools.cache
 def _register_bits(cpu: str | None) -> int:
-    """Width of the vector registers of a processor in LLVM's words, or of this one (`None`)."""
+    """Return the width of a processor's vector registers (LLVM's name, `None` for this one)."""
     if cpu is not None:
         return {"x86-64-v4": 512, "x86-64-v3": 256}.get(cpu, 128)
     features = llvm().get_host_cpu_features()
@@ -109,11 +109,11 @@ def _register_bits(cpu: str | None) -> int:
 
 
 class Kernel:
-    """The machine code of a program, which is compiled on another thread and lives as long as this
+    """The machine code of a program. It is compiled on another thread and lives as long as this
     object.
 
-    **Arguments:** LLVM's text; the processor in LLVM's words, or `None` for this one; the lanes of
-    a group.
+    **Arguments:** LLVM's text; the processor's name in LLVM, or `None` for this one; the lanes of a
+    group.
     """
 
     def __init__(self, text: str, cpu: str | None, width: int):
@@ -122,7 +122,7 @@ class Kernel:
 
     @functools.cached_property
     def function(self) -> Any:
-        """The kernel as a function of `ctypes`, with the arguments of `_kernel.py`.
+        """The kernel as a `ctypes` function with the arguments of `_kernel.py`.
 
         **Raises:** `RuntimeError` if LLVM could not compile it.
         """
@@ -136,11 +136,10 @@ class Kernel:
 
 
 class KernelCall:
-    """One call of a kernel, which holds what its threads read and write until they end.
+    """One call of a kernel. It holds the memory that its threads use until they end.
 
-    **Arguments:** the kernel; the addresses of the input arrays; the numbers that each has per
-    lane, or 0 for one that all lanes share; the addresses of the output arrays; the number of
-    lanes.
+    **Arguments:** the kernel; the addresses of the input arrays; the numbers per lane of each, or 0
+    for one that all lanes share; the addresses of the output arrays; the number of lanes.
     """
 
     def __init__(
@@ -160,11 +159,11 @@ class KernelCall:
         self._lock, self._inside = threading.Lock(), 0
 
     def run(self) -> bool:
-        """Run all lanes on as many threads as there is work for.
+        """Run all lanes, on as many threads as have work.
 
-        **Returns:** whether all have ended without being stopped.
+        **Returns:** True if all lanes have ended and the call was not stopped.
 
-        **Raises:** what a signal raises, in the main thread; then `stop_and_wait` is to be called.
+        **Raises:** in the main thread the exceptions of signals. Then call `stop_and_wait`.
         """
         if self._number == 1 and threading.current_thread() is not threading.main_thread():
             self._run_here()
@@ -173,11 +172,12 @@ class KernelCall:
             jobs = [_pool(self._number).submit(self._run_here) for _ in range(self._number)]
             for job in jobs:
                 job.result()
-        # A thread takes lanes until none are left, and ends when its own have, if not stopped.
+        # Unless stopped, a thread takes lanes until none are left, and ends when its own have
+        # ended.
         return self._given.value >= self._lanes and not self.stop.value
 
     def _run_here(self) -> None:
-        """What one thread does: lanes until none are left, unless the call was stopped before."""
+        """Run lanes on one thread until none are left, unless the call was stopped before."""
         with self._lock:
             if self.stop.value:
                 return
@@ -189,7 +189,7 @@ class KernelCall:
                 self._inside -= 1
 
     def stop_and_wait(self) -> None:
-        """Wait until the threads have ended; called again where a signal's exception ends it."""
+        """Stop the threads and wait for them. Call it again if a signal's exception leaves it."""
         with self._lock:
             self.stop.value = 1
         while self._inside:
@@ -202,7 +202,7 @@ def _pool(number: int) -> ThreadPoolExecutor:
 
 
 def key_of(text: str, cpu: str | None) -> int:
-    """A number for a program's text and a processor, the same in every process."""
+    """Return a number for a program's text and a processor, equal in all processes."""
     digest = hashlib.blake2b((text + (cpu or "")).encode(), digest_size=7).digest()
     return int.from_bytes(digest, "little")
 
@@ -216,12 +216,11 @@ _keys: "weakref.WeakKeyDictionary[AnyProgram, dict[tuple, int]]" = weakref.WeakK
 
 
 def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = ()) -> Kernel:
-    """The kernel of a program for a number of lanes: one for the same text, compiled once while it
-    is in use.
+    """Return the kernel of a program for a number of lanes. Equal texts share a kernel.
 
-    **Arguments:** further, which inputs all lanes share.
+    **Arguments:** the program; the number of lanes; flags of the inputs that all lanes share.
 
-    **Raises:** `Unsupported` if the program has no vector form, or LLVM cannot be had.
+    **Raises:** `Unsupported` if the program has no vector form, or LLVM is missing.
     """
     cpu = _cpu.get()
     bits = _register_bits(cpu)
@@ -237,18 +236,18 @@ def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = (
 
 
 def _width(program: AnyProgram, lanes: int, bits: int) -> int:
-    """Lanes of a group: a power of two of at least 4. It changes no result.
+    """Return the lanes of a group: a power of two of at least 4. It does not change results.
 
     **Arguments:** the program; the lanes of the batch; the bits of a vector register.
     """
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
-    # At least 4: two registers of 128 bits, to hide the arithmetic's latency.
+    # At least 4: two registers of 128 bits hide the latency of arithmetic.
     full = max(4, bits // (64 if wide else 32))
     if lanes <= full // 2:
-        return max(4, full // 2)  # half a register is quicker than a half empty one
-    # A step is a chain of operations that wait for each other: a second register in each of them
-    # takes up to a quarter less time, if there are lanes enough for all cores.
+        return max(4, full // 2)  # faster than a half-empty register
+    # The operations of a step wait for each other. Two registers per operation save up to a quarter
+    # of the time, if there are enough lanes for all cores.
     many = lanes >= 4 * full * cores()
     few_numbers = sum(a.size for a in avals) <= _MOST_NUMBERS.get(bits, 0)
     return 2 * full if many and few_numbers else full
@@ -257,8 +256,8 @@ def _width(program: AnyProgram, lanes: int, bits: int) -> int:
 def _new_kernel(
     program: AnyProgram, cpu: str | None, form: tuple[int, int, tuple[bool, ...]]
 ) -> Kernel:
-    """The kernel of a program whose text was not written yet, in the form that the arguments of
-    `kernel_text` say; compiled unless its text is known."""
+    """Return the kernel of a program without a text for these arguments `form` of `kernel_text`. It
+    is compiled only if its text is new."""
     for jaxpr in program.jaxprs:
         check(jaxpr.jaxpr)
     backward = isinstance(program, ReverseProgram)
@@ -272,5 +271,5 @@ def _new_kernel(
 
 
 def kernel_by_key(key: int) -> Kernel | None:
-    """The kernel of this key (see `key_of`), if it is in use."""
+    """Return the kernel of this key (see `key_of`) if it is in use, else `None`."""
     return _in_use.get(key)
