@@ -129,8 +129,7 @@ class Lane(NamedTuple):
     """Time since the start of the interval at the last impulse of noise; `None` if the impulses
     come at times known in advance."""
     completed: Flag | None = None
-    """True if the interval is complete, while the events of a step are applied; `None` between
-    steps."""
+    """True if the interval is complete, while events are applied; `None` between steps."""
 
     def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
         """Return the lane, ended with `reason` (a name in `RESULTS` or its number) if both flags
@@ -190,18 +189,16 @@ class Impulses(eqx.Module):
     count: int = eqx.field(static=True)
     """Impulses in a cycle; a multiple of the record points."""
     functions: tuple[Callable | None, ...] = eqx.field(static=True)
-    """For each array of the state, a factor of its impulses as a function of the state, or
-    `None`."""
+    """For each array of the state, a function of the state that scales its impulses, or `None`."""
     timed: bool = eqx.field(static=True)
-    """True if the loop measures the time between impulses; `scales` are then for one unit of
-    time."""
+    """True if the loop measures the time between impulses; `scales` are then per unit of time."""
     modes: tuple[Array | None, ...] = ()
     """For each array of the state, the matrix that transforms its impulse to natural modes, if the
     loop carries these instead."""
 
 
 class Plan(eqx.Module):
-    """The plan of a simulation, the same for all lanes of a batch. Static fields are compile-time
+    """The plan of a simulation, the same for all lanes. Static fields are compile-time
     constants."""
 
     machine: AbstractMachine

@@ -150,8 +150,7 @@ def _output_shapes(whose: str, function: Callable[..., Any], *arguments: Any) ->
 
 
 def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
-    """Check restitution laws. **Raises:** `TypeError` if one cannot be traced or returns no number;
-    as `check_field`."""
+    """**Raises:** `TypeError` for an invalid restitution law; as `check_field`."""
     for i, stop in enumerate(stops_of(machine)):
         if stop.is_one_number:
             continue
@@ -262,9 +261,9 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """Return the cycle; the field at its start, within it and at its end, if `s` `ticks`; for each
+    """Return the cycle; the field at its start, within it and at its end (if `ticks`); for each
     guard, whether it is negative in any state around the start. `zero` is an argument, since JAX
-    evaluates what depends on constants alone separately."""
+    compiles expressions of constants separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     instants = (zero, _INSIDE * cycle, cycle) if ticks else ()
@@ -380,7 +379,7 @@ def check_parts(machine: AbstractMachine) -> None:
 
 
 def _check_names(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for a stop that names no velocity, or an angle of `wrap_angles`."""
+    """**Raises:** `ValueError` for a stop on an angle of `wrap_angles`, or with an invalid `on`."""
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
         named = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
@@ -401,7 +400,7 @@ def _check_names(machine: AbstractMachine) -> None:
 
 
 def _check_frictions(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for friction with an unknown stop, or across its stop."""
+    """**Raises:** `ValueError` for friction across its stop, or with an invalid number."""
     name = type(machine).__name__
     known = {
         "stop": ("stop", len(stops_of(machine))),

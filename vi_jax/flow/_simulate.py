@@ -1,4 +1,4 @@
-"""`simulate`: returns a run from a machine, a start, a number of cycles and a method."""
+"""`simulate`: the motion of a machine from a start, for a number of cycles, as a `Run`."""
 
 import dataclasses
 from collections.abc import Callable

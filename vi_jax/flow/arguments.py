@@ -89,8 +89,7 @@ class RunOptions:
 
     def checked(self, machine: AbstractMachine | None) -> "RunOptions":
         """Return the options after validation, with the method that they choose for the machine
-        (`None` if it is not known yet). **Raises:** `TypeError` or `ValueError` that names the
-        option."""
+        (`None` if not known yet). **Raises:** `TypeError` or `ValueError` that names the option."""
         most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
         return dataclasses.replace(
             self,
@@ -269,8 +268,7 @@ def _check_numbers(machine: AbstractMachine) -> None:
 
 
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
-    """**Raises:** `TypeError` for an invalid state of a machine without velocities, by evaluating
-    the field."""
+    """**Raises:** `TypeError` for an invalid state, which only the field can show."""
     try:
         jax.eval_shape(
             lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x)), jnp.zeros(()), state
@@ -316,8 +314,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 
 
 def check_start(machine: AbstractMachine, start: State) -> None:
-    """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` if a concrete start cannot be
-    simulated."""
+    """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` for an invalid concrete
+    start."""
     shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(

@@ -197,8 +197,7 @@ class FlowToEvent:
         return met_after(self._pure_rate, guard, offset, *self._given())
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
-        """Return `height`, of coordinate number k, with its derivatives; see
-        `drift.height_of_turn`."""
+        """Return the `height` of coordinate number k with derivatives (`drift.height_of_turn`)."""
         place = self._pure(self._position_of(k))
         return height_of_turn(self._pure_rate, place, height, turns, offset, *self._given())
 

@@ -59,9 +59,9 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     """Return the expected size of each number of the state if that is less than 1; else 1. `None`
     for a machine whose numbers are about 1 by definition.
 
-    The size is the greater of the value at the start and its change in cycle/2π at the rates there.
-    If both are tiny, it is the change that the sizes of the other numbers cause. The size of a
-    number that is zero and that nothing moves yet is unknown, and is returned as 1.
+    The size is the greater of the value at the start and its change at the rates there, in 1/2π of
+    a cycle or of a shorter natural period. If both are tiny, it is the change that the sizes of the
+    other numbers cause. The size of a zero that nothing moves yet is unknown, and returned as 1.
     """
     if scales_known(machine):
         return None
@@ -95,8 +95,7 @@ _compiled_sizes = compiled(row_sizes)
 
 
 def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> np.ndarray:
-    """Return `row_sizes` as a NumPy array, by a program that is compiled once for any number of
-    `rows`."""
+    """Return `row_sizes` as a NumPy array, compiled once for any number of `rows`."""
     largest = np.abs(rows.reshape(-1, rows.shape[-1])).max(axis=0)
     return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
 

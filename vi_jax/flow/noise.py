@@ -215,8 +215,8 @@ def _check_machine(machine: AbstractMachine, start: State) -> None:
 
 
 def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Return the amplitude of each array of the state, `None` without noise and 1 if a function
-    returns it; and these functions, or `None`."""
+    """Return the amplitude of each array of the state (`None` without noise; 1 for a function), and
+    the functions, or `None`."""
     functions = dict(noise.functions)
     amplitudes = {**noise.amplitudes, **dict.fromkeys(functions, 1.0)}
     names = leaf_names(start)

@@ -136,9 +136,8 @@ class EventKind(enum.IntEnum):
 
 
 EVENTS = tuple(kind.name for kind in EventKind)
-"""The names of the kinds of events in an `EventLog`: an impact on a stop; a body comes to rest on a
-stop; a body leaves the stop on which it rested; a switch changes its mode; one of the machine's
-`events`."""
+"""The names of the kinds of events in an `EventLog`: `impact` on a stop; `rest` on a stop;
+`release` from it; change of a switch's `mode`; `reset`, one of the machine's `events`."""
 
 Variables = dict[str, tuple[tuple[str, ...], np.ndarray]]
 
@@ -448,8 +447,7 @@ class Run(Summarized):
     """States at the start and after each cycle, a pytree like the start; leaves (cycles + 1,), with
     further axes for an array in the state."""
     y_max: Float[Array, " cycles"] | None
-    """Greatest position (of the first coordinate) of the motion in each cycle, not only of sample
-    points."""
+    """Greatest position (of the first coordinate) in each cycle, also between sample points."""
     y_min: Float[Array, " cycles"] | None
     """Smallest position of the motion in each cycle."""
     impacts: Int[Array, " cycles"]
@@ -485,8 +483,7 @@ class Run(Summarized):
     rejected: Int[Array, ""]
     """Steps rejected on their error estimate."""
     averages: dict[str, Float[Array, " cycles"]] = eqx.field(default_factory=dict)
-    """The machine's own averages over the time of each cycle, by name (see
-    `AbstractMachine.averages`)."""
+    """The machine's own averages in each cycle, by name (see `AbstractMachine.averages`)."""
     quantities: dict[str, Float[Array, " sections"]] = eqx.field(default_factory=dict)
     """The machine's own functions of its state on the sections, by name; (cycles + 1,)."""
     labels: tuple[str, str] = eqx.field(static=True, default=PLAIN)

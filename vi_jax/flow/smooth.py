@@ -51,8 +51,7 @@ def limited_of(machine: AbstractMachine) -> list[int]:
 
 
 class SmoothMachine(eqx.Module):
-    """A machine during one step. It is smooth, since its modes stay fixed and resting bodies are
-    held."""
+    """A machine during one step: smooth, since its modes are fixed and resting bodies are held."""
 
     machine: AbstractMachine
     modes: Scalars
@@ -87,9 +86,9 @@ def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
 
 
 def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
-    """Return the rate of a state along `flow` while this coordinate keeps its position and velocity
-    if it `rests`: without the part along `push`, or the derivative of `placed`, which need not be
-    linear."""
+    """Return the rate of a state along `flow` with this coordinate at constant position and
+    velocity if it `rests`: without the part along `push`, or by the derivative of the nonlinear
+    `placed`."""
     if coordinate.push is not None:
         taken = jnp.where(rests, -gained(coordinate, state, flow), 0.0)
         return added(flow, (taken,), (push_of(coordinate, state),))

@@ -66,8 +66,7 @@ def crests(
     plan: Plan, sides: list[Side], below: list[Flag], shares: tuple[float, ...], h: Scalar
 ) -> list[tuple[Flag, Scalar]]:
     """Return for each function whether it may have been positive within a step, and the first such
-    place. Functions whose flag `below` is false are skipped. `shares` are the places of the
-    stages."""
+    place. Functions with a false flag in `below` are skipped. `shares` are the stages' places."""
     ends = [stop_gradient((x.begin.x, x.begin.v, x.end.x, x.end.v)) for x in sides]
     values = [stop_gradient(x.within) for x in sides]
     slack = [jnp.asarray(x.slack, h.dtype) for x in sides]
@@ -236,9 +235,9 @@ class First(NamedTuple):
     """The first event of a step."""
 
     crossed: Flag
-    """The step ends beyond an event."""
+    """True if the step ends beyond an event."""
     turned: Flag
-    """There is a turn that matters, which comes before."""
+    """True if a turning point that matters comes before any event."""
     theta: Scalar
     """The place of the event or turn within the step, if there is one."""
     target: Scalar
@@ -340,7 +339,7 @@ def _root(curve: Curve, corrections: int) -> tuple[Scalar, Flag | None]:
 
 def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scalar) -> Flag:
     """Return whether a step of length h may have to end at a turning point of coordinate number k.
-    It is a bound that does not need the place of the turn."""
+    The test is a bound, before the place of the turn is known."""
 
     def bound(stop: RigidStop) -> Scalar:
         gap = stop_gradient(stop.gap)

@@ -46,8 +46,7 @@ class _Due(NamedTuple):
     due: Scalars
     """For each event that is no impact, 1 while it is due, else 0."""
     near: Scalars
-    """For each event that happens from below, 1 if its guard is at zero too and it has not
-    happened."""
+    """For each event that happens from below, 1 if its guard is zero and it has not happened."""
 
 
 def happened(
@@ -379,8 +378,8 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         if path.leaves is not None:
             lane = _released(at, lane, k, path.leaves)
     places = (plan.machine.position(lane.state), *before)
-    # At a switch the field may have an infinite slope (Hertz's damper at first touch), which does
-    # not appear only if derivatives move along with the event.
+    # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
+    # are finite along with the event, but not at a fixed clock.
     fixed = plan.ticks(lane.state) and not switches_of(plan.machine)
     return (_at_fixed_clock(at, lane) if fixed else lane), places
 

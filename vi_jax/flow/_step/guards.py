@@ -47,8 +47,7 @@ class Within(NamedTuple):
 
     forces: dict[int, Array]
     """For each coordinate: at rest, the force that pulls the body away from its stop, negative
-    while it is pressed on; if the body is free and slow, its velocity, positive once it has turned;
-    else -1."""
+    while it is pressed on; if it is free and slow, its velocity, positive after a turn; else -1."""
     events: dict[int, tuple[Array, ...]]
     """For each event, the values of each side of its guard (see `AbstractEvent.sides`)."""
     slow: dict[int, Flag]
@@ -216,8 +215,7 @@ def _is_slow(plan: Plan, lane: Lane, k: int, ends: tuple[Rates, Rates], h: Scala
 
 
 def _reaches(stop: RigidStop, here: Rates, h: Scalar) -> Flag:
-    """Return whether a body may get to a stop within the time h, before or after, with this
-    acceleration."""
+    """Return whether a body may get to a stop within ±h, with this acceleration."""
     return -stop.beyond(here.x) <= (jnp.abs(here.v) + 0.5 * jnp.abs(here.a) * h) * h
 
 
@@ -234,7 +232,7 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
 # a lane with this many attempts (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
 
-# A guard above this (a choice) has jumped: it is more than the rounding error at an event.
+# A guard above this share of its size (a choice) has jumped: rounding leaves less at an event.
 JUMPED = 1e-9
 
 # The place of a jump within a step is bisected to this length (in s): a choice.
@@ -267,8 +265,7 @@ class Crossing(NamedTuple):
     coordinate: int | None = None
     """The coordinate that a stop limits."""
     slack: Scalar | None = None
-    """A step may begin or end beyond the event by this rounding error; `None` if positions on it
-    are exact."""
+    """A step may be beyond the event by this rounding; `None` if positions on it are exact."""
     above: Flag | None = None
     """True if the guard has jumped above zero at the start of the step, for example with the clock
     of a new cycle; `None` for a stop."""
@@ -280,7 +277,7 @@ class Crossing(NamedTuple):
     again: Any = None
     """The step was aimed at the event and has to be corrected by δ."""
     sudden: Any = None
-    """True if the guard jumped above zero there; its slope does not locate a jump; or `None`."""
+    """True if the guard jumped above zero there, so that δ has no meaning; `None` if none can."""
     sides: tuple[Side, ...] = ()
     """The smooth functions whose maximum is g, if they were evaluated at stages."""
 
@@ -341,8 +338,7 @@ def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
 
 
 def _with_stages(lane: Lane, c: Crossing, seen: Within) -> Crossing:
-    """Return a stop with its distance at the stages, if that was evaluated; -1 while its body rests
-    on it."""
+    """Return a stop with its distance at the stages, if evaluated; -1 while its body rests."""
     if c.number not in seen.events:
         return c
     begin, end, (values,) = c.begin, c.end, seen.events[c.number]
@@ -421,11 +417,11 @@ def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
 def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
     """Return whether a guard that must have been negative counts now, and `Lane.below` at the
     step's end. A guard that begins at zero and falls counts."""
-    # The end of a search, so close to the surface, is on it too: a cycle is no shorter.
+    # A point that a search left this close to the surface is on it too: no cycle is this short.
     rounding = guard_rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
-    # If the motion began on the surface, which is then behind it, rounding may be all that falls.
+    # If the motion began on the surface, a falling guard may be rounding alone.
     deep = here.v * here.v > 2 * rounding * jnp.maximum(here.a, 0.0)
     falls = falls & ((below == 0) | deep)
     armed = (below > 0) | (here.x < -rounding) | falls

@@ -5,8 +5,8 @@ Each iteration tries one step of one lane:
 - *advance*: the step contains no event and is taken;
 - *aim*: it crosses a stop (or a section of the time clock, or a turning point that matters); it is
   not taken, and the next one is shortened to end there;
-- *land*: the shortened step ends within 1e-9 of the event; the offset of a second-order expansion δ
-  = t* - t moves the state to it, and the jump is applied. Otherwise it is aimed once more.
+- *land*: the shortened step ends within 1e-9 of the event; the offset δ = t* - t of a second-order
+  expansion moves the state to it, and the jump is applied. Otherwise it is aimed once more.
 
 The length of an aimed step is a constant for differentiation, while δ carries dt*/dp. Therefore
 forward and reverse derivatives through an impact are exact (the saltation matrix). After an impact
@@ -110,8 +110,8 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
 
 def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     """Return whether a motion has died out, to rounding, in an equilibrium on the machine's
-    section. Then a step changes nothing, and the cycle lasts twice as long as expected. The motion
-    would meet the section by rounding only, or never."""
+    section. Then a step changes nothing, and the cycle has lasted twice as long as expected. The
+    motion would meet the section by rounding only, or never."""
     old, new = (jtu.tree_leaves(stop_gradient(x)) for x in (lane.state, arrived.state))
     sizes = [1.0] * len(old) if plan.sizes is None else jtu.tree_leaves(plan.sizes)
     slack, cycle = 8 * float(jnp.finfo(arrived.s.dtype).eps), plan.machine.cycle
@@ -175,9 +175,9 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
         return lane.length
     h = stop_gradient(trial.h)
     factor = plan.method.resize(trial.error)
-    # Choices: if its error is too large, a step shrinks at least by 0.7; if it was rejected for
-    # another reason (NaN, for example), by 0.2. A step cut short by an event says little about the
-    # length of the next.
+    # Choices: if its error is too large, a step shrinks to at most 0.7 of its length; if it was
+    # rejected for another reason (NaN, for example), to 0.2. After a step cut short by an event,
+    # the next is at least as long as was proposed before.
     grown = jnp.where(h < lane.length, jnp.maximum(lane.length, h * factor), h * factor)
     shrunk = h * jnp.where(trial.error > 1, jnp.minimum(factor, 0.7), 0.2)
     return jnp.where(taken, grown, jnp.where(rejected, shrunk, lane.length))

@@ -2,8 +2,8 @@
 the transition of a body to rest on a stop.
 
 If a force presses the body on, small impacts follow each other ever faster. Their speeds are a
-geometric series in k, and end in rest after a finite time (chatter): Σ 2 kⁿ V⁻/a = 2 k V⁻ / (a (1 -
-k)). The series is completed at once when its remaining time is short.
+geometric series in k, and end in rest (chatter) after the time Σ 2 kⁿ V⁻/a = 2 k V⁻ / (a (1 - k)).
+The series is completed at once when its remaining time is short.
 """
 
 from typing import NamedTuple
@@ -158,7 +158,7 @@ class _Instant(NamedTuple):
     before: dict[int, Scalar]
     """Their velocities before the impacts."""
     gains: list[list[Scalar]]
-    """Their changes by each other's unit impulse (see `machine.contacts`)."""
+    """Their changes by each other's push (see `machine.contacts`)."""
     landed: dict[int, Flag]
     touches: dict[int, Flag]
     """For each stop, true if its contact is closed."""
@@ -175,7 +175,7 @@ class _Instant(NamedTuple):
 def strike_in_turn(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, Blow]]:
-    """Return as `strike_once`, if stops limit several coordinates, or with contact friction.
+    """Return the results of `strike_once` for stops on several coordinates or with friction.
 
     If bodies touch, an impact on one contact closes the next one at the same instant. The contact
     that closes fastest is struck first; contacts that close equally fast are struck together, which

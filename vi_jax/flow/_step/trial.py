@@ -71,11 +71,11 @@ def release(
     aimed = held & (lane.target == to_release(k))
     met = rising & aimed & (h <= 2 * straight) & near
     # At the start of so short a step the force was all rounding, and may still be: for example that
-    # of a stack released as one, whose bodies separate by what comes later.
+    # of a stack released as one, whose bodies separate later.
     landed = met | aimed & (h <= close)
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
-    # If the force is barely positive, but for long, chords do not converge: bisect.
+    # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > straight, share * place, place)
     # Late rather than early by a rounding error, when it would be pressed on again; and no step

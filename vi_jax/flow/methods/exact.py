@@ -90,8 +90,7 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
 def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     """Return a time of free flight in which no stop can be met; 0 if it is not known. A decaying
     mode stays within its amplitude a, and its acceleration within κa. So a parabola bounds the
-    distance to a stop from below. The time is infinite if the sum of all amplitudes does not reach
-    it."""
+    distance to a stop from below. The time is infinite if the amplitudes' sum does not reach it."""
     machine, s, state = stop_gradient((machine, s, state))  # a length has no derivative
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)

@@ -279,8 +279,7 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
 
 
 def _sized_by(state: State, beside: Integrals) -> tuple[State, Integrals]:
-    """Return the numbers that determine the size of a step: state and integrals without elapsed
-    time."""
+    """Return the numbers that determine a step's size: state and integrals without elapsed time."""
     return state, {name: x for name, x in beside.items() if name != TIME}
 
 
@@ -371,8 +370,7 @@ class Adaptive(_RungeKutta):
         return new, after, norm, stages
 
     def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
-        """Return rtol, atol and the least value of both: below rounding, steps would be rejected
-        for ever."""
+        """Return rtol, atol and the floor of both, below which rounding would reject all steps."""
         floor = 8 * float(jnp.finfo(like.dtype).eps)
         rtol = jnp.maximum(jnp.asarray(self.rtol, like.dtype), floor)
         atol = rtol if self.atol is None else jnp.maximum(jnp.asarray(self.atol, like.dtype), floor)
@@ -477,8 +475,8 @@ class FixedStep(_RungeKutta):
 
 class ImplicitSteps(FixedStep):
     """An implicit solver with a fixed number of steps in a cycle, however fast the decay. It is
-    used to follow the branch of a stiff machine. If the stages of a step have no solution, its end
-    is NaN."""
+    used to follow the branch of a stiff machine. A step without a solution of its stages ends as
+    NaN."""
 
     takes_implicit = True
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)

@@ -113,8 +113,8 @@ _JOINED = {
 
 
 # Primitives that are not smooth in some of their operands: the function's name for users, and the
-# operands' positions. A series continues the branch at the start of the step. Comparisons count if
-# something is selected by them.
+# operands' positions. A series continues the branch at the start of the step. A comparison counts
+# only if `select_n` uses it.
 KINKS = {
     "abs": ("abs", slice(None)),
     "max": ("maximum", slice(None)),
@@ -361,9 +361,8 @@ def expand(
     field: Callable[[Scalar, State], State], s: Scalar, state: State, order: int
 ) -> tuple[Any, list[Series]]:
     """Return the solution of d(state)/ds = field(s, state) in powers of s - s0: its tree, and for
-    each leaf a list of `order + 1` coefficients (`None` for zero). **Raises:** `NoSeries` if the
-    field has a primitive without a recursion, `NotSmooth` if a primitive that is not smooth acts on
-    a variable."""
+    each leaf a list of `order + 1` coefficients (`None` for zero). **Raises:** `NoSeries` for a
+    primitive without a recursion, `NotSmooth` for one that is not smooth and acts on a variable."""
     leaves, treedef = jtu.tree_flatten(state)
 
     def flat(s, *leaves):
@@ -441,8 +440,8 @@ class Along(NamedTuple):
 
 
 class _Flow:
-    """A jaxpr evaluated coefficient by coefficient; each equation keeps the series of its operands
-    and results."""
+    """A jaxpr evaluated coefficient by coefficient; equations keep series of operands and
+    results."""
 
     def __init__(self, closed: ClosedJaxpr, inputs: list[Series]):
         self.env: dict[Any, Series] = {}
