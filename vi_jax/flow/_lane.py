@@ -69,7 +69,6 @@ def select(condition: Flag, a: object, b: object) -> Any:
 
 
 def in_place(values: tuple, k: int, value: object) -> tuple:
-    """Return a copy of `values` whose entry k is `value`."""
     return (*values[:k], value, *values[k + 1 :])
 
 
@@ -145,7 +144,6 @@ class Lane(NamedTuple):
         return self._replace(completed=self.completed | when)
 
     def recording(self, **changes: Any) -> "Lane":
-        """Return the lane with fields of its record replaced."""
         return self._replace(record=self.record._replace(**changes))
 
     def noting(
@@ -329,7 +327,6 @@ class Plan(eqx.Module):
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
     def ticks(self, state: State) -> bool:
-        """Return whether `s` itself counts the cycles."""
         return ticks(self.machine, state)
 
     def clock(self, s: Scalar, state: State) -> Scalar:
@@ -361,7 +358,6 @@ class Plan(eqx.Module):
         return with_modes(state, own_modes(self.machine, modes))
 
     def fresh(self, state: State) -> Record:
-        """Return the record of an interval that begins in `state`."""
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
         names = (TIME, *self.averages) if self.timed(state) else self.averages

@@ -516,12 +516,10 @@ _TAKEN = frozenset(
 
 
 def has_averages(machine: AbstractMachine) -> bool:
-    """Return whether a machine defines averages."""
     return is_own(type(machine).averages)
 
 
 def has_quantities(machine: AbstractMachine) -> bool:
-    """Return whether a machine defines functions of its state."""
     return is_own(type(machine).quantities)
 
 

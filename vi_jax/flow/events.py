@@ -27,7 +27,6 @@ class Rates(NamedTuple):
     a: Scalar
 
     def scaled(self, factor: int, offset: Scalar) -> "Rates":
-        """Return the rates of factor·x - offset."""
         return Rates(factor * self.x - offset, factor * self.v, factor * self.a)
 
 

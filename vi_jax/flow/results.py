@@ -206,7 +206,6 @@ def _met(log: Any, number: str) -> Any:
 def run_dataset(
     run: Any, dims: Sequence[str] | None, result: np.ndarray, along: str | None
 ) -> "xr.Dataset":
-    """Return a run as a data set (see `Run.to_xarray`)."""
     batch = batch_names(dims, run.steps.ndim)
     cycle, section = (*batch, "cycle"), (*batch, "section")
     names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
@@ -321,7 +320,6 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 
 def reason_of(reason: Scalar) -> RESULTS:
-    """Return the member of `RESULTS` for a reason as a number."""
     return member_of(RESULTS, jnp.floor(reason))
 
 

@@ -86,9 +86,8 @@ def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
 
 
 def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
-    """Return the rate of a state along `flow` with this coordinate at constant position and
-    velocity if it `rests`: without the part along `push`, or by the derivative of the nonlinear
-    `placed`."""
+    """Return the rate of a state along `flow` with this coordinate's position and velocity constant
+    if it `rests`: without the part along `push`, else by the derivative of `placed`."""
     if coordinate.push is not None:
         taken = jnp.where(rests, -gained(coordinate, state, flow), 0.0)
         return added(flow, (taken,), (push_of(coordinate, state),))

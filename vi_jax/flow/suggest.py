@@ -261,12 +261,10 @@ class _Bench:
         return lambda: jax.block_until_ready(run(numbers, self.nudges))
 
     def follow(self, truth: AbstractMethod) -> None:
-        """Set the method with which others are compared."""
         self.truth, sizes = map(np.asarray, self.program(truth)())
         self.sizes = np.where(sizes > 0, sizes, 1.0).max(axis=0)
 
     def tried(self, method: AbstractMethod, name: str) -> Tried:
-        """Return a method with its error."""
         found, truth = np.asarray(self.program(method)()[0]), self.truth
         apart = np.abs(found - truth) / (self.sizes + np.abs(truth))
         apart = np.where(np.isnan(found) & np.isnan(truth), 0.0, apart)

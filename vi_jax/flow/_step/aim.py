@@ -442,7 +442,6 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
 
 
 def at_a_turn(trial: Trial) -> Flag:
-    """Return whether the step met a turning point that was its target."""
     return any_of(trial.good, (path.at_turn for path in trial.paths))
 
 
@@ -498,7 +497,6 @@ class _Goal(NamedTuple):
 
 
 def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Scalar, Scalar]:
-    """Return the result of `aim_at` for a step that may have met something."""
     h, landed = trial.h, any_of(trial.good, (c.landed for c in trial.crossings))
     first = first_event(plan, lane, seen.guards, seen.courses, landed, corrections=0)
     met = landed | at_a_turn(trial)

@@ -448,7 +448,6 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
 
 
 def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
-    """Return the lane with coordinate number k free, if the step ended at its release."""
     plan, flow, contact = at.plan, at.flow, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)

@@ -96,7 +96,6 @@ def guards_error(
 
 
 def separated(stages: list[Stage]) -> list[Stage]:
-    """Return those stages within a step that are apart from each other."""
     found: list[Stage] = []
     for stage in sorted(stages, key=lambda x: x.share):
         if 0 < stage.share < 1 and (not found or stage.share - found[-1].share >= _APART):

@@ -46,26 +46,22 @@ def nth(series: Series, n: int) -> Coefficient:
 
 
 def plus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """Return the sum a + b of two coefficients."""
     if a is None or b is None:
         return b if a is None else a
     return a + b
 
 
 def minus(a: Coefficient, b: Coefficient) -> Coefficient:
-    """Return the difference a - b of two coefficients."""
     if b is None:
         return a
     return -b if a is None else a - b
 
 
 def times(a: Coefficient, b: Coefficient) -> Coefficient:
-    """Return the product a b of two coefficients."""
     return None if a is None or b is None else a * b
 
 
 def scaled(c: float, a: Coefficient) -> Coefficient:
-    """Return the coefficient a times a number c."""
     return None if a is None else a if c == 1 else a * c
 
 
@@ -419,7 +415,6 @@ class Along(NamedTuple):
         return Along([x, v, a, j, *rest])
 
     def ends(self, h: Scalar) -> tuple[Rates, Rates]:
-        """Return its rates at both ends of a step of this length."""
         slope, zero = _slope(self.series), jnp.zeros_like(h)
         each = self.series, slope, _slope(slope)
 
