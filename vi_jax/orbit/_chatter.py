@@ -1,13 +1,12 @@
-"""The chatter with which a body comes to rest on a stop, and where its rest is lost.
+"""The chatter with which a body comes to rest on a stop, and the loss of its rest.
 
-The hops of a chatter are followed one by one, until one is so slow, compared with the fastest, that
-the body may be put on its stop without rebound: the error of the state is of third order in that
-speed.
+The hops of a chatter are computed one by one until one is slow compared with the fastest. Then the
+body is put on its stop without rebound: the error of the state is of third order in that speed.
 
-The body rests as long as its chatter ends before the stop lets go of it. Near that limit the hops
-are a map with a saddle: of τ, the time left until the release, and ξ = u/(β τ²), with the speed u
-of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest, those
-above it escape (`escape`).
+The body rests if its chatter ends before its release from the stop. Near that limit the hops are a
+map with a saddle. Its variables are τ, the time left until the release, and ξ = u/(β τ²), with the
+speed u of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest,
+those above it escape (`escape`).
 """
 
 from functools import partial
@@ -23,44 +22,44 @@ from ..flow import TIME, Integrals, Rates, force_rate, guard_rates
 from ..machine import RigidStop, push_of, stops_of
 from ._flight import Flight, force_on
 
-# Hops of a chatter at most, and corrections of the landing of each: choices. With restitution 0.95
-# there are 180 hops until a rebound has 1e-4 of the first speed.
+# Most hops of a chatter, and most corrections of the landing of each: choices. With restitution
+# 0.95 a rebound has 1e-4 of the first speed after 180 hops.
 _HOPS, _CORRECTIONS = 400, 7
 
-# A landing is corrected until a correction is less than this share of the hop: the next one would
-# be its square, and what the derivatives are off by is of the order of the last one.
+# A landing is corrected until a correction is below this share of the hop. The next one would be
+# its square; the error of the derivatives is of the order of the last one.
 _CLOSE = 1e-9
 
-# A landing is found if what is missing is less than this share of the hop's height, which is more
-# than so many roundings of the stop's place then: choices.
+# A landing is found if the remaining distance is below this share of the hop's height. That
+# distance must exceed so many roundings of the stop's place. Both are choices.
 _LANDED, _ROUNDINGS = 1e-6, 10
 
-# A hop is the last one if its rebound is slower than this share of the fastest one: its error of
-# third order is rounding then, and its landing is still known to a millionth of its duration.
+# A hop is the last one if its rebound is slower than this share of the fastest. Its error of third
+# order is then rounding, and its landing is accurate to a millionth of its duration.
 _SLOW = 1e-4
 
-# A chatter that takes less than this share of the time until the release ends before it: at the
-# limit it is 0.6, for each restitution. A choice.
+# A chatter shorter than this share of the time until the release ends before it: a choice. At the
+# limit the share is 0.6 for each restitution.
 _OVER = 0.1
 
-# A motion that escapes has this share of (ξ/ξ of the manifold τ²)^(5/6) at least: at the limit it
-# is more than 0.4, with a restitution above 0.4. A choice.
+# An escaping motion has at least this share of (ξ/ξ of the manifold τ²)^(5/6): a choice. At the
+# limit the share is more than 0.4, with a restitution above 0.4.
 _ESCAPES = 0.1
 
 
 class Hops(NamedTuple):
-    """A chatter on its way, right after an impact."""
+    """The state of a chatter just after an impact."""
 
     s: Scalar
     u: Vector
     passed: Integrals
     over: Flag
-    """Whether there is no next impact, or it comes too late."""
+    """True if there is no next impact, or if it comes too late."""
 
 
 def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: int) -> Hops:
-    """The first impact of a chatter whose rebound is slow, or the last one before the clock
-    `until`; `free`, the flight with the body free, `begin`, the first impact."""
+    """Return the first impact of a chatter with a slow rebound, or the last one before the clock
+    `until`; `free` is the flight with the body free, `begin` the first impact."""
     stop = stops_of(free.machine)[number]
     averages = tuple(name for name in begin.passed if name != TIME)
 
@@ -107,13 +106,13 @@ def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: int)
 
 
 def _rates(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Rates:
-    """How far a body is beyond its stop, and the first two derivatives by s, if it is free."""
+    """Return the distance of a body beyond its stop, and two derivatives d/ds, if it is free."""
     guard = partial(stop.guard, free.machine)
     return guard_rates(free.smooth.field, guard, s, free.unravel(u))
 
 
 def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
-    """About how long a hop takes: the force grows evenly."""
+    """Estimate the duration of a hop, with a force that grows linearly."""
     s, u = stop_gradient((s, u))
     here, body = _rates(free, stop, s, u), free.machine.coordinates[stop.coordinate]
     rise = stop.sign * force_rate(free.smooth, body.position, free.smooth, s, free.unravel(u))
@@ -125,7 +124,7 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
 
 
 def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
-    """Return about how long a chatter goes on; infinite where the force pulls the body off."""
+    """Estimate the remaining time of a chatter; infinite if the force pulls the body off."""
     stop = stops_of(free.machine)[number]
     here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
     share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))
@@ -134,13 +133,12 @@ def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
 
 
 def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scalar:
-    """How far the last impact of a chatter is above the stable manifold of the hops: negative where
-    the body comes to rest.
+    """Return how far the last impact of a chatter is above the stable manifold of the hops.
 
-    That is ((ξ/ξ of the manifold)^(5/6) - 1) τ^(5/3). Close to the manifold ln(ξ/ξ of the manifold)
-    grows from hop to hop as τ^-q with q close to 5/3, so that this depends little on the number of
-    hops. Far from it this is not zero where the last impact comes with the release (τ = 0, while
-    ξ τ² is not 0).
+    This is ((ξ/ξ of the manifold)^(5/6) - 1) τ^(5/3), negative if the body comes to rest. Close to
+    the manifold ln(ξ/ξ of the manifold) grows from hop to hop as τ^-q with q close to 5/3, so the
+    result depends little on the number of hops. Far from it the result is not zero if the last
+    impact coincides with the release (τ = 0, while ξ τ² is not 0).
 
     **Arguments:** the flight in which the body rests; the number of its stop; the last impact;
     clock and state of the release.
@@ -163,7 +161,7 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     beta, mu, nu = -first(s, state), second(s, state), -along(second)(s, state)
     left, free = s - hops.s, held.letting_go(stop.coordinate)
     speed = -_rates(free, stop, hops.s, hops.u).v
-    # By y' of the distance y from the stop, along what an impact changes.
+    # Derivative with respect to the speed y' from the stop, along the change by an impact.
     push = push_of(body, state)
 
     def leaves(state: State) -> Scalar:
@@ -183,7 +181,7 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     height = speed / (beta * limit)
     safe = jnp.where((share > 0) & (height > 0), height, 1.0) ** (5 / 6)
     above = safe - jnp.sign(left) * (left**2) ** (5 / 6)
-    # Far from the limit, as of a force that hardly changes then, the manifold is not known.
+    # Far from the limit, as with a nearly constant force, the manifold is not known.
     over = remaining(free, number, hops) < _OVER * left
     above = jnp.where(over, -jnp.abs(above), above)
     above = jnp.where(hops.over, jnp.maximum(above, _ESCAPES * safe), above)
@@ -193,11 +191,12 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
 def _manifold(
     k: Scalar, left: Scalar, M: Scalar, N: Scalar, c: Scalar, p: Scalar, k1: Scalar
 ) -> Scalar:
-    """ξ on the stable manifold of the hops.
+    """Return ξ on the stable manifold of the hops.
 
-    **Arguments:** the restitution at low speeds; the time left until the release; D²F/β and
-    -D³F/β along the rest, with the force F; its derivative by the speed from the stop; that by the
-    place and by what follows the speed; β times the derivative of the restitution by the speed.
+    **Arguments:** the restitution at low speeds; the time left until the release; D²F/β and -D³F/β
+    along the rest, with the force F; the derivative c of F with respect to the speed from the stop;
+    p = c² + the derivative of F along the field's derivative with respect to this speed; β times
+    the derivative of the restitution with respect to the speed.
     """
     s = 1 - stop_gradient(k) ** 0.6
 

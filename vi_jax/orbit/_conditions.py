@@ -1,9 +1,8 @@
-"""Conditions beside the equations of a motion: each frees one number of the machine more.
+"""Conditions added to the equations of a motion; each frees one more parameter of the machine.
 
-With as many of them as there are parameters less one, the motions are a curve again, which
-`_follow.both_ways` follows: `boundary` asks that a motion be special, `continue_orbit` that a
-number of it be held. Numbers of a motion have names; as functions of its unknowns they can be
-differentiated.
+With one condition fewer than parameters, the motions form a curve, which `_follow.both_ways`
+follows. `boundary` requires a special motion, `continue_orbit` a fixed quantity of the motion.
+Quantities of a motion have names and are differentiable functions of its unknowns.
 """
 
 import abc
@@ -29,13 +28,13 @@ from .results import compound
 
 _SECTION = "section_"
 
-# Branches cross for all values of a second parameter if its part of the derivative along the left
-# null vector is no more than this share of the largest: a choice, above what a point is off by.
+# Branches cross for all values of a second parameter if the component of its derivative along the
+# left null vector is at most this share of the largest: a choice, above the error of a point.
 _APART = 1e-6
 
 
 def names_of(problem: Shooting) -> tuple[str, ...]:
-    """The numbers of a motion that these equations tell, those of the machine's own included."""
+    """Return the names of the quantities of a motion, the machine's own included."""
     found = ["y_min", "y_max", "clearance", "duration", "multiplier"]
     if frequency_ratio(problem.machine, jnp.ones(())) is not None:
         found.append("frequency_ratio")
@@ -47,7 +46,7 @@ def names_of(problem: Shooting) -> tuple[str, ...]:
 
 
 def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scalar:
-    """A number, one of `names_of`, of a solution of which `seen` is observed."""
+    """Return a quantity, one of `names_of`, of a solution with the observations `seen`."""
     if name in seen.averages:
         return seen.averages[name]
     if name in ("y_min", "y_max", "duration"):
@@ -79,7 +78,7 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
 def rates_at(
     problem: Shooting, names: tuple[str, ...], x: Vector, direction: Vector
 ) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
-    """Numbers of a motion, and how they change where its unknowns go in a direction."""
+    """Return quantities of a motion, and their derivatives along a direction of its unknowns."""
 
     def values(x):
         seen = problem.observe(x)
@@ -93,24 +92,24 @@ _DOUBLE = 1e-4
 
 
 class AbstractCondition(eqx.Module):
-    """An equation more for a motion."""
+    """An additional equation for a motion."""
 
     @property
     def observes(self) -> bool:
-        """Whether it is an equation of what is observed of the motion."""
+        """True if it is an equation of the quantities observed of the motion."""
         return True
 
     @abc.abstractmethod
     def missing(self, problem: Shooting, x: Vector, seen: Observed, chatters: Hops) -> Scalar:
-        """Return what `x` lacks to meet the condition; `chatters`, those that begin its legs."""
+        """Return the residual of the condition; `chatters` holds those that begin the legs."""
 
     def exchanged(self, problem: Shooting, x: Vector, missing: Vector) -> Vector:
-        """The residual of the motion's own equations, some of them exchanged if need be."""
+        """Return the residual of the motion's own equations, with some replaced if necessary."""
         return missing
 
 
 class Held(AbstractCondition):
-    """A number of the motion, one of `names_of`, has a given value."""
+    """The condition that a quantity of the motion, one of `names_of`, has a given value."""
 
     name: str = eqx.field(static=True)
     value: Scalar
@@ -120,12 +119,12 @@ class Held(AbstractCondition):
 
 
 class HeldMultiplier(AbstractCondition):
-    """The greatest multiplier has a given modulus, as an equation that is smooth where two of them
-    meet on the real axis, as their moduli are not there: a root of the characteristic polynomial of
-    the monodromy matrix, or of that of its second compound (`compound`)."""
+    """The condition that the greatest multiplier has a given modulus: a root of the characteristic
+    polynomial of the monodromy matrix or of its second compound (`compound`). Unlike the moduli it
+    is smooth where two multipliers meet on the real axis."""
 
     value: Scalar
-    """The multiplier, with its sign; of a complex pair its modulus."""
+    """The multiplier, with its sign; for a complex pair the modulus."""
     pair: bool = eqx.field(static=True)
 
     def missing(self, problem, x, seen, chatters):
@@ -135,7 +134,8 @@ class HeldMultiplier(AbstractCondition):
         return jnp.linalg.det(matrix - root * jnp.eye(len(matrix), dtype=matrix.dtype))
 
     def overtaken(self, seen: Observed) -> float:
-        """Negative while the multiplier held is the greatest, or the pair complex; host-side."""
+        """Return a number that is negative while the held multiplier is the greatest, or the held
+        pair is complex and the greatest; host-side."""
         values, value = np.asarray(seen.multipliers), float(self.value)
         if not self.pair:
             others = np.delete(values, np.argmin(np.abs(values - value)))
@@ -149,7 +149,7 @@ class HeldMultiplier(AbstractCondition):
 
 
 def alone(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
-    """The equations and the step in the last parameter only, the others as they are at the step."""
+    """Return equations and step in the last parameter only; the others keep their values."""
     count = len(problem.parameters)
     if not problem.conditions:
         return problem, step
@@ -188,12 +188,12 @@ def held_in_words(problem: Shooting) -> str:
 
 
 class Exchange(eqx.Module):
-    """Another equation in the place of one of a motion's own, where branches of it cross.
+    """A replacement for one equation of a motion where branches of it cross.
 
-    There the equations F(x, p) = 0 from event to event cannot be solved for x: the Jacobian
-    J = ∂F/∂x has a null vector r and a left null vector l. Where branches cross for all values of a
-    second parameter, as those of symmetric and other motions do, l·F = 0 follows from the other
-    equations, and l(x)·∂F/∂p = 0, with the left null vector at x, gives way to it:
+    There the equations F(x, p) = 0 from event to event cannot be solved for x: the Jacobian J =
+    ∂F/∂x has a null vector r and a left null vector l. Let branches cross for all values of a
+    second parameter, as symmetric and other motions do. Then l·F = 0 follows from the other
+    equations. It is replaced by l(x)·∂F/∂p = 0, with the left null vector at x:
 
         F + l (l(x)·∂F/∂p - l·F) = 0.
 
@@ -201,9 +201,9 @@ class Exchange(eqx.Module):
     """
 
     left: Float[Array, " equations"]
-    """l, where the curve begins."""
+    """The vector l at the begin of the curve."""
     right: Float[Array, " equations"]
-    """r, there."""
+    """The vector r there."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
         jacobian, n = jax.jacfwd(problem.lacks)(x), self.left.size
@@ -214,8 +214,9 @@ class Exchange(eqx.Module):
 
 
 def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
-    """The exchange at a motion at which branches cross, by the singular vectors of its Jacobian
-    without the columns of the two parameters; `None` if the second one takes them apart."""
+    """Return the exchange at a motion at which branches cross, from the singular vectors of its
+    Jacobian without the parameters' columns; `None` if the second parameter separates the
+    branches."""
     scale = problem.scale
     jacobian = jacobian_at(problem, x) * scale
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
@@ -225,7 +226,7 @@ def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
 
 
 class Apart(AbstractCondition):
-    """The unknowns have a given component."""
+    """The condition that the unknowns have a given component along a row."""
 
     row: Float[Array, " unknowns"]
     value: Scalar
@@ -237,29 +238,30 @@ class Apart(AbstractCondition):
 class Special(AbstractCondition):
     """The condition that a motion is special.
 
-    With the monodromy matrix M that is det(M - I) = 0 at a fold or where branches cross,
-    det(M + I) = 0 at a period doubling, and where a pair of multipliers leaves the unit circle that
-    the product of two is 1, det(M₂ - I) = 0 with the compound matrix M₂ (see `compound`). M has
-    poles where an impact grazes, which the speeds of approach take away. At a grazing the condition
-    is V⁻ = 0 of the impact that is lost, or a clearance of zero; where a rest is lost that its
-    chatter takes until the release (`escape`), or that the force on the body is zero; where a
-    switch is held no longer, or not yet, that the force at its event is just what holds it.
+    M is the monodromy matrix, with second compound M₂ (`compound`). Factors of the speeds of
+    approach remove the poles of M at grazing impacts.
+
+    - Fold or branch point: det(M - I) = 0. Period doubling: det(M + I) = 0.
+    - Neimark–Sacker bifurcation: det(M₂ - I) = 0, the product of two multipliers is 1.
+    - Grazing: V⁻ = 0 of the lost impact, or a clearance of zero.
+    - Lost rest: the chatter takes until the release (`escape`), or the force on the body is zero.
+    - Sliding: the force at the event of a switch is at the limit of holding it.
     """
 
     kind: str = eqx.field(static=True)
     impact: int | None = eqx.field(static=True)
-    """The event that grazes, or at which a switch is only just held; `None` without one."""
+    """The event that grazes, or at which a switch is at the limit of being held, or `None`."""
     exchange: Exchange | None = None
     speed: Scalar | float = 0.0
-    """V⁻ of that impact, for motions beside a grazing."""
+    """V⁻ of that impact, for motions near a grazing."""
     double: bool = eqx.field(static=True, default=False)
-    """Whether two multipliers are 1 all along a curve of folds, with an eigenvector each, as of
-    equal machines that do not know of each other: det(M - I) is zero twice then, and the condition
-    is that the product of its other factors is, the sum of the principal minors."""
+    """True if two multipliers are 1 all along a curve of folds, with an eigenvector each, as for
+    uncoupled equal machines. Then det(M - I) has a double zero, and the condition is that the
+    product of its other factors, the sum of the principal minors, is zero."""
 
     @property
     def observes(self) -> bool:
-        """False where a rest is lost, or a switch is only just held."""
+        """False for a lost rest, or a switch at the limit of being held."""
         return not (self.kind == REST or (self.kind in SLIDING and self.impact is not None))
 
     def exchanged(self, problem, x, missing):
@@ -285,8 +287,8 @@ class Special(AbstractCondition):
 
 
 def minors(matrix: Array | np.ndarray) -> Array:
-    """The sum of the principal minors of one row less: the product of all eigenvalues but one,
-    where that one is zero, and smooth, unlike them."""
+    """Return the sum of the principal minors of one row less. If one eigenvalue is zero, it is the
+    product of the others, and smooth, unlike them."""
     if len(matrix) == 1:
         return jnp.ones((), matrix.dtype)
     rest = (np.delete(np.arange(len(matrix)), i) for i in range(len(matrix)))
@@ -294,7 +296,8 @@ def minors(matrix: Array | np.ndarray) -> Array:
 
 
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Whether a double multiplier has only one eigenvector, so that a complex pair can arise."""
+    """Return whether a double multiplier has one eigenvector only, as where a complex pair
+    begins."""
     sizes, M = np.asarray(problem.sizes)[1:], step.seen.monodromy
     values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
     return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

@@ -26,7 +26,7 @@ from .special import Point
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
-# An orbit found on the cycle map solves the equations of its branch closer than this: a choice.
+# The corrector moves an orbit of the cycle map by less than this (scaled): a choice.
 _SAME = 1e-3
 
 
@@ -45,7 +45,7 @@ def continue_orbit(
     method: MethodLike = None,
     progress: bool = True,
 ) -> Branch:
-    """Follow a periodic motion in one number of its machine, both ways, through folds.
+    """Follow a periodic motion in one parameter of its machine, both ways, through folds.
 
     Pseudo-arclength on the equations from impact to impact, which stay smooth at a grazing. Special
     points are located to rounding. A branch of motions that rest on a stop ends if the chatter
@@ -56,39 +56,36 @@ def continue_orbit(
     **Arguments:**
 
     - `orbit`: from `find_orbit`, or from another branch.
-    - `parameter`, `bounds`: a number of the machine, such as `"drive.frequency_ratio"` or
+    - `parameter`, `bounds`: a parameter of the machine, such as `"drive.frequency_ratio"` or
       `"stops.0.gap"`, and its interval.
-    - `step`, `max_step`: first and longest step along the branch, in the norm of the unknowns: each
-      number of the state in half its largest modulus along the motion, the clock of each impact in
-      1/2π of a cycle, the parameter in half its interval.
-    - `max_points`: points in each direction at most.
-    - `extrema`: names of numbers whose largest and least values along the branch are located, as
+    - `step`, `max_step`: first and longest step along the branch, in the norm of the scaled
+      unknowns. Scales: half the largest modulus of each component of the state along the motion,
+      1/2π of a cycle for the clock of each impact, half its interval for the parameter.
+    - `max_points`: maximum number of points in each direction.
+    - `extrema`: names of quantities whose largest and least values along the branch are located, as
       special points: `"y_min"`, `"y_max"`, `"clearance"`, `"duration"`, `"frequency_ratio"`,
-      `"fastest_impact"`, `"slowest_impact"`, `"multiplier"` (the greatest modulus), an average of
-      the machine's own, and of the section `"section_Y"` and the like. They need one more compiled
+      `"fastest_impact"`, `"slowest_impact"`, `"multiplier"` (the greatest modulus), the machine's
+      own averages, and quantities on the section such as `"section_Y"`. They need one more compiled
       program.
-    - `watch`: functions of the orbit, by names of your choice, whose zeros along the branch are
-      located as special points of kind `"watched"`:
-      `{"limit": lambda orbit: orbit.impact_speed.max() - 2.0}`.
-    - `free`: further parameters that vary, with the interval of each:
-      `{"stops.0.gap": (1.0, 3.0)}`.
-    - `fixed`: for each of them a property of the motion, one of the names above, that is held:
-      `{"y_min": -3.0}`; `None` holds the orbit's own value. A given value must be near that of the
-      orbit. A property that the free parameters do not change cannot be held (`"y_max"` of a motion
-      that hits its right stop, unless the gap is free). The special point `turn` is one where the
-      parameter turns back; a `fold` is then where a multiplier passes 1. Hopf points are not
-      sought.
+    - `watch`: functions of the orbit, by name. Their zeros along the branch are located as special
+      points of kind `"watched"`: `{"limit": lambda orbit: orbit.impact_speed.max() - 2.0}`.
+    - `free`: additional parameters that vary, with the interval of each: `{"stops.0.gap": (1.0,
+      3.0)}`.
+    - `fixed`: for each of them a quantity of the motion, one of the names above, that is held:
+      `{"y_min": -3.0}`; `None` holds the orbit's own value. A given value must be near the orbit's.
+      The free parameters must change the quantity: `"y_max"` of a motion that hits its right stop
+      can only be held if the gap is free. The parameter turns back at special points of kind
+      `turn`; at a `fold` a multiplier passes 1. Hopf points are not sought.
     - `method`: a method of fixed steps: by default that of the orbit if its steps are fixed, else
       `ExactFlight()` if it applies, else 20 steps of `Verner9` a cycle. An implicit solver, such as
       `Adaptive(diffrax.Kvaerno5())`, then takes equal steps.
-    - `progress`: count the points found, in a terminal or a notebook.
+    - `progress`: whether to count the points found, in a terminal or a notebook.
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` if the orbit was not found, rests on a stop of a machine with a
-    section, `renewed` or friction on a stop, does not list all its impacts, or lies outside the
-    bounds, or if the name is unknown; on Ctrl-C `Interrupted`, whose `partial` is the branch so
-    far.
+    **Raises:** `ValueError` for an unknown name, or an orbit that was not found, does not list all
+    its impacts, lies outside the bounds, or rests on a stop of a machine with a section, `renewed`
+    or friction on a stop. On Ctrl-C `Interrupted`, whose `partial` is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)
@@ -134,7 +131,7 @@ def _check_orbit(orbit: Orbit) -> None:
 
 
 def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
-    """**Raises:** an error unless these free and hold equally many numbers of the orbit."""
+    """Check that these arguments free and hold equally many quantities of the orbit."""
     for argument, given in (("free", free), ("fixed", fixed)):
         if not isinstance(given, Mapping):
             example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
@@ -155,7 +152,7 @@ def _freed(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
-    """The equations with further parameters and as many conditions, the unknowns, the intervals."""
+    """Add parameters and as many conditions; return equations, unknowns and intervals."""
     if not free:
         return _scaled(problem, [bounds]), x, [bounds]
     machine, values, ranges = problem.machine, [], []
@@ -183,14 +180,14 @@ def _freed(
 def _widened(
     problem: Shooting, x: np.ndarray, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
 ) -> Shooting:
-    """The equations with these parameters before their own, and steps for all their intervals."""
+    """Put these parameters before the equations' own, with steps for all their intervals."""
     wide = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
     steps = steps_of(problem.method, wide.corners(ranges), problem.like, cycles_to_fly(problem, x))
     return _scaled(dataclasses.replace(wide, steps=max(problem.steps, steps)), ranges)
 
 
 def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
-    """Names of numbers of a motion. **Raises:** `ValueError` that lists those there are."""
+    """Check names of quantities of a motion; an error lists the known names."""
     known = names_of(problem)
     return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
 
@@ -198,7 +195,7 @@ def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tupl
 def _watched(
     watch: Mapping[str, Callable[[Orbit], float]], orbit: Orbit
 ) -> Mapping[str, Callable[[Orbit], float]]:
-    """Functions by name. **Raises:** `TypeError` for what does not give a number of the orbit."""
+    """Check that each function returns a number of the orbit, else raise `TypeError`."""
     if not isinstance(watch, Mapping) or not all(callable(f) for f in watch.values()):
         raise TypeError(
             "Argument `watch` must map names to functions of an `Orbit`, as "
@@ -212,14 +209,14 @@ def _watched(
 
 
 def _scaled(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
-    """The equations with the sizes of their parameters: half their intervals."""
+    """Set the sizes of the parameters, half the widths of their intervals."""
     widths = jnp.asarray([0.5 * (high - low) for low, high in ranges])
     return dataclasses.replace(problem, widths=widths)
 
 
 def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
-    """The orbit as a solution of its equations from event to event: refined at its parameter, or at
-    a fold across the branch, which takes a program of its own."""
+    """Refine the orbit as a solution of its equations from event to event, at its parameter. At a
+    fold it is refined across the branch instead, which needs another compiled program."""
     start, moved = _refined(problem, x, np.eye(problem.size)[-1])
     if problem.conditions:
         if bool(start.good):
@@ -247,14 +244,15 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
 
 
 def _refined(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step, float]:
-    """The solution in the plane across a tangent at `x`, and how far (scaled) it is from there."""
+    """Return the solution in the plane across a tangent at `x`, and its scaled distance from
+    `x`."""
     start = advance(problem, x, tangent, 0.0)
     moved = float(np.max(np.abs(start.x - x) / problem.scale))
     return start, moved if bool(start.good) else np.inf
 
 
-# A unit tangent (scaled) of a curve has this component along its second parameter at least, if the
-# curve is begun with that kept: a choice.
+# A curve begins in the plane of constant second parameter if its unit tangent (scaled) has at least
+# this component along that parameter: a choice.
 _STEEP = 1e-3
 
 _INSTEAD = (
@@ -275,11 +273,10 @@ def boundary(
 ) -> Boundary:
     """Follow a bifurcation of a branch in a second parameter, both ways.
 
-    Pseudo-arclength on the orbit's equations together with the condition that makes the point
-    special: det(M - I) = 0 for a fold or where branches cross, det(M + I) = 0 for a period
-    doubling, two multipliers whose product is 1 for a Neimark–Sacker bifurcation, V⁻ = 0 or a
-    clearance of zero for a grazing, a chatter that ends at the release or a least force of zero for
-    a rest. Host-side: not to be traced.
+    Pseudo-arclength on the orbit's equations, with the condition of the bifurcation: det(M - I) = 0
+    of a fold or branch point, det(M + I) = 0 of a period doubling, product 1 of two multipliers at
+    a Neimark–Sacker bifurcation. At a grazing it is V⁻ = 0 or a clearance of zero, at a lost rest a
+    chatter that ends at the release or a least force of zero. Host-side: not to be traced.
 
     **Arguments:**
 
@@ -287,14 +284,15 @@ def boundary(
       is the first of the two.
     - `parameter`: name of the second.
     - `bounds`: intervals of the first and of the second parameter.
-    - `step`, `max_step`, `max_points`, `progress`: as for `continue_orbit`, parameters in half
-      their intervals.
+    - `step`, `max_step`, `max_points`, `progress`: as for `continue_orbit`; the scale of a
+      parameter is half its interval.
 
     **Returns:** a `Boundary`, whose `special` are its points of codimension two. It ends where the
     motion changes (another impact grazes, another rest is lost).
 
-    **Raises:** `ValueError` if the point is of another kind, outside the bounds, or the name
-    unknown or the same; on Ctrl-C `Interrupted`, whose `partial` is the curve so far.
+    **Raises:** `ValueError` if the point is of another kind or outside the bounds, or the name is
+    unknown or that of the first parameter. On Ctrl-C `Interrupted` with the curve so far,
+    `partial`.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)
@@ -302,7 +300,7 @@ def boundary(
     ranges = _checked_bounds(point, parameter, bounds)
     problem, x = _special_motion(point, parameter, ranges)
 
-    # Ahead the second parameter rises. Where it hardly does, the tangent takes its own program.
+    # The second parameter rises ahead. If it hardly does, the tangent needs another program.
     start = advance(problem, x, np.eye(x.size)[-2], 0.0)
     if not bool(start.good) or start.tangent[-2] < _STEEP:
         tangent = tangent_at(problem, x)
@@ -338,8 +336,8 @@ def _check_point(point: Point) -> None:
 
 
 def _checked_bounds(point: Point, parameter: str, bounds: Any) -> Intervals:
-    """The intervals of the second parameter and of the point's own, in the order of the unknowns.
-    **Raises:** `ValueError` unless both are intervals that hold the point."""
+    """Return the intervals of the second parameter and of the point's own, in the order of the
+    unknowns; raise `ValueError` unless both are intervals that contain the point."""
     machine, name = point.problem.machine, point.problem.parameters[0]
     check_leaf(machine, parameter)
     if name == parameter:
@@ -358,10 +356,10 @@ def _checked_bounds(point: Point, parameter: str, bounds: Any) -> Intervals:
 
 
 def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Shooting, np.ndarray]:
-    """The equations of the curve with its condition, and the unknowns where it begins."""
+    """Return the equations of the curve with its condition, and its first unknowns."""
     old, start, impact = point.problem, np.asarray(point.step.x), point.impact
     change = change_at(old, point.step) if point.kind in SLIDING else None
-    if change is not None:  # with the part that vanishes it could not be solved for beyond
+    if change is not None:  # with the vanishing part it could not be solved beyond the point
         old, start, impact = without_part(old, point.step, change)
     problem = _widened(old, start, (parameter,), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter

@@ -1,4 +1,4 @@
-"""The cycle map: a state on the section to the state n drive cycles later."""
+"""The cycle map: from a state on the section to the state n drive cycles later."""
 
 import contextlib
 from collections.abc import Callable
@@ -46,10 +46,11 @@ from ..machine import (
 
 
 def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f`, with a derivative that is its Jacobian, taken forward, times the tangent.
+    """Return `f` with a derivative that is its Jacobian, computed in forward mode, times the
+    tangent.
 
-    Only leaves that are being differentiated make columns. Inside of another derivative, as that of
-    an orbit by the implicit function theorem, the columns are few and stay together.
+    The Jacobian has columns for differentiated leaves only. Inside another derivative, such as an
+    orbit's by the implicit function theorem, the columns are few and stay together.
     """
 
     @eqx.filter_custom_jvp
@@ -81,7 +82,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def tied(out: object, args: object) -> Any:
-    """`out`, batched by `vmap` in every leaf as soon as one of `args` is.
+    """Return `out`, batched by `vmap` in every leaf if a leaf of `args` is.
 
     JAX mixes up the axes of a staged custom derivative whose values are batched in other leaves
     than its tangents.
@@ -100,24 +101,24 @@ class CycleMap(eqx.Module):
     """
 
     machine: AbstractMachine
-    """In the phase clock; a `Scene` carries the section phase."""
+    """The machine in the phase clock; a `Scene` carries the section phase."""
     method: AbstractMethod
     cycles: int = eqx.field(static=True)
     rests: bool = eqx.field(static=True)
-    """Whether the body may come to rest on a stop."""
+    """True if the body may come to rest on a stop."""
 
     def __call__(self, state: State) -> State:
-        """The state `cycles` drive cycles after `state`; a `HybridState` for a machine with modes
-        of its own."""
+        """Return the state `cycles` drive cycles after `state`; a `HybridState` for a machine with
+        modes."""
         return _end(self, adopted(self.machine, state))
 
     def residual(self, state: State) -> State:
-        """The mapped state less `state`: zero for a periodic motion."""
+        """Return the mapped state minus `state`, zero for a periodic motion."""
         state = adopted(self.machine, state)
         return jtu.tree_map(lambda a, b: a - b, bare(_end(self, state)), bare(state))
 
     def jacobian(self, state: State) -> Float[Array, "states states"]:
-        """Derivative of the map: the monodromy matrix if `state` lies on a periodic motion.
+        """Return the map's derivative: the monodromy matrix if `state` lies on a periodic motion.
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
         """
@@ -146,28 +147,28 @@ def cycle_map(
 
     **Arguments:**
 
-    - `machine`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or one of your own
+    - `machine`: a `Scene` with an ideal drive (2 states) or a motor (3 states), or another machine
       whose independent variable counts its cycles. A machine in the time clock is observed by the
       angle of its shaft.
     - `cycles`: number of drive cycles n, at least 1; static.
-    - `method`: how the motion is computed: by default by the `"standard"` preset, as in `simulate`,
-      but for a `Scene` with a motor by `Adaptive(Tsit5(), rtol=1e-11)`.
-    - `section`: crank angle of the section (radians) instead of the machine's own, which is 0.
+    - `method`: integration method: by default the `"standard"` preset, as in `simulate`, except
+      `Adaptive(Tsit5(), rtol=1e-11)` for a `Scene` with a motor.
+    - `section`: crank angle of the section (radians); by default the machine's own, which is 0.
 
     **Returns:** a `CycleMap`: call it on a state from `machine.start(...)`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments.
     """
     machine = in_cycle_clock(machine_of(machine))
     if section is not None:
         require("section", section)
         machine = at_section(machine, section)
     usual = preset(machine)
-    if isinstance(usual, FixedStep):  # which errs more than an orbit should
+    if isinstance(usual, FixedStep):  # its errors are too large for an orbit
         usual = Adaptive(diffrax.Tsit5(), rtol=1e-11)
     method = chosen(machine, method, usual)
     method.check(machine)
-    # Tolerances are numbers: another one must not be another program.
+    # Tolerances are numbers: another tolerance must not need another compilation.
     carried: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
@@ -175,7 +176,7 @@ def cycle_map(
 
 
 def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:
-    """A state as a cycle map needs it: floating-point arrays of one type, with its modes."""
+    """Convert a state for a cycle map: floating-point arrays of one type, with its modes."""
     modes, state = modes_of(state), bare(state)
     state = adopt(machine, in_cycle_state(machine, name, state))
     check_reals(name, state)
@@ -193,7 +194,7 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
 
 
 def axes_of(machine: AbstractMachine, state: State) -> int:
-    """Along how many axes a guess is several: how many its position has."""
-    with contextlib.suppress(AttributeError, TypeError, LookupError):  # looked at where it is one
+    """Return the number of batch axes of a guess, the dimension of its position."""
+    with contextlib.suppress(AttributeError, TypeError, LookupError):  # invalid states raise later
         return jnp.ndim(machine.position(bare(state)))
     return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(bare(state))))

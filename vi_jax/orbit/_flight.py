@@ -29,17 +29,18 @@ LANDS, LEAVES = "lands", "leaves"
 
 
 class Event(NamedTuple):
-    """One of the machine's events, met in the course of a periodic motion."""
+    """An event of the machine as it occurs in a periodic motion."""
 
     number: int
-    """Its place among the machine's events, in the order of `events_of(machine)`."""
+    """Its index among the machine's events, in the order of `events_of(machine)`."""
     cycle: int | None = None
-    """The number, from 0, of the cycle of the period that begins with it; `None` if none does."""
+    """The number, from 0, of the cycle of the period that begins with it, or `None`."""
     use: str = ""
-    """Of a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` where a rest ends."""
+    """For a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` at the end of a
+    rest."""
 
     def called(self, machine: AbstractMachine) -> str:
-        """Its name in messages: its own, its side, or its kind and its place among these."""
+        """Return its name for messages: its own, its side, or its kind and its index there."""
         event, events = self.of(machine), events_of(machine)
         if isinstance(event, RigidStop | SoftStop):
             soft = "soft " if isinstance(event, SoftStop) else ""
@@ -55,13 +56,12 @@ class Event(NamedTuple):
 
 
 def section_of(machine: AbstractMachine, cycle: int) -> Event:
-    """The section with which a cycle begins."""
     return Event(section_number(machine), cycle)
 
 
 def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
-    """The guard of an event that ends the flight `before`, in the state before it, zero there and
-    rising; `s` counts from the begin of the period. Of a release it is what pulls the body off."""
+    """Return the guard of an event that ends the flight `before`; it is zero and rising there. `s`
+    counts from the begin of the period. The guard of a release is the force off the stop."""
     if event.use == LEAVES:
         return -force_on(before, event.number, s, state)
     if event.cycle is not None:
@@ -70,7 +70,7 @@ def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
 
 
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
-    """The acceleration by s of a body, if it were free, towards the stop on which it rests."""
+    """Return the acceleration d²/ds² of the resting body towards its stop, if it were free."""
     stop = stops_of(flight.machine)[number]
     field = flight.letting_go(stop.coordinate).smooth.field
     return guard_rates(field, partial(stop.guard, flight.machine), s, state).a
@@ -83,8 +83,8 @@ def on_stop(machine: AbstractMachine, number: int, state: State) -> State:
 
 
 class Flight(eqx.Module):
-    """The motion between two events: du/ds = f(s, u), the machine's field in its modes, which stay
-    as they are; solved with steps of one length by a method of fixed steps."""
+    """The motion between two events: du/ds = f(s, u), the machine's field in constant modes, solved
+    in equal steps by a method of fixed steps."""
 
     machine: AbstractMachine
     modes: Scalars
@@ -92,11 +92,11 @@ class Flight(eqx.Module):
     like: State
     """A state, for its structure."""
     contact: Scalars = ()
-    """Of each coordinate, 1 + i while it rests on stop number i, else 0; empty if none does."""
+    """1 + i for each coordinate that rests on stop number i, else 0; empty if none rests."""
 
     @property
     def smooth(self) -> SmoothMachine:
-        """The machine in its modes, with the bodies held that rest."""
+        """The machine in its modes, with its resting bodies held."""
         return SmoothMachine(self.machine, self.modes, self.contact)
 
     def holding(self, contact: Scalars) -> "Flight":
@@ -112,27 +112,27 @@ class Flight(eqx.Module):
     def step(
         self, s0: Scalar, s1: Scalar, u: Vector, passed: Integrals
     ) -> tuple[Vector, Integrals]:
-        """The state, the time and the integrals beside it, after one step of the method."""
+        """Return the state, and the time and integrals passed, after one step of the method."""
         smooth, state = self.smooth, self.unravel(u)
         beside = carried(smooth, s0, state, passed)
         new, after, _ = self.method.step(smooth, s0, s1, state, beside)
         for number, stop in enumerate(stops_of(self.machine) if self.contact else ()):
-            # A closed form of the flight leaves out what holds the body.
+            # A closed form of the flight leaves out the force that holds the body.
             rests = self.contact[stop.coordinate] == 1.0 + number
             put = on_stop(self.machine, number, new)
             new = jax.tree.map(partial(jnp.where, rests), put, new)
         return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
-        """A function of the flight and of one lane's numbers, as vector code (`lanes.once`)."""
+        """Compute a function of the flight and one lane's inputs as vector code (`lanes.once`)."""
         numbers, rest = eqx.partition(self, eqx.is_array)
         return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
 
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
     ) -> tuple[Vector, Integrals, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
-        """The flight from `u` at clock `s0` to clock `s1`, in equal steps: the state then; time and
-        integrals of these averages; clock and state before each step."""
+        """Integrate from `u` at clock `s0` to clock `s1` in equal steps. Return the final state;
+        time and integrals of `averages`; clock and state before each step."""
         form = prepared(self.machine)
         if form.machine is not self.machine:
             inward = form.inward(self.like)

@@ -1,8 +1,8 @@
-"""The engine that follows curves: one way or both, step by step, until something ends them.
+"""The engine that follows curves, one way or both, step by step, until an event ends them.
 
-What can happen on a curve stands in its table (`Table`). A row of it (`Event`) is a test that is
-positive until it happens. The engine finds the first of the rows that happen within a step; what
-lies beyond that place is no longer the curve, and does not count.
+The table of a curve (`Table`) lists its possible events. A row (`Event`) is a test that is positive
+until the event happens. The engine finds the first event within a step; beyond it the curve is no
+longer valid, and later events do not count.
 """
 
 import abc
@@ -26,73 +26,74 @@ from ._solution import Step, advance, distance_along, located, off_by, on_host
 from ._surgery import halves_apart
 from .special import Point
 
-# Reasons to end that a curve has of itself: Ctrl-C was pressed, or the corrector has no answer.
+# Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
 INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "bounds"
 
-# Stands for the reason to end where a step has led to another curve: it is to be shorter.
+# In place of the reason to end if a step has led to another curve: the step is repeated, shorter.
 SHORTER = "shorter"
 
-# The numbers below are choices where no measurement is given.
-# The tangents of two points close to each other on one curve have at least this product.
+# The numbers below are choices where no measurement is given. The tangents of two points close to
+# each other on one curve have at least this product.
 SAME_CURVE = 0.9
 
-# A step of a curve whose tangent turns by less than 26° (as the walk asks) lies within half that of
-# its first tangent: so far off, as the cosine, it is another curve, beyond a jump of the equations,
-# or another part of this one. Steps no longer than the second are rounding.
+# A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
+# angle of its first tangent. A step with a smaller cosine than this has reached another curve,
+# beyond a jump of the equations, or another part. Steps no longer than the second number are
+# rounding.
 _ASIDE, _TINY = 0.9, 1e-6
 
-# A walk whose steps have to be shorter than this share of the longest stalls. The shortest that the
-# branches of the tests need is 2e-3 of it.
+# A walk stalls if its steps must be shorter than this share of the longest. The branches of the
+# tests need 2e-3 of it at least.
 _SHORTEST = 1e-6
 
-# After a step that had to be cut so many have its length, before they grow again.
+# After a cut, this many steps keep their length before it grows again.
 _STEADY = 3
 
-# What changes within so much of the way to a place changes there, and so does a test that falls to
-# so small a share of what it was: above what tests are off by where equations are singular.
+# A test has changed its sign at a place if it does so within this share of the way to it, or falls
+# to this share of its first value: above the errors of tests near singular equations.
 _SHORT, _NOISE = 1e-4, 1e-3
 
-# Points whose states twice the steps change by more than this, if no more are allowed, are warned
-# of: of a motor whose crank slowed to a fifth, with the steps of its first motion, it was 0.07.
+# A warning is given for points whose states change by more than this with twice the steps, if more
+# are not allowed. For a motor whose crank slowed to a fifth, with its first steps, it was 0.07.
 _WRONG = 1e-8
 
-# A curve begins at the zero of a test that has this share of what it has a step further on.
+# A curve begins at the zero of a test that is at most this share of its value a step further on.
 _BEGINS = 1e-7
 
-# A walk that stalls this close to a bound (in the parameter's scale) is taken to it: a few times
-# what the shortest of its steps leave.
+# A walk that stalls this close to a bound (in the parameter's scale) is extended to it: a few times
+# the rest that its shortest steps leave.
 _STALLED_AT = 1e-6
 
 
 class Ending(NamedTuple):
-    """Where a curve ends."""
+    """The end of a curve."""
 
     last: Step
     reason: str
     point: Point | None = None
-    """The special point that it ends at, if it is one."""
+    """The special point at the end, if it is one."""
     until: Step | None = None
-    """Up to where other things on the curve can be told, if not up to `last`."""
+    """The step up to which other events on the curve are found, if not `last`."""
 
 
 class Event(NamedTuple):
-    """A row of a curve's table: what ends it."""
+    """A row of a curve's table: an event that may end the curve."""
 
     test: Callable[[Step], float]
-    """Positive as long as it has not happened."""
+    """Positive until the event happens."""
     ending: Callable[[Step], Ending | None]
-    """How the curve ends at the place where the test is zero; `None` if it does not."""
+    """Return how the curve ends at the zero of the test; `None` if it does not end."""
     locate: Callable[[Step, Step], Step | None] | None = None
-    """That place between two points; by default the zero of a smooth test (`located`)."""
+    """Locate the event between two points; by default as the zero of a smooth test (`located`)."""
     noise: float = 0.0
-    """What lies below zero by no more than this is zero to rounding."""
+    """A negative value of at most this modulus is zero to rounding."""
 
 
 class Table(abc.ABC):
-    """The equations of a curve, and what can happen on it, with the intervals of its parameters."""
+    """The equations of a curve, its possible events, and the intervals of its parameters."""
 
     symmetric: bool = False
-    """Whether a motion can become its own image, or cease to be it."""
+    """True if a motion can become its own image, or cease to be it."""
 
     def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
         self.problem, self.bounds = problem, bounds
@@ -104,10 +105,10 @@ class Table(abc.ABC):
 
     @abc.abstractmethod
     def ends(self, here: Step, new: Step) -> list[Event]:
-        """The rows for a step between two points."""
+        """Return the rows for a step between two points."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
-        """The point at this length along the tangent."""
+        """Return the point at this length along the tangent."""
         new = advance(self.problem, x, tangent, length)
         gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
         aside = gone > _TINY and not abs(length) >= _ASIDE * gone
@@ -117,20 +118,21 @@ class Table(abc.ABC):
         return located(self.problem, here, new, test)
 
     def images(self, step: Step) -> np.ndarray:
-        """How far a motion is from being its own image; empty if it cannot be."""
+        """Return the difference of a motion from its own image; empty if it cannot be symmetric."""
         return halves_apart(self.problem, step, mirrored=True) if self.symmetric else np.zeros(0)
 
     def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
-        """What happens between two points without ending the curve, in its order."""
+        """Return the events between two points that do not end the curve, in order."""
         return []
 
     def stalled(self, steps: list[Step]) -> Ending:
-        """How a curve ends that the corrector follows no further."""
+        """Return how a curve ends if the corrector cannot follow it further."""
         return Ending(steps[-1], STALLED)
 
 
 def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
-    """The settings of a walk. **Raises:** `ValueError` or `TypeError` that names the wrong one."""
+    """Return the settings of a walk; raise `ValueError` or `TypeError` with the name of a wrong
+    one."""
     return {
         "step": given_number("step", step, low=0.0, open_low=True),
         "max_step": given_number("max_step", max_step, low=0.0, open_low=True),
@@ -147,8 +149,10 @@ def both_ways(
     progress: bool,
     settings: dict[str, Any],
 ) -> Any:
-    """The curve through a point, followed ahead and back, a new table for each way; `result` makes
-    it of the fields of a `Curve` and its `special` points, `what` it is called.
+    """Follow the curve through a point ahead and back, with a new table for each way.
+
+    **Arguments:** `result` makes the result from the fields of a `Curve` and its `special` points;
+    `what` is its name in messages.
 
     **Raises:** on Ctrl-C `Interrupted`, with the result so far.
     """
@@ -179,15 +183,13 @@ def both_ways(
 
 
 class _Walk:
-    """One of the two ways along a curve, from its first point."""
-
     def __init__(self, table: Table, start: Step):
         self.table, self.steps, self.end = table, [start], INTERRUPTED
         self.special: list[Point] = []
-        self._vain, self._worst = 0.0, (0.0, 0.0)  # how far off the states are, and where
+        self._vain, self._worst = 0.0, (0.0, 0.0)  # error that more steps leave; largest, and where
 
     def follow(self, tell: Tell, *, step: float, max_step: float, max_points: int) -> str:
-        """Walk on, in the sense of the first point's tangent; why it ended."""
+        """Walk on in the direction of the first point's tangent; return the reason to end."""
         length, failed, steady, end, points = step, 0, 0, "max_points", 1
         while points < max_points:
             here = self.steps[-1]
@@ -224,17 +226,16 @@ class _Walk:
         return end
 
     def _note(self, step: Step | None, point: Point | None = None) -> None:
-        """Add a point of the curve, and what is special there, if it is."""
+        """Add a point of the curve, and its special point if there is one."""
         self.steps += [] if step is None else [step]
         if point is not None:
             self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
 
     def _first(self, here: Step, new: Step) -> Ending | None:
-        """The first of the rows that happen between two points.
+        """Return the first event between two points.
 
-        One is looked for where its test has changed its sign, and then again on the way there: a
-        test may have changed it back, since beyond the first place the curve is no longer one of
-        the machine's.
+        An event is located if its test has changed sign, and then again up to the first event.
+        Beyond it the curve is not one of the machine's: a test may have changed sign twice there.
         """
         rows = [(row, row.test(here)) for row in self.table.ends(here, new)]
         for row, begin in rows:
@@ -257,7 +258,7 @@ class _Walk:
             ending = None if at is None else row.ending(at)
             if ending is None:
                 continue
-            # What falls together with the first one is not looked for, nor what comes later.
+            # Later events, and those that coincide with the first one, are not located.
             first = ending
             length = (1 - _SHORT) * distance_along(self.table.problem, here, first.last)
             end = self.table.advance(here.x, here.tangent, length)
@@ -265,8 +266,8 @@ class _Walk:
                 return first
 
     def _stalled(self, last: Step) -> Ending:
-        """How the curve ends where the corrector has no answer: at a bound right ahead beyond which
-        its machine has another form, as with a restitution of 0 or 1, or as its table says."""
+        """Return how the curve ends if the corrector fails: at a bound right ahead beyond which the
+        machine has another form, as with a restitution of 0 or 1, or as the table defines."""
         table, axes = self.table, np.eye(len(last.x))
         for i, ends in enumerate(table.bounds, -len(table.bounds)):
             for bound in ends:
@@ -278,12 +279,13 @@ class _Walk:
         return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
-        """Give the flights more steps where only the motion tells how many; whether it did."""
+        """Refine the steps of the flights if they depend on the motion; return whether they
+        changed."""
         table = self.table
         if not sized_by_motion(table.problem):
             return False
         off = off_by(table.problem, new.x)
-        if off > max(COARSE, 10 * self._vain):  # it is rounding what more steps do not change
+        if off > max(COARSE, 10 * self._vain):  # otherwise rounding
             better = finer(table.problem, new.x, off)
             if better is not None:
                 table.problem = better
@@ -293,7 +295,7 @@ class _Walk:
         return False
 
     def _resize(self, new: Step) -> None:
-        """Take the sizes of a motion that has become twice as large as it was anywhere."""
+        """Adopt the sizes of a motion that has become twice as large as before."""
         table, before = self.table, self.table.scale
         larger = grown(table.problem, new.seen.largest)
         if larger is None:
@@ -314,7 +316,7 @@ class _Walk:
 
 
 def _falls(row: Event, begin: float, new: Step) -> bool:
-    """Whether a test is zero at a point, to rounding, and falls from there."""
+    """Return whether a test is zero at a point, to rounding, and falls from there."""
     if begin > row.noise:
         return False
     end = row.test(new)
@@ -332,7 +334,7 @@ def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[S
 
 
 def bounds_of(table: Table) -> list[Event]:
-    """The rows of a table that end a curve at the bounds of its parameters."""
+    """Return the rows of a table that end a curve at the bounds of its parameters."""
 
     def row(i: int, bound: float, sense: float) -> Event:
         def left(step: Step) -> float:
@@ -347,21 +349,22 @@ def bounds_of(table: Table) -> list[Event]:
     return [row(i, *at) for i, (low, high) in places for at in ((low, 1.0), (high, -1.0))]
 
 
-# The same motion is met again within this (scaled), in a direction that is the same within that:
-# choices, ten thousand times what the corrector leaves, and far less than two passages differ by.
+# A motion within this distance (scaled), in a direction within the second number, is the same one
+# again: choices, ten thousand times the corrector's error, and far below the difference of two
+# passages.
 _AGAIN, _ALONG = 1e-7, 1e-2
 
-# A curve is away from its first point, or near it, at so many lengths of its step: a choice.
+# A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
 _NEAR = 2.0
 
 
 class Closing:
-    """Looks at each step of a walk whether the curve has come back to where it was.
+    """A detector of curves that come back to one of their points.
 
-    It has if it passes the plane across one of its points, the first or a later one, at the same
-    motion in the same direction. A curve that only comes close to itself passes that plane
-    elsewhere. The motion may be met again some cycles later, with angles that have made whole
-    turns, or with another of its events as the first one: that is the same motion.
+    A curve has come back if it passes the plane across one of its points, the first or a later one,
+    at the same motion in the same direction. A curve that only comes close to itself passes that
+    plane elsewhere. The same motion may reappear some cycles later, with angles that have made
+    whole turns, or with another of its events as the first one.
     """
 
     def __init__(self, table: Table):
@@ -369,14 +372,15 @@ class Closing:
         self.begin([])
 
     def begin(self, points: list[Step]) -> None:
-        """Take these points of the curve as those it came by."""
+        """Set these points as those that the curve has passed."""
         self.points: list[Step] = list(points)
         self.begins, self.cycle = [], 0.0
         if points:
             self._begin_at(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
-        """The rows for a step between two points: one for each place where the curve was before."""
+        """Return the rows for a step between two points, one for each earlier place of the
+        curve."""
         if not self.points:
             self._begin_at(here)
         if not self.points or self.points[-1] is not here:
@@ -386,7 +390,7 @@ class Closing:
         apart = np.linalg.norm((xs - new.x) / self.table.scale, axis=1)
         if apart.max() <= near:
             return
-        away = int(np.flatnonzero(apart > near)[-1])  # from the next one on it is near
+        away = int(np.flatnonzero(apart > near)[-1])  # all later points are near
         met = [self.points[i] for i in np.flatnonzero(apart[: away + 1] <= near) if i]
         places: list[tuple[np.ndarray, np.ndarray, float, Step | None]] = [
             *((x, t, self.cycle, None if i else self.points[0])
@@ -414,7 +418,7 @@ class Closing:
         return float(np.linalg.norm((step.x - begin) / self.table.scale))
 
     def _begin_at(self, first: Step) -> None:
-        """Take unknowns and tangent of the first motion, and of the same one observed otherwise."""
+        """Store unknowns and tangent of the first motion and of its other representations."""
         self.cycle = self._cycle(first)
         scale = self.table.scale
         found = _others_with_rates(self.table.problem, first.x, first.tangent * scale)
@@ -425,21 +429,21 @@ class Closing:
         ]
 
     def _cycle(self, step: Step) -> float:
-        """The length of a cycle by the clock, where motions may be counted from any; else 0."""
+        """Return the length of a cycle by the clock if motions may be counted from any, else 0."""
         problem = self.table.problem
         if not problem.events or problem.autonomous:
             return 0.0
         return float(problem.period(jnp.asarray(step.x))) / problem.cycles
 
     def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
-        """The motion with its first event and its angles nearest to those of another one."""
+        """Shift a motion by cycles and turns so that it is nearest to another one."""
         begin = self._turned(begin, here)
         if cycle:
             begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
         return begin
 
     def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
-        """Motions with their angles at the turns nearest to those of another one."""
+        """Shift the angles of motions by the turns that bring them nearest to another one."""
         problem, xs = self.table.problem, xs.copy()
         angles = angles_in(problem.machine, problem.like)
         if angles is not None:
@@ -451,12 +455,12 @@ class Closing:
 
 @on_host
 def _others_with_rates(problem: Shooting, x, along):
-    """The same motion observed otherwise, each with its derivative along a direction."""
+    """Return the motion's other representations, each with its derivative along a direction."""
     return list(zip(*jax.jvp(partial(_observed_otherwise, problem), (x,), (along,)), strict=True))
 
 
 def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
-    """The same motion from other events on, or without events from its other sections on."""
+    """Return the same motion from other events, or without events from its other sections."""
     if problem.autonomous:
         return []
     clock, states = problem.parts(x)

@@ -1,11 +1,9 @@
-"""The local map of a grazing: what a periodic motion that just touches something does to others
-near it.
+"""The local map of a grazing: the dynamics near a periodic motion that just touches something.
 
-Behind the motion stands its section map without the touch, which is smooth: from one reading of the
-clock, that of the touch, to the next it is a matrix. A neighbour that would pass beyond the stop is
-corrected by the discontinuity mapping. All numbers here are derivatives of what the machine says
-(Nordmark 1991; di Bernardo, Budd, Champneys and Kowalczyk, Piecewise-smooth Dynamical Systems,
-2008, chapters 6 to 8).
+Without the touch the motion has a smooth section map: a matrix from one touch to the next, at fixed
+readings of the clock. The discontinuity mapping corrects neighbours that would pass beyond the
+stop. All numbers here are derivatives of the machine's functions (Nordmark 1991; di Bernardo, Budd,
+Champneys and Kowalczyk, Piecewise-smooth Dynamical Systems, 2008, chapters 6 to 8).
 """
 
 from math import log2
@@ -30,22 +28,22 @@ from .special import Point
 # A field that differs by less than this share of its size is continuous at a switch: a choice.
 _CONTINUOUS = 1e-9
 
-# How far off a touch is located, as a share of the state: a choice, ten times what is promised.
+# Error of the place of a touch, as a share of the state: a choice, ten times the promised one.
 _PLACED = 1e-12
 
-# The first contact lasts so much of a cycle, each further one a quarter of that, at most so many of
-# them. Measured powers that agree within this are settled. Steps of a flight. Choices.
+# Duration of the first contact in cycles; each further contact has a quarter of it; most contacts;
+# measured powers that agree within this have converged; steps of a flight. Choices.
 _SHARE, _TRIES, _AGREE, _STEPS = 0.02, 10, 0.03, 8
 
-# The first contact is so brief that what turns the motion back anyway does most: there a stop gives
-# less than this share of it. A deeper contact with a stiff stop is an impact, with powers of its
-# own. A choice, with which the kick of a spring is right to 1e-3.
+# The first contact is so brief that the stop adds less than this share to the acceleration that
+# turns the motion back anyway. A deeper contact with a stiff stop is an impact, with other powers.
+# A choice, with which the kick of a spring is correct to 1e-3.
 _WEAK = 0.03
 
 
 class Kick(NamedTuple):
-    """By how much an impact changes the state: vector·(-h)^order, at a fixed reading of the
-    clock, h being the least distance that there would be without it."""
+    """The change of the state by an impact: vector·(-h)^order at a fixed reading of the clock, with
+    the least distance h without the impact."""
 
     vector: np.ndarray
     order: float
@@ -55,23 +53,26 @@ def soft_kick(
     problem: Shooting, x: np.ndarray, number: int, leg: int, clock: float, u: np.ndarray,
     gradient: np.ndarray, fast: np.ndarray, rate: float,
 ) -> Kick:  # fmt: skip
-    """The kick of a switch that a motion grazes at this clock in the state u: `gradient` and `fast`
-    are those of the distance h and of dh/ds, `rate` is d²h/ds²."""
+    """Return the kick of a switch that a motion grazes at this clock in the state u.
+
+    **Arguments:** `gradient` and `fast`, the gradients of the distance h and of dh/ds; `rate`,
+    d²h/ds².
+    """
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The field, and what it is more beyond the surface."""
+        """Return the field, and the change of the field beyond the surface."""
         before, after = _fields_beside_surface(problem, x, number, leg, clock, u)
         return before, after - before
 
     def greatest(length: float) -> tuple[float, np.ndarray]:
-        """The root of the depth of a contact of this length, and the state there."""
+        """Return the root of the depth of a contact of this length, and the state there."""
         y = length * np.sqrt(rate / 8)
         return y, u - gradient / (gradient @ gradient) * y * y
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deep) = fields(u), greatest(length)
     push = fields(deep)[1]
-    # A stiff stop pushes by rounding, as far as the place of the touch is known.
+    # A stiff stop pushes by rounding, up to the error of the touch's place.
     known = _PLACED * np.abs(gradient) @ np.abs(u) / y**2
     rounded = max(_CONTINUOUS * np.abs(field).max(), known * np.abs(push).max())
     if np.abs(change).max() > rounded:
@@ -103,7 +104,7 @@ def soft_kick(
     order = round(2 * orders[-1]) / 2 if abs(orders[-1] % 0.5 - 0.25) > 0.2 else orders[-1]
     (y0, k0), (y1, k1) = measured[-2:]
     first, second = k0 / y0 ** (2 * order), k1 / y1 ** (2 * order)
-    # What is left of the first falls by four with the length, as its size does.
+    # The error of the first falls by four with the length, as its size does.
     return Kick(second + (second - first) / 3, order)
 
 
@@ -123,16 +124,16 @@ def _fields_beside_surface(problem: Shooting, x, number: int, leg, s, u):
 
 @on_host
 def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
-    """The state at `s1` and the guard there, in contact or apart."""
+    """Return the state at `s1` and the guard there, in contact or apart."""
     machine = problem.at(x)
-    # A body that just comes in: which mode that is, no rounding is to decide.
+    # The mode must not depend on rounding: at the touch the body just comes in.
     modes = _modes_beside_switch(problem, machine, number, leg, s0, u)[int(touching)]
     end = Flight(machine, modes, problem.method, problem.like).fly(s0, s1, u, _STEPS)[0]
     return end, guard_of(machine, number, s1, problem.unravel(end), modes)
 
 
 def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np.ndarray:
-    """What a contact changes in the state; `deep`, the greatest depth of the free flight."""
+    """Return the change of the state by a contact; `deep` is the free flight's deepest state."""
     from scipy.optimize import brentq  # slow to load
 
     unit = problem.radian
@@ -177,37 +178,37 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
 # A turn this near to a stop, as a share of the motion, touches it: as for the special points.
 _TOUCHES = 1e-6
 
-# Touches that are closer than this share of a period are one: the depth of what is between them is
-# then of the order of `_TOUCHES`. A choice.
+# Touches that are closer than this share of a period are one: the depth between them is then of the
+# order of `_TOUCHES`. A choice.
 _APART = 1e-3
 
-# How fast a body approaches a stop on which its rebound is differentiated, as a share of the
-# motion's speed: laws that depend on the speed are taken at this one. A choice.
+# Speed of approach, as a share of the motion's, at which rebounds are differentiated: laws that
+# depend on the speed are taken at this one. A choice.
 _SLOW = 1e-8
 
 
 class Touch(NamedTuple):
-    """Where the motion grazes, and what an impact there would do."""
+    """A place where the motion grazes, and the effect of an impact there."""
 
     number: int
     """The event's number among the machine's events."""
     leg: int
-    """The flight in which it lies."""
+    """The flight that contains it."""
     clock: float
     state: np.ndarray
     gradient: np.ndarray
-    """∂h: of the distance by the state."""
+    """∂h, the distance's derivative with respect to the state."""
     rate: float
     """a = d²h/ds², positive."""
     slope: float
-    """Of the least distance by the parameter, along the motion."""
+    """Derivative of the least distance with respect to the parameter, along the motion."""
     kick: Kick
-    """What the state loses by an impact, by the depth."""
+    """The change of the state by an impact, as a function of the depth."""
 
 
 @on_host
 def _rooms(problem: Shooting, x):
-    """Distance and clock of each turn; (legs, events, steps) each."""
+    """Return distance and clock of each turn; (legs, events, steps) each."""
     machine = problem.at(x)
     clock, states = problem.parts(x)
 
@@ -226,8 +227,8 @@ def _rooms(problem: Shooting, x):
 def touched(
     problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
 ) -> list[tuple[int, int, float]]:
-    """Event, leg and clock of each touch of a motion that goes as far as `length`, each once. The
-    one that is known may fall on the end of a flight, where no turn is seen."""
+    """Return event, leg and clock of each touch of a motion of extent `length`, each once. The
+    known touch may fall on the end of a flight, where no turn is found."""
     (rooms, places), period = _rooms(problem, x), float(problem.period(x))
     leg, within = problem.leg_at(x, clock)
     found = [(number, int(leg), float(within))]
@@ -245,7 +246,7 @@ def touched(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """At a touch the state, ∂h, a, dh by the parameter, the gradient of dh/ds, and the kick."""
+    """Return the state, ∂h, a, dh/dparameter, the gradient of dh/ds, and the kick, at a touch."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
@@ -281,7 +282,7 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
 def touch_at(
     problem: Shooting, x: np.ndarray, along: np.ndarray, number: int, leg: int, clock: float
 ) -> Touch:
-    """All about one touch; `along`, the derivative of the motion by the parameter."""
+    """Return one touch; `along` is the derivative of the motion with respect to the parameter."""
     event = events_of(problem.machine)[number]
     u, gradient, rate, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
@@ -302,39 +303,39 @@ def touch_at(
     return Touch(number, leg, clock, u, gradient, float(rate), float(slope), kick)
 
 
-# A branch that is this steep in its parameter (share of a unit step in scaled unknowns) turns back.
+# A branch this steep in its parameter (share of a unit step in scaled unknowns) turns back.
 _STEEP = 1e-6
 
 
 class LocalMap(eqx.Module):
-    """z ↦ N (z + kick·(-h)₊^order), h = slope·(p - p*) + ∂h·z: neighbours of a grazing motion, by
-    how far they are from it where it grazes.
+    """The map z ↦ N (z + kick·(-h)₊^order), h = slope·(p - p*) + ∂h·z, of neighbours of a grazing
+    motion, with their displacement z from it at the touch.
 
-    A motion that grazes several times in its period has such a map for each touch; one leads to the
-    next. Arrays of the host; m touches, n states.
+    A motion that grazes several times in its period has such a map for each touch, from which it
+    leads to the next. Host arrays; m touches, n states.
     """
 
     matrices: np.ndarray
     """N, from each touch to the next; (m, n, n)."""
     gradients: np.ndarray
-    """∂h at each; (m, n)."""
+    """∂h at each touch; (m, n)."""
     kicks: np.ndarray
-    """(m, n)."""
+    """The vector of each kick; (m, n)."""
     orders: np.ndarray
-    """Of the depth: 1/2 for a rigid stop; (m,)."""
+    """The power of the depth in each kick, 1/2 for a rigid stop; (m,)."""
     slopes: np.ndarray
-    """Of h by the parameter; (m,)."""
+    """Derivative of h with respect to the parameter; (m,)."""
 
     @property
     def matrix(self) -> np.ndarray:
-        """Over the whole period, from the first touch on."""
+        """The matrix of the whole period, from the first touch on."""
         product = np.eye(self.matrices.shape[1])
         for N in self.matrices:
             product = N @ product
         return product
 
     def later(self, u: np.ndarray, count: int) -> np.ndarray:
-        """∂h·Nⁿ·u, n = 1 … count."""
+        """Return ∂h·Nⁿ·u, n = 1 … count."""
         found, matrix = [], self.matrix
         for _ in range(count):
             u = matrix @ u
@@ -342,41 +343,41 @@ class LocalMap(eqx.Module):
         return np.array(found)
 
     def entries(self, count: int) -> np.ndarray:
-        """e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: what a penetration to the depth one
-        adds to the distance n periods later."""
+        """Return e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: the change of the distance n
+        periods after a penetration of depth one."""
         return self.later(self.kicks[0], count)
 
     def passages(self, n: int) -> np.ndarray:
-        """What one impact of depth one in n periods leaves of the distance at the passages between
-        its impacts, which must be positive: ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1."""
+        """Return ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1: the distances between the impacts of
+        a motion with one impact of depth one in n periods. They must be positive."""
         power = np.linalg.matrix_power(self.matrix, n)
         found = self.later(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
         return found[:-1] - found[-1]
 
     def resonance(self, n: int, sign: int) -> float:
-        """Zero where a curve of folds (`sign` 1) or doublings (-1) of the motion with one impact in
-        n periods leaves the curve of grazings: ∂h adj(±I - Nⁿ) Nⁿ kick. With two numbers in the
-        state that is eₙ."""
+        """Return ∂h adj(±I - Nⁿ) Nⁿ kick, which is eₙ for two components of the state. It is zero
+        where a curve of folds (`sign` 1) or doublings (-1) of the motion with one impact in n
+        periods leaves the curve of grazings."""
         power, unit = np.linalg.matrix_power(self.matrix, n), sign * np.eye(len(self.matrix))
         kicked = np.outer(power @ self.kicks[0], self.gradients[0])
         return float(np.linalg.det(unit - power + kicked) - np.linalg.det(unit - power))
 
 
 class Section(NamedTuple):
-    """The section of the smooth motion, beside the place where it grazes first."""
+    """The section of the smooth motion near its first grazing."""
 
     state: np.ndarray
     slope: np.ndarray
-    """Of the state by the parameter."""
+    """Derivative of the state with respect to the parameter."""
     matrix: np.ndarray
-    """From the first touch, whose kick is done, to the next section."""
+    """The matrix from just after the first touch's kick to the next section."""
 
 
 class Graze(NamedTuple):
-    """A grazing, as its local map says it."""
+    """A grazing with its local map."""
 
     problem: Shooting
-    """Of the motion without the touch."""
+    """The equations of the motion without the touch."""
     x: np.ndarray
     touches: list[Touch]
     map: LocalMap
@@ -384,7 +385,7 @@ class Graze(NamedTuple):
 
 
 def graze_at(point: Point) -> Graze:
-    """The local map of a special point that is a grazing of a stop or a switch."""
+    """Return the local map of a special point that is a grazing of a stop or a switch."""
     problem, x, number, clock = _without_touch(point)
     problem, x = of_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
@@ -398,7 +399,7 @@ def graze_at(point: Point) -> Graze:
     places = touched(problem, x, number, clock, point.step.seen.length)
     touches = [touch_at(problem, x, along, *place) for place in places]
     touches.sort(key=lambda touch: touch.clock % period)
-    touches = touches[-1:] + touches[:-1]  # behind the first one comes the section
+    touches = touches[-1:] + touches[:-1]  # the section follows the first touch
     ends = [
         touch.clock + (np.mod(then.clock - touch.clock, period) or period)
         for touch, then in zip(touches, [*touches[1:], touches[0]], strict=True)
@@ -417,7 +418,7 @@ def graze_at(point: Point) -> Graze:
 
 
 def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
-    """The motion that grazes without the impact that does; the event's number and its clock."""
+    """Return the motion without the grazing impact, the event's number and its clock."""
     if point.kind != "grazing" or not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but is "
@@ -456,13 +457,12 @@ def _carried(problem: Shooting, x, leg, s0, s1):
 
 @on_host
 def _through(problem: Shooting, x, leg):
-    """The saltation matrix of the event that begins a leg."""
     clock, states = problem.parts(x)
     return problem.saltation(problem.at(x), leg, clock[leg], states[leg])[0]
 
 
 def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) -> np.ndarray:
-    """How a perturbation at clock `s0`, in this leg, is carried to a later clock."""
+    """Return the matrix that maps a perturbation at clock `s0` in this leg to a later clock."""
     M, (clock, _, period) = np.eye(problem.states), problem.values(x)
     turn, begin, n = 0.0, s0, leg
     while True:
@@ -480,7 +480,7 @@ def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) 
 
 
 def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) -> Section:
-    """The smooth motion on its first section."""
+    """Return the smooth motion on its first section."""
     period = float(problem.period(x))
     place = period * (np.floor(touch.clock / period) + 1)
     leg, within = problem.leg_at(x, place if problem.events else 0.0)
@@ -493,7 +493,7 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
 
 @on_host
 def _placed(problem: Shooting, x, along, leg, s):
-    """The state on the section at clock `s`, and its derivative by the parameter."""
+    """Return the state on the section at clock `s`, and its derivative along the parameter."""
     turns = jnp.round(s / problem.period(x))  # 0 or 1: the section moves with the period
 
     def placed(x):

@@ -1,5 +1,5 @@
-"""The equations of an orbit from event to event, made from one that was found: of a motion in
-flight (`problem_of`), or of one that rests (`legs_of`)."""
+"""The equations from event to event of an orbit that was found: of a motion in flight
+(`problem_of`), or of one that rests (`legs_of`)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -58,21 +58,21 @@ from .results import Orbit
 
 
 def has_fixed_steps(method: AbstractMethod) -> bool:
-    """Whether a method takes the same steps along the same motion, sized by no tolerance."""
+    """Return whether a method takes the same steps along the same motion, without a tolerance."""
     return not method.adaptive and not np.any(np.asarray(method.wander))
 
 
 def fixed_step_method(
     asked: MethodLike, found_with: AbstractMethod, machine: AbstractMachine
 ) -> AbstractMethod:
-    """A method of fixed steps for the branch of an orbit.
+    """Choose a method of fixed steps for the branch of an orbit.
 
-    **Returns:** the one asked for, if any; else that of the orbit, if its steps are fixed; else
-    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, whose error is 1e-13. Of an
-    implicit solver equal steps. Where the motion paces its own clock, and of such a solver, there
-    are as many steps as it takes (see `problem_of`).
+    **Returns:** the argument, if given; else the method of the orbit, if its steps are fixed; else
+    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, with error 1e-13. For an
+    implicit solver, equal steps. With such a solver, or if the motion paces its own clock, the
+    number of steps is found by refinement (see `problem_of`).
 
-    **Raises:** `ValueError` if the one asked for is explicit and sizes its steps by a tolerance.
+    **Raises:** `ValueError` if the argument is explicit and sizes its steps by a tolerance.
     """
     method = found_with if asked is None else asked
     if isinstance(method, Adaptive) and method.solver.implicit:
@@ -95,8 +95,8 @@ def fixed_step_method(
 def steps_of(
     method: AbstractMethod, machines: list[AbstractMachine], like: State, cycles: int
 ) -> int:
-    """Steps that a flight over so many cycles needs, in the most demanding of the machines."""
-    # Turning points are looked for between steps: more of them than flying needs.
+    """Return the steps of a flight over so many cycles, for the most demanding of the machines."""
+    # Turning points are sought between steps: this needs more steps than the flight itself.
     fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
     return max(method.steps_per_cycle, 16, *fewest) * cycles
 
@@ -104,8 +104,8 @@ def steps_of(
 def longest_leg(
     places: Sequence[float] | np.ndarray, events: Sequence[Event], period: float, cycles: int
 ) -> int:
-    """Cycles for which each leg gets steps: those of the longest leg, rounded up, and one more,
-    since legs grow along a branch; all, where a chatter takes its share of them."""
+    """Return the number of cycles for which each leg gets steps: those of the longest leg, rounded
+    up, plus one, since legs grow along a branch. All cycles if a chatter takes a share of them."""
     if not events or any(event.use == LANDS for event in events):
         return cycles
     longest = float(np.diff([*places, places[0] + period]).max())
@@ -122,30 +122,31 @@ def _fewest(method: AbstractMethod, machine: AbstractMachine, like: State) -> Sc
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
-# Events of a cycle that can be followed, with switches or a section of one's own: a choice.
+# Most events of a cycle that are followed, with switches or a section of the machine: a choice.
 _LISTED = 32
 
-# Twice the steps of a flight change its end by less than this (relative to the motion's size); a
-# motion that asks for more of them than this is followed with so many. The first is the tolerance
-# of `corrected`, the second a choice.
+# Steps are doubled until this changes a flight's end by less than the first (relative to the
+# motion's size; the corrector's tolerance), but not beyond the second (a choice).
 _SETTLED, _MOST = 1e-11, 4096
 
-# Twice the steps of the flights change the states of a point of a curve by less than this: above
-# the corrector's tolerance and below that to which special points are promised.
+# Doubling the steps changes the states of a point of a curve by less than this: above the
+# corrector's tolerance, below the promised accuracy of special points.
 COARSE = 1e-10
 
 
-# Events so close (by the clock) are at one instant; a guard so far from zero is not met: choices.
+# Events this close (by the clock) are simultaneous; a guard this far from zero is no event:
+# choices.
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 
-# A number of the state that is less than the first share of the largest one at events, or less than
-# the second in the whole course of a motion, is taken for as large: choices, the second one above
-# what is left of one that decays to zero. If all are less than the third, 1 is their size, at rest.
+# A component of the state below the first share of the largest one at events, or below the second
+# along the whole motion, gets the size of the largest. Both are choices; the second is above the
+# remainder of a component that decays to zero. If all are below the third, at rest, their size is
+# 1.
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
-# The clock of an event, since the section.
+# The clock of an event, counted from the section.
 Placed = tuple[float, Event]
 
 # The machine's modes in each flight.
@@ -156,8 +157,8 @@ def check_parameter(
     machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str,
     argument: str = "bounds",
 ) -> None:  # fmt: skip
-    """**Raises:** `ValueError` unless the interval of a machine's number holds its value, and the
-    machine is valid with either end of it; `whose`, whose value that is, in words."""
+    """Check that an interval of a parameter contains its value and that the machine is valid at
+    both ends, else raise `ValueError`; `whose` names the owner of the value in the message."""
     low, high = interval
     if not low <= value <= high:
         raise ValueError(
@@ -179,7 +180,7 @@ def check_parameter(
 def problem_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of an orbit from impact to impact, and the unknowns it gives."""
+    """Return the equations of an orbit from impact to impact, and its values of the unknowns."""
     machine = orbit.machine
     carried = fixed_step_method(method, orbit.method, machine)
     corners = [with_leaf(machine, parameter, end) for end in bounds]
@@ -202,7 +203,7 @@ def problem_of(
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
         states, modes = _followed(blank, orbit.state, found, period)
         if np.max(np.abs(states - before) / _sizes(states)) < _SETTLED:
-            break  # the finer one stays: along the branch flights may ask for more
+            break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
@@ -211,7 +212,7 @@ def problem_of(
 
 
 def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
-    """The equations with the sizes of the clock (a cycle is 2π) and of the numbers of the state."""
+    """Set the sizes of the clock (a cycle is 2π) and of the components of the state."""
     _, states, period = problem.values(x)
     sizes = _sizes(states)
     if largest is not None and np.isfinite(largest).all():
@@ -221,7 +222,7 @@ def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> 
 
 
 def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
-    """The equations with the sizes of a motion that has become twice as large; else `None`."""
+    """Return the equations with the sizes of a motion that has doubled, else `None`."""
     before, now = np.asarray(problem.sizes), 0.5 * np.asarray(largest)
     if not (now > 2 * before[1:]).any():
         return None
@@ -230,8 +231,8 @@ def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
 
 
 def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
-    """Half the largest modulus of each number of some states, (…, states); of one that is a small
-    share of the others that of the largest of all, as it may be larger elsewhere."""
+    """Return half the largest modulus of each component of some states, (…, states). A component
+    that is a small share of the others gets the largest of all: it may be larger elsewhere."""
     most = np.abs(np.atleast_2d(states)).max(axis=0)
     largest = most.max() if most.max() > _REST else 1.0
     return 0.5 * np.where(most > small * largest, most, largest)
@@ -240,8 +241,8 @@ def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
 def _check_instants(
     blank: Shooting, found: list[Placed], states: np.ndarray, in_flight: Modes
 ) -> None:
-    """**Raises:** `ValueError` for an event that another one sets off, or the clock as it begins
-    anew: its guard is not zero there, so that the equations have no place for it."""
+    """Raise `ValueError` for an event that another event or the restart of the clock triggers: its
+    guard is not zero there, so that the equations cannot contain it."""
     machine, last = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
         if abs(place - last) <= _SAME_INSTANT and event.cycle is None:
@@ -258,15 +259,16 @@ def _check_instants(
 
 
 def sized_by_motion(problem: Shooting) -> bool:
-    """Whether only the motion tells how many steps it needs, as its pace may be slow anywhere."""
+    """Return whether the number of steps depends on the motion, as its pace may be slow
+    anywhere."""
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
 def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
-    """The equations with as many steps as a solution that is now `off_by` so much asks for, and as
-    exact a method; `None` where more steps change nothing, or are not allowed."""
+    """Return the equations with the steps and the tolerance that a solution needs; `off` is its
+    present `off_by`. `None` if more steps change nothing or are not allowed."""
     more = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
@@ -283,7 +285,7 @@ def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
 def _followed(
     blank: Shooting, state: State, found: list[Placed], period: float
 ) -> tuple[np.ndarray, Modes]:
-    """A motion of one period: the states just before each event and at the end, and the modes."""
+    """Return the states just before each event and at the end of one period, and the modes."""
     machine = blank.machine
     own, state = modes_of(state), bare(state)
     modes = begin_modes(machine, jnp.zeros(()), state, own)
@@ -294,7 +296,7 @@ def _followed(
             u = _carry(blank, modes, s, place, u)
         states.append(np.asarray(u))
         here = blank.unravel(u)
-        if (place, event.cycle) != (0.0, 0):  # after which an orbit's state is
+        if (place, event.cycle) != (0.0, 0):  # an orbit's state is after this event
             here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
@@ -306,7 +308,7 @@ def _followed(
 
 
 def events_in(orbit: Orbit) -> list[Placed]:
-    """The events of a motion, with the clock of each since the section, in their order."""
+    """Return the events of a motion in order, with their clocks since the section."""
     machine, cycles = orbit.machine, int(orbit.cycles)
     autonomous = is_autonomous(machine, bare(orbit.state))
     clock = np.asarray(orbit.impact_phase) - float(phase_at(machine, 0.0))
@@ -320,12 +322,12 @@ def events_in(orbit: Orbit) -> list[Placed]:
         found = listed if others else found
     if section_in(machine, bare(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
-    # What is met with a section belongs to the cycle that ends there.
+    # An event that coincides with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
-    """When each cycle of a motion begins, and its impacts, switches and jumps, by a simulation."""
+    """Simulate a motion; return the begins of its cycles, and its impacts, switches and jumps."""
     machine, cycles = orbit.machine, int(orbit.cycles)
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LISTED + 1)
     assert run.event_log is not None and run.duration is not None
@@ -349,7 +351,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
 
 
 def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, int, int]]:
-    """Of each event of a run the cycle, the clock in it, the `EventKind` and the number."""
+    """Return the cycle, its clock, the `EventKind` and the number of each event of a run."""
     assert run.event_log is not None
     kind, number, clock = (
         np.asarray(a) for a in (run.event_log.kind, run.event_log.number, run.event_log.phase)
@@ -363,19 +365,19 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
 
 @compiled
 def _carry(blank: Shooting, modes, s0, s1, u):
-    """The state at clock `s1`, from the state `u` at `s0`, without an event in between."""
+    """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
     flight = Flight(blank.machine, modes, blank.method, blank.like)
     return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
 
 
-# Events of a cycle that are looked at, and of a period that are followed: choices.
+# Most events of a cycle that are logged, and of a period that are followed: choices.
 _LOGGED, _FOLLOWED = 512, 24
 
-# The state before an event is taken so much earlier (as a share of a cycle): a choice, far above
-# rounding, within what is corrected.
+# The state before an event is taken earlier by this share of a cycle: a choice, far above rounding
+# and within the reach of the corrector.
 _EARLIER = 1e-7
 
-# A hop longer than a fifth of a cycle, the longest step of a simulation, is no part of a chatter.
+# A hop longer than a fifth of a cycle, the longest step of a simulation, is not part of a chatter.
 _SHORT = 5
 
 _INSTEAD = (
@@ -389,8 +391,8 @@ _ON = 1e-9
 def legs_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion that rests on stops, and the unknowns that it gives; bodies chatter
-    one by one, and no switch changes with their hops."""
+    """Return the equations of a motion that rests on stops, and its values of the unknowns. Bodies
+    must chatter one at a time, and no switch may change with their hops."""
     machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
     if is_autonomous(machine, state) or renews(machine) or has_contact_friction(machine):
@@ -427,7 +429,7 @@ def legs_of(
 
 
 def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
-    """The states of a motion at some clocks since its section, (clocks, states)."""
+    """Return the states of a motion at some clocks since its section, (clocks, states)."""
     cycle, found = float(orbit.machine.cycle), []
     sections = np.asarray(in_rows(orbit.sections, 1))
     for clock in clocks:
@@ -441,7 +443,7 @@ def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
 
 @compiled
 def _state_at(machine, method, like, row, own, clock):
-    """The state at a clock within the cycle that begins in the state of a row, in these modes."""
+    """Return the state at a clock in the cycle that begins with these components and modes."""
     unravel = ravel_pytree(like)[1]
     options = RunOptions(method=method, record="sections", rests=True, until=clock)
     start = lambda u: (machine, with_modes(unravel(u), own))
@@ -449,7 +451,8 @@ def _state_at(machine, method, like, row, own, clock):
 
 
 def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
-    """The machine's modes in each leg, from the first state, and clock and state of each event."""
+    """Return the machine's modes in each leg, from the first state and each event's clock and
+    state."""
     machine, start = problem.machine, jnp.zeros(())
     modes = begin_modes(machine, start, bare(state), modes_of(state))
     found = [modes] * problem.legs
@@ -464,7 +467,7 @@ def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) 
 
 
 def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) -> tuple[float, ...]:
-    """Of each coordinate, 1 + i if it is on stop number i without landing or leaving, else 0."""
+    """Return, per coordinate, 1 + i if it always rests on stop number i, else 0."""
     contact, stops = [0.0] * len(machine.coordinates), stops_of(machine)
     moves = {stops[event.number].coordinate for event in events if event.use}
     row, unravel = ravel_pytree(state)
@@ -479,10 +482,10 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
 
 
 def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> list[Placed] | None:
-    """The events of a period that begins with a release, if there is one, without the hops of its
-    chatters, from clock, kind and number of each; `None` where a rest has no impact before it."""
+    """Return the events of a period without the hops of its chatters, from the clock, kind and
+    number of each. It begins with a release, if any. `None` if a rest has no impact before it."""
     for number in {n for *_, n in log}:
-        # A body that its stop lets go of on the section itself begins the motion as one in flight.
+        # A body released on the section itself begins the motion as one in flight.
         kinds = [kind for _, kind, n in log if n == number]
         rests = [kind for kind in kinds if kind != EventKind.impact]
         lands = kinds[0] == EventKind.impact and bool(rests)
@@ -502,7 +505,7 @@ def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> 
         elif kind == EventKind.release:
             found.append((clock, Event(number, use=LEAVES)))
             resting.discard(number)
-        elif number not in resting:  # else it begins on its stop in the section
+        elif number not in resting:  # else it begins on its stop at the section
             resting.add(number)
             begin = len(found)
             while begin and found[begin - 1][1] == Event(number):

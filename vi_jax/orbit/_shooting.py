@@ -1,11 +1,10 @@
-"""A periodic motion as a smooth system of equations: its events in a given order.
+"""Periodic motions as smooth systems of equations, for a given order of their events.
 
-The cycle map has no derivative where an impact grazes. From event to event it has: with the order
-of the impacts and switches given, the unknowns are the clock and the state at each of them, the
-equations say that the flight from one leads to the next, and nothing has to be detected. Such a
-solution passes smoothly through V⁻ = 0 and through a touch of the stop; on the far side it is a
-motion that the stop forbids, as the sign of V⁻ or of the clearance says. (The same idea carries
-`hspo` of COCO.)
+The cycle map has no derivative at a grazing impact. With the order of impacts and switches given,
+the equations from event to event have one. Their unknowns are the clock and the state at each
+event; the flight from one event must lead to the next, and no event has to be detected. Solutions
+pass smoothly through V⁻ = 0 and through a touch of the stop. On the far side the stop forbids the
+motion; the sign of V⁻ or of the clearance shows this. (`hspo` of COCO has the same idea.)
 """
 
 import itertools
@@ -49,62 +48,64 @@ ROUNDING = 1e-9
 
 
 class Observed(NamedTuple):
-    """What is said about a solution of the equations of an orbit, at one point of a branch."""
+    """Quantities observed of a solution of an orbit's equations, at one point of a branch."""
 
     multipliers: Complex[Array, " states"]
     """Eigenvalues of the monodromy matrix, the largest modulus first."""
     monodromy: Float[Array, "states states"]
-    """Derivative by the state just before the first event of the state a period later."""
+    """Derivative of the state a period later with respect to the state just before the first event.
+    """
     approach: Float[Array, " events"]
-    """V⁻ at each impact, of other events how fast the guard rises; negative beyond its loss."""
+    """V⁻ at each impact, the rate of the guard at other events; negative beyond the event's loss.
+    """
     y_min: Scalar
     """Smallest position of the first coordinate over the period."""
     y_max: Scalar
     nearest: Nearest
-    """Of all its turning points; its `room` is the clearance."""
+    """Over all turning points; its `room` is the clearance."""
     pull: Nearest
-    """Where the force on a body that rests has its least turn; that force is its `room`."""
+    """The least extremum of the force on a resting body; its `room` is that force."""
     order: Scalar
-    """1 where each switch goes into the mode that is its next one here, else -1."""
+    """1 if each switch changes here to the mode that follows in the order of events, else -1."""
     order_margin: Scalar
-    """How far its events are from coming in another order: the least time between two that follow
-    each other, or the least distance, where one is met, of those that are not met there. Negative
-    where the motion is none of the machine's."""
+    """Margin until the order of events changes: the least time between consecutive events, or the
+    least distance, at an event, to another one that does not occur there. Negative if the machine
+    does not have this motion."""
     duration: Scalar
     """The period in time."""
     averages: dict[str, Scalar]
-    """The machine's own, over the period."""
+    """The machine's averages over the period."""
     largest: Float[Array, " states"]
-    """The largest modulus of each number of the state over the period; NaN where not known."""
+    """The largest modulus of each component of the state over the period; NaN if unknown."""
     escape: Float[Array, " landings"] | None = None
-    """χ of each chatter that ends in a rest: negative as long as it does before its release."""
+    """χ of each chatter that ends in a rest; negative while the chatter ends before the release."""
 
     @property
     def length(self) -> float:
-        """How far the body goes: the scale by which distances are judged; host-side."""
+        """Return the length by which distances are judged, the extent of the motion; host-side."""
         y_min, y_max = float(self.y_min), float(self.y_max)
         return max(y_max - y_min, abs(y_min), abs(y_max))
 
     def admissible(self, events: Sequence[int]) -> bool:
-        """Whether the motion stays inside its stops and approaches these events; host-side."""
+        """Return whether it stays inside the stops and approaches these events; host-side."""
         inside = float(self.nearest.room) >= -ROUNDING * self.length
         slowest = np.asarray(self.approach)[list(events)].min(initial=0.0)
         return bool(inside and slowest >= -ROUNDING * self.fastest)
 
     @property
     def fastest(self) -> float:
-        """How fast events are approached: the scale by which that is judged; host-side."""
+        """The scale of speeds of approach, by which they are judged; host-side."""
         usual = 2 * np.pi * self.length / float(self.duration)
         return max(usual, np.abs(np.asarray(self.approach)).max(initial=0.0))
 
 
-# A hop has the steps of this share of a cycle: the longest one of a chatter (see `legs_of`).
+# A hop has this share of a cycle's steps: the longest hop of a chatter (see `legs_of`).
 _HOP = 0.2
 
-# The number of a leg, which may be traced.
+# The number of a leg; it may be traced.
 Leg = int | Array
 
-# Of an orbit, as numbers of the host or of a program.
+# The unknowns of an orbit, on the host or in a compiled program.
 Unknowns = np.ndarray | Array
 
 
@@ -112,41 +113,43 @@ class Shooting(eqx.Module):
     """The equations of an orbit with given events: multiple shooting from each event to the next.
 
     A *leg* is the motion from just before event i to just before event i + 1: the event's jump Rᵢ,
-    then the flight over the time in between. With sᵢ the clock at event i, uᵢ the state just before
-    it, gᵢ its guard, φ the flow in the modes of the leg and p the parameters, the equations are
+    then the flight over the time in between. Let sᵢ be the clock at event i, uᵢ the state just
+    before it, gᵢ its guard, φ the flow in the modes of the leg and p the parameters. The equations
+    are
 
         φ(Rᵢ(uᵢ); sᵢ → sᵢ₊₁) - uᵢ₊₁ = 0,   gᵢ(sᵢ, uᵢ) = 0,   i = 1 … n, cyclically,
 
-    where after the last event comes the first one a period later. The unknowns, in one vector x,
-    are (s₁ … sₙ, u₁ … uₙ, p). Without events there is one leg, from the state at the clock's zero,
-    and x = (u, p). An autonomous machine's first event is a section, at the clock's zero; its
-    period is an unknown and stands in the place of s₁.
+    and the event after the last is the first one, a period later. The unknowns, in one vector x,
+    are (s₁ … sₙ, u₁ … uₙ, p). Without events there is one leg, from the state at clock zero, and x
+    = (u, p). The first event of an autonomous machine is a section, at clock zero; its period is an
+    unknown and replaces s₁.
     """
 
     machine: AbstractMachine
     method: AbstractMethod
-    """The integrator, one of fixed steps so that what it returns is smooth in its arguments."""
+    """The integrator; its steps are fixed, so that its result is smooth in its arguments."""
     like: State
     """A state, for its structure."""
     cycles: int = eqx.field(static=True)
-    """The period in cycles of the machine."""
+    """The period, in cycles of the machine."""
     events: tuple[Event, ...] = eqx.field(static=True)
-    """In their order; each begins a leg."""
+    """The events in their order; each begins a leg."""
     modes: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     """The machine's modes in each leg."""
     steps: int = eqx.field(static=True)
-    """Steps of the flight of a leg."""
+    """Number of steps of the flight of a leg."""
     parameters: tuple[str, ...] = eqx.field(static=True)
-    """Names of the machine's numbers that are unknowns."""
+    """Names of the machine's parameters that are unknowns."""
     sizes: Any = None
-    """How large the clock and each number of the state are along the motion, (1 + states,): the
-    scales by which differences between motions are judged (see `sized`)."""
+    """Sizes of the clock and of each component of the state along the motion, (1 + states,): the
+    scales of differences between motions (see `sized`)."""
     widths: Any = ()
-    """The sizes of the parameters: half their intervals."""
+    """The sizes of the parameters, half the widths of their intervals."""
     held: tuple[float, ...] = eqx.field(static=True, default=())
-    """Of each coordinate that always rests its `Flight.contact`, of others 0; or empty."""
+    """`Flight.contact` of the coordinates that always rest, 0 for others; or empty."""
     conditions: tuple[Any, ...] = ()
-    """Equations more (`AbstractCondition`), as many as there are parameters less one on a curve."""
+    """Additional equations (`AbstractCondition`); on a curve one fewer than there are parameters.
+    """
 
     @property
     def legs(self) -> int:
@@ -164,7 +167,7 @@ class Shooting(eqx.Module):
 
     @property
     def autonomous(self) -> bool:
-        """Whether the period is an unknown."""
+        """True if the period is an unknown."""
         return is_autonomous(self.machine, self.like)
 
     @property
@@ -175,22 +178,22 @@ class Shooting(eqx.Module):
 
     @property
     def landings(self) -> tuple[int, ...]:
-        """Which of the events begin a chatter that ends in a rest."""
+        """Indices of the events that begin a chatter that ends in a rest."""
         return tuple(i for i, event in enumerate(self.events) if event.use == LANDS)
 
     @property
     def rests(self) -> bool:
-        """Whether a body rests for a part of the motion, or all the time."""
+        """True if a body rests during a part of the motion or all of it."""
         return bool(self.landings or self.held)
 
     @property
     def is_double(self) -> bool:
-        """Whether these are the equations of a curve of double folds (see `Special`)."""
+        """True if these are the equations of a curve of double folds (see `Special`)."""
         return any(getattr(condition, "double", False) for condition in self.conditions)
 
     @property
     def contacts(self) -> tuple[tuple[float, ...], ...]:
-        """Of each leg the contact of each coordinate (`Flight.contact`); empty without rests."""
+        """`Flight.contact` of each coordinate in each leg; empty without rests."""
         if not self.landings:
             return (self.held,) * self.legs
         held, found = list(self.held) or [0.0] * len(self.machine.coordinates), []
@@ -202,18 +205,18 @@ class Shooting(eqx.Module):
         return tuple(found[self.legs :])
 
     def at(self, x: Unknowns) -> AbstractMachine:
-        """The machine with the parameters of `x`."""
+        """Return the machine with the parameters in `x`."""
         machine, x = self.machine, jnp.asarray(x)
         for i, name in enumerate(self.parameters, x.shape[0] - len(self.parameters)):
             machine = with_leaf(machine, name, x[i])
         return machine
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
-        """The machines at the ends of these intervals of the parameters."""
+        """Return the machines at the ends of these intervals of the parameters."""
         return [self.at(jnp.asarray(ends)) for ends in itertools.product(*intervals)]
 
     def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
-        """Clock and state at the start of each leg (before its event)."""
+        """Return clock and state at the start of each leg (before its event)."""
         legs, x = self.legs, jnp.asarray(x)
         if not self.events:
             return jnp.zeros((1,), x.dtype), x[: self.states][None]
@@ -224,23 +227,23 @@ class Shooting(eqx.Module):
         return clock, x[legs:end].reshape(legs, self.states)
 
     def values(self, x: Unknowns) -> tuple[np.ndarray, np.ndarray, float]:
-        """The `parts` and the period of a solution; host-side."""
+        """Return the `parts` and the period of a solution; host-side."""
         clock, states = self.parts(x)
         return np.asarray(clock), np.asarray(states), float(self.period(x))
 
     def lengths(self, x: Unknowns) -> np.ndarray:
-        """How long each leg lasts by the clock; host-side."""
+        """Return the duration of each leg by the clock; host-side."""
         clock, _ = self.parts(x)
         return np.asarray(self.ends(clock, self.period(x)) - clock)
 
     def period(self, x: Unknowns) -> Array:
-        """The period by the clock."""
+        """Return the period by the clock."""
         if self.autonomous:
             return jnp.asarray(x[0])
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
 
     def pack(self, clock: Any, states: Any, x: Any, period: Any = None) -> Vector:
-        """The unknowns, from `parts`, others with the same parameters, and perhaps a period."""
+        """Pack `parts`, the parameters of other unknowns `x` and perhaps a period into unknowns."""
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = clock.at[0].set(period)
@@ -260,7 +263,7 @@ class Shooting(eqx.Module):
         return float(self.sizes[0])
 
     def half_scale(self) -> np.ndarray:
-        """The sizes of the clocks and states of half a period; host-side."""
+        """Return the sizes of the clocks and states of half a period; host-side."""
         half, scale = len(self.events) // 2, self.scale
         end = len(self.events) + max(1, half) * self.states
         return np.concatenate([scale[:half], scale[len(self.events) : end]])
@@ -275,13 +278,13 @@ class Shooting(eqx.Module):
         return tuple(modes[j] for j in range(len(self.modes[0])))
 
     def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
-        """`function(event, *inputs)` for the event that begins a leg, which may be traced."""
+        """Return `function(event, *inputs)` for the event that begins a leg, maybe traced."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
         return jax.lax.switch(which, [partial(function, kind) for kind in kinds], *inputs)
 
     def after(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Vector:
-        """R(u), the state after the event that begins a leg."""
+        """Return R(u), the state after the event that begins a leg."""
 
         def new(event, s, u):
             if event.use == LEAVES:
@@ -293,7 +296,7 @@ class Shooting(eqx.Module):
         return self._each(leg, new, s, u) if self.events else u
 
     def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
-        """g(s, u), which is zero at the event that begins a leg, and rises there."""
+        """Return g(s, u), which is zero and rising at the event that begins a leg."""
 
         before = self.flight(machine, leg - 1)
 
@@ -306,25 +309,25 @@ class Shooting(eqx.Module):
         return jnp.concatenate([clock[1:], clock[:1] + period])
 
     def leg_at(self, x: Unknowns, s: Any) -> tuple[Array, Array]:
-        """The leg in which a clock lies, any number of periods later, and the clock there."""
+        """Return the leg that contains a clock, modulo the period, and the clock there."""
         clock, _ = self.parts(x)
         place = clock[0] + jnp.mod(s - clock[0], self.period(x))
         return jnp.maximum(jnp.searchsorted(clock, place, side="right") - 1, 0), place
 
     def sections(self, x: Vector) -> tuple[Int[Array, " cycles"], Float[Array, " cycles"]]:
-        """Of each section the leg in which it lies, and its clock."""
+        """Return the leg in which each section lies, and the clock of each section."""
         begins = [i for i, event in enumerate(self.events) if event.cycle is not None]
         if begins:
             return jnp.asarray(begins), self.parts(x)[0][jnp.asarray(begins)]
         return self.leg_at(x, self.at(x).cycle * jnp.arange(self.cycles, dtype=x.dtype))
 
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
-        """The flight of a leg; behind the hops of a chatter, if it begins with one."""
+        """Return the flight of a leg; after the hops of the chatter, if the leg begins with one."""
         flight = Flight(machine, self.modes_in(leg), self.method, self.like)
         return flight.holding(self._contact(self.contacts, leg)) if self.rests else flight
 
     def departing(self, machine: AbstractMachine, leg: Leg) -> Flight:
-        """The flight of a leg right behind the event that begins it."""
+        """Return the flight of a leg just after the event that begins it."""
         if not self.landings:
             return self.flight(machine, leg)
         first = [self.contacts[i - (i in self.landings)] for i in range(self.legs)]
@@ -337,7 +340,7 @@ class Shooting(eqx.Module):
         self, machine: AbstractMachine, leg: Leg, begin: Hops, s: Scalar,
         averages: tuple[str, ...] = (),
     ) -> Any:  # fmt: skip
-        """The flight of a leg behind its chatter, to clock `s`, as `Flight.fly` returns it."""
+        """Integrate the flight of a leg after its chatter, to clock `s`; see `Flight.fly`."""
         flight, u = self.flight(machine, leg), begin.u
         for number, lands in self._landing(leg):
             put = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
@@ -348,7 +351,7 @@ class Shooting(eqx.Module):
         return end, passed, path
 
     def _landing(self, leg: Leg) -> list[tuple[int, Array]]:
-        """The stops on which bodies come to rest, and whether one does on each in this leg."""
+        """Return the stops on which bodies come to rest, and for each if one does in this leg."""
         numbers = [event.number if event.use == LANDS else -1 for event in self.events]
         numbers = numbers or [int(x) - 1 for x in self.held]
         return [(n, jnp.asarray(numbers)[leg] == n) for n in sorted(set(numbers) - {-1})]
@@ -357,7 +360,7 @@ class Shooting(eqx.Module):
         self, machine: AbstractMachine, leg: Leg, s: Scalar, until: Scalar, u: Vector,
         averages: tuple[str, ...] = (),
     ) -> Hops:  # fmt: skip
-        """The last impact, before `until`, of the chatter that begins a leg; else its begin."""
+        """Return the last impact before `until` of the chatter that begins a leg, or the begin."""
         hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
             free, begin = self.departing(machine, leg), hops._replace(over=~lands | hops.over)
@@ -367,7 +370,7 @@ class Shooting(eqx.Module):
         return hops
 
     def residual(self, x: Vector) -> Vector:
-        """The left sides of the motion's equations, then those of the conditions."""
+        """Return the left sides of the motion's equations, then those of the conditions."""
         missing, chatters = self._arrivals(x)
         if not self.conditions:
             return missing
@@ -378,12 +381,12 @@ class Shooting(eqx.Module):
         return jnp.concatenate([missing, jnp.stack(more)])
 
     def lacks(self, x: Vector) -> Vector:
-        """The left sides of the motion's own equations: what each leg lacks to end where the next
-        one begins, then the guards; zero for a periodic motion."""
+        """Return the left sides of the motion's own equations, zero for a periodic motion: the
+        difference from the end of each leg to the begin of the next, then the guards."""
         return self._arrivals(x)[0]
 
     def _arrivals(self, x: Vector) -> tuple[Vector, Hops]:
-        """The same, and of each leg the end of the chatter with which it begins."""
+        """Return the same, and the end of the chatter with which each leg begins."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
@@ -402,10 +405,10 @@ class Shooting(eqx.Module):
         return jnp.concatenate([(arrived - after).ravel(), away.ravel()]), begins
 
     def observe(self, x: Vector) -> Observed:
-        """Multipliers, extremes and the distances to grazing of a solution `x`.
+        """Compute multipliers, extremes and the distances to grazing of a solution `x`.
 
-        The monodromy matrix is the product over the legs of a flight's derivative times the
-        saltation matrix of the event that begins it.
+        The monodromy matrix is the product over the legs of the flight's derivative times the
+        saltation matrix of the event that begins the leg.
         """
         machine = self.at(x)
         clock, states = self.parts(x)
@@ -480,13 +483,13 @@ class Shooting(eqx.Module):
                 if met or 1.0 + number in self.contacts[i - 1]:
                     continue
                 room = -guard_of(machine, number, clock[i], state, before, contact)
-                if other.from_below:  # beyond it the motion may be, until it comes from below again
+                if other.from_below:  # if it is beyond zero, it must come from below again first
                     room = jnp.where(room > 0, room, jnp.inf)
                 least = jnp.minimum(least, room)
         return least
 
     def _time_left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
-        """Time from the end of a chatter to the next event, if that is not its release."""
+        """Return the time from the end of a chatter to the next event other than its release."""
         landing = self.events[i]
         if self.events[(i + 1) % self.legs] == landing._replace(use=LEAVES):
             return jnp.full_like(until, jnp.inf)
@@ -496,7 +499,7 @@ class Shooting(eqx.Module):
         self, machine: AbstractMachine, i: int, last: Hops, clock: Array, states: Array,
         period: Scalar,
     ) -> Scalar:  # fmt: skip
-        """χ of the chatter that begins with event number i (see `_chatter.escape`)."""
+        """Return χ of the chatter that begins with event number i (see `_chatter.escape`)."""
         landing, later = self.events[i], (*range(i + 1, self.legs), *range(i))
         j = next(j for j in later if self.events[j] == landing._replace(use=LEAVES))
         s = clock[j] + (period if j < i else 0.0)
@@ -505,9 +508,9 @@ class Shooting(eqx.Module):
         return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
 
     def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
-        """χ of the chatter that begins with the event `landing`, or, if that is `None`, the least
-        force on a body within its rest. Both are zero where a rest is lost. `chatters` holds the
-        last impact of the chatter of each leg."""
+        """Return χ of the chatter that begins with the event `landing`. If that is `None`, return
+        the least force on a body within its rest. Both are zero where a rest is lost. `chatters`
+        holds the last impact of the chatter of each leg."""
         machine, (clock, states), period = self.at(x), self.parts(x), self.period(x)
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
         last = lambda i: jax.tree.map(lambda a: a[i], chatters)
@@ -525,11 +528,11 @@ class Shooting(eqx.Module):
     def saltation(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector
     ) -> tuple[Float[Array, "states states"], Scalar]:
-        """How a perturbation passes the event that begins a leg: the saltation matrix
-        DR + (f⁺ - DR f⁻) ∇g / ġ, with ġ = ∇g·f⁻ + ∂g/∂s; and how fast the event is met.
+        """Return the saltation matrix of the event that begins a leg, and the speed of approach.
 
-        The jump is differentiated where the body is, not put on its stop first (`jump_of`): it is
-        ∇g that says what comes of the time of the event.
+        The matrix DR + (f⁺ - DR f⁻) ∇g / ġ, with ġ = ∇g·f⁻ + ∂g/∂s, maps perturbations across the
+        event. The jump is differentiated where the body is, without moving it onto its stop
+        (`jump_of`): ∇g accounts for the change of the event's time.
         """
         old, new = self.flight(machine, leg - 1).smooth, self.departing(machine, leg).smooth
 
@@ -548,7 +551,7 @@ class Shooting(eqx.Module):
         jacobian = jax.jacfwd(reset)(u)
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
-            # From the section on the clock counts anew, so that what lies along the motion is gone.
+            # The clock restarts at a section, so a perturbation along the motion vanishes.
             goes_on = [float(not event.of(machine).ends_cycle) for event in self.events]
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
         gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
@@ -563,7 +566,7 @@ class Shooting(eqx.Module):
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
 
     def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
-        """1 if the event that begins a leg leads its switch into the mode of the leg; else -1."""
+        """Return 1 if the event that begins a leg puts its switch into the leg's mode, else -1."""
 
         def order(event, s, u):
             if not event.of(machine).holds_mode:
@@ -577,7 +580,7 @@ class Shooting(eqx.Module):
         return self._each(leg, order, s, u)
 
     def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
-        """The state at clock `s`, which lies in leg number `leg`."""
+        """Return the state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)
         s0, s1 = clock[leg], self.ends(clock, self.period(x))[leg]

@@ -1,7 +1,7 @@
-"""Solutions of an orbit's equations along a curve: the corrector, the programs that it needs, the
-places at which a test is zero, and a solution as data.
+"""Solutions of an orbit's equations along a curve: the corrector and its compiled programs, the
+location of zeros of tests, and a solution as data.
 
-A curve is the solutions of n - 1 equations in n unknowns (pseudo-arclength).
+A curve is the set of solutions of n - 1 equations in n unknowns (pseudo-arclength).
 """
 
 import contextlib
@@ -27,39 +27,39 @@ from .root_finders import smallest_solution
 
 Vector = Float[Array, " n"]
 
-# The largest component of a last correction, in scaled unknowns.
+# The largest component of the last correction, in scaled unknowns.
 _TOLERANCE = 1e-11
 
-# Along a curve of double folds one direction changes nothing in the equations to first order: a
-# singular value is zero within this share of the greatest. A choice.
+# On a curve of double folds the equations do not change to first order in one direction: singular
+# values below this share of the greatest are zero. A choice.
 _DOUBLE = 1e-6
 
 
 class Step(NamedTuple):
-    """A point of the curve, as one corrector finds it."""
+    """A point of the curve, as the corrector returns it."""
 
     x: Any
     """The unknowns, the curve's parameter last."""
     tangent: Any
-    """Unit tangent in scaled unknowns, in the sense of the step."""
+    """Unit tangent in scaled unknowns, in the direction of the step."""
     size: Scalar
     """Largest component of the last correction (scaled)."""
     iterations: Int[Array, ""]
-    """Corrections that it took."""
+    """Number of corrections."""
     good: Flag
-    """Whether the corrector converged."""
+    """True if the corrector converged."""
     seen: Any
-    """What is observed there, an `Observed` of arrays of the host."""
+    """Observations of the solution, an `Observed` of host arrays."""
 
 
 def distance_along(problem: Shooting, here: Step, at: Step) -> float:
-    """How far along the first one's tangent the second lies, in scaled unknowns."""
+    """Return the distance from the first step to the second along the first's tangent, scaled."""
     return float(np.dot(here.tangent, (at.x - here.x) / problem.scale))
 
 
 def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: the function compiled, with arrays and floats of the host as arguments and arrays
-    of the host as results, so that what follows costs no dispatch."""
+    """Compile a function whose arguments and results are arrays and floats of the host, so that
+    operations on the results cost no dispatch."""
     program = compiled(function)
 
     @functools.wraps(function)
@@ -72,7 +72,7 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
-    """Derivative and value; unlike `jax.jacfwd`, where loops do not give one value for all."""
+    """Return derivative and value, also where loops make `jax.jacfwd` return several values."""
 
     def along(direction):
         return jax.jvp(function, (x,), (direction,))
@@ -83,8 +83,8 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
 
 @on_host
 def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
-    """As `advance`. Newton's method on the equations and the plane: nothing is close to singular at
-    a fold, since the parameter is one of the unknowns."""
+    """Advance as `advance` does, by Newton's method on the equations and the plane. The parameter
+    is one of the unknowns, so the Jacobian is not close to singular at a fold."""
 
     def equations(y):
         return jnp.concatenate([problem.residual(y * scale), jnp.dot(tangent, y - y0)[None]])
@@ -105,7 +105,7 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
     y0 = x / scale + length * tangent
     start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
-    # One correction more than it takes: the tangent is then that of the solution.
+    # One correction more than needed: the tangent is then that of the solution.
     y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
     along = along / jnp.linalg.norm(along)
     # Rounding may keep the last correction above the tolerance where the curve is steep.
@@ -114,13 +114,14 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
-    """The solution on the plane across a unit tangent, at a length along it from `x` (scaled)."""
+    """Return the solution on the plane across a unit tangent, at `length` along it from `x`
+    (scaled)."""
     return _advanced(problem, x, tangent, problem.scale, float(length))
 
 
 @on_host
 def observe(problem: Shooting, x):
-    """What is observed of a solution: multipliers, extremes, clearance, speeds of approach."""
+    """Compute the multipliers, extremes, clearance and speeds of approach of a solution."""
     return problem.observe(x)
 
 
@@ -131,70 +132,72 @@ def _lacks(problem: Shooting, x):
 
 
 def off_by(problem: Shooting, x: Unknowns) -> float:
-    """How much twice the steps change the ends of the flights, relative to their sizes."""
+    """Return how much doubling the steps changes the ends of the flights, relative to their
+    sizes."""
     finer = dataclasses.replace(problem, steps=2 * problem.steps)
     return float(np.max(np.abs(_lacks(finer, x) - _lacks(problem, x))))
 
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
-    """The unit tangent (scaled) of the solutions through `x`, the last unknown rising."""
+    """Return the scaled unit tangent of the solutions through `x`; its last component is
+    positive."""
     null = np.linalg.svd(jacobian_at(problem, x) * problem.scale)[2]
     tangent = null[-1]
-    if problem.is_double:  # of the plane one direction moves the parameters
+    if problem.is_double:  # one direction of the plane moves the parameters
         tangent = np.linalg.svd(null[-2:, -2:])[0][:, 0] @ null[-2:]
     return tangent * np.copysign(1.0, tangent[-1])
 
 
 @on_host
 def state_at(problem: Shooting, x, leg, s):
-    """The numbers of the state at clock `s` within the leg of this number."""
+    """Return the components of the state at clock `s` within the leg of this number."""
     return ravel_pytree(problem.state_at(x, leg, s))[0]
 
 
 @on_host
 def jacobian_at(problem: Shooting, x):
-    """The derivatives of the equations by all unknowns."""
+    """Return the derivatives of the equations with respect to all unknowns."""
     return _jacobian(problem.residual, x)[0]
 
 
-# How far short of a place that has no solution (as a share of the step) one is looked for: choices.
+# Distances, as shares of the step, to retry before a place without a solution: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
-# Places without a solution after which none closer is looked for: around a place at which the
-# equations are singular, what is left to be told is the rounding of the corrector. A choice.
+# Search no closer after this number of places without a solution: around a singularity of the
+# equations only the corrector's rounding would be resolved. A choice.
 _TRIALS = 5
 
-# How far beside a point where branches cross (by the scaled unknowns) it is looked at: a choice.
+# Distance of samples from a point where branches cross, in scaled unknowns: a choice.
 BESIDE = 1e-3
 
-# At most so many times as far on each side.
+# At most so many times that distance on each side.
 MOST = 8
 
-# A neighbour whose tangent is so many times as far from the middle one as half of them are lies on
-# the curve that crosses: a choice, where equal distances leave 3 at most.
+# A neighbour lies on the crossing curve if its tangent deviates from the median one by more than
+# this multiple of the median deviation: a choice; equal distances give 3 at most.
 _ASTRAY = 10.0
 
-# A zero beside a solution is not further from it (in the parameter's scale): a choice.
+# A zero near a solution is at most this far from it (in the parameter's scale): a choice.
 _CLOSE = 1e-2
 
 
 class NoValueError(ArithmeticError):
-    """A test has no value, because the corrector has no answer there."""
+    """A test has no value, because the corrector did not converge."""
 
 
 class _CloseError(ArithmeticError):
-    """The corrector has had no answer so often that no closer place is to be had."""
+    """The corrector has failed so often that no closer place can be reached."""
 
 
 def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-    """The point between two, along the first one's tangent, at which a test that changes its sign
-    between them is zero; `None` if there is none. `new` may lie on either side of `here`."""
+    """Return the point between two, along the first one's tangent, at which a test that changes its
+    sign between them is zero, or `None`. `new` may lie on either side of `here`."""
     length = distance_along(problem, here, new)
     at: dict[float, Step] = {0.0: here, length: new}
     silent: list[float] = []
 
     def reached(s: float) -> Step:
-        """There, or where there is no answer, as close to where branches cross, right beside."""
+        """Return the solution there; if none, as at crossing branches, the one just before it."""
         step = advance(problem, here.x, here.tangent, s)
         for short in _SHORT_OF:
             if bool(step.good):
@@ -216,7 +219,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
 
     from scipy.optimize import brentq  # slow to load
 
-    # Where the test jumps, or has no value, the closest point to it has to do.
+    # If the test jumps or has no value, use the closest point.
     options: Any = {"xtol": 1e-14, "rtol": 1e-14, "maxiter": 80}
     try:
         if not value(0.0) * value(length) <= 0:
@@ -227,7 +230,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
         return None
     except _CloseError:
         root = silent[-1]
-    # Where branches cross, or a motion shrinks to rest, a point short of it has to do.
+    # At crossing branches, or if a motion shrinks to rest, use a point just before it.
     for short in _SHORT_OF:
         if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
             break
@@ -236,7 +239,7 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
     begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
 
     def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
-        """How far a point is from it; of a test that jumps, the last one before is closest."""
+        """Rank a point by its distance from zero; if the test jumps, prefer the last one before."""
         left = test(place[1])
         return abs(left), bool(left * begin < 0), abs(place[0] - root)
 
@@ -244,14 +247,14 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
 
 
 def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
-    """The solution near one at which a test is zero, by the secant method; `None` without."""
+    """Return the solution near one at which a test is zero, by the secant method, or `None`."""
     found: list[Step] = []
 
     def value(shift: float) -> float:
         step = advance(problem, x, np.eye(x.size)[-1], shift)
         found.append(step)
         if not bool(step.good):
-            raise NoValueError  # else the secant goes on with NaN, fifty times
+            raise NoValueError  # else the secant method continues with NaN, fifty times
         return test(step)
 
     from scipy.optimize import newton  # slow to load
@@ -270,15 +273,15 @@ def crossing(
     problem: Shooting, advance: Callable[[Any, Any, float], Step], here: Step, root: float,
     test: Callable[[Step], float], admits: Callable[[Step, float], bool] = lambda *_: True,
 ) -> Step | None:  # fmt: skip
-    """The point of a curve at which a test is zero, where its equations are singular: where
-    branches cross, or where an impact grazes. `None` if too few points were found, or no zero.
+    """Return the point of a curve at which a test is zero and the equations are singular: where
+    branches cross, or where an impact grazes. `None` with too few points or without a zero.
 
-    Close to it the equations cannot be solved, but the curve passes through it smoothly, so that a
-    polynomial through its neighbours tells where it is, and what the motion is there. Where the
-    curve is found on the near side only, there are more neighbours of that one.
+    The equations cannot be solved close to it, but the curve passes through it smoothly: a
+    polynomial through its neighbours gives the place and the motion there. If the curve is found on
+    the near side only, more neighbours of that side are taken.
 
-    **Arguments:** `root`, about how far the place is along the tangent; `admits`, of a point and
-    its length, whether it belongs to this curve.
+    **Arguments:** `root`, the approximate distance of the place along the tangent; `admits`, a
+    function of a point and its distance that returns whether the point belongs to this curve.
     """
     found: dict[float, Step] = {}
 
@@ -317,21 +320,21 @@ def crossing(
     return here._replace(x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(problem, x))
 
 
-# Impacts of a cycle that are listed, hops of a chatter included: a choice. Others are counted only.
+# Most impacts of a cycle in the list, with hops of a chatter: a choice. Others are only counted.
 _LISTED = 32
 
 
 class Hits(NamedTuple):
-    """The impacts of a motion; of one that rests as the simulator finds them, hops included."""
+    """The impacts of a motion; for one that rests those of a simulation, hops included."""
 
     clock: np.ndarray
-    """Clock of each impact that is listed, since the section."""
+    """Clock of each listed impact, since the section."""
     speed: np.ndarray
-    """V⁻ of each."""
+    """V⁻ of each listed impact."""
     stop: np.ndarray
-    """Number of the rigid stop of each."""
+    """Number of the rigid stop of each listed impact."""
     number: int
-    """How many there are in the period."""
+    """Number of impacts in the period."""
 
 
 @compiled
@@ -341,12 +344,12 @@ def _sections(problem: Shooting, x: Array):
 
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
-    """The states on the sections, leaves (cycles,), and the largest component of the residual."""
+    """Return the states on the sections, leaves (cycles,), and the largest residual component."""
     return _sections(problem, jnp.asarray(x))
 
 
 def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
-    """The state on the first section of a solution, with the machine's own modes."""
+    """Return the state on the first section of a solution, with the machine's own modes."""
     sections = sections_of(problem, x)[0] if sections is None else sections
     modes = problem.modes_in(int(problem.sections(jnp.asarray(x))[0][0]))
     state = jax.tree.map(lambda x: x[0], sections)
@@ -354,13 +357,13 @@ def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> Sta
 
 
 def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
-    """The impacts of a solution, whose state on the section may be known."""
+    """Return the impacts of a solution; `state`, if known, is its state on the section."""
     if problem.landings:
         state = _first(problem, step.x) if state is None else state
         count, *listed = map(np.asarray, _simulated(problem, jnp.asarray(step.x), state))
         clock, speed, stop = (a[listed[2] >= 0] for a in listed)
         return Hits(clock, speed, stop.astype(np.int32), int(count))
-    # Along a branch an impact may move past the section: an orbit's clocks lie within its period.
+    # Along a branch an impact may move past the section; an orbit's clocks lie within its period.
     impacts, (clock, _, period) = np.asarray(problem.impacts, int), problem.values(step.x)
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
     speed = np.asarray(step.seen.approach)[impacts]
@@ -369,7 +372,7 @@ def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
 
 @compiled
 def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
-    """Number, clock, V⁻ and stop of the impacts."""
+    """Return the number of impacts, and their clocks, V⁻ and stops."""
     machine, cycles = problem.at(x), problem.cycles
     run = simulate(machine, state, cycles, method=problem.method, impact_log=_LISTED, rests=True)
     log = run.impact_log
@@ -380,7 +383,7 @@ def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
 
 
 def energies_of(problem: Shooting, steps: Sequence[Step]) -> np.ndarray:
-    """The energy that impacts take in a cycle, in the mean of the period, at each step."""
+    """Return the energy that impacts take in a cycle, averaged over the period, at each step."""
     xs = [jnp.asarray(step.x) for step in steps]
     states = jax.tree.map(lambda *x: jnp.stack(x), *(_first(problem, x) for x in xs))
     return np.asarray(_lost(problem, jnp.stack(xs), states))

@@ -1,7 +1,7 @@
-"""Where a flight turns, and how near it comes there to an event that it does not meet.
+"""Turning points of a flight, and their distances to events that do not happen.
 
-A body turns where its velocity vanishes, the guard g of an event where dg/ds does. Along a branch
-such a turn grows until it touches: the motion ends there in a grazing.
+A body turns where its velocity vanishes, the guard g of an event where dg/ds does. Along a branch a
+turn may grow until it touches: the branch ends there in a grazing.
 """
 
 from functools import partial
@@ -18,8 +18,8 @@ from ..flow import Rates, SmoothMachine, guard_rates
 from ..machine import events_of, guard_of, happens_at, has_velocity, section_number, stops_of
 from ._flight import Flight, force_on
 
-# Newton's method has met a turn if it ends this close to it (as a share of the step): a choice,
-# since what is left enters the height in second order and is taken off.
+# Newton's method has converged if it ends this close to a turn (as a share of the step): a choice.
+# The remainder changes the height in second order and is subtracted.
 _TURNED = 1e-3
 
 # A guard is zero within this share of its largest modulus along a flight: a choice.
@@ -27,25 +27,25 @@ _ROUNDED = 1e-12
 
 
 class Path(NamedTuple):
-    """A flight, step by step."""
+    """A flight as a sequence of steps."""
 
     flight: Flight
     places: Float[Array, " steps"]
     """Clock at the start of each step."""
     states: Float[Array, "steps states"]
-    """State there."""
+    """State at the start of each step."""
     h: Scalar
     """Length of the steps."""
     closed: bool
-    """Whether it ends in the state in which it begins (static)."""
+    """True if the flight ends in its first state (static)."""
 
 
 class Nearest(NamedTuple):
     """The turning point that is nearest to an event which does not happen there."""
 
     room: Scalar
-    """Distance to the stop at a body's turn; of another event how far its guard stays below zero.
-    Negative where it is passed through, infinite if there is no such turn."""
+    """Distance to the stop at a body's turn; for another event, its guard's distance below zero.
+    Negative if the guard is crossed, infinite without such a turn."""
     clock: Scalar
     """Clock of the turn."""
     event: Scalar
@@ -56,19 +56,19 @@ class _Found(NamedTuple):
     """The turning points of a function of the state along a flight, one for each step."""
 
     turns: Bool[Array, " steps"]
-    """Whether there is one within the step."""
+    """True for each step that contains a turn."""
     height: Float[Array, " steps"]
     """Value of the function at the turn."""
     place: Float[Array, " steps"]
     """Clock (phase or time) of the turn."""
     before: Float[Array, " steps"]
-    """The function's rate, or one of its sign, at the start of the step."""
+    """The function's rate at the start of the step, or a number of its sign."""
     happens: Bool[Array, " steps"]
-    """Whether an event would happen there."""
+    """True if an event would happen there."""
 
 
 class _Watched(NamedTuple):
-    """Something that may turn along a flight, by its number in the machine."""
+    """A quantity that may turn along a flight, by its number in the machine."""
 
     number: int
 
@@ -76,15 +76,15 @@ class _Watched(NamedTuple):
         raise NotImplementedError
 
     def rate(self, flight: Flight, s: Scalar, u: Vector) -> Scalar:
-        """d/ds of the value along the flight, or another number of the same sign."""
+        """Return d/ds of the value along the flight, or another number of the same sign."""
         return self.rates(flight, flight.smooth, s, u).v
 
     def happens(self, flight: Flight, s: Scalar, u: Vector, length: Scalar) -> Flag:
-        """Whether it would happen, as an event, if it were zero at a `length` from here."""
+        """Return whether an event would happen if the value were zero at `length` from here."""
         return jnp.ones((), bool)
 
     def rates(self, flight: Flight, smooth: SmoothMachine, s: Scalar, u: Vector) -> Rates:
-        """The value and its first two derivatives by s."""
+        """Return the value and its first two derivatives with respect to s."""
 
         def guard(s, state):
             return self.value(flight, s, state)
@@ -107,7 +107,7 @@ class _Guard(_Watched):
 
 
 class _Body(_Watched):
-    """A coordinate, which turns where its velocity is zero."""
+    """A coordinate; it turns where its velocity is zero."""
 
     def value(self, flight, s, state):
         return flight.machine.coordinates[self.number].position(state)
@@ -127,12 +127,12 @@ class _Pull(_Watched):
 
 
 _Room = tuple[Float[Array, " steps"], Float[Array, " steps"]]
-"""`Nearest.room` of one event in each step, infinite without a turn; and its clock."""
+"""`Nearest.room` of one event in each step, infinite without a turn, and the clock of the turn."""
 
 
 def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
-    """The least and the greatest turn of the first coordinate (infinite without a turn), the turn
-    nearest to an event, and the result of `pull_of`."""
+    """Return the least and the greatest turn of the first coordinate (infinite without a turn), the
+    turn nearest to an event, and the result of `pull_of`."""
     bodies, rooms = turning(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
@@ -150,7 +150,7 @@ def _least_room(rooms: dict[int, _Room], h: Scalar) -> Nearest:
 
 
 def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
-    """The turning points of each coordinate, and of each event but the section how near it is."""
+    """Return the turning points of each coordinate, and the room of each event but the section."""
     flight, machine, begin = path.flight, path.flight.machine, path.places[0]
     found = partial(_turns_in, path)
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
@@ -158,7 +158,7 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
     for stop in stops_of(machine):
         at = bodies[stop.coordinate]
         facing = at.turns & (stop.sign * at.before > 0)
-        if flight.contact:  # one that is let go of begins to move with velocity zero
+        if flight.contact:  # a released body begins to move with velocity zero
             free = flight.contact[stop.coordinate] == 0
             facing = facing & free & (at.place > begin + _TURNED * path.h)
         rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
@@ -167,13 +167,13 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
             continue
         guard = _Guard(number)
         at = found(guard)
-        # A body that friction lets go begins to slide with velocity and acceleration zero.
+        # A body that leaves sticking begins to slide with velocity and acceleration zero.
         away = at.place > begin + _TURNED * path.h
         facing = at.turns & (at.before > 0) & away
-        if event.from_below:  # it touches nothing where it has not been below zero
+        if event.from_below:  # it touches nothing unless it has been below zero
             along = lambda s, u, guard=guard: guard.value(flight, s, flight.unravel(u))
             value = jax.vmap(along)(path.places, path.states)
-            # Right behind the event itself it is zero, to rounding of either sign.
+            # Just after the event itself it is zero, to rounding of either sign.
             below = -_ROUNDED * jnp.max(jnp.abs(value))
             facing = facing & at.happens & (jax.lax.cummin(value) < below)
         rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
@@ -182,18 +182,18 @@ def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
 
 def _turns_in(path: Path, watched: _Watched) -> _Found:
     flight, places, states, h, closed = path
-    # The end of the last step is the next event: its velocity is that of a further step.
+    # The end of the last step is the next event: its velocity is that of one more step.
     last = flight.once(_stepped, (places[-1], h, states[-1]))
     v = jax.vmap(partial(watched.rate, flight))(places, states)
-    # What turns on the section itself does so at the begin or at the end, whatever the sign of
-    # the rounding that its rate consists of there: so that sign has to be one.
+    # A turn on the section itself is at the begin or the end of a closed flight. Its rate there is
+    # rounding of either sign, so both must have the same sign.
     end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
     v1 = jnp.concatenate([v[1:], end[None]])
     return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
 
 
 def pull_of(path: Path) -> Nearest:
-    """Where the force on a body that rests has its least turn, as if that were a distance."""
+    """Return the least extremum of the force on a resting body, with the force as `room`."""
     flight, forces = path.flight, {}
     for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
         at = _turns_in(path, _Pull(number))
@@ -204,7 +204,7 @@ def pull_of(path: Path) -> Nearest:
 
 
 def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
-    """The state after one step from `inputs`, the clock, the step's length and the state."""
+    """Return the state after one step from `inputs`: the clock, the step's length and the state."""
     s, h, u = inputs
     return flight.step(s, s + h, u, {})[0]
 
@@ -212,10 +212,10 @@ def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
 def _turn(
     watched: _Watched, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
 ) -> _Found:
-    """The turning point within a step, if the rate changes its sign (`v0` and `v1` at its ends): by
-    Newton's method on the length from the step's start, each trial a step of the method itself."""
+    """Return the turning point in a step, if the rate changes its sign (`v0` and `v1` at the ends),
+    by Newton's method on the length from the step's start; each trial is a step of the method."""
     h, s, u, v0, v1 = inputs
-    # A turn may fall on the end of a step.
+    # A turn may coincide with the end of a step.
     turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
 
     def at(moved: Flight, s: Scalar, u: Vector, length: Scalar) -> Rates:

@@ -1,4 +1,4 @@
-"""The kinds of special points, and what is said of them."""
+"""The kinds of special points, and their descriptions in messages."""
 
 import numpy as np
 
@@ -18,16 +18,16 @@ DEGENERATE, DEGENERATE_SYMMETRY = "degenerate-doubling", "degenerate-symmetry-br
 RESONANCE_1, RESONANCE_2 = "resonance-1:1", "resonance-1:2"
 RESONANCE_3, RESONANCE_4 = "resonance-1:3", "resonance-1:4"
 
-# Kinds at which something is touched: by a flight, or by a body that is only just held.
+# Kinds at which something is touched: by a flight, or by a body at the limit of being held.
 TOUCHING = (GRAZING, REST, *SLIDING)
 
-# A turn that a branch makes where it leaves another one to both sides.
+# A turn of a branch that begins at another branch and leaves it to both sides.
 TURNS = "turns"
 
-# Events closer than this (a cycle is 2π) fall together: a choice, above what places are off by.
+# Events closer than this coincide (a cycle is 2π): a choice, above the errors of places.
 TOGETHER = 1e-6
 
-# What is said of a special point, by its kind or one of these.
+# Descriptions of special points, by kind or one of these.
 DETAILS = {
     FOLD: "a multiplier passes 1 and the branch turns back",
     DOUBLING: "a multiplier passes -1",
@@ -39,7 +39,7 @@ DETAILS = {
     HOPF: "the motion shrinks to an equilibrium",
 }
 
-# What is said of a point of codimension two.
+# Descriptions of points of codimension two.
 AT_CODIMENSION_TWO = {
     CUSP: "two curves of folds meet and end",
     DEGENERATE: "beyond, the motions of twice the period begin on the other side",
@@ -61,13 +61,13 @@ def one(kind: str) -> str:
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
-    """Where in its period a motion is at a clock that counts from the section on."""
+    """Return the place in its period of a motion, in words; `clock` counts from the section."""
     period = float(problem.period(at.x))
     return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
 
 
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
-    """Which two events of a motion come together, if they follow each other, and where."""
+    """Describe two consecutive events of a motion that come together, and their place."""
     lengths, which = problem.lengths(at.x), ""
     i = int(np.argmin(lengths))
     if lengths[i] < TOGETHER * problem.radian:
@@ -78,7 +78,7 @@ def coincidence_in_words(problem: Shooting, at: Step) -> str:
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
-    """What a motion loses, if that is an impact, or touches, and where within its period."""
+    """Describe what a motion touches, or the impact that it loses, and the place in its period."""
     machine = problem.machine
     if impact is None:
         touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
