@@ -214,9 +214,8 @@ class Exchange(eqx.Module):
 
 
 def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
-    """Return the exchange at a motion at which branches cross, from the singular vectors of its
-    Jacobian without the parameters' columns; `None` if the second parameter separates the
-    branches."""
+    """Return the exchange at a crossing of branches, from the singular vectors of the motion's
+    Jacobian without the parameters' columns; `None` if the second parameter separates them."""
     scale = problem.scale
     jacobian = jacobian_at(problem, x) * scale
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
@@ -296,8 +295,7 @@ def minors(matrix: Array | np.ndarray) -> Array:
 
 
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Return whether a double multiplier has one eigenvector only, as where a complex pair
-    begins."""
+    """Return whether a double multiplier has one eigenvector only, as at a resonance."""
     sizes, M = np.asarray(problem.sizes)[1:], step.seen.monodromy
     values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
     return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

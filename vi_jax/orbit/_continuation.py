@@ -244,8 +244,7 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
 
 
 def _refined(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step, float]:
-    """Return the solution in the plane across a tangent at `x`, and its scaled distance from
-    `x`."""
+    """Return the solution in the plane across a tangent at `x`, and its scaled distance from it."""
     start = advance(problem, x, tangent, 0.0)
     moved = float(np.max(np.abs(start.x - x) / problem.scale))
     return start, moved if bool(start.good) else np.inf

@@ -46,8 +46,7 @@ from ..machine import (
 
 
 def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `f` with a derivative that is its Jacobian, computed in forward mode, times the
-    tangent.
+    """Return `f` with its Jacobian, computed in forward mode, times the tangent as derivative.
 
     The Jacobian has columns for differentiated leaves only. Inside another derivative, such as an
     orbit's by the implicit function theorem, the columns are few and stay together.
@@ -108,7 +107,7 @@ class CycleMap(eqx.Module):
     """True if the body may come to rest on a stop."""
 
     def __call__(self, state: State) -> State:
-        """Return the state `cycles` drive cycles after `state`; a `HybridState` for a machine with
+        """Return the state `cycles` drive cycles later; a `HybridState` if the machine has
         modes."""
         return _end(self, adopted(self.machine, state))
 

@@ -36,8 +36,7 @@ class Event(NamedTuple):
     cycle: int | None = None
     """The number, from 0, of the cycle of the period that begins with it, or `None`."""
     use: str = ""
-    """For a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` at the end of a
-    rest."""
+    """For a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` at a rest's end."""
 
     def called(self, machine: AbstractMachine) -> str:
         """Return its name for messages: its own, its side, or its kind and its index there."""

@@ -38,8 +38,7 @@ SAME_CURVE = 0.9
 
 # A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
 # angle of its first tangent. A step with a smaller cosine than this has reached another curve,
-# beyond a jump of the equations, or another part. Steps no longer than the second number are
-# rounding.
+# beyond a jump of the equations, or another part. Steps up to the second number are rounding.
 _ASIDE, _TINY = 0.9, 1e-6
 
 # A walk stalls if its steps must be shorter than this share of the longest. The branches of the
@@ -131,8 +130,7 @@ class Table(abc.ABC):
 
 
 def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
-    """Return the settings of a walk; raise `ValueError` or `TypeError` with the name of a wrong
-    one."""
+    """Return the settings of a walk; raise `ValueError` or `TypeError` for wrong ones."""
     return {
         "step": given_number("step", step, low=0.0, open_low=True),
         "max_step": given_number("max_step", max_step, low=0.0, open_low=True),
@@ -279,8 +277,7 @@ class _Walk:
         return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
-        """Refine the steps of the flights if they depend on the motion; return whether they
-        changed."""
+        """Refine the steps of the flights if they depend on the motion; return True if changed."""
         table = self.table
         if not sized_by_motion(table.problem):
             return False
@@ -350,8 +347,7 @@ def bounds_of(table: Table) -> list[Event]:
 
 
 # A motion within this distance (scaled), in a direction within the second number, is the same one
-# again: choices, ten thousand times the corrector's error, and far below the difference of two
-# passages.
+# again: choices, ten thousand times the corrector's error, far below the distance of two passages.
 _AGAIN, _ALONG = 1e-7, 1e-2
 
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
@@ -379,8 +375,7 @@ class Closing:
             self._begin_at(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
-        """Return the rows for a step between two points, one for each earlier place of the
-        curve."""
+        """Return the rows for a step between two points, one for each earlier place near it."""
         if not self.points:
             self._begin_at(here)
         if not self.points or self.points[-1] is not here:

@@ -53,11 +53,8 @@ def soft_kick(
     problem: Shooting, x: np.ndarray, number: int, leg: int, clock: float, u: np.ndarray,
     gradient: np.ndarray, fast: np.ndarray, rate: float,
 ) -> Kick:  # fmt: skip
-    """Return the kick of a switch that a motion grazes at this clock in the state u.
-
-    **Arguments:** `gradient` and `fast`, the gradients of the distance h and of dh/ds; `rate`,
-    d²h/ds².
-    """
+    """Return the kick of a switch that a motion grazes at this clock in the state u; `gradient` and
+    `fast` are the gradients of the distance h and of dh/ds, `rate` is d²h/ds²."""
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the field, and the change of the field beyond the surface."""
@@ -348,8 +345,8 @@ class LocalMap(eqx.Module):
         return self.later(self.kicks[0], count)
 
     def passages(self, n: int) -> np.ndarray:
-        """Return ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1: the distances between the impacts of
-        a motion with one impact of depth one in n periods. They must be positive."""
+        """Return ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1: the distances at the passages between
+        the impacts, with one impact of depth one in n periods. They must be positive."""
         power = np.linalg.matrix_power(self.matrix, n)
         found = self.later(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
         return found[:-1] - found[-1]

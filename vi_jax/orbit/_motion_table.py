@@ -1,22 +1,22 @@
-"""The table of a branch: what can happen to a periodic motion that is followed in one number.
+"""The table of a branch: possible events of a periodic motion that is followed in one parameter.
 
-| what | test, positive before it | ends the branch as |
+| event | test, positive before it | end of the branch |
 |---|---|---|
 | a bound is reached | distance of the parameter | `bounds` |
 | an autonomous motion gets long | four times its first duration less the duration | `long` |
 | another multiplier becomes the greatest | that held less the others | `multiplier` |
-| an impact or a switch is lost | V⁻, or how fast its guard rises | `grazing`, sliding |
+| an impact or a switch is lost | V⁻, or the rate of its guard | `grazing`, sliding |
 | a stop or a surface is touched | least distance at a turn | the same |
-| a switch goes into another mode | 1 or -1 | the same |
+| a switch changes to another mode | 1 or -1 | the same |
 | two events come together | time between them | `grazing` |
 | the cycle shrinks to rest | the rate of the section at the equilibrium | `hopf` |
-| a chatter takes until the release | how much less it takes | `rest` |
-| a stop is about to let go of a body within a rest | the least force | `rest` |
+| a chatter takes until the release | the time left | `rest` |
+| a body is at the limit of release within a rest | the least force | `rest` |
 | a flight between two rests vanishes | its length | `rest` |
-| two halves of the period become alike, or images | their difference | `period-doubling`, … |
-| it comes back to where it was | distance to the plane across it | `closed` |
+| two halves of the period become equal, or images | their difference | `period-doubling`, … |
+| the curve closes | distance to the plane across an earlier point | `closed` |
 
-Folds, branch points, doublings, tori, extremes and numbers that a user watches are passed
+Folds, branch points, doublings, tori, extremes and zeros of watched functions do not end the branch
 (`MotionTable.passed`).
 """
 
@@ -71,58 +71,58 @@ from ._words import (
 from .results import NEUTRAL, Orbit
 from .special import Point, further_of, point_at
 
-# These thresholds are choices; where one was measured, the comment gives the figure.
-# What lies before the place where a branch springs is looked for on so much of the way there.
+# These thresholds are choices; measured ones have the figure in the comment. Events before the
+# place where a branch begins are located on this share of the way.
 _SHORT = 0.999
 
-# And what lies before an impact that is lost, where the monodromy matrix has a pole: on so much.
+# The same share before a lost impact, where the monodromy matrix has a pole.
 _BEFORE_POLE = 1 - 1e-6
 
-# An autonomous motion of so much of the size of another is an equilibrium.
+# An autonomous motion with this share of another's size is an equilibrium.
 _STILL = 1e-6
 
-# One of so much of the size of its neighbours is about to shrink to rest.
+# A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
 
-# Where the motion of half the period is found, the halves of the branch's may differ by so many
-# times what is alike: of one with twelve impacts in 32π the corrector fails from four times on.
+# The motion of half the period is sought if the halves of the period differ by at most so many
+# times `ALIKE`: for a motion with twelve impacts in 32π the corrector fails from four times on.
 _ALMOST = 10.0
 
-# A motion so many times as long as that from which a branch begins has steps as much longer. Of a
-# rimless wheel towards its homoclinic motion the multiplier is right to 2e-12 then.
+# A branch ends at this multiple of its first duration; the steps are then as much longer. For a
+# rimless wheel near its homoclinic motion the multiplier is then correct to 2e-12.
 _LONG = 4.0
 
-# A flight between two rests is over at once if it is this brief (a cycle is 2π).
+# A flight between two rests vanishes if it is this brief (a cycle is 2π).
 _BRIEF = 1e-3
 
-# A multiplier this close to where its test is zero passes there; else it is a pole of the
+# A multiplier passes if it is this close to the zero of its test. Otherwise that is a pole of the
 # determinant, or a real pair μ, 1/μ.
 _PASSES = 1e-5
 
-# A step is halved so often to tell bifurcations in it apart: a 100,000th of it is left.
+# Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
 _HALVES = 17
 
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
 _SAME_WAY = 0.99
 
-# A number passes zero where it is less than this share of what it is beside; else it jumps.
+# A quantity passes zero if it is less than this share of its neighbours; otherwise it jumps.
 _ZERO = 1e-6
 
-# A number that changes less than this along the branch (as a share of it, in the norm of the scaled
-# unknowns) does not change but for rounding: a choice. Of a body that hits a stop the greatest
-# position, which is that stop's place, changes by some 1e-16.
+# A quantity that changes less than this along the branch (relative, in the norm of the scaled
+# unknowns) changes by rounding only: a choice. The greatest position of a body that hits a stop,
+# the stop's place, changes by some 1e-16.
 _CHANGES = 1e-9
 
-# If it goes on changing faster than this share of its rates on both sides, there is a corner: a
-# choice, far above what is left at a place that is located to rounding.
+# An extremum is a corner if the quantity still changes there by more than this share of its rates
+# on both sides: a choice, far above the rest at a place that is located to rounding.
 _CORNER = 1e-4
 
 Passed = list[tuple[Point, Step]]
 
 
 class MotionTable(Table):
-    """What can happen on a branch, for each of its steps; `extrema` are names of numbers whose
-    extremes are sought, `watched` functions of the orbit whose zeros are, by name."""
+    """Possible events of a branch in each of its steps; `extrema` are names of quantities whose
+    extrema are sought, `watched` functions of the orbit, by name, whose zeros are sought."""
 
     def __init__(
         self, problem: Shooting, bounds: list[tuple[float, float]],
@@ -131,7 +131,7 @@ class MotionTable(Table):
         super().__init__(problem, bounds)
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
-        self.size, self.duration = 0.0, 0.0  # of the first motion
+        self.size, self.duration = 0.0, 0.0  # those of the first motion
         self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
@@ -164,13 +164,13 @@ class MotionTable(Table):
         return Ending(at, kind, self._point(kind, at, detail, impact))
 
     def _divided(self, at: Step) -> Ending:
-        """The end where a stop is about to let go of a body within its rest."""
+        """Return the end at which the force on a body falls to zero within its rest."""
         place = place_in_words(self.problem, at, float(at.seen.pull.clock))
         detail = f"a rest on a stop is divided {place}, where the force on the body falls to zero"
         return self._named(REST, at, detail)
 
     def _merged(self, at: Step, release: int) -> Point:
-        """The point where two rests become one, of the motion without the flight between them."""
+        """Return the point at which two rests merge, of the motion without the flight between."""
         both = [release, (release + 1) % self.problem.legs]
         clock = float(self.problem.values(at.x)[0][release])
         place = place_in_words(self.problem, at, clock)
@@ -181,14 +181,14 @@ class MotionTable(Table):
         return point_at(new, at, REST, detail, springs=True)
 
     def _lost(self, here: Step) -> Iterator[Event]:
-        """The rows of events that are lost, of touches, and of events that come otherwise."""
+        """Yield the rows of lost events, of touches, and of changes in the order of events."""
         for i, event in enumerate(self.problem.events):
             falls = lambda step, i=i: float(step.seen.approach[i])
             if event.cycle is not None and not self.problem.conditions:
                 shrinks = lambda at: self._named(HOPF, at, DETAILS[HOPF], 0)
                 yield Event(falls, shrinks, partial(_hopf_between, self.problem))
             yield Event(falls, partial(self._ended, here, impact=i))
-        # Of events that are together all along the rounding is left out.
+        # Ignore rounding for events that always coincide.
         together = ROUNDING * self.problem.radian
         off = 0.0 if here.seen.order_margin > together else together
         for i, event in enumerate(self.problem.landings):
@@ -210,7 +210,7 @@ class MotionTable(Table):
         self, here: Step, at: Step, *, impact: int | None = None,
         other: Callable[[Step], str] | None = None,
     ) -> Ending:  # fmt: skip
-        """The end where an event is lost, something is touched, or events come otherwise."""
+        """Return the end at a lost event, a touch, or a change in the order of events."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
             return Ending(at, REST, self._merged(at, flight))
@@ -227,8 +227,8 @@ class MotionTable(Table):
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
             return self._named(GRAZING, at, detail)
-        # There a multiplier goes to infinity, and comes back from the other side: its sign is that
-        # of rounding, and the tests for bifurcations may have changed twice.
+        # A multiplier goes to infinity there and returns from the other side. Its sign is that of
+        # rounding, and the tests for bifurcations may have changed sign twice.
         short = self._on_the_way(here, at, _BEFORE_POLE)
         short = short if bool(short.good) else at
         M, values = short.seen.monodromy, short.seen.multipliers
@@ -236,8 +236,8 @@ class MotionTable(Table):
         return self._named(GRAZING, at, detail, impact)._replace(until=short)
 
     def _springs_off(self, here: Step) -> Iterator[Event]:
-        """The rows of places where both halves of the period become alike, or images of each other:
-        beyond, the same motions come again, half a period later or in the mirror."""
+        """Yield the rows of places where both halves of the period become equal, or images of each
+        other. Beyond, the same motions repeat, half a period later or mirrored."""
         for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self.images)):
             begin = apart(here)
             if np.linalg.norm(begin) < ROUNDED:
@@ -254,20 +254,20 @@ class MotionTable(Table):
                 else:
                     at = self._crossing(here, at, FOLD)
                     point = self._point(kind, at, "the branch begins at a symmetric motion")
-                # Beyond it the tests have changed twice: what lies before it shows short of it.
+                # Tests change sign twice there: locate earlier events from a point just before.
                 return Ending(at, kind, point, self._on_the_way(here, at, _SHORT))
 
             along = lambda step, begin=begin, apart=apart: float(np.dot(begin, apart(step)))
             yield Event(along, ending)
 
     def stalled(self, steps: list[Step]) -> Ending:
-        """At the motion of half its period from which the branch springs, if that is close."""
+        """Return the end at the motion of half the period, if the branch begins at it close by."""
         apart = np.linalg.norm(self._halves(steps[-1]))
         sprung = self._sprung(steps[-1]) if apart > ROUNDED else None
         return super().stalled(steps) if sprung is None else Ending(sprung[0], DOUBLING, sprung[1])
 
     def _sprung(self, at: Step) -> tuple[Step, Point] | None:
-        """Where the branch springs from a motion of half its period: its step and that motion's."""
+        """Return the step where the branch begins at a motion of half the period, and that one."""
         apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at)
         if apart > _ALMOST * ALIKE:
             return None
@@ -280,12 +280,13 @@ class MotionTable(Table):
         return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
     def passed(self, here: Step, last: Step) -> Passed:
-        """Bifurcations, extremes and zeros of what is watched between two points, in order."""
+        """Return bifurcations, extrema and zeros of watched functions between two points,
+        sorted."""
         found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
         return sorted(found, key=lambda f: distance_along(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
-        """Where a number is larger, or less, than beside, and where one watched passes zero."""
+        """Yield local extrema of quantities, and zeros of watched functions."""
         known, before = self._known
         before = before if np.array_equal(known, here.x) else self._numbers(here)
         self._known = last.x, self._numbers(last)
@@ -302,7 +303,7 @@ class MotionTable(Table):
                 real, detail = abs(value_there) <= _ZERO * steep, f"{name} passes zero"
             else:
                 sense, most = (1, "largest") if begin > 0 else (-1, "least")
-                # Else it has a pole, as a multiplier at a grazing.
+                # Otherwise it has a pole, as a multiplier at a grazing.
                 real = sense * value_there >= max(sense * value, sense * other) - least
                 corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
                 detail = f"{name} = {value_there:.10g} is the {most} nearby{corner}"
@@ -310,7 +311,7 @@ class MotionTable(Table):
                 yield self._point(kind, at, detail, quantity=name), at
 
     def _numbers(self, step: Step) -> dict[tuple[str, str], tuple[float, float]]:
-        """Of each number sought its value at a point, and what is to vanish: its rate or itself."""
+        """Return the value of each sought quantity, and the number that vanishes: rate or value."""
         found = {}
         if self.extrema:
             direction = step.tangent * self.scale
@@ -323,11 +324,10 @@ class MotionTable(Table):
         return found
 
     def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Passed:
-        """The bifurcations between two points, by the tests that change their signs.
+        """Return the bifurcations between two points, from the tests that change sign.
 
-        The multipliers outside the unit circle are counted: where those that are found do not
-        explain how many there are more, or less, the step is halved, as two that cross together
-        leave no sign.
+        The multipliers outside the unit circle are counted. If the bifurcations do not explain the
+        change of their number, the step is halved: two that cross together leave no sign change.
         """
         held = bool(self.problem.conditions)
         kinds, found, crossed = _changed(here, last, held=held), [], 0
@@ -349,14 +349,14 @@ class MotionTable(Table):
         return self._within((here, middle, last), halves_left - 1)
 
     def _within(self, steps: tuple[Step, ...], halves_left: int) -> Passed:
-        """The bifurcations in several parts of a step."""
+        """Return the bifurcations in several parts of a step."""
         parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(steps))
         return list(itertools.chain.from_iterable(parts))
 
     def _turn_apart(self, here: Step, last: Step) -> tuple[Step, ...]:
-        """Two points beside the place where the branch turns back between two others, if a
-        multiplier passes 1 there: it is a fold, and a branch point lies within the same step. If
-        they are closer to each other than `BESIDE`, they count as one branch point."""
+        """Return two points around the place where the branch turns back between two others, if a
+        multiplier passes 1 there: the place is a fold, and a branch point lies within the same
+        step. If they are closer to each other than `BESIDE`, they count as one branch point."""
         at = self.where(here, last, lambda step: tests_of(step)[TURNS])
         if at is None:
             return ()
@@ -365,13 +365,13 @@ class MotionTable(Table):
             return ()
         sides = [self.advance(here.x, here.tangent, root + x) for x in (-BESIDE, BESIDE)]
         passes = [tests_of(step)[CROSSING] for step in sides]
-        # One that lies on the branch that crosses has another tangent.
+        # A point on the crossing branch has another tangent.
         alike = np.dot(sides[0].tangent, sides[1].tangent) > _SAME_WAY
         real = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
         return tuple(sides) if real else ()
 
     def _twice(self, here: Step, last: Step) -> Passed:
-        """The place between two close points where multipliers cross the circle together."""
+        """Return the place between two close points where multipliers cross the circle together."""
         outside = _outside(here)
         at = self.where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
         if at is None:
@@ -384,17 +384,17 @@ class MotionTable(Table):
         return []
 
     def _bifurcation(self, kind: str, here: Step, last: Step) -> Passed:
-        """The bifurcation between two points at which a test changes its sign, if it is one."""
+        """Return the bifurcation between two points at which a test changes its sign, if any."""
         at = self.where(here, last, lambda step: tests_of(step)[kind])
         if at is None:
             return []
         held = bool(self.problem.conditions)
         if kind in (FOLD, TURNS) and not held and not _turns_back(here, at, last, self.scale):
-            return []  # rounding: the tangent is ill-defined close to where branches cross
+            return []  # rounding: the tangent is ill-defined close to a crossing of branches
         if kind in (FOLD, TURNS, CROSSING) and self._shrinks_to_rest(here, at, last):
-            return []  # it has a multiplier 1 to rounding
+            return []  # a multiplier is 1 there to rounding
         if kind in (FOLD, TURNS, CROSSING) and self._springs(here, at):
-            return []  # both are zero there
+            return []  # both tests are zero there
         if held and kind == TURNS:
             return [(self._point(TURN, at, DETAILS[TURN]), at)]
         if kind == TURNS or (kind == CROSSING and (self.symmetric or not held)):
@@ -417,7 +417,7 @@ class MotionTable(Table):
         return size < _SHRINKS * max(beside)
 
     def _springs(self, here: Step, at: Step) -> bool:
-        """Whether the branch springs there: halves of a period are alike, or images."""
+        """Return whether the branch begins there: halves of a period are equal, or images."""
         apart, images = self._halves(at), self.images(at)
         if apart.size and np.linalg.norm(apart) < ALIKE:
             return True
@@ -426,7 +426,7 @@ class MotionTable(Table):
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         def admits(step: Step, length: float) -> bool:
-            # So close to where they cross the corrector may find the other branch.
+            # So close to the crossing the corrector may find the other branch.
             return not self.symmetric or (kind == FOLD) != (self._asymmetry(step) < ALIKE * BESIDE)
 
         root = distance_along(self.problem, here, at)
@@ -434,7 +434,7 @@ class MotionTable(Table):
         return crossing(self.problem, self.advance, here, root, tested, admits) or at
 
     def _halves(self, step: Step) -> np.ndarray:
-        """How the second half of the period differs from the first; empty if it cannot be alike."""
+        """Return the difference of the period's halves; empty if they cannot be equal."""
         return halves_apart(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
 
     def _asymmetry(self, step: Step) -> float:
@@ -442,7 +442,7 @@ class MotionTable(Table):
 
 
 def _brief_flight(problem: Shooting, at: Step) -> int | None:
-    """The number of a release whose flight to the same stop is brief and the shortest, if any."""
+    """Return the index of the release of the shortest flight, if it is brief and to its stop."""
     if not problem.landings:
         return None
     lengths = problem.lengths(at.x)
@@ -453,17 +453,17 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
 
 
 def room(step: Step) -> float:
-    """The clearance, as a share of how far the body goes; of motions without a turn 1."""
+    """Return the clearance as a share of the motion's extent; 1 for motions without a turn."""
     return float(np.clip(step.seen.nearest.room / step.seen.length, -1.0, 1.0))
 
 
 def pulled(step: Step) -> float:
-    """The least force on a body within its rest, as a share of what moves it; at most 1."""
+    """Return the least force on a body within its rest, relative to the motion's; at most 1."""
     unit = step.seen.length * (2 * np.pi / float(step.seen.duration)) ** 2
     return float(np.clip(step.seen.pull.room / unit, -1.0, 1.0))
 
 
-# How many multipliers cross the unit circle where each test changes its sign.
+# The number of multipliers that cross the unit circle at a change of sign of each test.
 _CROSS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
 
 
@@ -471,7 +471,7 @@ def tests_of(step: Step) -> dict[str, float]:
     """Functions that change sign at the bifurcations."""
     M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
     values = step.seen.multipliers
-    with np.errstate(invalid="ignore"):  # a step without an answer has none here either
+    with np.errstate(invalid="ignore"):  # without an answer of the corrector these are NaN
         doubling, crosses = np.linalg.det(M + identity), np.linalg.det(M - identity)
     pairs = [1 - a * b for a, b in itertools.combinations(values, 2)]
     turns = float(step.tangent[-1])
@@ -485,11 +485,11 @@ def tests_of(step: Step) -> dict[str, float]:
 
 
 def _changed(here: Step, last: Step, *, held: bool) -> list[str]:
-    """Which tests change their sign from one step to another.
+    """Return the tests that change sign from one step to another.
 
-    At a fold the parameter turns back as a multiplier passes 1; where it turns back alone, the
-    multiplier only touches 1, and the branch is one that leaves another to both sides. Where
-    numbers of the motion are `held` the one has nothing to do with the other.
+    At a fold the parameter turns back as a multiplier passes 1. If only the parameter turns back,
+    the multiplier touches 1, and the branch leaves another one to both sides. If quantities of the
+    motion are `held`, the two are independent.
     """
     before, after = tests_of(here), tests_of(last)
     changed = [kind for kind in before if before[kind] * after[kind] < 0]
@@ -505,7 +505,7 @@ def _changed(here: Step, last: Step, *, held: bool) -> list[str]:
 
 
 def _offs(step: Step) -> dict[str, np.ndarray]:
-    """How far the multipliers are from where those of each kind cross the unit circle."""
+    """Return the distances of the multipliers from the crossing of each kind."""
     values = step.seen.multipliers
     one, complex_ones = values - 1, np.abs(values[np.abs(values.imag) > 1e-9])
     return {
@@ -514,7 +514,8 @@ def _offs(step: Step) -> dict[str, np.ndarray]:
 
 
 def _outside(step: Step) -> int | None:
-    """The number of multipliers outside the unit circle; `None` if not known, as where one is 1."""
+    """Return the number of multipliers outside the unit circle; `None` if unknown or one is on
+    it."""
     sizes = np.abs(step.seen.multipliers)
     if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
         return None
@@ -522,26 +523,26 @@ def _outside(step: Step) -> int | None:
 
 
 def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
-    """Whether the parameter turns back at a point between two, by more than rounding."""
+    """Return whether the parameter turns back at a point between two, by more than rounding."""
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
 
 
-# Where the cycle of an autonomous machine shrinks onto an equilibrium, its equations cannot be
-# solved: the equilibrium solves them as well, with every period, and where the section is a
-# velocity for every number of the machine. So it is the equilibrium that is solved for there, and
-# the number at which two of its eigenvalues are imaginary.
+# The cycle of an autonomous machine may shrink onto an equilibrium. Its equations are singular
+# there: the equilibrium solves them with every period, and, if the section is a velocity, for every
+# value of the parameter. So the equations of the equilibrium are solved instead, with the parameter
+# at which two of its eigenvalues are imaginary.
 
-# The motion that stands for the branch there has so much of the size of the one before it.
+# Size of the motion that represents the branch there, as a share of the one before it.
 _TINY = 1e-5
 
-# By how much an eigenvalue's period may differ from that of the last motion, as a share of it.
+# Largest relative difference of an eigenvalue's period from that of the last motion.
 _ALIKE_PERIOD = 0.2
 
-# Zero, as a share of what it is beside.
+# Zero, relative to the scale of comparison.
 _VANISHES = 1e-9
 
-# A multiplier is 1 within this.
+# Tolerance of a multiplier 1.
 _ONE = 1e-6
 
 
@@ -552,26 +553,26 @@ def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
 
 @on_host
 def _leaving(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
-    """How fast a motion leaves its section, and its period."""
+    """Return the rate of a motion on its section, and its period."""
     machine = problem.at(x)
     u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
     return _rate(problem, machine, u), problem.period(x)
 
 
 def _size_of(problem: Shooting, x: Unknowns) -> float:
-    """How far an autonomous motion would get in its period as fast as it leaves the section."""
+    """Return the distance that an autonomous motion would move in its period at its first rate."""
     rate, period = _leaving(problem, x)
     return float(np.linalg.norm(rate) * period)
 
 
 def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
-    """A motion of hardly any size about the equilibrium onto which the cycle shrinks between two
-    points, whose eigenvalues ±iω are imaginary. That it has a multiplier 1 is checked."""
+    """Return a tiny motion about the equilibrium with eigenvalues ±iω onto which the cycle shrinks
+    between two points; `None` unless it has a multiplier 1."""
     if problem.events != (section_of(problem.machine, 0),) or renews(problem.machine):
         return None
     rates = [_leaving(problem, step.x)[0] for step in (here, new)]
     if np.dot(*rates) >= 0:
-        return None  # beyond an equilibrium the motion is turned round
+        return None  # beyond an equilibrium the motion is reversed
     size, other = np.linalg.norm(rates, axis=1)
     guess = here.x + size / (size + other) * (new.x - here.x)
     found = _imaginary(problem, guess)
@@ -582,7 +583,7 @@ def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
 
 @on_host
 def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
-    """Derivative of the field in the state of `x`, the section there and its derivative."""
+    """Return the field's derivative in the state of `x`, the section there and its derivative."""
     machine, u = problem.at(x), problem.parts(x)[1][0]
     section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
     return jax.jacfwd(partial(_rate, problem, machine))(u), section, slope
@@ -590,8 +591,9 @@ def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
 
 @on_host
 def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
-    """What (u, p, ω, Re v, Im v) = y·scale lacks to be an equilibrium u with an eigenvector v to
-    iω, like another one in length and phase, relative to its size; and its derivative."""
+    """Return the residual of the equations of an equilibrium u with an eigenvector v to iω, and its
+    derivative. The unknowns (u, p, ω, Re v, Im v) are y·scale; `like` fixes v in length and
+    phase."""
     n = problem.states
 
     def missing(y):
@@ -607,7 +609,7 @@ def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Ve
 
 
 def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """The equilibrium near a guess that has imaginary eigenvalues, as unknowns; an eigenvector."""
+    """Return the equilibrium near a guess with imaginary eigenvalues, and an eigenvector."""
     n, turn, matrix = problem.states, 2 * np.pi / guess[0], _linear(problem, guess)[0]
     if not np.isfinite(matrix).all():
         return None
@@ -621,7 +623,7 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
         missing, jacobian = _lacks(problem, y, scale, like)
         if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):
             return None
-        move = np.linalg.lstsq(jacobian, missing)[0]  # the smallest, where a component is neutral
+        move = np.linalg.lstsq(jacobian, missing)[0]  # the smallest if a component is neutral
         y, size = y - move, np.abs(move).max()
         if size <= 1e-14:
             break
@@ -633,13 +635,13 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
-    """A motion of hardly any size about an equilibrium, where it passes the section."""
+    """Return a tiny motion about an equilibrium, where it passes the section."""
     _, section, slope = _linear(problem, x)
     seen, steep = slope @ vector, np.linalg.norm(slope)
     apart = np.linalg.norm(here.x[1:-1] - x[1:-1])
     if abs(seen) <= _VANISHES * steep or abs(section) > _VANISHES * steep * apart:
-        return None  # the section does not see it
-    # Of all the phases of the linear motion the one in which the section rises through zero.
+        return None  # the motion does not cross the section
+    # The phase of the linear motion in which the section rises through zero.
     way = (vector * (-1j * np.conj(seen))).real
     way = np.concatenate([[0.0], way / np.linalg.norm(way), [0.0]])
     x = x + _TINY * apart * way

@@ -134,15 +134,13 @@ _SETTLED, _MOST = 1e-11, 4096
 COARSE = 1e-10
 
 
-# Events this close (by the clock) are simultaneous; a guard this far from zero is no event:
-# choices.
+# Events this close (by the clock) are simultaneous; a guard must be this close to zero: choices.
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 
 # A component of the state below the first share of the largest one at events, or below the second
 # along the whole motion, gets the size of the largest. Both are choices; the second is above the
-# remainder of a component that decays to zero. If all are below the third, at rest, their size is
-# 1.
+# remainder of a component that decays to zero. If all are below the third, at rest, the size is 1.
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
@@ -259,8 +257,7 @@ def _check_instants(
 
 
 def sized_by_motion(problem: Shooting) -> bool:
-    """Return whether the number of steps depends on the motion, as its pace may be slow
-    anywhere."""
+    """Return whether the number of steps depends on the motion, as its pace may be slow."""
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
@@ -451,8 +448,7 @@ def _state_at(machine, method, like, row, own, clock):
 
 
 def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
-    """Return the machine's modes in each leg, from the first state and each event's clock and
-    state."""
+    """Return the machine's modes in each leg, from the first state and each event's."""
     machine, start = problem.machine, jnp.zeros(())
     modes = begin_modes(machine, start, bare(state), modes_of(state))
     found = [modes] * problem.legs

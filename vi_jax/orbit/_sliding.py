@@ -1,15 +1,15 @@
-"""Sliding bifurcations: where a motion gains or loses a part in which a body sticks, or slides
-along the surface of a switch.
+"""Sliding bifurcations: a motion gains or loses a part in which a body sticks, or slides along the
+surface of a switch.
 
-Such a part begins where the motion comes upon the surface with the fields of both sides pointing at
-it, and ends where one of them turns away. There are four ways in which the sequence changes (di
-Bernardo, Budd, Champneys and Kowalczyk, Piecewise-smooth Dynamical Systems, 2008, chapter 8), told
-apart by the modes before, in and after the part that is brief.
+Such a part begins where the motion reaches the surface while the fields of both sides point at it,
+and ends where one of them turns away. The modes before, in and after a brief part distinguish four
+kinds (di Bernardo, Budd, Champneys and Kowalczyk, Piecewise-smooth Dynamical Systems, 2008, chapter
+8).
 
-A place of that kind is located on the motion without the part that vanishes there. Close to it the
-equations of the motion with that part have a second solution, in which both events that bound the
-part coincide, and a corrector finds the one or the other. Without the part they are regular: what
-remains is a touch, or a guard that vanishes at an event.
+These points are located on the motion without the vanishing part. Close to them the equations with
+the part have a second solution, in which both events that bound the part coincide, and a corrector
+may find either. The equations without the part are regular: the condition is a touch, or a guard
+that vanishes at an event.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,7 @@ from ._surgery import without_events
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
 SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
 
-# What is said of each: of a motion without the part that is brief, and of one with it.
+# Descriptions of each kind: of a motion without the brief part, and of one with it.
 SLIDING = {
     CROSSING_SLIDING: (
         "{name} passes its surface {place}, and beyond is held there for a while",
@@ -55,26 +55,26 @@ SLIDING = {
     ),
 }
 
-# A part of a motion this brief, as a share of its period, vanishes; where nothing else happens one
-# that is nearly so, as a corrector may not get closer. A guard this small is zero. Choices: special
-# points are located far closer (see `refined`).
+# A part of a motion this brief, as a share of its period, vanishes; if nothing else is found, also
+# a nearly brief one, as a corrector may not get closer. A guard this small is zero. Choices:
+# special points are located far closer (see `refined`).
 _BRIEF, _NEARLY, _ZERO = 1e-4, 1e-2, 1e-6
 
 
 class Change(NamedTuple):
-    """A part of a motion that vanishes at a special point, or appears there."""
+    """A part of a motion that vanishes or appears at a special point."""
 
     number: int
     """The number of the switch."""
     clock: float
     modes: tuple[float, float, float]
-    """Of the switch, before that part, in it and after it."""
+    """Modes of the switch before, in and after that part."""
     exists: bool
-    """Whether the motion has that part, on this side."""
+    """True if the motion has that part on this side."""
 
     @property
     def kind(self) -> str | None:
-        """Which of the four it is, if any."""
+        """The kind of sliding bifurcation, or `None`."""
         before, brief, after = self.modes
         if brief == 0 and before and after:
             return GRAZING_SLIDING if before == after else CROSSING_SLIDING
@@ -84,12 +84,12 @@ class Change(NamedTuple):
 
 
 def holds(event: AbstractEvent) -> bool:
-    """Whether a switch has a mode (0) in which the motion stays on its surface."""
+    """Return whether a switch has a mode (0) in which the motion stays on its surface."""
     return event.holds_mode and (isinstance(event, DryFriction) or getattr(event, "blends", False))
 
 
 def change_at(problem: Shooting, at: Step) -> Change | None:
-    """The change of sticking and sliding at a special point; `None` if none of the four."""
+    """Return the change of sticking or sliding at a special point; `None` if of no kind."""
     if not problem.modes[0]:
         return None
     found = (
@@ -106,7 +106,7 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
 
 
 def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
-    """The briefest part between two events of one switch, if shorter than this share."""
+    """Return the briefest part between two events of one switch, if shorter than this share."""
     (clock, _, period), lengths = problem.values(at.x), problem.lengths(at.x)
     events, found = problem.events, []
     for i, event in enumerate(events):
@@ -120,12 +120,12 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
 
 
 def _unit(problem: Shooting, at: Step, *, held: bool) -> float:
-    """What counts as 1 of a switch's guard: of a velocity, or while it is held of a force."""
+    """Return the unit of a switch's guard: that of a velocity, or while `held` of a force."""
     return at.seen.length / problem.radian ** (2 if held else 1)
 
 
 def _touching(problem: Shooting, at: Step) -> Change | None:
-    """A flight that just touches a switch's surface, or a body that is only just held."""
+    """Return a flight's touch of a switch's surface, or a body at the limit of being held."""
     nearest, number = at.seen.nearest, int(at.seen.nearest.event)
     if not holds(Event(number).of(problem.machine)):
         return None
@@ -136,13 +136,13 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     force, _, away = holding_force(problem, at, leg, number, place)
     if not mode:
         return Change(number, place, (0.0, away, 0.0), False)
-    # A surface that is touched from one side holds only what the other side's field drives on.
+    # Without the other side's field towards it, a surface does not hold a motion that touches it.
     is_held = force < _ZERO * _unit(problem, at, held=True)
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
 def _beginning(problem: Shooting, at: Step) -> Change | None:
-    """An event of a switch at which it is only just held, or only just not."""
+    """Return an event of a switch at the limit of being held there."""
     clock, found = problem.values(at.x)[0], []
     for i, event in enumerate(problem.events):
         if not holds(event.of(problem.machine)):
@@ -156,7 +156,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
     force, rate, number, place, before, after = min(found)
     if force > _ZERO * _unit(problem, at, held=True):
         return None
-    if rate > 0:  # what holds it is about to let go of it
+    if rate > 0:  # at the limit of release
         return Change(number, place, (before, 0.0, after or -before), False)
     return Change(number, place, (before, -before, 0.0), after != 0)
 
@@ -164,7 +164,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
 def holding(
     problem: Shooting, machine: AbstractMachine, leg: Leg, number: int, s: Scalar, state: State
 ) -> Rates:
-    """How far what drives a switch off its surface exceeds what holds it, and the rates of that."""
+    """Return how far the driving force of a switch exceeds the holding force, with its rates."""
     j, modes = mode_number(machine, number), problem.modes_in(leg)
     modes = (*modes[:j], jnp.zeros_like(modes[j]), *modes[j + 1 :])
     contact = problem.flight(machine, leg).contact
@@ -179,7 +179,7 @@ def holding(
 @on_host
 def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     machine, states = problem.at(x), problem.parts(x)[1]
-    # An event's state is that before it; in a leg it is flown to.
+    # At an event the state just before it; otherwise the leg is integrated.
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
     force, modes = holding(problem, machine, leg, number, s, state), problem.modes_in(leg)
     contact = problem.flight(machine, leg).contact
@@ -190,7 +190,7 @@ def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
 def holding_force(
     problem: Shooting, at: Step, leg: int, number: int, s: float
 ) -> tuple[float, float, float]:
-    """By how much a switch is driven off its surface, the rate of that, and its next mode."""
+    """Return the excess force off a switch's surface, its rate, and the switch's next mode."""
     begins = bool(s == problem.values(at.x)[0][leg])
     force, rate, mode = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
     return float(force), float(rate), float(mode)
@@ -201,13 +201,13 @@ _CLOSE = 1e-8
 
 
 def refined(problem: Shooting, at: Step, change: Change) -> Step:
-    """The special point at which a part of the motion vanishes, from one that is close to it."""
+    """Locate the special point at which a part of the motion vanishes, from one close to it."""
     clock = problem.values(at.x)[0]
     close = abs(float(at.seen.order_margin)) < _CLOSE * problem.radian
     if not change.exists or problem.conditions or close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
-    if first + 1 == problem.legs:  # the part lies across the begin of the period
+    if first + 1 == problem.legs:  # the part contains the begin of the period
         return at
     new, x, event = without_part(problem, at, change)
 
@@ -224,8 +224,8 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
 def without_part(
     problem: Shooting, at: Step, change: Change
 ) -> tuple[Shooting, np.ndarray, int | None]:
-    """The equations and unknowns of a motion without the part that vanishes, and its event at which
-    the switch is only just held, `None` where its surface is touched."""
+    """Return the equations and unknowns of a motion without the vanishing part, and its event at
+    which the switch is at the limit of being held; `None` if its surface is touched."""
     first = int(np.argmin(np.abs(problem.values(at.x)[0] - change.clock)))
     alike = change.modes[0] == change.modes[2]
     if not change.exists:
@@ -238,8 +238,8 @@ def without_part(
 def _with_part(
     problem: Shooting, at: Step, new: Shooting, step: Step, first: int, alike: bool
 ) -> Step:
-    """The solution with a part that has no length and begins with event `first`, from that without
-    it, `step` of `new`; `alike`, whether both events of the part were left out."""
+    """Insert a part of no length, from event `first` on, into the solution `step` of `new` without
+    it. `alike` is true if both events of the part were left out."""
     clock, states, period = new.values(step.x)
     if not new.events:
         clock, states = np.zeros(0), np.zeros((0, problem.states))

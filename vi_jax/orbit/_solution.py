@@ -114,8 +114,7 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
-    """Return the solution on the plane across a unit tangent, at `length` along it from `x`
-    (scaled)."""
+    """Return the solution on the plane across a unit tangent, at `length` from `x` (scaled)."""
     return _advanced(problem, x, tangent, problem.scale, float(length))
 
 
@@ -132,15 +131,13 @@ def _lacks(problem: Shooting, x):
 
 
 def off_by(problem: Shooting, x: Unknowns) -> float:
-    """Return how much doubling the steps changes the ends of the flights, relative to their
-    sizes."""
+    """Return the relative change of the ends of the flights by doubling the steps."""
     finer = dataclasses.replace(problem, steps=2 * problem.steps)
     return float(np.max(np.abs(_lacks(finer, x) - _lacks(problem, x))))
 
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
-    """Return the scaled unit tangent of the solutions through `x`; its last component is
-    positive."""
+    """Return the scaled unit tangent of the solutions through `x`, last component positive."""
     null = np.linalg.svd(jacobian_at(problem, x) * problem.scale)[2]
     tangent = null[-1]
     if problem.is_double:  # one direction of the plane moves the parameters

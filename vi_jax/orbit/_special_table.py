@@ -1,16 +1,15 @@
 """The table of a curve of special motions in two parameters, and its points of codimension two.
 
-| what | test, positive before it | ends the curve as |
+| event | test, positive before it | end of the curve |
 |---|---|---|
 | a bound is reached | distance of the parameter | `bounds` |
 | another impact is lost, a stop touched | V⁻, least distance at a turn | `grazing` |
-| another chatter takes until the release | how much less it takes | `rest` |
+| another chatter takes until the release | the time left | `rest` |
 | a pair of multipliers becomes real | 1 ∓ the cosine of its angle | `resonance-1:1`, `-1:2` |
 | the motion becomes its own image | its difference from that | `symmetry-breaking` |
-| it comes back to where it was | distance to the plane across it | `closed` |
+| the curve closes | distance to the plane across an earlier point | `closed` |
 
-The points of codimension two that do not end it are looked for when the curve is finished
-(`points_of`).
+The other points of codimension two are located on the finished curve (`points_of`).
 """
 
 import contextlib
@@ -64,34 +63,34 @@ from ._words import (
 )
 from .special import Point, point_at
 
-# The thresholds here are choices.
-# A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
-# pole. The second for entries of the local map: one that is as small vanishes as well.
+# The thresholds here are choices. A test that changes its sign without coming this near to zero (as
+# a share of its neighbours) has a pole. The second is for entries of the local map; entries this
+# small are zero.
 _ZERO, _ENTRY = 1e-6, 1e-4
 
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
 
-# Motions that graze are looked at over so many periods.
+# Local maps of grazing motions are examined over so many periods.
 PERIODS = 3
 
-# Of the first and of the second parameter.
+# The intervals of the first and of the second parameter.
 Intervals = tuple[tuple[float, float], tuple[float, float]]
 
 
 class SpecialTable(Table):
-    """What can happen on a curve of special motions in two parameters, for each of its steps."""
+    """Possible events of a curve of special motions in two parameters, in each of its steps."""
 
     def __init__(self, problem: Shooting, bounds: Intervals):
         super().__init__(problem, bounds)
         self.condition: Special = problem.conditions[0]
-        # Along a curve of symmetric motions the images are alike everywhere.
+        # All motions of a symmetric curve are their own images.
         self.symmetric = self.condition.kind != SYMMETRY and may_be_symmetric(
             problem, [problem.machine, *problem.corners(bounds)]
         )
 
     def stalled(self, steps: list[Step]) -> Ending:
-        """The end of a curve that stalls: perhaps where its motions become symmetric."""
+        """Return the end of a stalled curve, perhaps where its motions become symmetric."""
         last = steps[-1]
         if self.symmetric and np.linalg.norm(self.images(last)) < ALIKE:
             for here in reversed(steps):
@@ -108,7 +107,7 @@ class SpecialTable(Table):
         ]  # fmt: skip
 
     def _grazings(self, here: Step) -> Iterator[Event]:
-        """Where an impact beside the one that grazes is lost, or a stop is touched."""
+        """Yield the rows of lost impacts other than the grazing one, and of touched stops."""
         kind, grazes = self.condition.kind, self.condition.impact
         # At a grazing the body turns on the stop, to rounding.
         if kind not in TOUCHING or kind == REST or grazes is not None:
@@ -129,7 +128,7 @@ class SpecialTable(Table):
             yield Event(test, lost, noise=ROUNDING)
 
     def _singular(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
-        """The end at a place at which an impact grazes, where the monodromy matrix has a pole."""
+        """Return the end at a grazing impact, where the monodromy matrix has a pole."""
         found = None
         if self.condition.kind not in TOUCHING and at is not here:
             root = distance_along(self.problem, here, at)
@@ -141,16 +140,16 @@ class SpecialTable(Table):
         return Ending(found._replace(seen=found.seen._replace(**gone)), GRAZING)
 
     def _resonances(self) -> Iterator[Event]:
-        """Where a pair of multipliers on the unit circle becomes real: beyond, the product of two
-        is still 1, but none has the modulus 1."""
+        """Yield the rows of places where a pair of multipliers on the unit circle becomes real.
+        Beyond, the product of the two is still 1, but neither has modulus 1."""
         for kind, sign in ((RESONANCE_1, 1), (RESONANCE_2, -1)):
             if self.condition.kind == TORUS:
                 left = lambda step, sign=sign: 1 - sign * cosine_of(step)
                 yield Event(left, lambda at, kind=kind: Ending(at, kind), noise=ROUNDING)
 
     def _mirror(self, here: Step) -> Iterator[Event]:
-        """Where the motion becomes symmetric: beyond, the same ones come again in the mirror, and
-        what grazed on one side is passed through on the other."""
+        """Yield the row of a place where the motion becomes symmetric. Beyond, the same motions
+        repeat mirrored, and a grazing of one side is passed through on the other."""
         begin = self.images(here)
         if np.linalg.norm(begin) < ROUNDED:
             return
@@ -165,8 +164,8 @@ class SpecialTable(Table):
         yield Event(lambda step: float(np.dot(begin, self.images(step))), ending)
 
     def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
-        """The point about so far ahead at which the motion is symmetric and the curve is crossed by
-        that of the symmetric motions; `beyond`, whether this one can be followed further."""
+        """Return the point about so far ahead where the motion is symmetric and the curve of
+        symmetric motions crosses this one; `beyond` is true if this one can be followed further."""
         begin = self.images(here)
 
         def admits(step: Step, length: float) -> bool:
@@ -178,7 +177,7 @@ class SpecialTable(Table):
 
 
 def cosine_of(step: Step) -> float:
-    """The cosine of the angle of the pair whose product is nearest to 1; beyond ±1 if real."""
+    """Return the cosine of the angle of the pair with product nearest to 1; beyond ±1 if real."""
     values = step.seen.multipliers
     first, second = np.triu_indices(len(values), 1)
     pair = int(np.argmin(np.abs(values[first] * values[second] - 1)))
@@ -186,7 +185,7 @@ def cosine_of(step: Step) -> float:
 
 
 class Vectors(NamedTuple):
-    """Left and right null vector of the Jacobian by all unknowns but the parameters."""
+    """Left and right null vector of the Jacobian in all unknowns but the parameters."""
 
     left: np.ndarray
     right: np.ndarray
@@ -197,7 +196,7 @@ Test = Callable[[Step, Vectors | None], tuple[float, Vectors | None]]
 
 
 def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> list[Point]:
-    """The points of codimension two on a curve, in its order."""
+    """Return the points of codimension two on a curve, in its order."""
     condition: Special = problem.conditions[0]
 
     def point(kind: str, step: Step, detail: str | None = None, **fields: Any) -> Point:
@@ -218,7 +217,7 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
             symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
-        with contextlib.suppress(ValueError):  # the local map is not known
+        with contextlib.suppress(ValueError):  # without a local map
             for place, step, what in _resonances(problem, condition.impact, steps):
                 found.append((place, point(RESONANT, step, what, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
@@ -235,10 +234,10 @@ def _symmetric(problem: Shooting, step: Step) -> bool:
 
 
 def _grazes(step: Step) -> int | None:
-    """The impact that grazes at the end of a curve; `None` at a touch."""
+    """Return the impact that grazes at the end of a curve; `None` at a touch."""
     approach = np.asarray(step.seen.approach)
-    # An impact that is lost comes with a turn near the stop: of a speed v at a distance of about
-    # v². Where a stop is touched the impacts keep their speed.
+    # A lost impact comes with a turn near the stop: at a distance of about v² for a speed v. At a
+    # touched stop the impacts keep their speed.
     touches = max(_SAME_TURN * np.sqrt(abs(room(step))), _ZERO)
     if approach.size and approach.min() < touches * step.seen.fastest:
         return int(np.argmin(approach))
@@ -248,8 +247,8 @@ def _grazes(step: Step) -> int | None:
 def _resonances(
     problem: Shooting, impact: int | None, steps: list[Step]
 ) -> Iterator[tuple[float, Step, str]]:
-    """The resonant grazings of a curve: its step, with the fraction of the way to the next one, the
-    point, and what begins there."""
+    """Yield the resonant grazings of a curve: the position in steps with a fraction, the point, and
+    a description of the curve that begins there."""
 
     def local(step: Step) -> LocalMap:
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
@@ -274,13 +273,13 @@ def _resonances(
 
 
 def _place(problem: Shooting, i: int, steps: list[Step], at: Step) -> float:
-    """Where on a curve a point is: the number of the step before it, and the share of the way."""
+    """Return the position of a point on a curve: the step before it plus a fraction."""
     whole, part = ((step.x - steps[i].x) / problem.scale for step in (steps[i + 1], at))
     return i + float(whole @ part / (whole @ whole))
 
 
 def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
-    """Functions that change their sign at the points of each kind, by the curve's kind."""
+    """Return functions that change sign at the points of each kind, by the curve's kind."""
 
     def plain(function: Callable[[Step], float]) -> Test:
         return lambda step, like: (function(step), None)
@@ -291,7 +290,7 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     bare = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
-    # The product of all eigenvalues of M ± I but one, where that one is zero.
+    # The product of all eigenvalues of M ± I but one, if that one is zero.
     sign = 1 if condition.kind == DOUBLING else -1
     shifted = lambda s: s.seen.monodromy + sign * np.eye(len(s.seen.monodromy))
     double = plain(lambda s: float(minors(shifted(s))))
@@ -304,15 +303,15 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
         return {RESONANCE_1: double}
     if condition.kind == SYMMETRY:
         return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
-    # Where an impact grazes M has a pole, but not where a stop is touched.
+    # M has a pole at a grazing impact, but not at a touched stop.
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
 
 
 def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
-    """The null vectors l and r of a square matrix.
+    """Return the null vectors l and r of a square matrix.
 
-    Their senses go together: the adjugate is r lᵀ times det U · det V and a positive number, and it
-    is continuous. Which of the two pairs it is the vectors of a point close by say.
+    Their signs are coupled: the adjugate is r lᵀ times det U · det V and a positive number, and it
+    is continuous. The vectors `like` of a point close by determine the common sign.
     """
     left, _, right = np.linalg.svd(matrix)
     found = Vectors(left[:, -1] * np.linalg.det(left) * np.linalg.det(right), right[-1])
@@ -323,11 +322,11 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
 
 
 def _cusp(bare: Shooting, many: int) -> Test:
-    """How fast the parameters move along a curve of folds, with a sign.
+    """Return a test for cusps: the signed rate of the parameters along a curve of folds.
 
-    With the left null vector l of F_x both change so that l·F_p dp = 0: along the line across the
-    vector l·F_p, which turns slowly, while the sense in which they go is turned round at a cusp. Of
-    `many` null vectors that one counts on which the parameters act.
+    With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
+    across l·F_p. That line turns slowly, while their direction reverses at a cusp. If there are
+    `many` null vectors, the parameters act on the one that is used.
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
@@ -348,7 +347,7 @@ def _cusp(bare: Shooting, many: int) -> Test:
 
 @on_host
 def _bent(problem: Shooting, x, right, bend):
-    """Second and third derivative of the equations along x + t right + t² bend/2, at t = 0."""
+    """Return the equations' second and third derivatives d/dt along x + t right + t² bend/2."""
 
     def along(t):
         return problem.lacks(x + t * right + 0.5 * t * t * bend)
@@ -362,12 +361,12 @@ def _bent(problem: Shooting, x, right, bend):
 
 
 def _cubic(bare: Shooting, *, twice: bool) -> Test:
-    """The cubic coefficient of the motions that begin at a doubling, or where a symmetry is lost.
+    """Return the cubic coefficient of the motions that begin at a doubling or a symmetry breaking.
 
-    Of the equations F of the motion that is gone through twice, or those of the symmetric motion,
-    with null vectors l and r: l·(C(r, r, r) + 3 B(r, w))/6, F_x w = -B(r, r), where B and C are
-    their second and third derivatives (Kuznetsov, Elements of Applied Bifurcation Theory, 2004,
-    section 5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
+    Let F be the equations of the motion gone through twice, or of the symmetric motion, with null
+    vectors l and r, and second and third derivatives B and C. The coefficient is l·(C(r, r, r) + 3
+    B(r, w))/6, F_x w = -B(r, r) (Kuznetsov, Elements of Applied Bifurcation Theory, 2004, section
+    5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
     """
     whole = several(bare, 2) if twice else bare
 
@@ -385,11 +384,11 @@ def _cubic(bare: Shooting, *, twice: bool) -> Test:
 
 
 def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[float, Step]]:
-    """Where a test changes its sign along a curve: which step, with a fraction, and the point."""
+    """Yield the zeros of a test along a curve: position in steps with a fraction, and point."""
     seen: list[tuple[float, Vectors | None]] = []
     for step in steps:
         like = seen[-1][1] if seen else None
-        # At an end where an impact is lost the tests have poles.
+        # At an end with a lost impact the tests have poles.
         regular = np.isfinite(step.seen.monodromy).all()
         seen.append(test(step, like) if regular else (np.nan, like))
     for i, (here, new) in enumerate(itertools.pairwise(steps)):
@@ -405,11 +404,11 @@ def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[f
 def _zero(
     problem: Shooting, here: Step, new: Step, test: Callable[[Step], float], most: float
 ) -> Step | None:
-    """The point between two at which a test, at most so large there, is zero and has no pole."""
+    """Return the point between two where a test, of size `most` there, is zero without a pole."""
     at = located(problem, here, new, test)
     if at is None or abs(test(at)) <= _ZERO * most:
         return at
-    # Where another curve crosses this one the corrector has no answer.
+    # At a crossing with another curve the corrector fails.
 
     def admits(step: Step, length: float) -> bool:
         return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most

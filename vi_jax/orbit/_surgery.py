@@ -1,7 +1,7 @@
-"""The equations of a motion without some of its events, or over another number of its cycles; and
-motions whose second half is as the first, or its image under the symmetry of their machine.
+"""The equations of a motion without some of its events, or over another number of its cycles;
+motions whose second half equals the first, or its image under the machine's symmetry.
 
-A branch may spring from a motion of half the period of its own (`origin`).
+A branch may begin at a motion of half its period (`origin`).
 """
 
 import dataclasses
@@ -18,16 +18,15 @@ from ._flight import Event
 from ._shooting import ROUNDING, Shooting
 from ._solution import Step, advance, observe, on_host, sections_of, state_at, tangent_at, zero_near
 
-# Halves of a period that differ by less than this are alike, or images of each other; and by less
-# than this but for rounding: choices.
+# Halves of a period that differ by less than the first are equal, or images of each other; by less
+# than the second up to rounding. Both are choices.
 ALIKE, ROUNDED = 1e-3, 1e-7
 
 
 def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> bool:
-    """Whether a motion with these events can be its own image, on each of these machines.
+    """Return whether a motion with these events can be its own image, on each of these machines.
 
-    A machine that is driven is its own image after half a drive cycle, so that only periods of an
-    odd number of cycles can be.
+    A driven machine is its own image after half a drive cycle, so the number of cycles must be odd.
     """
     events, half = problem.events, len(problem.events) // 2
     if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
@@ -49,7 +48,7 @@ def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
 
 
 def may_repeat(problem: Shooting) -> bool:
-    """Whether the second half of a period with these events can be as the first."""
+    """Return whether the second half of a period with these events can equal the first."""
     events, half = problem.events, len(problem.events) // 2
     later = tuple(event.later(-(problem.cycles // 2)) for event in events[half:])
     return problem.cycles % 2 == 0 and events[:half] == later
@@ -59,8 +58,8 @@ def may_repeat(problem: Shooting) -> bool:
 def _halves(
     problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
 ) -> Float[Array, " differences"]:
-    """How the second half of a period differs from the first, or from its image; smooth along a
-    branch, as the events of both halves are compared."""
+    """Return the difference of the second half of a period from the first, or from its image;
+    smooth along a branch, as the events of both halves are compared."""
     half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
 
     def image(u):
@@ -76,15 +75,15 @@ def _halves(
 
 
 def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
-    """The difference of both halves of the period, or from the image, in the unknowns' sizes."""
+    """Return the difference of the period's halves, or from the image, in the unknowns' sizes."""
     return _halves(problem, step.x, mirrored) / problem.half_scale()
 
 
 def several(old: Shooting, n: int) -> Shooting:
-    """The equations of a motion that is gone through n times."""
+    """Return the equations of a motion that is gone through n times."""
     events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
-    # With events `steps` counts those of one leg, which stays as long; but each hop of a chatter
-    # takes a part of `steps / cycles`, so that there they grow with the cycles.
+    # With events, `steps` counts those of one leg, which stays as long. Each hop of a chatter takes
+    # a part of `steps / cycles`, so that with chatters the steps grow with the cycles.
     steps = old.steps if events and not old.landings else n * old.steps
     return dataclasses.replace(
         old, cycles=n * old.cycles, events=events, modes=old.modes * (n if events else 1),
@@ -93,7 +92,7 @@ def several(old: Shooting, n: int) -> Shooting:
 
 
 def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndarray:
-    """The unknowns of a motion that is gone through several times, as those of `new`."""
+    """Return the unknowns of a motion that is gone through several times, as those of `new`."""
     (clock, states, turn), n = problem.values(x), new.cycles // problem.cycles
     if problem.events:
         clock = (clock + turn * np.arange(n)[:, None]).ravel()
@@ -102,11 +101,11 @@ def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndar
 
 
 def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
-    """The point where a branch springs, on the branch and on the motion of half the period, with
-    the problem of that motion; on the latter it is located.
+    """Return the point where a branch begins, the problem of the motion of half the period, and the
+    point on the latter, on which it is located.
 
-    Both branches cross there, so that the equations of this one cannot be solved close by. The
-    mean of the two halves is a motion of half the period but for a term of second order.
+    Both branches cross there, so the equations of this one are singular close by. The mean of both
+    halves is a motion of half the period up to a term of second order.
     """
     legs, (clock, states, period) = len(problem.events) // 2, problem.values(at.x)
     turn = period / 2
@@ -133,7 +132,7 @@ def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
 
 
 def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step | None:
-    """The admissible motion at a distance from a solution, on whichever side there is one."""
+    """Return the admissible motion at a distance from a solution, on either side, or `None`."""
     tangent = tangent_at(problem, x)
     for sense in (1.0, -1.0):
         found = advance(problem, x, sense * tangent, distance)
@@ -146,14 +145,14 @@ def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step
 
 
 # Sections of one motion that differ by less than this (relative to 1 + |state|) are the same: a
-# choice, far above what a located point is off by, far below what tells motions apart.
+# choice, far above the error of a located point, far below the difference of distinct motions.
 _SAME = 1e-7
 
 
 def without_events(
     old: Shooting, x: np.ndarray, which: Sequence[int]
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations and unknowns of a motion without events that only graze."""
+    """Return the equations and unknowns of a motion without events that only graze."""
     clock, states, period = old.values(x)
     keep = [i for i in range(old.legs) if i not in which]
     if keep:
@@ -166,7 +165,7 @@ def without_events(
 
 
 def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    """The equations of the same motion over its least period, and the unknowns that solve them."""
+    """Return the equations of the same motion over its least period, and their unknowns."""
     leaves = jax.tree.leaves(sections_of(old, x)[0])
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):

@@ -1,4 +1,4 @@
-"""What begins at a special point: motions of other branches, and other curves in two parameters."""
+"""Motions of other branches, and other curves in two parameters, that begin at a special point."""
 
 import dataclasses
 import itertools
@@ -54,26 +54,26 @@ from .special import Point, point_at
 
 _ORBIT = "orbit"
 
-# Periods after which a stable motion has settled; impacts of a cycle that are listed: choices.
+# Periods after which a stable motion has settled; most impacts of a cycle in the list: choices.
 _SETTLES, _LISTED = 100, 32
 
 
 def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
-    """The motion at a step. **Raises:** `ValueError` if the corrector found none there."""
+    """Return the motion at a step; raise `ValueError` if the corrector found none there."""
     if not bool(step.good):
         raise ValueError(f"No motion of {what} was found at distance {distance:g}; try another.")
     return orbit_of(problem, step)
 
 
 def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
-    """The motion gone through n times, and right singular vectors of the derivative by its x."""
+    """Return the motion gone through n times, and right singular vectors of its Jacobian in x."""
     new = several(point.problem, n)
     x = repeated(point.problem, point.step.x, new)
     return new, x, np.linalg.svd((jacobian_at(new, x) * new.scale)[:, :-1])[2]
 
 
 def _doubled(point: Point, distance: float) -> Orbit:
-    """A motion of twice the period, or of half of it where the branch springs from one."""
+    """Return a motion of twice the period, or of half of it if the branch begins at one."""
     if point.springs:
         problem, x = point.problem, point.step.x
         step = advance(problem, x, tangent_at(problem, x), distance)
@@ -86,7 +86,7 @@ def _doubled(point: Point, distance: float) -> Orbit:
 def _crossed(point: Point, distance: float) -> Orbit:
     problem, x = point.problem, point.step.x
     jacobian = jacobian_at(problem, x) * point.scale
-    # Here the equations have two null vectors: one leads along this branch, the other off it.
+    # The equations have two null vectors here: one leads along this branch, the other off it.
     plane = np.linalg.svd(jacobian)[2][-2:]
     along = plane.T @ (plane @ point.step.tangent)
     off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
@@ -95,7 +95,7 @@ def _crossed(point: Point, distance: float) -> Orbit:
 
 
 def _held_otherwise(point: Point, distance: float) -> Orbit:
-    """The motion on the other side of a sliding bifurcation."""
+    """Return the motion on the other side of a sliding bifurcation."""
     problem, change = point.problem, change_at(point.problem, point.step)
     if change is not None and change.exists and change.modes[0] == change.modes[2]:
         new, start, _ = without_part(problem, point.step, change)
@@ -107,7 +107,7 @@ def _held_otherwise(point: Point, distance: float) -> Orbit:
 
 
 def _resting_otherwise(point: Point, distance: float) -> Orbit:
-    """The motion with a rest more or less; where two become one, that with one."""
+    """Return the motion with one rest more or less; where two become one, that with one."""
     if not point.springs:
         other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
         return _beside(point, distance, "another number of rests", other)
@@ -118,11 +118,11 @@ def _resting_otherwise(point: Point, distance: float) -> Orbit:
 
 
 def _reordered(point: Point, distance: float) -> Orbit:
-    """The motion beside a place where two events fall together, with others or in another order."""
+    """Return a motion with other events or another order, near where two events coincide."""
     problem, (clock, _, period) = point.problem, point.problem.values(point.step.x)
     here, begins = list(problem.events), range(len(problem.events))
     if all(event.cycle is None for event in here):
-        # The same motion may be observed whole cycles later, not from any other of its events.
+        # The same motion may begin whole cycles later, but not at any other of its events.
         n = problem.cycles
         begins = [int(np.sum(clock < i * period / n)) for i in range(n)]
     turned = [here[i:] + here[:i] for i in begins]
@@ -131,7 +131,7 @@ def _reordered(point: Point, distance: float) -> Orbit:
 
 
 def _swapped(point: Point) -> Iterator[State]:
-    """The state on the section where an event that falls on it comes on the other side of it."""
+    """Yield the state on the section after an event that coincides with it has changed sides."""
     problem, x = point.problem, jnp.asarray(point.step.x)
     machine, clock, states = problem.at(x), *problem.parts(x)
     lengths = np.abs(problem.lengths(x)) / problem.radian
@@ -140,7 +140,7 @@ def _swapped(point: Point) -> Iterator[State]:
         if 0 not in (event.cycle, after.cycle) or lengths[i] > TOGETHER:
             continue
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
-        # The section's state is that behind it.
+        # The section's state is the one just after it.
         for each in (after, event) if event.cycle == 0 else (after,):
             state, modes = after_event(machine, each.number, clock[i], state, modes)
         yield state
@@ -150,14 +150,14 @@ def _beside(
     point: Point, distance: float, what: str, other: Callable[[Orbit], bool],
     guesses: Sequence[State] = (),
 ) -> Orbit:  # fmt: skip
-    """A motion beside a point that the branch has not.
+    """Return a motion near a point that does not belong to the branch.
 
-    The map of the section has no jump there but where an impact falls on the section, so that the
-    motion is looked for by its fixed points: from the guesses and from those close by on the
-    branch, and from where a simulation settles. Beyond the point is looked at first.
+    The section map has no jump there unless an impact falls on the section, so its fixed points are
+    sought: from the guesses, from points close by on the branch, and from a settled simulation. The
+    far side of the point is tried first.
 
-    **Arguments:** what the motion has, in words; whether a motion is such a one; states on the
-    section.
+    **Arguments:** `what`, the motion in words; `other`, a function that accepts a motion;
+    `guesses`, states on the section.
 
     **Raises:** `ValueError` if none is found.
     """
@@ -184,7 +184,7 @@ def _beside(
 
 
 def _beyond_grazing(point: Point, distance: float) -> Orbit:
-    """The motion with the grazing impact less, or with the touch as an impact more."""
+    """Return the motion without the grazing impact, or with the touch as an additional impact."""
     old, step = point.problem, point.step
     if point.impact is not None and old.events[point.impact].use:
         raise ValueError(
@@ -224,7 +224,7 @@ def _check_plain(problem: Shooting) -> None:
 def _with_touch(
     old: Shooting, x: np.ndarray, number: int, touch: float
 ) -> tuple[Shooting, np.ndarray]:
-    """The equations of a motion with a touch as one of its events; and their unknowns."""
+    """Return the equations of a motion with a touch as one of its events, and their unknowns."""
     (clock, states, period), events = old.values(x), list(old.events)
     u, hit = state_at(old, x, *old.leg_at(x, touch))[None], Event(number)
     if not events:
@@ -239,7 +239,7 @@ def _with_touch(
 
 
 def _as_kind(kind: str, point: Point, distance: float) -> Point:
-    """The motion at a point of a boundary as a special point of another kind."""
+    """Return the motion at a point of a boundary as a special point of another kind."""
     impact = point.impact if kind == GRAZING else None
     found = point_at(point.problem, point.step, kind, impact=impact)
     return dataclasses.replace(found, further=point.further)
@@ -248,7 +248,7 @@ def _as_kind(kind: str, point: Point, distance: float) -> Point:
 def _in_two(
     point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
 ) -> tuple[Shooting, np.ndarray]:
-    """Equations and unknowns beside a point of a boundary in two parameters, with a condition."""
+    """Return equations and unknowns near a point of a two-parameter boundary, with a condition."""
     ((name, (value, size)),) = point.further.items()
     two = dataclasses.replace(
         problem, parameters=(name, *problem.parameters), conditions=(condition,),
@@ -258,7 +258,7 @@ def _in_two(
 
 
 def _of_periods(n: int, point: Point, distance: float) -> Orbit:
-    """A motion of n periods beside one with multipliers exp(±2πi/n).
+    """Return a motion of n periods near one with multipliers exp(±2πi/n).
 
     The derivative of n periods is the identity in a plane. Each direction in it leads to such
     motions, at some values of both parameters.
@@ -272,21 +272,21 @@ def _of_periods(n: int, point: Point, distance: float) -> Orbit:
     return _found(two, step, f"{n} times the period", distance)
 
 
-# The first step along a curve is this share of the distance, each further one twice as long as the
-# one before, so many at most. With half the speed, what is found lies half as far off, within this.
-# A resonance is zero to this share of the kick. Choices.
+# The first step along a curve is this share of the distance; each further one is twice as long, so
+# many at most. With half the speed the found point is half as far off, within these bounds. A
+# resonance is zero to this share of the kick. Choices.
 _FIRST, _LOOKED, _HALF, _RESONANT = 1e-3, 16, (0.35, 0.65), 1e-5
 
 
 def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
-    """A fold or a doubling of the motion with one impact, beside a resonant grazing."""
+    """Return a fold or doubling of the motion with one impact, near a resonant grazing."""
     graze, sign = graze_at(dataclasses.replace(point, kind=GRAZING)), -1 if kind == DOUBLING else 1
     problem, local, touch = graze.problem, graze.map, graze.touches[0]
     _check_plain(problem)
     sizes = np.asarray(problem.sizes)[1:]
 
     def deep(n: int) -> float:
-        """As deep as this an impact is, if what is left of its kick n periods later is as large."""
+        """Return the depth of an impact whose kick is as large n periods later."""
         left = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
         return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(left / sizes))
 
@@ -313,8 +313,8 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
 
 
 def _changes(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step | None:
-    """Where a test changes its sign along the motions whose impact has a given low speed, a curve
-    in both parameters; the place next to that of the resonance, which is about at `x`."""
+    """Return the point where a test changes sign along the motions with an impact of a given low
+    speed, a curve in both parameters; the closest one to the resonance, which is about at `x`."""
     begin = advance(two, x, np.eye(len(x))[-2], 0.0)
     heads = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
     value = lambda step: tests_of(step)[test]
@@ -327,8 +327,8 @@ def _changes(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step |
     return None
 
 
-# What can be switched at, by the kind of the boundary (`None` of a branch) and that of the point;
-# and what begins there, by its kind.
+# Functions for `switch`: by the kind of the boundary (`None` for a branch) and that of the point,
+# then by the kind of the result.
 BEGINS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] = {
     (None, DOUBLING): {_ORBIT: _doubled},
     (None, GRAZING): {_ORBIT: _beyond_grazing},

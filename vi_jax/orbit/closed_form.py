@@ -1,18 +1,18 @@
-"""Every motion with one impact per n drive cycles of the ideal scene, from the closed form.
+"""All motions with one impact per n drive cycles of the ideal scene, in closed form.
 
-The paper's analysis (Eq. 14 to 21), here for any damping ξ ≥ 0 and through resonance. Between
-impacts Y'' + 2ξY' + Y = cos φ with φ' = ζ is linear in (Y, V, cos φ, sin φ), so a flight over
-T = 2πn/ζ is a matrix, with blocks M (free motion) and G (response from rest). A motion with one
-impact leaves the stop as (d, -k v) at phase φ0 and returns as (d, v):
+The paper's analysis (Eq. 14 to 21), for any damping ξ ≥ 0 and through resonance. Between impacts
+Y'' + 2ξY' + Y = cos φ with φ' = ζ is linear in (Y, V, cos φ, sin φ). A flight over T = 2πn/ζ is
+therefore a matrix, with blocks M (free motion) and G (response from rest). A motion with one impact
+leaves the stop as (d, -k v) at phase φ0 and returns as (d, v):
 
     (d, v) = M (d, -k v) + G (cos φ0, sin φ0).
 
-This gives cos φ0 and sin φ0 as affine functions of v, and cos² + sin² = 1 makes a quadratic in v:
-at most two motions. With ξ = 0, A = 1/(1 - ζ²) and v0 = v/ζ (the velocity dY/dφ) it reads
+This gives cos φ0 and sin φ0 as affine functions of v, and cos² + sin² = 1 is a quadratic equation
+for v, with at most two motions. With ξ = 0, A = 1/(1 - ζ²) and v0 = v/ζ (the velocity dY/dφ)
 
-    sin φ0 = -(1 - k) v0/(2A),   cos φ0 = d/A + ζ (1 + k)/(2A) cot(nπ/ζ) v0;
+    sin φ0 = -(1 - k) v0/(2A),   cos φ0 = d/A + ζ (1 + k)/(2A) cot(nπ/ζ) v0.
 
-the printed Eq. 21 lacks the factor ζ of the cosine and so misses the boundary conditions (16) to
+The printed Eq. 21 lacks the factor ζ of the cosine and violates the boundary conditions (16) to
 (18).
 """
 
@@ -34,13 +34,12 @@ _POINTS = 256
 
 
 class ClosedFormOrbits(Shown):
-    """Motions with one impact per n cycles, two places long: admissible ones come first, then
-    faster impacts. Places without a motion hold NaN. Lengths in units of a, velocities of a ω.
-    """
+    """Motions with one impact per n cycles, in two places: admissible ones come first, then faster
+    impacts. Places without a motion are NaN. Lengths in units of a, velocities of a ω."""
 
     Y: Float[Array, "... 2"]
-    """Position on the scene's section (φ = 0 mod 2π, unless `at_section` has moved it), the first
-    one after the impact; d, just after the impact, where that falls on the section."""
+    """Position on the scene's first section after the impact (φ = 0 mod 2π, or as set by
+    `at_section`); d, just after the impact, if that falls on the section."""
     V: Float[Array, "... 2"]
     """dY/dτ on that section."""
     impact_phase: Float[Array, "... 2"]
@@ -56,29 +55,28 @@ class ClosedFormOrbits(Shown):
     multipliers: Complex[Array, "... 2 2"]
     """Floquet multipliers over the n cycles (last axis); their product is k² exp(-2ξT)."""
     admissible: Bool[Array, "... 2"]
-    """The motion exists and stays inside the gap between impacts."""
+    """True if the motion exists and stays inside the gap between impacts."""
     exists: Bool[Array, "... 2"]
-    """The equations have this real solution and its body approaches the stop (v > 0)."""
+    """True if the equations have this real solution and the body approaches the stop (v > 0)."""
 
 
 def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> ClosedFormOrbits:
     """Return all motions of an ideal scene with one impact in `cycles` drive cycles (Eq. 14 to 21).
 
     **Arguments:** a `Scene` with an `IdealDrive`, a `CosineCrank` and one stop on the right, whose
-    numbers are scalars, traced or not (for arrays of numbers use `jax.vmap`); the period of the
-    motion in drive cycles.
+    parameters are scalars, traced or not (for arrays use `jax.vmap`); the period in drive cycles.
 
     **Returns:** `ClosedFormOrbits`, stable and unstable motions alike. Differentiable if a motion
     exists; derivatives grow without bound towards a fold or a grazing. Resonance (ζ = 1, ξ = 0) is
-    not special. If sin(nπ/ζ) = 0 with ξ = 0, the free motion is periodic itself and every motion
-    has shrunk to a grazing: nothing exists. Impacts slower than rounding can resolve count as
-    grazing too. Turning points are bracketed on 256 points per drive cycle and then solved for, so
-    ζ should be well above 1/256, or peaks between the points can be missed.
+    not special. If sin(nπ/ζ) = 0 with ξ = 0, the free motion is periodic itself, every motion has
+    shrunk to a grazing, and none exists. Impacts slower than rounding can resolve count as grazing.
+    Turning points are bracketed on 256 points per drive cycle and then solved for. With ζ near or
+    below 1/256, peaks between the points can be missed.
 
-    An impact may fall on the section itself: on φ = 0 it does with ξ = 0 and k = 1 or ζ = 1. The
-    state is that just after it, and the next impact is the last thing that happens in the period:
-    V is changed in its last digits if that keeps rounding from putting it beyond, and what comes to
-    the section within rounding of the stop is counted by `simulate` before it.
+    An impact may fall on the section: on φ = 0 it does with ξ = 0 and k = 1 or ζ = 1. The state is
+    then that just after it, and the next impact is the last event of the period. If rounding would
+    put it beyond the section, the last digits of V are changed. `simulate` counts an impact within
+    rounding of the section before it.
 
     **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
     """
@@ -113,22 +111,22 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
 def one_impact_orbits(
     zeta: Number, xi: Number, k: Number, d: Number, n: int, section: Number = 0.0
 ) -> ClosedFormOrbits:
-    """`closed_form_orbits` on bare dimensionless scalars.
+    """Compute `closed_form_orbits` from dimensionless scalars.
 
     **Arguments:** `zeta` > 0, `xi` ≥ 0, the restitution `k` in [0, 1], the gap `d`, the period `n`
-    ≥ 1 in drive cycles, and the crank angle of the section (radians).
+    ≥ 1 in drive cycles, and `section`, its crank angle (radians).
     """
     dtype = jnp.result_type(float, zeta, xi, k, d)
     zeta, xi, k, d, section = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d, section))
     period = 2 * pi * n / zeta
     rates = _rates(zeta, xi)
-    # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They
-    # hold through resonance and critical damping, where sines and a steady response do not.
+    # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They hold
+    # through resonance and critical damping, unlike sines and a steady response.
     doublings = (_POINTS * n - 1).bit_length()
     whole, flights = _squared(_exponential(rates * (period / 2**doublings)), doublings)
     v, phase, slack, resolved = _impacts(whole, k, d, period)
 
-    # Absent motions go on as a harmless one, so that their derivatives cannot be NaN.
+    # Absent motions are replaced by a harmless one, so that their derivatives cannot be NaN.
     exists = resolved & (v > 64 * jnp.finfo(dtype).eps * (1 + period) * (1 + jnp.abs(d)))
     v, phase = jnp.where(exists, v, 1.0), jnp.where(exists, phase, 1.0)
     follow = jax.vmap(lambda v, phase: _follow(rates, flights, period, k, d, v, phase))
@@ -167,18 +165,18 @@ _one_impact_orbits = compiled(one_impact_orbits)
 
 
 def _dot(a, b):
-    # Accelerators may round the factors of a float32 product to fewer bits unless told not to.
+    # Without this accelerators may round the factors of a float32 product to fewer bits.
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def _exponential(matrix: Float[Array, "... 4 4"], doublings: int = 0) -> Float[Array, "... 4 4"]:
-    """e^(2^doublings matrix), for matrices of norm up to 8, by Taylor's series and squaring.
+    """Return e^(2^doublings matrix), for norms up to 8, by Taylor's series and squaring.
 
-    Products only: the library's solver for batches of small systems can lock up two threads.
+    It uses products only: the library's solver for batches of small systems may lock two threads.
     """
     identity = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
     small, first = matrix / 4, jnp.broadcast_to(identity, matrix.shape)
-    # Loops rather than written out, to be compiled sooner.
+    # A loop compiles faster than the written-out series.
     total, _ = jax.lax.scan(
         lambda total, n: (identity + _dot(small, total) / n, None),
         first,
@@ -190,18 +188,18 @@ def _exponential(matrix: Float[Array, "... 4 4"], doublings: int = 0) -> Float[A
 def _squared(
     matrix: Float[Array, "... n n"], times: int
 ) -> tuple[Float[Array, "... n n"], Float[Array, "times ... n n"]]:
-    """matrix^(2^times), and the powers before it: 1, 2, 4, …"""
+    """Return matrix^(2^times), and the powers 1, 2, 4, … before it."""
     return jax.lax.scan(lambda m, _: (_dot(m, m), m), matrix, length=times)
 
 
 def _rates(zeta: Scalar, xi: Scalar) -> Float[Array, "4 4"]:
-    """The matrix of d/dτ (Y, V, cos φ, sin φ)."""
+    """Return the matrix of d/dτ (Y, V, cos φ, sin φ)."""
     constant = jnp.zeros((4, 4), zeta.dtype).at[0, 1].set(1).at[1, 0].set(-1).at[1, 2].set(1)
     return constant.at[1, 1].set(-2 * xi).at[2, 3].set(-zeta).at[3, 2].set(zeta)
 
 
 def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
-    """(Y, V, cos φ, sin φ) just after the impact."""
+    """Return (Y, V, cos φ, sin φ) just after the impact."""
     parts = jnp.broadcast_arrays(d, -k * v, jnp.cos(phase), jnp.sin(phase))
     return jnp.stack(parts, axis=-1)
 
@@ -209,12 +207,12 @@ def _after_impact(k, d, v, phase) -> Float[Array, "... 4"]:
 def _impacts(
     flight: Float[Array, "4 4"], k: Scalar, d: Scalar, period: Scalar
 ) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"], Flag]:
-    """Impact speeds (unit: a ω), impact phases in [0, 2π) with what rounding leaves open of them,
-    and whether they are real.
+    """Return impact speeds (unit: a ω), impact phases in [0, 2π), the rounding error of these, and
+    whether they are real.
 
-    With r(v) = f + g v = (d, v) - M (d, -k v) and the adjugate G⁺ of G, the condition on the
-    phase is |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant is det² (|G⁺ g|² -
-    (f × g)²): neither the speeds nor the test for real ones divide by det.
+    Let r(v) = f + g v = (d, v) - M (d, -k v) and G⁺ be the adjugate of G. The condition on the
+    phase is then |G⁺ r(v)| = |det G|. Since det G⁺ = det G, the discriminant is det² (|G⁺ g|² - (f
+    × g)²). Neither the speeds nor the test for real ones divide by det.
     """
     M, G = flight[:2, :2], flight[:2, 2:]
     f = jnp.stack([d - M[0, 0] * d, -M[1, 0] * d])
@@ -226,7 +224,7 @@ def _impacts(
     radicand = size - (f[0] * g[1] - f[1] * g[0]) ** 2
     # Guarded on both sides of `where`, so that no derivative is infinite at a fold or beyond it.
     root = jnp.where(radicand > 0, jnp.sqrt(jnp.where(radicand > 0, radicand, 1.0)), 0.0)
-    # A flight that is the identity to rounding (sin(nπ/ζ) = 0 with ξ = 0) decides nothing.
+    # A flight that is the identity to rounding (sin(nπ/ζ) = 0 with ξ = 0) determines no motion.
     noise = 16 * jnp.finfo(flight.dtype).eps * (1 + period)
     decided = size > noise**2
     v = (jnp.array([1.0, -1.0], det.dtype) * det * root - jnp.sum(p * q)) / jnp.where(
@@ -238,7 +236,7 @@ def _impacts(
     phase = jnp.mod(jnp.arctan2(jnp.where(resolved, direction[1], 0.0), cosine), 2 * pi)
     # A rounding error below zero comes back from `mod` as a full turn.
     phase = jnp.where(phase >= 2 * pi, 0.0, phase)
-    # What v is made of cancels towards a grazing, and what the phase is made of too.
+    # The terms of v and of the phase cancel towards a grazing.
     length = jnp.sqrt(jnp.where(decided, size, 1.0))
     terms = 2 * jnp.sqrt(jnp.sum(p * p)) + jnp.abs(det) * root / length + length * jnp.abs(v)
     slack = 16 * noise * terms / jnp.where(resolved, jnp.hypot(*direction), 1.0)
@@ -246,8 +244,8 @@ def _impacts(
 
 
 def _early(flight, k, d, v, period) -> Float[Array, "2"]:
-    """A change of V just after the impact, in its last digits, by which the next one comes before
-    the section on which both fall, rather than where rounding puts it."""
+    """Return a change in the last digits of V just after the impact. With it the next impact comes
+    before the section on which both fall, instead of where rounding puts it."""
     rounding = 64 * jnp.finfo(v.dtype).eps * (1 + period) * (1 + jnp.abs(d) + v)
     rise = flight[0, 1]
     change = rounding * rise / (rise * rise + 0.01)
@@ -255,15 +253,15 @@ def _early(flight, k, d, v, period) -> Float[Array, "2"]:
 
 
 def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Scalar]:
-    """Smallest and largest Y over the flight after the impact, and d - Y at its highest peak."""
+    """Return smallest and largest Y over the flight after the impact, and d - Y at the peak."""
     states = _after_impact(k, d, v, phase)[None]
     for flight in flights:  # over 1, 2, 4, … grid steps
         states = jnp.concatenate([states, _dot(states, flight.T)])
-    end = jnp.stack([d, v, jnp.cos(phase), jnp.sin(phase)])  # what the flight was solved for
+    end = jnp.stack([d, v, jnp.cos(phase), jnp.sin(phase)])  # the solved end
     states = jnp.concatenate([states, end[None]])
     y, w = states[:, 0], states[:, 1]
     h = period / (y.size - 1)
-    # Where in its cell w = 0 (linearly) and how high Y is there (cubic Hermite, fourth order).
+    # The place of w = 0 in its cell (linear) and Y there (cubic Hermite, fourth order).
     drop = w[:-1] - w[1:]
     at = jnp.clip(w[:-1] / jnp.where(drop == 0, 1.0, drop), 0, 1)
     rise, back = at * at * (3 - 2 * at), at * (1 - at)
@@ -282,7 +280,7 @@ def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Sca
 
 
 def _turning_point(rates, state, guess, h) -> Scalar:
-    """Y where its velocity vanishes near the time `guess` after `state`, by Newton's method."""
+    """Return Y where its velocity vanishes near `guess` after `state`, by Newton's method."""
 
     def at(time, rates, state):
         state = _dot(_exponential(rates * time), state)
@@ -297,15 +295,15 @@ def _turning_point(rates, state, guess, h) -> Scalar:
 
     time = jax.lax.fori_loop(0, 3, newton, jax.lax.stop_gradient(guess))
     Y, velocity, pull = at(time, rates, state)
-    # To rounding this is Y; with the last term its first and second derivatives are right too.
+    # To rounding this is Y; the last term makes its first and second derivatives correct too.
     return Y - 0.5 * velocity * velocity / pull
 
 
 def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:
-    """Eigenvalues of saltation times flight; [motion, multiplier].
+    """Return the eigenvalues of saltation times flight; [motion, multiplier].
 
-    The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]], where
-    damping drops out of k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
+    The saltation (δ before to δ after, at fixed time) is [[-k, 0], [(k a⁻ + a⁺)/V⁻, -k]]. Damping
+    cancels in k a⁻ + a⁺ = (1 + k)(cos φ0 - d).
     """
     kick = (1 + k) * (jnp.cos(phase) - d) / v
     half = 0.5 * (kick * flight[0, 1] - k * (flight[0, 0] + flight[1, 1]))
