@@ -1,4 +1,4 @@
-"""Curves of periodic motions, branches and boundaries, and the tables of their numbers."""
+"""Curves of periodic motions, branches and boundaries, and tables of their numbers."""
 
 import abc
 import dataclasses
@@ -32,7 +32,7 @@ from ._words import TORUS
 from .results import InWords, Orbit, stability_of
 from .special import Point
 
-# What is a number at each point of every curve.
+# Names of the numbers at each point of every curve.
 COLUMNS = (
     "parameter", "y_min", "y_max", "clearance", "frequency_ratio", "duration", "impacts",
     "fastest_impact", "slowest_impact", "impact_energy", "multiplier", "stable",
@@ -40,14 +40,14 @@ COLUMNS = (
 
 
 def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
-    """What is a number at each point of a branch of this machine, whose states are like this."""
+    """Return the names of the numbers at each point of a branch with this machine and state."""
     inner = (*components(like), *quantity_names(machine, like))
     return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))
 
 
 def special_table(special: list[Point], names: tuple[str, ...]) -> dict[str, Any]:
     orbits = [point.orbit for point in special]
-    # Without any the words are empty ones, whose type files can hold.
+    # Arrays without words keep a string type that files can hold.
     found = {
         "kind": np.array([point.kind for point in special], str),
         "detail": np.array([point.detail for point in special], str),
@@ -74,23 +74,23 @@ def _numbers(found: object) -> dict[str, np.ndarray]:
     return numbers
 
 
-# A point lies at a value of the parameter if it is no further from it (in the parameter's scale).
+# A point within this distance of a value (in the parameter's scale) lies at it.
 _ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Curve(InWords, abc.ABC):
-    """A curve of periodic motions: host arrays with one row for each point, in their order, in the
+    """A curve of periodic motions: host arrays with one row for each point, in order, in the
     machine's units (see `AbstractMachine.units`)."""
 
     problem: Shooting
     """The equations of the motions."""
     steps: list[Step]
-    """Their solutions, point by point."""
+    """The solution of the equations at each point."""
     ends: tuple[str, str]
-    """Why the curve ends on each side."""
+    """The reason for which the curve ends, on each side."""
     special: list[Point] = dataclasses.field(init=False)
-    """Its special points, in its order."""
+    """The special points, in the curve's order."""
 
     def _each(self, get: Callable[[Observed], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.seen)) for step in self.steps])
@@ -116,12 +116,12 @@ class Curve(InWords, abc.ABC):
 
     @property
     def free(self) -> dict[str, np.ndarray]:
-        """Values of the further parameters, by name."""
+        """Values of the additional parameters, by name."""
         return dict(zip(self.names[1:], self.parameters[:, 1:].T, strict=True))
 
     @cached_property
     def y_min(self) -> np.ndarray:
-        """Smallest position (of the first coordinate), in the machine's unit (of a `Scene` a)."""
+        """Smallest position of the first coordinate, in the machine's unit (for a `Scene` a)."""
         return self._each(lambda seen: seen.y_min)
 
     @cached_property
@@ -132,22 +132,20 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers over the period, the largest modulus first; (points, states). NaN at
-        an end of a boundary where an impact is lost and some of them have no limit."""
+        an end of a boundary with a lost impact, where some of them have no limit."""
         return self._each(lambda seen: seen.multipliers)
 
     @cached_property
     def impact_phase(self) -> np.ndarray:
-        """Clock of each impact, as `Orbit.impact_phase`, but it may lie beyond the period of the
-        motion; (points, impacts). Of a chatter that ends in a rest only the first one: `orbit(i)`
-        lists all."""
+        """Clock of each impact, as `Orbit.impact_phase`, possibly beyond the period of the motion;
+        (points, impacts). Only the first impact of a chatter into rest: `orbit(i)` lists all."""
         problem, places = self.problem, list(self.problem.impacts)
         phases = (phase_at(problem.at(x.x), x.x[places]) for x in self.steps)
         return np.stack([np.asarray(phase) for phase in phases])
 
     @cached_property
     def impact_speed(self) -> np.ndarray:
-        """V⁻ of each impact, in the machine's unit (of a `Scene` a ω); (points, impacts),
-        as in `impact_phase`."""
+        """V⁻ of each impact in `impact_phase`, in the machine's unit (for a `Scene` a ω)."""
         return self._each(lambda seen: seen.approach[list(self.problem.impacts)])
 
     @cached_property
@@ -162,7 +160,7 @@ class Curve(InWords, abc.ABC):
 
     @cached_property
     def frequency_ratio(self) -> np.ndarray:
-        """ζ: mean speed of the drive, NaN for machines that are not driven."""
+        """ζ: mean speed of the drive, NaN for machines without a drive."""
         ratio = frequency_ratio(self.problem.machine, jnp.asarray(self.duration / self.cycles))
         if ratio is None:
             return np.full(len(self.steps), np.nan)
@@ -182,12 +180,12 @@ class Curve(InWords, abc.ABC):
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether all multipliers lie inside the unit circle, at each point."""
+        """True at each point if all multipliers lie inside the unit circle."""
         return self.multiplier < 1
 
     @property
     def admissible(self) -> np.ndarray:
-        """Whether the motion stays inside the gap and approaches each impact, at each point."""
+        """True at each point if the motion stays inside the gap and approaches each impact."""
         return np.array([step.seen.admissible(self.problem.impacts) for step in self.steps])
 
     @property
@@ -207,8 +205,8 @@ class Curve(InWords, abc.ABC):
 
     @cached_property
     def impact_energy(self) -> np.ndarray:
-        """Energy that impacts take in a cycle, in the mean of the period, at each point (see
-        `Run.impact_energy`); simulated when it is first asked for."""
+        """Energy that impacts take in a cycle, averaged over the period, at each point (see
+        `Run.impact_energy`); simulated at the first access."""
         hit = bool(self.problem.impacts)
         return energies_of(self.problem, self.steps) if hit else np.zeros(len(self.steps))
 
@@ -223,13 +221,13 @@ class Curve(InWords, abc.ABC):
 
     @property
     def rests(self) -> np.ndarray:
-        """Times that a body comes to rest on a stop in the period, at each point."""
+        """Number of times that a body comes to rest on a stop in the period, at each point."""
         return np.full(len(self.steps), len(self.problem.landings))
 
     @cached_property
     def sections(self) -> dict[str, np.ndarray]:
-        """The state on the section and the machine's own quantities there, by name; solved for
-        when it is first asked for."""
+        """The state on the section and the machine's quantities there, by name; computed on
+        access."""
         rows = []
         for step in self.steps:
             first = jax.tree.map(lambda x: x[:1], sections_of(self.problem, step.x)[0])
@@ -239,14 +237,14 @@ class Curve(InWords, abc.ABC):
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        """Names of all that is a number at each point, as pictures and tables take them."""
+        """Names of all numbers at each point, for pictures and tables."""
         return (*column_names(self.problem.machine, self.problem.like), *self.names[1:])
 
     def column(self, name: str) -> np.ndarray:
-        """A number at each point: one of the curve's arrays, one of the machine's averages, a
-        parameter by name, or a part of the state or a quantity on the section, as `section_Y`.
+        """Return a number at each point: an array of the curve, an average of the machine, a
+        parameter, or a component of the state or a quantity on the section, as `section_Y`.
 
-        **Raises:** `ValueError` that lists the names there are.
+        **Raises:** `ValueError` with the known names.
         """
         if name == self.names[0] and name not in self.column_names:
             return self.parameter
@@ -257,13 +255,12 @@ class Curve(InWords, abc.ABC):
         return getattr(self, name) if inner == name else self.sections[inner]
 
     def table(self, function: Callable[[Orbit], Any]) -> "xr.Dataset":
-        """Evaluate a function of the orbit at each point: an `xarray.Dataset` over the points with
-        the parameter; `.to_dataframe()` makes it a table.
+        """Return an `xarray.Dataset` of a function of the orbit at each point, with the parameter.
 
-        **Arguments:** a function of an `Orbit` that returns numbers by name; or one number or
-        array, which is called `value` then. An array adds axes.
+        **Arguments:** a function of an `Orbit` that returns numbers by name, or one number or
+        array, which is then called `value`. An array adds axes. `.to_dataframe()` makes a table.
 
-        **Raises:** `TypeError` for a function that returns no numbers, or others at another point.
+        **Raises:** `TypeError` if the function returns no numbers, or different ones at a point.
         """
         if not callable(function):
             raise TypeError(
@@ -292,17 +289,17 @@ class Curve(InWords, abc.ABC):
         return with_units(table, units_of(self.problem.machine), named)
 
     def orbit(self, index: int) -> Orbit:
-        """The motion at one point; a negative `index` counts from the end."""
+        """Return the motion at one point; a negative `index` counts from the end."""
         many = len(self.steps)
         index = count("index", index, least=-many, most=many - 1)
         return orbit_of(self.problem, self.steps[index])
 
     def at(self, value: float) -> list[Orbit]:
-        """The curve's motions at a value of its (first) parameter, solved for; in its order."""
+        """Solve for the curve's motions at a value of its first parameter; return them in order."""
         value = given_number("value", value)
 
         def apart(step: Step) -> float:
-            # Points are put on a value, such as a bound, to rounding.
+            # Points at a value, such as a bound, are at it to rounding.
             by = float(step.x[-1]) - value
             return by if abs(by) > _ROUNDING * float(self.scale[-1]) else 0.0
 
@@ -318,15 +315,15 @@ class Curve(InWords, abc.ABC):
         return [orbit_of(self.problem, step) for step in found if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """The curve as an `xarray.Dataset` over its points, with a word for the `stability` at
-        each, and its special points: `special_kind`, `special_detail`, `special_parameter`, which
-        `special_point` of the curve it is (-1 if none), and more. The parameters are there by their
-        own names too, where these are not the name of another column. The ends are in `attrs`.
+        """Return the curve as an `xarray.Dataset` over its points, with the `stability` at each in
+        words, and its special points: `special_kind`, `special_detail`, `special_parameter`, the
+        index `special_point` of the curve's point (-1 if none), and more. The parameters are also
+        variables by their own names, unless another column has that name. The ends are in `attrs`.
 
         `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too.
 
-        **Arguments:** `along`, to keep only what has one dimension: `"point"`, `"special"`,
-        `"impact"` or `"state"` (the multipliers), which then makes a table without repetitions:
+        **Arguments:** `along`, to keep only variables of one dimension: `"point"`, `"special"`,
+        `"impact"` or `"state"` (the multipliers). This makes a table without repetitions:
         `branch.to_xarray(along="point").to_dataframe().to_csv(path)`.
 
         **Raises:** `ValueError` if there is no such dimension.
@@ -354,19 +351,20 @@ class Curve(InWords, abc.ABC):
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Branch(Curve):
-    """A branch of periodic motions in one parameter, and in further free parameters if properties
-    are held. NumPy arrays with one row for each point, in order, in the machine's units (see
-    `AbstractMachine.units`).
+    """A branch of periodic motions in one parameter, and in additional free parameters if
+    quantities are held. NumPy arrays with one row for each point, in order, in the machine's units
+    (see `AbstractMachine.units`).
 
-    It ends on each side at the "bounds", by "grazing" (an impact is lost or a stop touched), one of
-    the four sliding bifurcations ("crossing-sliding", …; see `Point.kind`), "period-doubling" (it
-    begins there, at a motion of half its period), "symmetry-breaking" (from a symmetric one),
-    "hopf" (it shrinks to an equilibrium), "rest" (a rest on a stop is lost or divided), "closed"
-    (it has come back to its first point, which is its last one as well: an isola), "multiplier"
-    (another multiplier becomes as large as a held one, or a held complex pair becomes real),
-    "stalled" (no further motion was found, even with the smallest step), "max_points",
-    "interrupted", "long" (the period of an autonomous motion is four times the first one, for which
-    the steps were chosen: begin another branch there)."""
+    It ends on each side at the "bounds"; by "grazing" (an impact is lost or a stop touched); by one
+    of the four sliding bifurcations ("crossing-sliding", …; see `Point.kind`); by "period-doubling"
+    (it begins at a motion of half its period); by "symmetry-breaking" (it begins at a symmetric
+    motion); by "hopf" (it shrinks to an equilibrium); by "rest" (a rest on a stop is lost or
+    divided); by "closed" (its last point is its first one: an isola); by "multiplier" (another
+    multiplier becomes as large as a held one, or a held complex pair becomes real); by "stalled"
+    (no motion was found even with the smallest step); by "max_points"; by "interrupted"; or by
+    "long" (the period of an autonomous motion is four times the first one, for which the steps were
+    chosen: begin another branch there).
+    """
 
     special: list[Point]
 
@@ -405,11 +403,12 @@ class Boundary(Curve):
     """A curve in two parameters along which an orbit bifurcates. NumPy arrays with one row for each
     point, in order, in the machine's units (see `AbstractMachine.units`).
 
-    It ends on each side at the "bounds", by "grazing" (an impact is gained or lost), "rest" (a rest
-    is gained or lost), "closed" (it has come back to its first point, which is its last one as
-    well), of a curve of Neimark–Sacker points by "resonance-1:1" and "resonance-1:2" (the two
-    multipliers become real), of a curve of motions without symmetry by "symmetry-breaking" (they
-    become symmetric), "stalled", "max_points", "interrupted"."""
+    It ends on each side at the "bounds"; by "grazing" (an impact is gained or lost); by "rest" (a
+    rest is gained or lost); by "closed" (its last point is its first one); by "stalled",
+    "max_points" or "interrupted". A curve of Neimark–Sacker points also ends by "resonance-1:1" and
+    "resonance-1:2" (the two multipliers become real); a curve of motions without symmetry by
+    "symmetry-breaking" (they become symmetric).
+    """
 
     @property
     def condition(self) -> Special:
@@ -418,14 +417,13 @@ class Boundary(Curve):
 
     @property
     def kind(self) -> str:
-        """The kind of its points: "fold", "period-doubling", "neimark-sacker",
-        "symmetry-breaking", "branch-point", "grazing" or that of a sliding bifurcation."""
+        """The kind of its points: "fold", "period-doubling", "neimark-sacker", "symmetry-breaking",
+        "branch-point", "grazing" or that of a sliding bifurcation."""
         return self.condition.kind
 
     @cached_property
     def special(self) -> list[Point]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The points of codimension two on the curve, in order, each located to rounding at the
-        first access."""
+        """The points of codimension two on the curve, in order; located to rounding if accessed."""
         return points_of(self.problem, self.steps, self.ends)
 
     @property
@@ -453,7 +451,7 @@ class Boundary(Curve):
 
 
 def branch_hits_in_words(branch: Branch) -> str:
-    """The impacts of a branch's motions, or that they rest, as their impacts differ in number."""
+    """Describe the impacts of a branch's motions, or their rests, with which the impacts vary."""
     if branch.problem.rests:
         return "rest on a stop"
     return so_many(branch.impact_speed.shape[1], "impact")

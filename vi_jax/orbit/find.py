@@ -1,8 +1,8 @@
-"""`find_orbit`: from a guess to a periodic motion that is judged and differentiable.
+"""`find_orbit`: from a guess to a differentiable periodic motion, with its stability.
 
-The period is cut into arcs of whole cycles (one, unless `Newton(arcs=...)` says otherwise). The
-unknowns x are the states in which they begin. The residual F(x, p) is what each arc lacks to end
-where the next one begins; p are the numbers of the machine.
+The period is divided into arcs of whole cycles (one by default, see `Newton(arcs=...)`). The
+unknowns x are the first states of the arcs. The residual F(x, p) is the difference from the end of
+each arc to the begin of the next; p are the parameters of the machine.
 """
 
 import dataclasses
@@ -48,16 +48,16 @@ from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest
 def _missing(
     arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
 ) -> Float[Array, "arcs states"]:
-    """F: what each arc lacks to end where the next one begins; after the last comes the first."""
+    """Return F: from each arc's end to the next arc's begin; the first follows the last."""
     ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
     angles, after = angles_in(arc.machine, bare(unravel(arcs[0]))), jnp.roll(arcs, -1, axis=0)
     return nearest_images(angles, ends, after) - after
 
 
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
-    """Where a root finder comes to from a guess, the first arc's start; the others begin where the
-    motion from there is then. The `x` found are the starts of the arcs, in rows. The residual is
-    relative to the sizes of their numbers. All numbers are floats."""
+    """Run a root finder from a guess, the first arc's start; the other arcs begin on the motion
+    from there. The result's `x` holds the starts of the arcs in rows. The residual is relative to
+    the sizes of the components. All numbers are floats."""
     x, unravel = raveled(guess)
     sizes = row_sizes(arc.machine, guess)
     arcs = x[None]
@@ -71,12 +71,12 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         root_finder, lambda z: _missing(arc, z * sizes, unravel) / sizes, arcs / sizes
     )
     found = found._replace(x=found.x * sizes)
-    return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # numbers all, for `jvp`
+    return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # all floats, for `jvp`
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
-    """∂F/∂x from the derivative Jᵢ of each arc's end by its start: Jᵢ on the diagonal, beside it
-    the -1 by which the next arc's start enters."""
+    """Return ∂F/∂x from the derivatives of each arc's end with respect to its start: these on the
+    diagonal, and beside each -1 for the next arc's start."""
     arcs, states, _ = jacobians.shape
     following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
     return block_diag(*jacobians) - following.astype(jacobians.dtype)
@@ -85,21 +85,21 @@ def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arra
 def _start_change(
     jacobians: Float[Array, "arcs states states"], missing: Vector, sizes: Vector
 ) -> Vector:
-    """The smallest change of the arcs' starts that changes F by `missing`, relative to sizes."""
+    """Return the smallest change of the arcs' starts that changes F by `missing`, in `sizes`."""
     sizes = jnp.tile(sizes, len(jacobians))
     matrix = shooting_matrix(jacobians) * sizes / sizes[:, None]
     return sizes * smallest_solution(matrix, missing / sizes)
 
 
-# Places in a cycle at which an orbit can be searched: a choice; each costs a sample of the guess.
+# Places in a cycle for the section of the search: a choice; each costs a sample of the guess.
 _PLACES = 8
 
-# A motion drifts if no other start would change so much of what it lacks to be periodic: a choice.
+# A motion drifts if no change of the start would reduce F by this share: a choice.
 _DRIFTS = 0.5
 
 
 def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
-    """The motion with its impacts: one program for the guess and the orbit, if as long."""
+    """Simulate the motion with its impacts; guess and orbit share a program if equally long."""
     places = _places(the_map, state)
     return simulate(
         the_map.machine, state, the_map.cycles, method=the_map.method,
@@ -108,17 +108,17 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 
 def _places(the_map: CycleMap, state: State) -> int:
-    """Places of a cycle at which the state is looked at; one on an autonomous machine."""
+    """Return the places of a cycle at which the state is sampled; one for an autonomous machine."""
     return 1 if is_autonomous(the_map.machine, bare(state)) else _PLACES
 
 
 def moved_from_impacts(
     the_map: CycleMap, guess: State, impact_log: int
 ) -> tuple[CycleMap, State, Int[Array, ""]]:
-    """Map, guess and their place (in eighths of a cycle) on the section to search on.
+    """Return map, guess and their place (in eighths of a cycle) for the section of the search.
 
-    The map jumps where an impact falls on its section, and no search gets across; so it is done
-    where the guess's motion is farthest from its impacts, if the machine's section can be moved.
+    The map jumps where an impact falls on its section, and no search crosses the jump. So the
+    section is put where the guess's motion is farthest from its impacts, if it can be moved.
     """
     machine = the_map.machine
     if not isinstance(machine, Scene):
@@ -139,44 +139,43 @@ def moved_from_impacts(
 
 
 class Impacts(NamedTuple):
-    """The impacts of each cycle in their order; all floats, NaN (of `stop` -1) beyond the last."""
+    """The impacts of each cycle in order; all floats, NaN (`stop`: -1) after the last."""
 
     phase: Float[Array, "cycles log"]
-    """Clock of each since its cycle began."""
+    """Clock of each impact since its cycle began."""
     speed: Float[Array, "cycles log"]
-    """V⁻ of each."""
+    """V⁻ of each impact."""
     stop: Float[Array, "cycles log"]
-    """Number of the rigid stop of each."""
+    """Number of the rigid stop of each impact."""
 
 
 class ObservedArc(NamedTuple):
-    """An arc of the shooting followed from its start, cycle by cycle; all floats."""
+    """An arc of the shooting from its start, cycle by cycle; all floats."""
 
     states: Float[Array, "cycles places states"]
-    """States at each place of each cycle, the start left out."""
+    """States at each place of each cycle, without the start."""
     modes: Float[Array, "cycles places modes"] | None
-    """The machine's own modes there; `None` if it has none."""
+    """The machine's own modes there, or `None`."""
     jacobians: Float[Array, "cycles states states"]
-    """Derivatives by the start of the states after each cycle."""
+    """Derivatives of the states after each cycle with respect to the start."""
     listed: Impacts
     impacts: Float[Array, " cycles"]
-    """Their number, those beyond the list included."""
+    """Number of impacts, those beyond the list included."""
     rests: Float[Array, " cycles"]
-    """Times that a body comes to rest on a stop."""
+    """Number of times that a body comes to rest on a stop."""
     y_min: Float[Array, " cycles"]
     y_max: Float[Array, " cycles"]
     clearance: Float[Array, " cycles"]
     duration: Float[Array, " cycles"]
     integrals: dict[str, Float[Array, " cycles"]]
-    """Of the machine's averages, over the time of each cycle."""
+    """Integrals of the machine's averages over the time of each cycle."""
 
 
 def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> ObservedArc:
-    """What is observed of an arc that begins in `state`; its derivatives are taken by columns (see
-    `forward_jacobian`). `second`, whether those of `jacobians` are, which are second derivatives of
-    the motion; else zero."""
+    """Observe an arc that begins in `state`, with derivatives by columns (see `forward_jacobian`).
+    `second`: whether `jacobians` are differentiated, as second derivatives of the motion."""
 
-    # Apart from the motion: a program with second derivatives should hold no more than it must.
+    # Separate from the motion, to keep a program with second derivatives small.
     def jacobians_from(arc, state):
         x, unravel = raveled(state)
 
@@ -200,7 +199,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
         own = run.modes if run.samples is None else run.samples.modes
         places, modes = in_rows(met)[1:], None
         places = places.reshape(arc.cycles, _places(arc, state), -1)
-        if own:  # batched as all else is, see `forward_jacobian`
+        if own:  # batched as all else, see `forward_jacobian`
             modes = in_rows(own)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
         assert run.clearance is not None and run.duration is not None
         rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
@@ -222,11 +221,11 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
 def found_and_seen(
     arc: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int, second: bool
 ) -> tuple[Found, ObservedArc]:
-    """The root that is found from a guess (`root_of`), and what is observed on its arcs, in rows.
+    """Return the root found from a guess (`root_of`), and the observations of its arcs, in rows.
 
-    Differentiated by the numbers p of `arc`: the root x(p) of F has dx/dp = -(∂F/∂x)⁻¹ ∂F/∂p, by
-    the implicit function theorem, so that no step of the search is. All derivatives are those of
-    what is observed, by one program.
+    The derivative with respect to the numbers p of `arc` is that of the root x(p) of F, dx/dp =
+    -(∂F/∂x)⁻¹ ∂F/∂p, by the implicit function theorem; the search is not differentiated. One
+    program computes all derivatives, those of the observations.
     """
     root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
     see = lambda x: observe_arc(arc, unravel(x), impact_log, second)
@@ -255,8 +254,7 @@ def _(primals, tangents):
     rate = (ends[..., :count] @ along).ravel()
     move = -_start_change(ends[..., count:], rate, row_sizes(arc.machine, guess))
     move = move.reshape(root.x.shape)
-    # Where there is no orbit there is no derivative of one.
-    # A product, since the transpose of a choice would be zero.
+    # Without an orbit the derivative is NaN. A product, as the transpose of a choice would be zero.
     move = move * jnp.where(root.converged > 0, 1.0, jnp.nan)
 
     def rates(slope):
@@ -267,8 +265,8 @@ def _(primals, tangents):
 
 
 def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
-    """Derivatives of the states after each cycle of all arcs by the first state of the first arc,
-    from those by the first state of their own arc: a running product."""
+    """Return the derivatives of the states after all cycles with respect to the first state: a
+    running product of those with respect to the first state of their own arc."""
     passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
     for own in jacobians:
         all_of_them.append(own @ passed)
@@ -279,9 +277,8 @@ def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Arra
 def error_of(
     angles: np.ndarray | None, seen: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
 ) -> tuple[Scalar, Flag]:
-    """The largest component of Newton's next step from the arcs' starts `x`, relative to `sizes`,
-    and whether the motion drifts: most of what it lacks to be periodic is what no other start would
-    change."""
+    """Return the largest component of Newton's next step from the arcs' starts `x`, relative to
+    `sizes`, and whether the motion drifts: most of F remains for any change of the starts."""
     after = jnp.roll(x, -1, axis=0)
     missing = (nearest_images(angles, seen.states[:, -1, -1], after) - after).ravel()
     step = _start_change(seen.jacobians[:, -1], missing, sizes)
@@ -295,9 +292,11 @@ def in_order(
     seen: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
     machine: AbstractMachine, place: Int[Array, ""] | None,
 ) -> Impacts:  # fmt: skip
-    """The impacts of a period, in one row and in their order from the section asked for: `hit`,
-    which of those listed they are; `place`, the eighths of a cycle by which the section searched on
-    lies behind the one asked for, `None` for an autonomous machine, whose cycles differ in length.
+    """Return the impacts of a period in one row, in order from the given section.
+
+    **Arguments:** `hit`, which of those listed belong to it; `place`, the eighths of a cycle from
+    the given section to that of the search, or `None` if the machine is autonomous (cycles of any
+    length).
     """
     phase, cycles = seen.listed.phase, seen.duration.shape[0]
     if place is not None:
@@ -312,11 +311,11 @@ def in_order(
     return Impacts(*(jnp.where(hit.ravel(), a.ravel(), none)[order] for a, none in columns))
 
 
-# Lanes searched at once, a choice: a batch lasts as long as its slowest lane.
+# Lanes of a batch, a choice: a batch lasts as long as its slowest lane.
 _BATCH = 512
 
-# A search that fails with an impact slower than this (or a turn that would be one) failed at a
-# grazing: there the map's derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
+# A search that fails with an impact (or a turn) slower than this failed at a grazing: there the
+# map's derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
 _SLOW = 0.02
 
 
@@ -341,31 +340,32 @@ def find_orbit(
 
     **Arguments:**
 
-    - `machine`: a `Scene` (ideal drive or motor, any crank, any stops), or one of your own whose
+    - `machine`: a `Scene` (ideal drive or motor, any crank, any stops), or another machine whose
       independent variable counts its cycles.
-    - `guess`: a state on the section from `machine.start(...)`, or another `Orbit`. With arrays of
-      one leading axis in it, every guess is searched from in one compiled call.
+    - `guess`: a state on the section from `machine.start(...)`, or another `Orbit`. If its arrays
+      have one leading axis, one compiled call searches from every guess.
     - `cycles`: period in drive cycles; static.
     - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
-    - `method`: how the motion is computed: by default by the `"standard"` preset, as in `simulate`,
-      but for a `Scene` with a motor by `Adaptive(Tsit5(), rtol=1e-11)`.
-    - `section`: crank angle of the section (radians) instead of the machine's own, which is 0. The
-      guess and the orbit's states are on it. The search uses a section some eighths of a cycle
-      later, where the guess's motion is farthest from its impacts, because the map jumps where an
-      impact falls on the section.
-    - `impact_log`: impacts of one cycle that the orbit can list.
-    - `multipliers`: whether the orbit gets its multipliers and its monodromy matrix, else NaN.
-      Their derivatives are second derivatives of the motion: without them the first gradient of
-      anything else takes half the time.
-    - `throw`: raise an error if no orbit is found, instead of only reporting it in `result`.
+    - `method`: integration method: by default the `"standard"` preset, as in `simulate`, except
+      `Adaptive(Tsit5(), rtol=1e-11)` for a `Scene` with a motor.
+    - `section`: crank angle of the section (radians) of the guess and of the orbit's states; by
+      default the machine's own, which is 0. The search uses a section some eighths of a cycle
+      later, where the guess's motion is farthest from its impacts, because the map jumps at an
+      impact on the section.
+    - `impact_log`: number of impacts of one cycle that the orbit can list.
+    - `multipliers`: whether to compute the multipliers and the monodromy matrix, else NaN. Their
+      derivatives are second derivatives of the motion: without them the first gradient of anything
+      else takes half the time.
+    - `throw`: whether to raise an error if no orbit is found, instead of only reporting it in
+      `result`.
 
-    **Returns:** an `Orbit`. Its `result` distinguishes an orbit of a smaller period, a search that
-    found none, one that ended at a grazing or at an equilibrium, a motion that drifts and a guess
-    that cannot be simulated. If a component is neutral (a multiplier is exactly 1), such as the
-    position of a body that slides freely, the orbits are a family. The search then returns the one
-    nearest to the guess, relative to the size of each number, with derivatives across the family.
+    **Returns:** an `Orbit`. Its `result` distinguishes an orbit of a smaller period and the reasons
+    of a failure: none found, a grazing, an equilibrium, a drift, a guess that cannot be simulated.
+    If a component is neutral (a multiplier is exactly 1), such as the position of a body that
+    slides freely, the orbits are a family. The search then returns the one nearest to the guess,
+    relative to the size of each component, with derivatives across the family.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, before any work.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments, before any work.
     """
     root_finder = Newton() if root_finder is None else root_finder
     if not isinstance(root_finder, AbstractRootFinder):
@@ -450,7 +450,7 @@ def _judged(
     error, drifts = error_of(angles, seen, x, sizes)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
-    # Back on the section asked for, of which the last one met is the guess's.
+    # Return to the given section; the last one met is the guess's.
     last = seen.states.shape[1] - 1
     sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
     modes, rows = None, sections
@@ -476,7 +476,7 @@ def _judged(
     found = (root.converged > 0) & again & ~still & close
     y_min = jnp.min(jnp.where(within, seen.y_min, jnp.inf))
     y_max = jnp.max(jnp.where(within, seen.y_max, -jnp.inf))
-    # As fast as a harmonic motion of this extent, once in a cycle, and a turn that is as sharp.
+    # Speed of a harmonic motion of this extent, once in a cycle, and a turn of that curvature.
     fast = jnp.pi * (y_max - y_min) * least / duration
     slow = fast * jnp.sqrt(4 * jnp.maximum(clearance, 0) / (y_max - y_min))
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
@@ -512,8 +512,8 @@ def _judged(
 
 
 def _in_later_modes(the_map: CycleMap, guess: State) -> State:
-    """The guess in the modes in which the motion from it is a period later, which are more likely
-    those of an orbit near it than those that a motion begins with."""
+    """Return the guess in the modes in which its motion is a period later: an orbit near it has
+    these more likely than the modes in which a motion begins."""
     if modes_of(guess) is None:
         return guess
     later = the_map(guess)
@@ -522,7 +522,7 @@ def _in_later_modes(the_map: CycleMap, guess: State) -> State:
 
 
 def _comes_back(start: State, seen: ObservedArc) -> Flag:
-    """Whether a motion ends in the modes in which it began, after all cycles asked for."""
+    """Return whether a motion ends in its first modes, after all cycles of the search."""
     modes = modes_of(start)
     if modes is None or seen.modes is None:
         return jnp.ones((), bool)
@@ -544,8 +544,8 @@ def _least_period(
 
 
 def stands_still(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
-    """Whether an autonomous machine stands still in a state, at an equilibrium: as fast as it
-    leaves the section it would get nowhere in its period, relative to `unit` + |state|."""
+    """Return whether an autonomous machine is at an equilibrium: at the rate of the state it would
+    not move in its period, relative to `unit` + |state|."""
     own, state = modes_of(state), bare(state)
     if not is_autonomous(machine, state):
         return jnp.zeros((), bool)
@@ -557,12 +557,12 @@ def stands_still(machine: AbstractMachine, state: State, duration: Any, unit: An
 
 
 def _slack(dtype: object) -> float:
-    """What tells states from each other, see `distance`."""
+    """Return the tolerance for equal states, see `distance`."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
 def _verdict(found: Array, smaller: Array, **reasons: Array) -> ORBIT_RESULTS:
-    """The result of a search; of several reasons for a failure the last one in this order."""
+    """Return the result of a search; of several reasons for a failure the last in this order."""
     where, missed = ORBIT_RESULTS.where, ORBIT_RESULTS.no_orbit
     for name in ("grazing", "drifts", "other_modes", "equilibrium", "not_simulated"):
         missed = where(reasons[name], getattr(ORBIT_RESULTS, name), missed)

@@ -1,7 +1,7 @@
-"""`grazing`: what a grazing leads to, by its local map and beside the machine itself.
+"""`grazing`: the attractor beyond a grazing, from its local map and from the machine itself.
 
-The local map is iterated over decades of the parameter, and what it settles on is named; the
-machine is simulated at some of these values.
+The local map is iterated over decades of the parameter, and its attractor is named; the machine is
+simulated at some of these values.
 """
 
 import dataclasses
@@ -24,30 +24,30 @@ from ._solution import on_host
 from .results import complex_in_words
 from .special import Point
 
-# Longest period looked for, and the iterates it is looked for in.
+# Longest period that is sought, and the number of iterates in which it is sought.
 LONGEST, LOOKED = 64, 192
 
-# A motion is periodic if it repeats within this share of one kick: a choice, far above what
-# settling leaves (`_LEFT`) and far below what chaos differs by.
+# A motion is periodic if it repeats within this share of one kick: a choice, far above the rest of
+# the transient (`_LEFT`) and far below the differences of chaos.
 _REPEATS = 1e-3
 
-# Farther away than so many kicks nothing comes back: a choice.
+# A motion beyond so many kicks does not return: a choice.
 _LOST = 1e9
 
-# So much of what the slowest multiplier keeps may be left after settling; within these bounds.
+# Share of the slowest transient that remains after settling; bounds of the iterates for it.
 _LEFT, _FEWEST, _MOST = 1e-7, 400, 6000
 
-# Attractors of the local map shrink towards the grazing; one whose depth is so many times that of a
-# first impact does not (a chain of impacts within a small attractor reached twice that at most in
-# trials). Depths, over the largest that matters, at which that is tried, and how many. Choices.
+# Attractors of the local map shrink towards the grazing. One whose depth exceeds this multiple of a
+# first impact's does not (a chain of impacts within a small attractor reached twice that at most in
+# trials). Depths, relative to the largest relevant one, of the test of this; their number. Choices.
 _LOCAL, _TINY, _PROBES = 4.0, (1e-14, 1e-12), 24
 
-# Of all values at most so many may be aperiodic for windows that lie next to each other, and at
-# least so many for chaos alone. Measured for the root map of one multiplier λ: at most 1.5 % at
-# λ = 0.24, 2.6 % at 0.26, 6 % at 0.3, 36 % at 0.5, 91 % at 0.66, 96.8 % at 0.67, all above 0.7.
+# Largest share of aperiodic values for adjacent windows, and smallest share for chaos alone.
+# Measured for the root map of one multiplier λ: at most 1.5 % at λ = 0.24; 2.6 % at 0.26; 6 % at
+# 0.3; 36 % at 0.5; 91 % at 0.66; 96.8 % at 0.67; all above 0.7.
 _FEW, _ALL = 0.02, 0.96
 
-# So many iterates are sought through for the greatest entry, by which the parameter is scaled.
+# Number of iterates in which the greatest entry is sought, which scales the parameter.
 _ENTRIES = 24
 
 
@@ -73,21 +73,21 @@ class SCENARIOS(NamedEnumeration):
 
 
 class Settled(NamedTuple):
-    """What the map settles on near the grazing, lane by lane."""
+    """Attractors of the map near the grazing, lane by lane."""
 
     period: np.ndarray
-    """In periods of the motion that grazes; 0 up to `LONGEST` if none, -1 if it goes away."""
+    """In periods of the motion that grazes; 0 if none up to `LONGEST`, -1 if it goes away."""
     impacts: np.ndarray
-    """At the touches, in a period; a mean over one where there is no period."""
+    """Impacts at the touches in a period; the mean over one without a period."""
     places: np.ndarray
-    """Behind the first touch, less the smooth motion there; (lanes, LOOKED, states)."""
+    """States after the first touch, less the smooth motion there; (lanes, LOOKED, states)."""
     depth: np.ndarray
-    """The deepest penetration √(-h) that there would be."""
+    """The deepest penetration √(-h), without an impact."""
 
 
 def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The least period of each lane up to `LONGEST`, or 0, with which `rows` (lanes, length,
-    numbers) repeat, to a share of a kick's `size`, and `hits`, the impacts in each iterate."""
+    """Return the least period of each lane up to `LONGEST`, or 0. `rows` (lanes, length,
+    components) must repeat to a share of a kick's `size`, `hits` (impacts per iterate) exactly."""
     found = np.zeros(len(rows), int)
     for p in range(LONGEST, 0, -1):
         apart = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
@@ -97,7 +97,7 @@ def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarr
 
 
 def settling(local: LocalMap) -> int:
-    """How many iterates it takes to settle, by the slowest multiplier."""
+    """Return the number of iterates of the transient, from the slowest multiplier."""
     slowest = np.abs(np.linalg.eigvals(local.matrix)).max()
     if slowest <= 0 or slowest >= 1:
         return _FEWEST if slowest <= 0 else _MOST
@@ -105,7 +105,7 @@ def settling(local: LocalMap) -> int:
 
 
 def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
-    """The largest change of a state by the first impact, at each offset of the parameter."""
+    """Return the largest change of a state by the first impact, at each offset of the parameter."""
     depth = np.abs(np.outer(offsets, local.slopes))
     return (depth**local.orders * np.abs(local.kicks).max(axis=1)).max(axis=1)
 
@@ -117,7 +117,7 @@ def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
 
 
 def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
-    """The local map iterated from the smooth motion on, at each offset of the parameter."""
+    """Iterate the local map from the smooth motion, at each offset of the parameter."""
     z = np.zeros((len(offsets), local.matrices.shape[1]))
     settle = settling(local)
     places = np.zeros((len(offsets), LOOKED, z.shape[1]))
@@ -142,17 +142,17 @@ def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
 
 
 def impacts_in(hits: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """Impacts in a period of each lane; in an iterate, on average, where there is none."""
+    """Return the impacts in a period of each lane; without a period the mean in an iterate."""
     last = np.arange(hits.shape[1]) >= hits.shape[1] - period[:, None]
     return np.where(period > 0, (hits * last).sum(axis=1), hits.mean(axis=1))
 
 
 def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
-    """How deep an attractor that begins at the grazing may be, at each offset of the parameter.
+    """Return the greatest depth of an attractor that begins at the grazing, at each offset.
 
-    Its depth is that of a first impact, √ε, times a number; or, where an impact brings a further
-    touch that is as much deeper as the kick is larger than ε, of the order of its root (as of some
-    motions between two stops). Whether that happens is seen far below all offsets.
+    Its depth is a multiple of that of a first impact, √ε. It is of the order of ε^(1/4) if an
+    impact brings a further touch whose depth exceeds ε as its kick does (as for some motions
+    between two stops). Iterates far below all offsets decide which.
     """
     first = np.sqrt(np.abs(np.outer(offsets, local.slopes)).max(axis=1))
     if local.orders[0] != 0.5:
@@ -169,16 +169,16 @@ def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
 
 
 def natural_depth(local: LocalMap) -> float:
-    """The depth (in the distance h) at which a kick of the root is as large as what it adds to the
-    distance later: beyond it there are no windows."""
+    """Return the depth (in the distance h) at which a kick of the root equals its later change of
+    the distance: beyond it there are no windows."""
     entries = np.abs(local.entries(_ENTRIES)) if local.orders[0] == 0.5 else np.array([np.inf])
     return float(entries.max() ** 2)
 
 
 def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[str, float]:
-    """What follows, by its name in `SCENARIOS`, and the share of offsets without a period. Whether
-    there is an attractor near, and whether that is the motion itself, the nearer half says. The
-    offsets lie on the side of the impacts, evenly spaced by their logarithm."""
+    """Return the scenario's name in `SCENARIOS`, and the share of offsets without a period. The
+    half of the offsets nearer to zero decides whether an attractor is near, and whether it is the
+    motion itself. The offsets lie on the side of the impacts, evenly spaced by their logarithm."""
     near = found.period >= 0
     close = np.abs(offsets) <= np.median(np.abs(offsets))
     if near[close].mean() < 0.5:
@@ -190,7 +190,7 @@ def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[s
     aperiodic = float((period == 0).mean())
     if aperiodic > _ALL:
         return "chaos", aperiodic
-    # A motion with one impact in n periods, or what doubling makes of it.
+    # A motion with one impact in n periods, or its period doublings.
     single = (period > 1) & (impacts > 0) & (period == impacts * (period // np.maximum(impacts, 1)))
     adding = single.sum() > 0.5 * (period > 0).sum() and _next_to_each_other(
         offsets[near], np.where(single & (impacts == 1), period, 0)
@@ -201,35 +201,35 @@ def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[s
 
 
 def _next_to_each_other(offsets: np.ndarray, period: np.ndarray) -> bool:
-    """Whether the periods of motions with one impact (0 elsewhere) grow towards the grazing, some n
-    next to n + 1. Between two stops there may be 5 and 7 without 6: no period adding."""
+    """Return whether the periods of motions with one impact (0 elsewhere) grow towards the grazing,
+    with some n next to n + 1. 5 and 7 without 6, as between two stops, are no period adding."""
     kinds = np.unique(period[period > 0])
     places = [np.median(np.log(np.abs(offsets[period == n]))) for n in kinds]
     return bool((np.diff(places) < 0).all() and (np.diff(kinds) == 1).any())
 
 
 def _sum_of_entries(local: LocalMap) -> float:
-    """Σ eₙ, whose sign says on which side there is a motion with an impact in each period."""
+    """Return Σ eₙ; its sign gives the side of the motion with an impact in each period."""
     N, u = local.matrix, local.kicks[0]
     return float(local.gradients[0] @ np.linalg.solve(np.eye(len(N)) - N, N @ u))
 
 
 class Windows(NamedTuple):
-    """Where motions with one impact in n periods exist, n = 1, 2, …; by the local map."""
+    """Intervals of motions with one impact in n periods, n = 1, 2, …; by the local map."""
 
     period: np.ndarray
-    """n of each row: how many cycles of the machine one motion takes."""
+    """n of each row, in periods of the motion that grazes."""
     exists: np.ndarray
-    """Offsets of the parameter between which it does, the nearer first, or NaN; (n, 2)."""
+    """Offsets of the parameter between which it exists, the nearer first, or NaN; (n, 2)."""
     stable: np.ndarray
-    """And is stable; (n, 2)."""
+    """Offsets between which it is stable; (n, 2)."""
 
 
 def windows(local: LocalMap, reach: float, count: int) -> Windows:
-    """Motions with one impact in n = 1 … count periods, by the local map of one touch with a root.
+    """Return motions with one impact in n = 1 … count periods, by the root map of one touch.
 
-    The depth y of the impact solves y² + Eₙ y = ε with Eₙ = ∂h (I - Nⁿ)⁻¹ Nⁿ kick, ε being how far
-    the smooth motion is beyond the stop; at the other passages the distance has to be positive. The
+    The smooth motion is a distance ε beyond the stop. The depth y of the impact solves y² + Eₙ y =
+    ε with Eₙ = ∂h (I - Nⁿ)⁻¹ Nⁿ kick. At the other passages the distance must be positive. The
     matrix of the motion is Nⁿ (I - kick ∂h/2y).
     """
     N, h, kick = local.matrix, local.gradients[0], local.kicks[0]
@@ -238,7 +238,7 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
     exist, steady = [], []
     for n in range(1, count + 1):
         power = np.linalg.matrix_power(N, n)
-        back = np.linalg.solve(identity - power, power @ kick)  # where it comes to, over y
+        back = np.linalg.solve(identity - power, power @ kick)  # the state after n periods, over y
         lack = depths**2 + (h @ back) * depths
         offset = -lack / local.slopes[0]
         passages = local.later(back + kick, n - 1)
@@ -251,41 +251,41 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
 
 
 def _between(offset: np.ndarray) -> tuple[float, float]:
-    """The ends of an interval, the one nearer to zero first."""
+    """Return the ends of an interval, the one nearer to zero first."""
     if not offset.size:
         return np.nan, np.nan
     low, high = float(offset.min()), float(offset.max())
     return (low, high) if abs(low) <= abs(high) else (high, low)
 
 
-# What differs by less, as a share of the motion, is the same but for rounding: a choice.
+# Differences below this share of the motion are rounding: a choice.
 _ROUNDING = 1e-11
 
-# Far away a motion is periodic if it repeats within 1e-6 of how far it is: a choice.
+# A distant motion is periodic if it repeats within 1e-6 of its distance: a choice.
 _FAR = 1e-3
 
-# A motion farther off on the section than so many of the deepest kicks has left: a choice.
+# A motion on the section farther off than so many of the deepest kicks has left: a choice.
 _KICKS = 64
 
 
 class Simulated(NamedTuple):
-    """What the machine settles on, lane by lane."""
+    """Attractors of the machine, lane by lane."""
 
     period: np.ndarray
     """As `Settled.period`; -1 also for a lane that left the neighbourhood or failed."""
     impacts: np.ndarray
-    """At the touches, as `Settled.impacts`; NaN where what is touched is no rigid stop."""
+    """As `Settled.impacts`; NaN if a touch is not one of a rigid stop."""
     places: np.ndarray
-    """On the section, less the smooth motion; (lanes, LOOKED, states)."""
+    """States on the section, less the smooth motion; (lanes, LOOKED, states)."""
     far: np.ndarray
-    """As `period`, of lanes that left; 0 for others."""
+    """As `period`, for lanes that left; 0 for others."""
     hits: np.ndarray
     """All impacts in `far` periods of the motion that grazes; in one of them if `far` is 0."""
 
 
 @on_host
 def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
-    """Sections and impacts of the last cycles, (lanes, cycles)."""
+    """Return sections and impacts of the last cycles, (lanes, cycles)."""
 
     def one(value, u):
         run = simulate(
@@ -299,7 +299,7 @@ def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
 
 
 def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
-    """The machine at each offset of the parameter, from the smooth motion on."""
+    """Simulate the machine at each offset of the parameter, from the smooth motion."""
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
@@ -335,14 +335,14 @@ def alike(forecast: Settled, machine: Simulated) -> np.ndarray:
     return (forecast.period == machine.period) & (counted | (forecast.period <= 0))
 
 
-# Decades below the greatest depth that are looked at: a choice.
+# Decades below the greatest depth that are examined: a choice.
 DECADES = 4
 
-# The machine is asked at one value of so many, and where nothing is touched at one of these.
+# The machine is simulated at every 6th value, and on the other side at every 4th of these.
 ASKED, _SPARSE = 6, 4
 
-# The machine agrees over a stretch of the parameter if it does in so much of each half decade: at
-# the edges of windows the first order that a local map is does not decide.
+# The machine agrees over a range of the parameter if it does in this share of each half decade: the
+# local map is of first order and does not decide at the edges of windows.
 _AGREES = 0.75
 
 
@@ -352,12 +352,11 @@ class Motions(NamedTuple):
     offset: Float[np.ndarray, " values"]
     """The parameter, less its value at the grazing."""
     period: Int[np.ndarray, " values"]
-    """In periods of the motion that grazes; 0 where there is none, -1 where what follows is far
-    away."""
+    """In periods of the motion that grazes; 0 without a period, -1 if the attractor is far away."""
     impacts: Float[np.ndarray, " values"]
-    """Impacts at the touch in a period; on average over one where there is none."""
+    """Impacts at the touch in a period; the mean over one without a period."""
     position: Float[np.ndarray, "values looked"]
-    """Of the first coordinate on the section, less that of the smooth motion."""
+    """The first coordinate on the section, less that of the smooth motion."""
 
 
 @on_host
@@ -367,7 +366,7 @@ def _position_of(problem: Shooting, states):
 
 
 def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """The first coordinate of states beside the smooth motion's on the section, less its own."""
+    """Return the first coordinate at displacements from the smooth section state, less its own."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
     there = _position_of(graze.problem, smooth[:, None] + beside)
     return there - _position_of(graze.problem, smooth)[:, None]
@@ -376,9 +375,8 @@ def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarr
 def beside_grazing(
     graze: Graze, offsets: np.ndarray, found: Settled
 ) -> tuple[Motions, tuple[np.ndarray, np.ndarray], tuple[int, int] | None]:
-    """What the machine does at offsets where the local map settles on `found`; whether that is
-    alike there, and (at some of them) on the other side; and period and impacts of what it settles
-    on if it goes far away."""
+    """Return the machine's attractors at offsets with the local attractors `found`; whether they
+    agree there, and (at some offsets) on the other side; period and impacts far away, or `None`."""
     sparse, n = offsets[::_SPARSE], len(offsets)
     machine = simulated(graze, np.concatenate([offsets, -sparse]))
     here, there = (jax.tree.map(lambda a: a[:n], machine), jax.tree.map(lambda a: a[n:], machine))
@@ -388,7 +386,7 @@ def beside_grazing(
 
 
 def _far(seen: Simulated, cycles: int) -> tuple[int, int] | None:
-    """Period and impacts of what most of the lanes that left settle on."""
+    """Return period and impacts of the attractor of most lanes that left."""
     left = seen.period < 0
     if left.mean() < 0.5:
         return None
@@ -400,8 +398,8 @@ def _far(seen: Simulated, cycles: int) -> tuple[int, int] | None:
 def stretch(
     size: np.ndarray, here: np.ndarray, there: np.ndarray
 ) -> tuple[tuple[float, float] | None, float]:
-    """The longest stretch of sizes of offsets (rising), in half decades, in which forecast and
-    machine agree `here` and `there`, on the other side; and the share of values there that do."""
+    """Return the longest range of sizes of offsets (rising), in half decades, in which forecast and
+    machine agree `here` and, on the other side, `there`; and the share of equal values in it."""
     parts = 2 * DECADES
     half = np.minimum((np.arange(len(size)) * parts) // (len(size) - 1), parts - 1)
     good = [
@@ -417,11 +415,11 @@ def stretch(
     return (float(size[inside][0]), float(size[inside][-1])), float(share)
 
 
-# Of the depth at which windows end, or of that which a touch of so much of a cycle has, the
-# greatest that is looked at; and values in each decade below it. Choices.
+# Greatest depth, as a share of that at which windows end or of that of a touch which lasts the
+# second share of a cycle; values in each decade below it. Choices.
 _DEEPEST, _BRIEF, _EACH = 0.1, 0.05, 144
 
-# What an impact does is forgotten if what it adds to the distance later is this small a share: a
+# The effect of an impact is lost if its later change of the distance is this small a share: a
 # choice, far above rounding (1e-28 for a van der Pol oscillator) and below all that was tried.
 _VANISHES = 1e-14
 
@@ -435,28 +433,28 @@ class Grazing(Summarized):
     value: float
     """The parameter at the grazing."""
     touched: str = eqx.field(static=True)
-    """What is touched, in words."""
+    """Name of the stop or switch that is touched."""
     cycles: int = eqx.field(static=True)
     """Period of the motion that grazes, in cycles: the unit of all periods here."""
     matrix: Float[np.ndarray, "n n"]
     """N, the derivative of the motion's section map without the impact, from touch to touch at a
     fixed reading of the clock."""
     multipliers: Complex[np.ndarray, " n"]
-    """Of N, the largest modulus first."""
+    """Eigenvalues of N, the largest modulus first."""
     rate: Float[np.ndarray, " m"]
     """a, the second derivative of the distance to the stop by the clock, at each touch."""
     gradient: Float[np.ndarray, "m n"]
-    """∂h, of that distance by the state."""
+    """∂h, the derivative of that distance with respect to the state."""
     kick: Float[np.ndarray, "m n"]
     """Change of the state by an impact, over the depth to the power of `order`; -√(2a) W for a
     rigid stop, whose impact adds W·dh/ds."""
     order: Float[np.ndarray, " m"]
     """1/2 for rigid and prestressed stops, 3/2 for a spring without prestress."""
     slope: Float[np.ndarray, " m"]
-    """Derivative of the least distance by the parameter, along the motion without impact."""
+    """Derivative of the least distance along the motion without impact, d/dparameter."""
     entries: Float[np.ndarray, " 12"]
-    """eₙ = ∂h Nⁿ kick, n = 1, 2, …: what an impact of depth one adds to the distance n periods
-    later. A motion with one impact in n periods needs eⱼ > 0 for 0 < j < n."""
+    """eₙ = ∂h Nⁿ kick, n = 1, 2, …: the change of the distance n periods after an impact of depth
+    one. A motion with one impact in n periods needs eⱼ > 0 for 0 < j < n."""
     side: int
     """1 if impacts appear as the parameter rises, -1 if as it falls."""
     outcome: SCENARIOS
@@ -464,7 +462,7 @@ class Grazing(Summarized):
     aperiodic: float
     """Share of these values, evenly spaced by their logarithm, without a period."""
     windows: Windows | None
-    """Motions with one impact in n periods; `None` where there are several touches or no root."""
+    """Motions with one impact in n periods; `None` for several touches or an order ≠ 1/2."""
     forecast: Motions
     """The attractors of the local map."""
     machine: Motions | None
@@ -473,18 +471,18 @@ class Grazing(Summarized):
     """Distances from the grazing, in the parameter, between which the machine agrees with the
     forecast on both sides, except at edges of windows; `None` if nowhere, or without a check."""
     agreement: float
-    """Share of the values there at which period and impacts are the same; NaN if none."""
+    """Share of the values there at which period and impacts are the same, or NaN."""
     far: tuple[int, int] | None
-    """Period in cycles and number of rigid impacts of the motion on which the machine settles, at
-    most values, if no attractor is near. The period is 0 if none was found up to 64 periods of the
-    motion that grazes. `None` if the machine stays near, or without a check."""
+    """Period in cycles and number of rigid impacts of the machine's attractor, at most values, if
+    no attractor is near. The period is 0 if none was found up to 64 periods of the motion that
+    grazes. `None` if the machine stays near, or without a check."""
     labels: tuple[str, str] = eqx.field(static=True)
-    """What pictures write beside position and velocity, in the machine's words."""
+    """Labels of position and velocity in pictures, from the machine."""
     units: Stated = eqx.field(static=True)
-    """In which units its quantities are, as the machine states it."""
+    """The units of its quantities, from the machine."""
 
     def summary(self) -> str:
-        """The stop, the local map, its attractor, and the agreement of the machine."""
+        """Describe the stop, the local map, its attractor, and the agreement of the machine."""
         at = in_unit(f"{self.value:.10g}", dict(self.units), self.parameter)
         values = ", ".join(complex_in_words(z, 6, 1e-9) for z in self.multipliers)
         entries = ", ".join(f"{e:.4g}" for e in self.entries[:6])
@@ -513,7 +511,7 @@ class Grazing(Summarized):
 
     @property
     def afar(self) -> str:
-        """The motion of the machine where nothing near attracts, `far` in words; "" if `None`."""
+        """The machine's attractor if none is near, `far` in words; "" if `None`."""
         if self.far is None:
             return ""
         period, impacts = self.far
@@ -526,14 +524,14 @@ class Grazing(Summarized):
             return []
         lines, least = [], np.abs(self.forecast.offset).min()
         for n, (near, far) in zip(self.windows.period, self.windows.stable, strict=True):
-            if np.isfinite(near) and abs(far) > least:  # further ones are too close to tell apart
+            if np.isfinite(near) and abs(far) > least:  # others are too close to distinguish
                 place = in_unit(f"{near:+.3g} … {far:+.3g}", dict(self.units), self.parameter)
                 each = f"{n} periods" if n > 1 else "each period"
                 lines.append(f"  one impact in {each}: stable at {place} from there")
         return lines
 
     def drawn(self):
-        """The period at each value, as the local map has it."""
+        """Return the period at each value, by the local map."""
         return self.forecast.period
 
 
@@ -547,21 +545,21 @@ def grazing(
     Kowalczyk 2008), by the root of the depth at a rigid stop. Both are derivatives of the machine's
     functions, for rigid, soft and prestressed stops and for autonomous machines. The map is
     iterated over decades of the parameter and its attractor is named. The machine itself is
-    simulated at the same values, on both sides. Host-side: not to be traced.
+    simulated at some of these values, on both sides. Host-side: not to be traced.
 
     **Arguments:**
 
     - `point`: a special point of a branch of the kind "grazing" (`Branch.special`).
     - `check`: whether to simulate the machine for comparison, which takes most of the time.
-    - `periods`: motions with one impact in up to so many periods are listed.
-    - `progress`: show a bar while the machine is simulated, in a terminal or a notebook.
+    - `periods`: largest n of the listed motions with one impact in n periods.
+    - `progress`: whether to show a bar during the simulation, in a terminal or a notebook.
 
     **Returns:** a `Grazing`.
 
-    **Raises:** `TypeError` if this is no special point; `ValueError` if it is of another kind, if
-    nothing is touched there, if an event is touched whose jump does not vanish with the speed, or
-    if the motion without the impact has a fold there; on Ctrl-C while the machine is simulated
-    `Interrupted`, whose `partial` is what `check=False` gives.
+    **Raises:** `TypeError` if `point` is no special point. `ValueError` if it is of another kind or
+    nothing is touched; if the jump of the touched event does not vanish with the speed; at a fold of
+    the motion without the impact. On Ctrl-C `Interrupted`; its `partial` is the result of
+    `check=False`.
     """
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
     check, periods = flag("check", check), count("periods", periods, least=1)
@@ -588,8 +586,8 @@ def grazing(
 def _within(
     found: Grazing, graze: Graze, settles: Settled, checked: tuple[float, float]
 ) -> Grazing:
-    """The same, what follows named for the values at which the machine agrees alone: elsewhere the
-    local map may go through other things than the machine does."""
+    """Name the scenario for the values at which the machine agrees only: elsewhere the local map
+    may have other attractors than the machine."""
     size = np.abs(found.forecast.offset)
     inside = (size >= checked[0]) & (size <= checked[1])
     some = jax.tree.map(lambda a: a[inside], settles)
@@ -598,7 +596,7 @@ def _within(
 
 
 def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
-    """What the local map forecasts, and what it settles on at each value of the parameter."""
+    """Return the forecast of the local map, and its attractor at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     half = 0.5 * _BRIEF * float(graze.problem.period(graze.x)) / graze.problem.cycles

@@ -1,4 +1,4 @@
-"""Periodic motions as data: their stability, why a search for one ended, and which differ."""
+"""Periodic motions as data: their stability, the results of searches, and distinct motions."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ NEUTRAL = 1e-9
 
 
 def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
-    """Eigenvalues of a monodromy matrix, the largest modulus first; NaN if it is not finite."""
+    """Return the eigenvalues of a monodromy matrix, the largest modulus first, or NaN."""
     finite = jnp.all(jnp.isfinite(monodromy))
     safe = jnp.where(finite, monodromy, jnp.eye(monodromy.shape[0], dtype=monodromy.dtype))
     if monodromy.shape == (2, 2):
@@ -81,17 +81,17 @@ def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
 def eigenvalues(
     half: Float[Array, "..."], determinant: Float[Array, "..."]
 ) -> Complex[Array, "... 2"]:
-    """Eigenvalues of 2x2 matrices from half their trace and their determinant."""
-    # Pinned: computed again with other rounding, it would be zero for one of those who ask, and not
-    # for another (seen with JAX 0.12: 1 ± 0.7 for 1 and 1).
+    """Return the eigenvalues of 2x2 matrices from half their trace and their determinant."""
+    # Pinned: computed again with other rounding, it might be zero in one use and not in another
+    # (seen with JAX 0.12: 1 ± 0.7 for 1 and 1).
     square = pin(half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
-    double = square == 0  # where the derivative of the root is infinite
+    double = square == 0  # the derivative of the root is infinite there
     root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
     return jnp.stack([half + root, half - root], axis=-1)
 
 
 def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
-    """The verdict of a set of multipliers: that of the largest."""
+    """Return the stability that the largest multiplier determines."""
     largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
     size = jnp.abs(largest)
     real = jnp.abs(largest.imag) <= NEUTRAL * size
@@ -107,8 +107,8 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
 
 
 def compound(matrix: Float[Array, "n n"]) -> Float[Array, "pairs pairs"]:
-    """The second compound matrix, of all determinants of two rows and two columns: its eigenvalues
-    are the products of two of the eigenvalues."""
+    """Return the second compound matrix, of all determinants of two rows and two columns. Its
+    eigenvalues are the products of two of the eigenvalues."""
     first, second = np.triu_indices(len(matrix), 1)
     rows, others = matrix[first], matrix[second]
     return rows[:, first] * others[:, second] - rows[:, second] * others[:, first]
@@ -150,8 +150,8 @@ class ORBIT_RESULTS(NamedEnumeration):
 class Orbit(Summarized):
     """A periodic motion, from `find_orbit`; check `result` before you use it.
 
-    Under `vmap` every array has the batch axes in front, and the impact arrays are padded with
-    NaN (stops: -1). Numbers are in the machine's units (see `AbstractMachine.units`): those of a
+    Under `vmap` every array has the batch axes in front, and the impact arrays are padded with NaN
+    (stops: -1). Numbers are in the machine's units (see `AbstractMachine.units`): those of a
     `Scene` in a and ω.
     """
 
@@ -159,66 +159,64 @@ class Orbit(Summarized):
     """The machine, in the phase clock."""
     method: AbstractMethod
     state: State
-    """State on the section, a pytree like a start; a `HybridState` for a machine with modes of its
-    own."""
+    """State on the section, a pytree like a start; a `HybridState` for a machine with modes."""
     sections: State
-    """States on the sections of the cycles that were asked for; leaves (cycles,)."""
+    """States on the sections of all cycles of the search; leaves (cycles,)."""
     cycles: Int[Array, "..."]
     """Least period in drive cycles."""
     duration: Float[Array, "..."]
     """Least period in time τ."""
     frequency_ratio: Float[Array, "..."] | None
-    """ζ: mean speed of the drive over the period; `None` for machines that are not driven."""
+    """ζ: mean speed of the drive over the period; `None` for machines without a drive."""
     impact_phase: Float[Array, "... impacts"]
     """Clock of each impact, rising from the section on, in the machine's units: the crank angle in
-    radians for a `Scene`, what counts the cycles for any other."""
+    radians for a `Scene`, the variable that counts the cycles for any other."""
     impact_speed: Float[Array, "... impacts"]
-    """V⁻, speed of approach just before each impact, in the machine's unit (of a `Scene` a ω)."""
+    """V⁻, speed of approach just before each impact, in the machine's unit (for a `Scene` a ω)."""
     impact_stop: Int[Array, "... impacts"]
     """Number of the rigid stop of each impact."""
     impacts: Int[Array, "..."]
     """Number of impacts in the period."""
     rests: Int[Array, "..."]
-    """How often a body comes to rest on a stop in the period; 0 also if it lies there all the
-    time."""
+    """Number of times that a body comes to rest on a stop in the period; 0 if it always rests."""
     y_min: Float[Array, "..."]
-    """Smallest position of the period (of the first coordinate)."""
+    """Smallest position of the first coordinate in the period."""
     y_max: Float[Array, "..."]
-    """Largest position of the period."""
+    """Largest position of the first coordinate in the period."""
     clearance: Float[Array, "..."]
-    """Smallest distance to a stop at which the body turns back without touching it;
-    infinite if it never does, negative where it would pass through the stop."""
+    """Smallest distance to a stop at a turn that does not touch it; infinite without such a turn,
+    negative if the motion would pass through the stop."""
     monodromy: Float[Array, "... states states"]
-    """Derivative of the map over the period, in the order of the state's leaves; on the section on
-    which the orbit was searched, which `find_orbit` chooses away from the impacts."""
+    """Derivative of the map over the period, in the order of the state's leaves, on the section of
+    the search, which `find_orbit` chooses away from the impacts."""
     multipliers: Complex[Array, "... states"]
     """Floquet multipliers over the period, the largest modulus first."""
     residual: Float[Array, "..."]
     """Largest component of P(x) - x, the difference of the state after one period, relative to the
-    size of each number (1 for a `Scene`)."""
+    size of each component (1 for a `Scene`)."""
     error: Float[Array, "..."]
-    """Estimated error of `state`, as relative: largest component of Newton's next step."""
+    """Estimated error of `state`, likewise relative: largest component of Newton's next step."""
     iterations: Int[Array, "..."]
-    """Steps of the search."""
+    """Number of steps of the search."""
     history: Float[Array, "... max_steps"]
     """Residual after each step of the search, NaN beyond the last."""
     result: ORBIT_RESULTS
-    """Whether an orbit was found, or why not."""
+    """Success, or the reason why no orbit was found."""
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
     `AbstractMachine.averages`)."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
-        """Whether an orbit was found, of the given period or a smaller one."""
+        """True if an orbit was found, of the given period or a smaller one."""
         return (self.result == ORBIT_RESULTS.successful) | (
             self.result == ORBIT_RESULTS.smaller_period
         )
 
     @property
     def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle, by more than rounding; false also
-        where they are not known (see `stability`)."""
+        """True if all multipliers lie inside the unit circle, by more than rounding; false also if
+        they are not known (see `stability`)."""
         return self.stability == STABILITY.stable
 
     @property
@@ -240,20 +238,20 @@ class Orbit(Summarized):
 
     @property
     def slowest_impact(self) -> Float[Array, "..."]:
-        """Smallest V⁻, the distance to a grazing by losing an impact; infinite without
-        impacts. The other distance is `clearance`."""
+        """Smallest V⁻, the distance to a grazing at which an impact is lost; infinite without
+        impacts. The distance to other grazings is `clearance`."""
         speed = jnp.where(jnp.isnan(self.impact_speed), jnp.inf, self.impact_speed)
         return jnp.min(speed, axis=-1, initial=jnp.inf)
 
     @property
     def admissible(self) -> Bool[Array, "..."]:
-        """Whether the motion stays inside the gap and every impact approaches its stop."""
+        """True if the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
         size = jnp.maximum(jnp.abs(self.y_min), jnp.abs(self.y_max))
         inside = self.clearance >= 0
         for stop in stops_of(self.machine):
             if stop.coordinate:
-                continue  # the extremes are those of the first coordinate
+                continue  # the extrema are those of the first coordinate
             reach = self.y_max if stop.sign > 0 else -self.y_min
             inside = inside & (reach <= stop.gap + slack * (size + jnp.abs(stop.gap)))
         return self.successful & inside & (self.slowest_impact > 0)
@@ -261,7 +259,7 @@ class Orbit(Summarized):
     def trajectory(
         self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8
     ) -> Run:
-        """The motion over one period (or `cycles` drive cycles), sampled, for plots.
+        """Return the motion over one period (or `cycles` drive cycles), sampled, for plots.
 
         **Raises:** `ValueError` for a batch of orbits.
         """
@@ -273,7 +271,7 @@ class Orbit(Summarized):
         if cycles is None:
             cycles = int(self.cycles)
         if is_autonomous(machine, self.state):
-            # Its cycles need not be of one length: the whole motion is one interval.
+            # Its cycles may differ in length: the whole motion is one interval.
             machine = machine.observed_every(self.duration * (cycles / self.cycles))
             samples, cycles = samples * cycles, 1
         return simulate(
@@ -284,17 +282,17 @@ class Orbit(Summarized):
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """This orbit, or a batch of them, as an `xarray.Dataset`.
+        """Return this orbit, or a batch of them, as an `xarray.Dataset`.
 
-        Section states become a variable for each component (`section_Y`), multipliers complex
-        ones; `result` and `stability` are words. Host-side: not to be traced.
+        Each component of the section states is a variable (`section_Y`), multipliers are complex;
+        `result` and `stability` are words. Host-side: not to be traced.
 
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only what has
-        one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the
-        monodromy matrix, or a batch axis), which then makes a table without repetitions.
+        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only variables
+        of one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the monodromy
+        matrix, or a batch axis). This makes a table without repetitions.
 
-        **Raises:** `ValueError` if these are not as many as there are batch axes, or there is no
-        such dimension.
+        **Raises:** `ValueError` if the number of names is not that of the batch axes, or there is
+        no such dimension.
         """
         batch = batch_names(dims, self.residual.ndim)
         alone = ("cycles", "duration", "frequency_ratio", "impacts", "rests", "y_min", "y_max",
@@ -312,7 +310,7 @@ class Orbit(Summarized):
         return tidy(with_units(data, units_of(self.machine), own), along)
 
     def summary(self) -> str:
-        """The motion, its impacts and its multipliers."""
+        """Describe the motion, its impacts and its multipliers."""
         if self.residual.ndim:
             found = self.successful
             counted = f"{int(jnp.sum(self.stable))} of them stable"
@@ -358,7 +356,7 @@ class Orbit(Summarized):
 
 
 def check_multipliers(name: str, orbit: Orbit) -> None:
-    """**Raises:** `ValueError` if a motion, or one of a batch, was found without multipliers."""
+    """Raise `ValueError` if a motion, or one of a batch, was found without multipliers."""
     if bool(jnp.any(orbit.successful & jnp.isnan(orbit.multipliers).any(axis=-1))):
         raise ValueError(
             f"Argument `{name}` must have multipliers, but they are not a number: find it without "
@@ -367,7 +365,7 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
 
 
 class InWords:
-    """What is shown by its `__str__`; in notebooks as a table, over a row of numbers drawn."""
+    """A mixin for display: the text of `__str__`; in notebooks a table above a row of numbers."""
 
     def __repr__(self) -> str:
         return str(self)
@@ -377,8 +375,8 @@ class InWords:
 
 
 def _nearly(orbit: Orbit) -> str:
-    """What to do where a search ended close to an orbit, by the errors of the steps."""
-    # A choice: starts that are no good end with residuals of some 1e-3 and more.
+    """Return advice for a search that ended close to an orbit, at the errors of the steps."""
+    # A choice: searches from bad starts end with residuals of some 1e-3 and more.
     if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
         return ""
     return (
@@ -388,7 +386,7 @@ def _nearly(orbit: Orbit) -> str:
 
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
-    """Whether a body lies still on a stop on the section."""
+    """Return whether a body rests on a stop on the section."""
     x, machine = bare(orbit.state), orbit.machine
     bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
@@ -402,21 +400,21 @@ def hits_in_words(orbit: Orbit) -> str:
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
-    """The interval of the first coordinate, by the name that pictures give it."""
+    """Return the interval of the first coordinate, with its name in pictures."""
     low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
     span = in_unit(f"[{low}, {high}]", units_of(orbit.machine), "position")
     return f"{name_in(orbit.machine.labels[0])} in {span}"
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:
-    """A complex number, or a real one if its imaginary part is such a share of it."""
+    """Format a complex number, or a real one if its imaginary part is rounding."""
     if abs(z.imag) <= rounding * abs(z):
         return f"{z.real:.{digits}g}"
     return f"{z.real:.{digits}g}{z.imag:+.{digits}g}i"
 
 
 def trimmed(orbit: Orbit) -> Orbit:
-    """One orbit without the padding of its impacts; anything traced or batched as it is."""
+    """Remove the padding of the impacts of one orbit; return traced or batched orbits unchanged."""
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
     keep = slice(int(orbit.impacts))
@@ -427,10 +425,10 @@ def trimmed(orbit: Orbit) -> Orbit:
 
 
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:
-    """Return how far states lie from others, relative to `unit` + |state| of the latter.
+    """Return the distance of states from others, relative to `unit` + |state| of the latter.
 
-    Of the components, the last axis, that counts which differs most. Everywhere in the package this
-    number says whether two states, or two motions, are the same; `unit` are their `row_sizes`.
+    It is the largest over the components, the last axis. Everywhere in the package it decides
+    whether two states, or two motions, are the same; `unit` are their `row_sizes`.
     """
     return (abs(here - there) / (unit + abs(there))).max(axis=-1)
 
@@ -457,16 +455,14 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     """Return the different motions among many searches.
 
     Motions that differ only by the cycle on which they are observed count as one, and a motion
-    found with a multiple of its period counts with its least period. Searches that found nothing
-    are left out. Host-side: not to be traced.
+    found with a multiple of its period counts with its least period. Failed searches are left out.
+    Host-side: not to be traced.
 
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
-    their sections agree to `tolerance`, relative to the size of each number
-    of the state.
+    their sections agree to `tolerance`, relative to the size of each component of the state.
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
-    each on the section on which it was first found; and for each of them the number of searches
-    that found it.
+    each on the section on which it was first found; and the number of searches that found each.
     """
     if not isinstance(orbits, Orbit):
         raise TypeError(f"Argument `orbits` must be from `find_orbit`, but got {short(orbits)}.")
@@ -476,8 +472,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
 
 
 def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, np.ndarray]:
-    """The different motions in several batches of searches, whose periods asked for may differ; and
-    how many searches of each batch found each, (motions, batches). See `distinct_orbits`."""
+    """Return the different motions in several batches of searches, possibly for different periods,
+    and the number of searches of each batch that found each, (motions, batches)."""
     chosen: list[Orbit] = []
     paths: list[tuple[np.ndarray, np.ndarray]] = []
     counts: list[np.ndarray] = []
@@ -509,8 +505,8 @@ def _known(
     paths: list[tuple[np.ndarray, np.ndarray]], path: np.ndarray, tolerance: float,
     angles: np.ndarray | None,
 ) -> int:  # fmt: skip
-    """Which of the known motions one is, by its sections from any of them on; else how many there
-    are. `paths` holds the sections of each, and the sizes of their numbers."""
+    """Return the index of a motion among the known ones, from any of its sections on, or their
+    number. `paths` holds the sections of each, and the sizes of their components."""
     for j, (other, sizes) in enumerate(paths):
         if len(other) == len(path):
             here = nearest_images(angles, path[0], other)

@@ -1,7 +1,7 @@
-"""Root finders, `Newton` and `Gradient`, and how equations with a neutral direction are solved.
+"""Root finders, `Newton` and `Gradient`, and the solution of equations with a neutral direction.
 
-They know nothing of orbits. What they are run on, and how the root moves with the numbers of the
-machine, is in `find.py`.
+They are independent of orbits. `find.py` applies them, and differentiates the root with respect to
+the numbers of the machine.
 """
 
 import abc
@@ -27,20 +27,19 @@ _STEEP = 1e3
 
 
 def rounding(dtype: object) -> float:
-    """The share of the greatest singular value below which one is zero to rounding: 2e-12 in double
-    and 6e-6 in single precision."""
+    """Return the share of the greatest singular value below which one is zero to rounding: 2e-12 in
+    double and 6e-6 in single precision."""
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
 def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None) -> Array:
-    """What solves `matrix @ step = missing`, where many do, the smallest one; singular values below
-    the share `least` of the greatest are zero. What no step reaches is left over: `missing - matrix
-    @ step`."""
+    """Return the smallest solution of `matrix @ step = missing`; singular values below the share
+    `least` of the greatest are zero. `missing - matrix @ step` is the part that no step reaches."""
     left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
     least = rounding(matrix.dtype) if least is None else least
     lost = sizes <= least * jnp.minimum(sizes[0], _STEEP)
     size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
-    # An image for each direction that has none, so that the matrix can be inverted.
+    # Directions without an image get one, so that the matrix can be inverted.
     filled = (left * (lost.astype(matrix.dtype) * size)) @ right
     return jnp.linalg.solve(matrix + filled, missing)
 
@@ -69,16 +68,16 @@ class AbstractRootFinder(eqx.Module):
 
     @abc.abstractmethod
     def init(self, residual: Residual, x: Unknowns) -> Any:
-        """The memory that `step` begins with: any pytree."""
+        """Return the memory with which `step` begins, any pytree."""
 
     @abc.abstractmethod
     def step(
         self, residual: Residual, x: Unknowns, memory: Any
     ) -> tuple[Unknowns, Any, Unknowns, Scalar]:
-        """One step from `x`.
+        """Make one step from `x`.
 
-        **Returns:** where to go on from; the memory; a place whose residual was computed, and the
-        largest component of that residual.
+        **Returns:** the next place; the memory; a place with known residual, and the largest
+        component of that residual.
         """
 
 
@@ -91,13 +90,13 @@ class Newton(AbstractRootFinder):
 
     **Arguments:**
 
-    - `tolerance`: largest residual component of a found orbit, relative to the sizes of the numbers
-      of its state; by default 1e-10 in double and 1e-4 in single precision. The
-      search continues below it as long as the residual decreases.
-    - `max_steps`: steps after which it gives up; static.
-    - `arcs`: 1 for single shooting. With more, the period is cut into that many arcs, whose
-      starting states are all unknowns (multiple shooting): for motions that amplify perturbations
-      too much within one period. Must divide the cycles; static.
+    - `tolerance`: largest residual component of a found orbit, relative to the sizes of the
+      components of its state; by default 1e-10 in double and 1e-4 in single precision. The search
+      continues below it as long as the residual decreases.
+    - `max_steps`: maximum number of steps; static.
+    - `arcs`: 1 for single shooting. With more, the period is divided into that many arcs, whose
+      first states are all unknowns (multiple shooting): for motions that amplify perturbations too
+      much within one period. Must divide the cycles; static.
     """
 
     tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
@@ -106,18 +105,18 @@ class Newton(AbstractRootFinder):
     usual_tolerance: ClassVar[float] = 1e-10
 
     def _solver(self, dtype):
-        # Where something is neutral, of all steps the smallest.
+        # If a direction is neutral, take the smallest of all steps.
         least = lx.SVD(rcond=rounding(dtype))
         return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=least)
 
     def init(self, residual, x):
-        """The memory at first: the dogleg's state."""
+        """Return the first memory, the dogleg's state."""
         fn = _with_aux(residual)
         shapes, aux = eqx.filter_eval_shape(fn, x, None)
         return self._solver(x.dtype).init(fn, x, None, {}, shapes, aux, frozenset())
 
     def step(self, residual, x, memory):
-        """One dogleg step, tried; the place moves only if the residual falls."""
+        """Try one dogleg step; the place moves only if the residual falls."""
         solver, fn = self._solver(x.dtype), _with_aux(residual)
         x, memory, _ = solver.step(fn, x, None, {}, memory, frozenset())
         return x, memory, x, _largest(memory.f_info.residual)
@@ -132,10 +131,10 @@ class Gradient(AbstractRootFinder):
 
     **Arguments:**
 
-    - `optimiser`: an `optax.GradientTransformation`; by default Adam, its rate falling along a
-      cosine from 0.02 to zero over `max_steps`.
+    - `optimiser`: an `optax.GradientTransformation`; by default Adam, with a rate that falls along
+      a cosine from 0.02 to zero over `max_steps`.
     - `tolerance`: as for `Newton`; by default 1e-7 in double and 1e-4 in single precision.
-    - `max_steps`: steps after which it gives up; static.
+    - `max_steps`: maximum number of steps; static.
     - `arcs`: as for `Newton`.
     """
 
@@ -157,11 +156,11 @@ class Gradient(AbstractRootFinder):
         return optax.adam(optax.cosine_decay_schedule(0.02, self.max_steps))
 
     def init(self, residual, x):
-        """The memory at first: the optimiser's state."""
+        """Return the first memory, the optimiser's state."""
         return self._optimiser.init(x)
 
     def step(self, residual, x, memory):
-        """One step of the optimiser; the place returned is the one it began from."""
+        """Make one step of the optimiser; the returned residual is that of its begin."""
 
         def loss(x):
             missing = residual(x)
@@ -173,31 +172,31 @@ class Gradient(AbstractRootFinder):
 
 
 def _largest(missing: Array) -> Array:
-    # A NaN must win, which `max` does not promise on every backend.
+    # A NaN must win; `max` does not guarantee this on every backend.
     return jnp.where(jnp.all(jnp.isfinite(missing)), jnp.max(jnp.abs(missing)), jnp.nan)
 
 
 class Found(NamedTuple):
-    """Where a root finder ended."""
+    """The result of a root finder."""
 
     x: Unknowns
-    """The place with the smallest residual that was met."""
+    """The place with the smallest residual of the search."""
     residual: Scalar
     """Largest component of the residual at `x`."""
     converged: Array
-    """Whether that is within its tolerance."""
+    """Nonzero if the residual is within its tolerance."""
     steps: Array
-    """Steps that the search took."""
+    """Number of steps of the search."""
     history: Float[Array, " max_steps"]
     """Largest residual component after each step, NaN beyond the last."""
     unit: Scalar
-    """What counts as 1 in the comparison with a tolerance: the largest unknown, of rest 1."""
+    """The unit of the tolerance: the largest unknown, or 1 at rest."""
 
 
 def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) -> Found:
-    """Run a root finder from `x` until the residual is within its tolerance and gains no more.
+    """Run a root finder from `x` until the residual is within its tolerance and decreases no more.
 
-    A place where the residual is not finite is never taken for better than another.
+    A place with a residual that is not finite is never better than another.
     """
     tolerance = root_finder.tolerance
     if tolerance is None:
@@ -205,7 +204,7 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
     nan, guess = jnp.full((), jnp.nan, x.dtype), x
 
     def unit(place):
-        # Of a motion that comes to rest in the origin nothing is left to be relative to.
+        # A motion that comes to rest in the origin has no size to be relative to.
         size = jnp.max(jnp.maximum(jnp.abs(place), _NOTHING * jnp.abs(guess)))
         return jnp.where(size > _REST, size, 1.0)
 
@@ -214,7 +213,7 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
 
     def going(carry):
         _, _, best, size, last, steps, _ = carry
-        # Newton's last steps fall from below the tolerance to rounding: worth their cost.
+        # Newton's last steps from the tolerance to rounding are worth their cost.
         gaining = ~(size > 0.1 * last) & (size > 0)
         hopeless = (steps > 0) & jnp.isnan(size)
         done = hopeless | ((size <= tolerance * unit(best)) & ~gaining)

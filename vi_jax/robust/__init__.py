@@ -1,5 +1,4 @@
-"""How hard a motion may be kicked: the least kick out of its basin, the motion on the edge,
-the manifolds of saddles."""
+"""Robustness of motions: the minimal kick out of a basin, edge states, manifolds of saddles."""
 
 from ._edge_state import EdgeState as EdgeState
 from ._edge_state import edge_state as edge_state

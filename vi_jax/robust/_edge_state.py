@@ -23,20 +23,19 @@ from ._settling import (
     settling_on,
 )
 
-# Two starts on both sides of the boundary are brought as close as this and followed until they are
-# as far apart as that, relative to the motion's size: choices. What lies between them is the edge's
-# motion to within the latter.
+# Two starts on both sides of the boundary are bisected to the first distance and followed until
+# they reach the second, relative to the motion's size: choices. The edge lies between them.
 _CLOSE, _APART = 1e-10, 1e-5
 
-# Pieces of `TRAIL` cycles after which two neighbours are bisected again, apart or not: a choice.
+# Pieces of `TRAIL` cycles after which two neighbours are bisected again in any case: a choice.
 _PIECES = 16
 
-# Of the 0-1 test: the fewest section states, and the correlation of time with the square of how far
-# a walk has strayed, 1 for chaos and 0 for anything regular. Choices.
+# The 0-1 test: the fewest section states, and the least correlation of time with the squared
+# distance of a walk from its origin (1 for chaos, 0 for regular motions). Choices.
 _LEAST, _GROWS = 200, 0.7
 
-# How near the edge's motion must come back to itself for a search, and how far from it an orbit may
-# be that counts as what it settles on. Choices; a search that leads elsewhere asks for a tenth.
+# The edge's motion must recur to within the first for a search; the orbit found may be farther off
+# by the second factor. Choices; after a failed search the first becomes a tenth.
 _RECURS, _NEAR = 1e-3, 10.0
 
 
@@ -44,20 +43,20 @@ class EdgeState(Summarized):
     """The attractor of motions on the boundary between two basins."""
 
     orbit: Orbit | None
-    """The periodic motion, unstable, by `find_orbit`; `None` where none was found."""
+    """The unstable periodic motion, by `find_orbit`; `None` if none was found."""
     kind: str = eqx.field(static=True)
     """`"saddle"`, a periodic motion with one multiplier outside the unit circle; `"unstable"`, one
     with more of them; `"chaotic"`, by the 0-1 test of the motion along the edge; `"irregular"`,
-    none of these: a quasi-periodic edge, one of a longer period than `longest`, or one that settles
+    otherwise: a quasi-periodic edge, one of a longer period than `longest`, or one that settles
     more slowly than it was followed."""
     sections: State
-    """Section states along the edge, arrays of shape (cycles,), each within 1e-5 (as
-    `tolerance` of `edge_state`) of the boundary."""
+    """Section states along the edge, arrays of shape (cycles,), each within 1e-5 of the boundary
+    (relative, as `tolerance` of `edge_state`)."""
     machine: AbstractMachine
-    """The machine that the basins on both sides belong to."""
+    """The machine of the basins on both sides."""
 
     def summary(self) -> str:
-        """The edge state in words."""
+        """Describe the edge state in words."""
         cycles = len(in_rows(self.sections))
         if self.orbit is not None:
             return f"Edge state ({self.kind}), after {cycles} cycles along it\n{self.orbit}"
@@ -80,8 +79,8 @@ def edge_state(
 ) -> EdgeState:
     """Find the edge state between two starts that settle on different motions.
 
-    The line between the starts is bisected until two on both sides of the boundary are 1e-10 apart;
-    these are followed until they are 1e-5 apart, and the line between them is bisected again. So
+    The line between the starts is bisected until two on both sides of the boundary are 1e-10 apart.
+    These are followed until they are 1e-5 apart, and the line between them is bisected again. So
     the motion stays on the boundary and converges to an attractor within it (edge tracking: Skufca,
     Yorke and Eckhardt 2006). Once it comes near to an earlier state, `find_orbit` makes it exact.
     Host-side: not to be traced.
@@ -92,21 +91,21 @@ def edge_state(
     - `inside`: a stable `Orbit`, or a state from which the machine settles on a motion that repeats
       within `longest` cycles; for a machine without a drive also an equilibrium.
     - `outside`: an `Orbit` or a state from which it settles on any other motion.
-    - `settle`: cycles after which a start that has not returned to the motion of `inside` counts as
-      settling elsewhere.
-    - `tolerance`: a start has returned once a section state is this close to one of the motion,
-      relative to u + |state|, with u the largest component of the motion, at most 1. It must be
-      smaller than the basin.
-    - `longest`: longest period of the edge state that is looked for, in cycles.
-    - `rounds`: bisections after which the edge is called irregular.
+    - `settle`: number of cycles after which a start that has not returned to the motion of `inside`
+      counts as settling elsewhere.
+    - `tolerance`: a start has returned once a section state is this close to one of the motion.
+      It is relative to u + |state|, with u the largest component of the motion, at most 1, and must
+      be smaller than the basin.
+    - `longest`: longest period of the edge state, in cycles.
+    - `rounds`: number of bisections after which the edge is called irregular.
     - `method`: as for `cycle_map`.
-    - `progress`: count the bisections, in a terminal or a notebook.
+    - `progress`: whether to count the bisections, in a terminal or a notebook.
 
     **Returns:** an `EdgeState`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, and `ValueError`
-    where both starts settle on the same motion; on Ctrl-C `Interrupted`, whose `partial` is an
-    irregular `EdgeState` as far as the edge was followed.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments, and `ValueError` if both starts
+    settle on the same motion. On Ctrl-C `Interrupted`, whose `partial` is an irregular `EdgeState`
+    as far as the edge was followed.
     """
     progress = flag("progress", progress)
     longest, rounds = count("longest", longest, least=1), count("rounds", rounds, least=1)
@@ -141,7 +140,7 @@ def tracked(
     trail: list[Rows] | None = None,
     tell: Tell = silent,
 ) -> EdgeState:
-    """The edge state between a start that comes back and one that does not; adds to `trail`."""
+    """Find the edge state between a start that returns and one that does not; extend `trail`."""
     recurs, trail = _RECURS, [] if trail is None else trail
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)
@@ -161,12 +160,12 @@ def tracked(
 
 
 def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
-    """Two neighbours once they are apart, and the section states half way between them before."""
+    """Follow two neighbours until they are apart; return them and their mean section states."""
     parts = []
     for _ in range(_PIECES):
         both = settling.trail(pair, TRAIL)
         both[1] = settling.near(both[1], both[0])
-        far = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or no number
+        far = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or NaN
         end = far[0] if far.size else TRAIL
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
@@ -179,7 +178,7 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
 def _met_again(
     trail: Rows, longest: int, recurs: float, settling: Settling
 ) -> tuple[Row, int] | None:
-    """A state near to which the motion comes back, the latest, and after how many cycles."""
+    """Return the last state if the motion has returned near to it, and the fewest cycles."""
     last = trail[-1]
     back = np.flatnonzero(settling.distance_to(trail[:-1], last)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
@@ -198,8 +197,8 @@ def _described(settling: Settling, trail: list[Rows], orbit: Orbit | None) -> Ed
 
 
 def _chaotic(rows: Rows) -> bool:
-    """The 0-1 test for chaos (Gottwald and Melbourne 2009) of section states, at least 200 of them:
-    a walk that is driven by a chaotic signal strays as a random one, any other stays bounded."""
+    """Apply the 0-1 test for chaos (Gottwald and Melbourne 2009) to at least 200 section states: a
+    walk driven by a chaotic signal diffuses like a random one, any other stays bounded."""
     count = len(rows)
     if count < _LEAST:
         return False

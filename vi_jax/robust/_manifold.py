@@ -14,27 +14,28 @@ from ..machine import AbstractMachine, Summarized, bare, in_rows, is_autonomous
 from ..orbit import Orbit, cycle_map
 from ._settling import Row, Rows, Settling, in_row, one_orbit
 
-# How far from the saddle, relative to its size, its manifolds are taken to be straight: they
-# part from their tangents by the square of it. A choice.
+# Distance from the saddle, relative to its size, at which its manifolds are taken to be straight.
+# They deviate from their tangents by the square of it. A choice.
 _BEGIN = 1e-5
 
-# The angle, in radians, by which a curve may turn from one point to the next, and the part of
-# `spacing` down to which points are set closer for its sake: choices.
+# The largest angle, in radians, of a curve's turn from point to point; the share of `spacing` to
+# which points are set closer for a smaller turn. Choices.
 _TURN, _CLOSEST = 0.15, 1 / 64
 
-# Points of an arc that are looked at once, its half angle, the rounds that narrow it, and by how
-# many points the next arc is wider than two neighbours: 6 rounds are an angle of 1e-9. Choices.
+# Points of an arc in one program; its half angle; the rounds that narrow it; the margin of the next
+# arc, in points. 6 rounds give an angle of 1e-9. Choices.
 _ARC, _HALF, _ROUNDS, _WIDER = 64, 2.9, 6, 0.25
 
-# How far apart the images of neighbours on an arc are, how near to the saddle an image must be, and
-# how much a difference may grow on the way. Choices.
+# Distance of the images of neighbours on an arc; largest distance of an image from the saddle; most
+# growth of a difference until then. Choices.
 _REACH, _FAR, _GROWTH = 0.1, 0.2, 1e6
 
-# Of `spacing`, what a period adds to an unstable manifold that has come to an attractor: a choice.
+# An unstable manifold has reached an attractor if it grows in a period by less than this share of
+# `spacing`: a choice.
 _ENDED = 1e-3
 
-# Parts of a period's stretch of an unstable manifold below which two neighbours are on both sides
-# of a jump, and the most points of one. Choices.
+# Two neighbours closer than this share of a period's stretch of an unstable manifold are on both
+# sides of a jump; most points of a stretch. Choices.
 _JUMP, _MOST = 1e-9, 4096
 
 
@@ -49,12 +50,12 @@ class Manifold(Summarized):
     """Section states along each branch from the saddle on, arrays of shape (points,); NaN where a
     curve is cut at a jump of the section map."""
     lengths: tuple[float, float] = eqx.field(static=True)
-    """Length of each branch, as `length` of `manifold`; less if the branch ends."""
+    """Length of each branch, as `length` of `manifold`; less if the branch ends early."""
     machine: AbstractMachine
-    """The machine that the saddle is a motion of."""
+    """The machine of the saddle."""
 
     def summary(self) -> str:
-        """The branches in words."""
+        """Describe the branches in words."""
         parts = [
             f"length {length:.4g} ({len(in_rows(branch))} points)"
             for length, branch in zip(self.lengths, self.branches, strict=True)
@@ -72,29 +73,29 @@ def manifold(
 ) -> Manifold:
     """Compute the stable or unstable manifold of a saddle of a driven machine with two states.
 
-    The stable manifold, the states from which the machine goes to the saddle, is the boundary of
-    basins near it. It is grown from the saddle point by point: on an arc ahead of the last one the
-    zero of w·(Pⁿ(x) - xₛ) is taken, with w the saddle's left unstable eigenvector and n as large as
-    neighbours on the arc stay together. This needs neither an inverse nor a derivative of the
-    section map, so the manifold continues through kinks at grazings. The unstable manifold, the
-    states that come from the saddle, is the image of a short stretch along its eigenvector, with
-    points set closer where the images part or turn. Host-side: not to be traced.
+    The stable manifold contains the states from which the machine goes to the saddle, and bounds
+    basins near it. It is computed point by point, from the saddle on. The next point is on an arc
+    ahead of the last one. It is the zero of w·(Pⁿ(x) - xₛ), with w the saddle's left unstable
+    eigenvector and n as large as neighbours on the arc stay together. This needs neither an inverse
+    nor a derivative of the section map, so the manifold continues through kinks at grazings. The
+    unstable manifold, the states that come from the saddle, is the image of a short stretch along
+    its eigenvector; points are added where the images separate or turn. Host-side: not to be
+    traced.
 
     **Arguments:**
 
     - `orbit`: an orbit from `find_orbit`, with one multiplier outside the unit circle and one
       inside.
     - `which`: `"stable"` or `"unstable"`.
-    - `length`: of each branch, each component of the state relative to its size in the saddle's
-      motion; of a `Scene` in its own units.
-    - `spacing`: the greatest distance of neighbouring points, likewise. They are closer, to a 64th
-      of that, if the curve turns by more than 0.15 from one to the next.
+    - `length`: length of each branch, each component of the state relative to its size in the
+      saddle's motion; for a `Scene` in its own units.
+    - `spacing`: the greatest distance of neighbouring points, in the same norm. Points are closer,
+      to a 64th of that, if the curve turns by more than 0.15 from one to the next.
 
-    **Returns:** a `Manifold`. A branch of a stable manifold ends early at a stop, at a jump of
-    the section map, or at a kink that turns by more than 166°; an unstable one goes on behind a
-    jump.
+    **Returns:** a `Manifold`. A branch of a stable manifold ends early at a stop, at a jump of the
+    section map, or at a kink that turns by more than 166°; an unstable one continues after a jump.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments.
     """
     progress = flag("progress", progress)
     which = one_of("which", which, ("stable", "unstable"))
@@ -132,12 +133,11 @@ def manifold(
 
 
 Pieces = Iterator[tuple[Rows, float]]
-"""Of a curve from the saddle on: further points, and how long it is with them."""
+"""Further points of a curve from the saddle, and its length with them."""
 
 
 class _Saddle:
-    """A saddle on its section, with its directions; states as rows of numbers relative to their
-    sizes."""
+    """A saddle on its section, with its directions; states are rows relative to their sizes."""
 
     def __init__(self, orbit: Orbit):
         the_map = cycle_map(orbit.machine, method=orbit.method)
@@ -154,23 +154,23 @@ class _Saddle:
         unstable, stable = (np.real(right[:, i]) for i in order)
         self.unstable, self.stable = (x / np.linalg.norm(x) for x in (unstable, stable))
         self.across = np.real(np.linalg.inv(right)[order[0]])
-        # A multiplier below zero changes sides: two periods do not.
+        # A negative multiplier changes sides; two periods do not.
         turns = 2 if growth[0] < 0 else 1
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
     def carried(self, rows: Rows, periods: int) -> Rows:
-        """Where states are after some periods."""
+        """Return states after some periods."""
         return self.map.carried(rows * self.map.unit, periods * self.period) / self.map.unit
 
     def states(self, parts: list[Rows]) -> Rows:
-        """Points of a curve as they are, with rows of NaN where an angle passes half a turn."""
+        """Return points of a curve in original units, with NaN rows where an angle jumps a turn."""
         rows = np.concatenate(parts) * self.map.unit
         rows = self.map.near(rows, np.zeros_like(rows))
         turned = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
         return np.insert(rows, np.flatnonzero(turned.any(axis=1)) + 1, np.nan, axis=0)
 
     def side_of(self, rows: Rows, apart: float) -> tuple[Row, Bool[np.ndarray, " _"]]:
-        """w·(Pⁿ(x) - xₛ) of neighbours that are so far `apart`, and whether Pⁿ(x) is near xₛ."""
+        """Return w·(Pⁿ(x) - xₛ) of neighbours `apart` by this, and whether Pⁿ(x) is near xₛ."""
         most = np.log(_GROWTH) / np.log(self.growth)
         periods = np.clip(np.log(_REACH / apart) / np.log(self.growth), 1, max(most, 1))
         there = self.carried(rows, int(periods))
@@ -198,7 +198,7 @@ def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Piec
 
 
 def _ahead(saddle: _Saddle, here: Row, ahead: Row, size: float) -> Row | None:
-    """The point of the stable manifold ahead of `here`, at the distance `size`, if one is found."""
+    """Return the point of the stable manifold at distance `size` ahead of `here`, or `None`."""
     middle, low, high = np.arctan2(ahead[1], ahead[0]), -_HALF, _HALF
     new = None
     for _ in range(_ROUNDS):
@@ -217,7 +217,7 @@ def _ahead(saddle: _Saddle, here: Row, ahead: Row, size: float) -> Row | None:
 
 
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
-    """One branch of an unstable manifold, with rows of NaN at jumps."""
+    """Yield one branch of an unstable manifold, with NaN rows at jumps."""
     begin = side * _BEGIN * saddle.unstable
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
@@ -230,7 +230,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
         use = int(np.searchsorted(run, length)) + 1
         cut = np.flatnonzero(~kept[: use - 1])
         if run[-1] - grown < _ENDED * spacing and grown > spacing:
-            break  # it has come to an attractor
+            break  # it has reached an attractor
         grown = float(min(run[-1], length))
         yield np.insert(rows[:use], cut + 1, np.nan, axis=0), grown
 
@@ -238,7 +238,7 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
 def _stretch(
     saddle: _Saddle, begin: Row, periods: int, spacing: float
 ) -> tuple[Rows, Bool[np.ndarray, " _"]]:
-    """Images of a period's stretch along the eigenvector, and which neighbours belong together."""
+    """Return images of a period's stretch along the eigenvector, and whether neighbours connect."""
 
     def images(parts):
         rows = saddle.place + begin * (saddle.growth**parts)[:, None]

@@ -1,15 +1,15 @@
 """`minimal_kick`: the smallest change of the state after which a machine settles elsewhere.
 
-Rays of kicks are simulated until they leave the basin (`first_exits`). Its boundary near the
-shortest kick is the stable manifold of a saddle xₛ: the states x whose image Pⁿ(x) has no part
-along the saddle's unstable direction (`shortest`). With w the left eigenvector of the saddle's
-monodromy matrix for its multiplier outside the unit circle, that is
+Rays of kicks are simulated until they leave the basin (`first_exits`). The basin's boundary near
+the shortest kick is the stable manifold of a saddle xₛ: the images Pⁿ(x) of its states x have no
+component along the saddle's unstable direction (`shortest`). With w the left eigenvector of the
+saddle's monodromy matrix for its multiplier outside the unit circle,
 
     g(z) = w·(Pⁿ(x(z)) - xₛ) = 0,
 
-up to the square of Pⁿ(x) - xₛ, which shrinks as n grows. Least |z|² under it has Lagrange's
-equations z = λ∇g, g = 0, which Newton's method solves; ∇g is exact, through the impacts, and its
-own derivatives are differences of ∇g between lanes beside each other.
+up to the square of Pⁿ(x) - xₛ, which shrinks as n grows. The minimum of |z|² under this condition
+satisfies Lagrange's equations z = λ∇g, g = 0, which Newton's method solves. ∇g is exact, through
+the impacts; its own derivatives are differences of ∇g between neighbouring lanes.
 """
 
 import dataclasses
@@ -33,23 +33,23 @@ from ._edge_state import EdgeState, tracked
 from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
 
 Kicks = Float[np.ndarray, "..."]
-"""Kicks, the components last."""
+"""Kicks, the components in the last axis."""
 
-# Points of a ray that are judged at once between two others: a choice, three bits a round.
+# Points of a ray between two others in one program: a choice, three bits a round.
 _BETWEEN = 7
 
-# Rounds that narrow the exits of rays before they are compared; at most, in a closer look. Choices.
+# Rounds that narrow the exits of rays before their comparison; most rounds of refinement. Choices.
 _COARSE, _FINE = 7, 17
 
-# Points on a ray as the rays grow, doubled until one leaves, at most so many times.
+# The rays grow to twice the length until one leaves, at most so many times.
 _DOUBLINGS = 12
 
-# Directions looked at around the best, per dimension; a round narrows them to a third. Choices.
+# Directions around the best, per dimension; a round narrows them by this factor. Choices.
 AROUND, NARROWER = 12, 3.0
 
 
 class Kick(eqx.Module):
-    """The kicks that are looked for: which numbers of the state, how they are weighed, how far.
+    """The space of kicks: components of the state, their weights and their ranges.
 
     A kick is a vector in units of the weights: component i of the state changes by zᵢ/wᵢ, and |z|
     is the kick's norm.
@@ -58,10 +58,10 @@ class Kick(eqx.Module):
     start: Row
     """The state that is kicked."""
     places: tuple[int, ...] = eqx.field(static=True)
-    """Of the components, among all numbers of the state."""
+    """Indices of the components among those of the state."""
     weights: Row
     low: Row
-    """The least that each component may become, -∞ if any."""
+    """The lower bound of each component, or -∞."""
     high: Row
 
     @property
@@ -80,18 +80,18 @@ class Kick(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Exits:
-    """Where rays leave the basin."""
+    """The exits of rays from the basin."""
 
     directions: Kicks
-    """Units, (rays, components)."""
+    """Unit vectors, (rays, components)."""
     inside: Float[np.ndarray, " rays"]
-    """The last radius on each that comes back, before the first that does not."""
+    """The last radius on each ray that returns, before the first that does not."""
     outside: Float[np.ndarray, " rays"]
-    """The first that does not; infinite where a ray ends before (a stop, a bound)."""
+    """The first radius that does not return; infinite if a ray ends before (a stop, a bound)."""
 
 
 def spread(count: int, size: int, seed: int) -> Kicks:
-    """Directions all around: both ways, evenly around a circle, at random in more dimensions."""
+    """Return directions: both, evenly around a circle, or at random in more dimensions."""
     if size == 1:
         return np.array([[1.0], [-1.0]])
     if size == 2:
@@ -104,13 +104,13 @@ def spread(count: int, size: int, seed: int) -> Kicks:
 def exits(
     settling: Settling, kick: Kick, directions: Kicks, inside: Any, outside: Any, points: int
 ) -> Exits:
-    """Of so many points between two radii of each ray, the first that does not come back."""
+    """Return the first of so many points between two radii of each ray that does not return."""
     parts = np.arange(1, points + 1) / points
     inside = np.broadcast_to(inside, len(directions)).astype(float)
     outside = np.broadcast_to(outside, len(directions)).astype(float)
     radii = inside[:, None] + parts * (outside - inside)[:, None]
     z = radii[..., None] * directions[:, None]
-    # What lies beyond a bound is not judged: the ray ends at the last point within.
+    # Points beyond a bound are not judged: the ray ends at the last point within.
     within = np.logical_and.accumulate(kick.allowed(z), axis=1).sum(axis=1)
     rows = kick.rows(z)
     rows[~kick.allowed(z)] = kick.start
@@ -124,7 +124,7 @@ def exits(
 
 
 def narrowed(settling: Settling, kick: Kick, found: Exits, rounds: int) -> Exits:
-    """Exits to some bits more: the first change in each bracket, again and again."""
+    """Narrow exits to more bits: the first change in each bracket, repeatedly."""
     good = np.isfinite(found.outside)
     inside, outside = found.inside[good], found.outside[good]
     directions = found.directions[good]
@@ -142,10 +142,10 @@ def narrowed(settling: Settling, kick: Kick, found: Exits, rounds: int) -> Exits
 def first_exits(
     settling: Settling, kick: Kick, directions: int, points: int, largest: float | None, seed: int
 ) -> Exits:
-    """Where rays all around leave the basin, each to some bits.
+    """Return the exits of rays in all directions from the basin, each to some bits.
 
-    The rays grow until one leaves, then points are set as densely again on what is not longer than
-    the shortest way out, until that is not shortened any more.
+    The rays grow until one leaves. Then as many points are set on the rays up to the shortest exit,
+    until this is not shortened any more.
     """
     rays = spread(directions, kick.size, seed)
     reach = largest
@@ -170,8 +170,8 @@ def first_exits(
 
 
 def nearest_first(found: Exits, most: int) -> list[int]:
-    """The rays that leave sooner than their neighbours, the soonest first, at most so many: two
-    neighbours around a circle, a choice of three per dimension in more."""
+    """Return the rays with earlier exits than their neighbours', the earliest first, at most so
+    many: of two neighbours around a circle, of three per dimension (a choice) in more."""
     units, size = found.directions, found.directions.shape[1]
     neighbours = 3 * size if size > 2 else 2 * (size - 1)
     near = np.argsort(-(units @ units.T), axis=1, kind="stable")[:, 1 : neighbours + 1]
@@ -183,14 +183,14 @@ def nearest_first(found: Exits, most: int) -> list[int]:
 def nearer(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, rounds: int, seed: int
 ) -> tuple[Row, float, float]:
-    """A direction near another that leaves sooner, by looking ever closer around the best; the
-    last radius that comes back and the first that does not."""
+    """Refine a direction around the best in ever smaller angles; return that with the earliest
+    exit, its last radius that returns and the first that does not."""
     rng = np.random.default_rng(seed)
     best: tuple[Row, float, float] = unit, 0.0, radius
     for _ in range(rounds):
         around = _around(best[0], angle, rng)
         coarse = exits(settling, kick, around, 0.0, best[2] * (1 + angle**2), 2 * AROUND)
-        # A direction so far off is worse by the square of the angle, or better.
+        # At so large an angle the norm changes by its square, or decreases.
         bits = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
         found = narrowed(settling, kick, coarse, max(1, bits))
         if len(found.outside):
@@ -202,7 +202,7 @@ def nearer(
 
 
 def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
-    """Directions within an angle of another one, and itself."""
+    """Return directions within an angle of another one, and that one."""
     if unit.size == 1:
         return unit[None]
     across = np.linalg.svd(unit[None])[2][1:]
@@ -215,30 +215,30 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
     return z / np.linalg.norm(z, axis=1, keepdims=True)
 
 
-# Where the motion on the edge is as near to the saddle as this, Newton's method begins; it goes on
-# with one period more until a kick moves by less than that, relative to its norm. Choices.
+# Newton's method begins where the motion on the edge is this near to the saddle; it adds periods
+# until a kick moves by less than the second number, relative to its norm. Choices.
 _BEGINS, _STANDS = 0.05, 1e-11
 
-# Below this, relative to the norm, a change that is no smaller than the one before is the method's
-# own error (adaptive steps of 1e-11 leave some 1e-9 in a gradient), and the kick stands. A choice.
+# A change below this, relative to the norm, is the method's error if it is no smaller than the one
+# before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
 _NOISE = 1e-7
 
-# Periods more that are tried, and Newton steps for each: choices.
+# Most additional periods, and Newton steps for each: choices.
 _PERIODS, _STEPS = 12, 12
 
-# Of the differences of gradients, relative to the norm of the kick; and the longest step, likewise.
+# Size of the differences of gradients, relative to the norm of the kick; and the longest step.
 _DIFFERENCE, _STEP = 1e-5, 0.2
 
-# A kick that turns by more than this, relative to its norm, has left the place where it was begun.
+# A kick that moves by more than this, relative to its norm, is another one than at first.
 _STRAYS = 0.5
 
 
 def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
-    """The kick of least norm onto the stable manifold of a saddle, near a kick onto it that is
-    known to rounding; `None` where Newton's method finds none, as beside a grazing.
+    """Return the kick of least norm onto the stable manifold of a saddle, near a kick onto it that
+    is known to rounding; `None` if Newton's method fails, as near a grazing.
 
-    **Returns:** the kick and what it lacks: its distance from the manifold to first order and how
-    far it is from standing at a right angle on it, both relative to its norm; the larger.
+    **Returns:** the kick and its residual, relative to its norm: the larger of its distance from
+    the manifold to first order and its deviation from a right angle to it.
     """
     rows, normals = _frame(settling, saddle)
     if not np.isfinite(normals).all():
@@ -274,12 +274,12 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
 
 
 def _stands(change: float, last: float) -> bool:
-    """Whether a change, relative to the norm, is nothing, or nothing but the method's error."""
+    """Return whether a change, relative to the norm, is zero or within the method's error."""
     return change <= _STANDS or last / 2 <= change <= _NOISE
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
-    """Section states of a saddle, and at each its left unstable eigenvector, of unit length."""
+    """Return section states of a saddle, and its left unstable unit eigenvector at each."""
     period = int(saddle.cycles)
     rows = np.asarray(in_rows(saddle.sections))[:period]
     the_map = settling.the_map
@@ -297,7 +297,7 @@ def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
 
 
 def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, float] | None:
-    """As `shortest`, with g and its gradient at some kicks."""
+    """Solve as `shortest` does; `edge` returns g and its gradient at some kicks."""
     size, multiplier, last = z.size, None, np.inf
     for _ in range(_STEPS):
         step = _DIFFERENCE * np.linalg.norm(z)
@@ -329,24 +329,24 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
     return None
 
 
-# Of the kick, relative to it: by how much more and less simulation confirms it.
+# Simulations with the kick larger and smaller by this share confirm it.
 _ASIDE = 1e-6
 
 # Two kicks are the same within this, relative to their norm. A choice.
 _SAME = 1e-4
 
-# Rounds of looking more closely around the best rays: before Newton's method, and instead of it.
-# Choices: the latter narrow a turn of 1/128 to 1e-8.
+# Rounds of refinement around the best rays: before Newton's method, and instead of it. Choices: the
+# latter narrow a turn of 1/128 to 1e-8.
 _LOOKS, _MORE_LOOKS = 2, 14
 
 # Rounds of bisection by eight that leave nothing between two numbers of double precision.
 _ROUNDING = 18
 
-# How much longer than what rays found Newton's may be, and how much shorter: else it is another
-# kick. A choice, for rays as dense as the default.
+# Newton's kick may be longer than that of the rays by the first share, and shorter by the second:
+# otherwise it is another kick. A choice, for rays as dense as the default.
 _LONGER, _SHORTER = 1e-4, 0.05
 
-# Edges are tracked for so many rounds.
+# Most rounds of edge tracking.
 _ROUNDS = 40
 
 
@@ -365,8 +365,7 @@ class MinimalKick(Summarized):
     """The time of the kick after the section of that cycle, in the machine's clock."""
     settles: Orbit | None
     """The motion on which the machine settles after a slightly harder kick; `None` if it does not
-    repeat within `longest` cycles or `find_orbit` fails, as for an equilibrium of a machine without
-    a drive."""
+    repeat within `longest` cycles or `find_orbit` fails, as for equilibria without a drive."""
     edge: EdgeState
     """The edge state: the attractor of motions on the boundary at which the kick ends."""
     residual: Any
@@ -374,12 +373,10 @@ class MinimalKick(Summarized):
     deviation from a right angle to it. If `exact` is false, the distance between the last kick that
     returns and the first one that does not."""
     exact: bool = eqx.field(static=True)
-    """Whether the kick was made exact by the saddle and Newton's method. Otherwise it was found by
-    simulations in more and more directions: its norm is accurate to about `residual`, its direction
-    to about 1e-4."""
+    """True if the kick was made exact by the saddle and Newton's method. Otherwise it was found by
+    simulations in many directions: its norm is accurate to about `residual`, its direction 1e-4."""
     confirmed: bool = eqx.field(static=True)
-    """Whether simulations of 1 - 1e-6 of the kick return and those of 1 + 1e-6 of it settle
-    elsewhere."""
+    """True if simulations of 1 - 1e-6 of the kick return and those of 1 + 1e-6 settle elsewhere."""
     others: tuple["MinimalKick", ...]
     """Local minima of the norm in other directions, the smallest first."""
     lanes: int = eqx.field(static=True)
@@ -388,7 +385,7 @@ class MinimalKick(Summarized):
     """The machine that is kicked."""
 
     def summary(self) -> str:
-        """The kick and where it leads, in words."""
+        """Describe the kick and the motion after it, in words."""
         units = units_of(self.machine)
         parts = state_in_words({name: np.asarray(x) for name, x in self.kick.items()}, 9, units)
         how = "exact" if self.exact else "by simulations only"
@@ -433,9 +430,9 @@ def minimal_kick(
     """Find the smallest kick (jump of the state) after which a stable motion does not return.
 
     It leads onto the boundary of the basin, the stable manifold of an unstable motion. Rays of
-    kicks in all directions are simulated, and the first exit of each is bisected; from the best,
+    kicks in all directions are simulated, and the first exit of each is bisected. From the best,
     `edge_state` follows the boundary to a saddle, and Newton's method makes the kick exact, through
-    the impacts. Simulation from 1 ± 1e-6 of it confirms it. If the boundary has no saddle (a
+    the impacts. Simulations with 1 ± 1e-6 of it confirm it. If the boundary has no saddle (a
     chaotic edge, a grazing), directions are narrowed by simulations. An exit and re-entry between
     two points or two rays may be missed. Host-side.
 
@@ -444,25 +441,26 @@ def minimal_kick(
     - `machine`: the machine.
     - `orbit`: the motion that is kicked, on the section: a stable `Orbit`, or a state on a motion
       that repeats; for a machine without a drive also an equilibrium.
-    - `components`: names of the numbers of the state that are kicked, such as `["V"]`; all of them
-      by default.
-    - `weights`: factors of some of them in the norm, positive; 1 by default. If velocities have the
-      weight √(m/2) and positions are not kicked, the norm squared is an energy.
-    - `bounds`: the range of the kicked state in some of them, such as `{"Y": (-3.0, 2.0)}`.
+    - `components`: names of the components of the state that are kicked, such as `["V"]`; by
+      default all.
+    - `weights`: factors of some components in the norm, positive; 1 by default. If velocities have
+      the weight √(m/2) and positions are not kicked, the norm squared is an energy.
+    - `bounds`: range of the kicked state in some components, such as `{"Y": (-3.0, 2.0)}`.
     - `cycle`: the cycle of an orbit of several cycles in which it is kicked, from 0 on.
     - `phase`: the time after the section of that cycle, in the machine's clock (a crank angle, or a
       time).
-    - `largest`: norm up to which kicks are looked for; by default until one leads elsewhere.
-    - `directions`, `points`: rays, and points on each that are simulated in a round; `candidates`:
-      rays that leave sooner than their neighbours, from which kicks are made exact.
+    - `largest`: largest norm of the search; by default it continues until a kick leads elsewhere.
+    - `directions`, `points`: number of rays, and of points on each that are simulated in a round;
+      `candidates`: number of rays with earlier exits than their neighbours' whose kicks are made
+      exact.
     - `settle`, `tolerance` (far smaller than the kick), `longest`, `method`: as for `edge_state`.
-    - `seed`: of the directions, where more than two components are kicked.
-    - `progress`: count the starts simulated, in a terminal or a notebook.
+    - `seed`: seed of the directions, if more than two components are kicked.
+    - `progress`: whether to count the simulated starts, in a terminal or a notebook.
 
     **Returns:** a `MinimalKick`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used, or if no kick leads
-    elsewhere; on Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so far.
+    **Raises:** `ValueError` or `TypeError` for invalid arguments, or if no kick leads elsewhere. On
+    Ctrl-C `Interrupted`, whose `partial` is the smallest kick found so far.
     """
     cycle, candidates = count("cycle", cycle), count("candidates", candidates, least=1)
     directions, points = count("directions", directions, least=4), count("points", points, least=2)
@@ -506,13 +504,13 @@ def _smallest(kicks: list[MinimalKick], settling: Settling) -> MinimalKick:
 
 
 _Found = tuple[Row, float, bool, EdgeState]
-"""A kick onto the boundary, its residual, whether it is exact, what a motion from it settles on."""
+"""A kick onto the boundary, its residual, whether it is exact, and its edge state."""
 
 
 def _exact(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, longest: int, seed: int
 ) -> _Found:
-    """The shortest kick near a ray that leaves the basin at a radius."""
+    """Return the shortest kick near a ray that leaves the basin at a radius."""
     unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
     line = narrowed(settling, kick, line, _ROUNDING)

@@ -1,4 +1,4 @@
-"""Which starts come back to a motion, and where states go: many lanes of one compiled program."""
+"""Tests of starts for their return to a motion, and images of states, in lanes of one program."""
 
 import copy
 import math
@@ -39,49 +39,49 @@ from ..orbit import (
 )
 
 Row = Float[np.ndarray, " _"]
-"""The numbers of a state, or of a kick."""
+"""The components of a state, or of a kick."""
 Rows = Float[np.ndarray, "_ _"]
-"""Of several states."""
+"""The components of several states."""
 
 RETURNS, ELSEWHERE, INADMISSIBLE = 1, 0, -1
-"""Verdicts on a start: it comes back to the motion, it does not, or it cannot be one."""
+"""Verdicts on a start: it returns to the motion, it does not, or it cannot be simulated."""
 
 # Lanes of the program that judges starts: those beyond the last start are not run. A choice.
 _LANES = 1024
 
-# All relative to the motion's size (see `orbit.distance`). A motion whose sections change by less
-# than the first is where it will stay, or nearer to an unstable one than starts are told apart;
-# section states a period apart are the same within the second; an orbit that is found from a state
-# is its motion if it lies as near as the third. Choices.
+# Relative to the motion's size (see `orbit.distance`). A motion whose sections change by less than
+# the first has settled, or is nearer to an unstable one than starts can be distinguished. Section
+# states a period apart are the same within the second. An orbit found from a state is its motion if
+# it lies within the third. Choices.
 _STAYS, _SAME, _NEAR = 1e-11, 1e-5, 1e-3
 
-# Sections of a motion that are recorded at once. A choice: longer ones are put together.
+# Sections of a motion that are recorded in one run. A choice: longer ones are put together.
 TRAIL = 16
 
 
 class Settling:
-    """Judges starts by whether they come back to a motion.
+    """A judge of starts by their return to a motion.
 
-    A start has come back once a section state of its motion lies within `tolerance` (relative to
-    the motion's size) of one of the motion's. That is looked at after 1, 2, 3, 4, 5, 6, … cycles,
-    each time a quarter more: a motion that decays towards an equilibrium is found back long before
-    it has shrunk to rounding, where its sections would be noise.
+    A start has returned once a section state of its motion lies within `tolerance` (relative to the
+    motion's size) of one of the motion's. This is tested after 1, 2, 3, 4, 5, 6, … cycles, each
+    time a quarter more: a motion that decays towards an equilibrium returns long before it has
+    shrunk to rounding, where its sections would be noise.
 
     **Arguments:** the map of one cycle; a state, for its structure; the motion's section states;
-    cycles after which a start that has not come back is elsewhere; the tolerance.
+    cycles after which a start that has not returned is elsewhere; the tolerance.
     """
 
     def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
         self.the_map, self.like, self.motion = the_map, like, motion
         self.settle, self.tolerance = settle, tolerance
         self.unit = sizes_on_host(the_map.machine, like, motion)
-        """What counts as 1 in all comparisons of states, for each of their numbers."""
+        """The unit of each component in all comparisons of states."""
         self.angles = angles_in(the_map.machine, like)
         self.begin = 0.0
-        """How long after the section starts are, by the clock of a machine with a drive."""
+        """Time of the starts after the section, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
         self.tell: Tell = silent
-        """Told of each start that is judged."""
+        """Callback with the number of starts that are judged."""
 
     def starting(self, begin: float) -> "Settling":
         new = copy.copy(self)
@@ -90,34 +90,34 @@ class Settling:
 
     @property
     def lanes(self) -> int:
-        """Starts judged so far, those at other clocks included."""
+        """The number of starts judged so far, those at other clocks included."""
         return sum(self._judged_so_far)
 
     def state(self, row: object) -> State:
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
     def near(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """States moved by whole turns of their angles to where they are nearest to others."""
+        """Move states by whole turns of their angles to where they are nearest to others."""
         return nearest_images(self.angles, here, there)
 
     def distance_to(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """How far states lie from others, up to whole turns, see `orbit.distance`."""
+        """Return the distance of states from others, up to whole turns, see `orbit.distance`."""
         return distance(self.near(here, there), there, self.unit)
 
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
-        """How far section states lie from the motion's nearest one."""
+        """Return the distance of section states from the motion's nearest one."""
         return self.distance_to(rows[:, None], self.motion).min(axis=1)
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
-        """`RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
+        """Return `RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
         return np.concatenate([self._judged(*part) for part in _filled(rows)])
 
     def _judged(self, here: Rows, goes_on: Bool[np.ndarray, " lanes"]) -> Int[np.ndarray, " _"]:
-        """The same for as many as the program has lanes, of those that count."""
+        """Judge one filled program of starts; return the verdicts on those that count."""
         count = int(goes_on.sum())
         self._judged_so_far.append(count)
         self.tell(count)
-        # What is on the motion need not come back to it; an equilibrium meets no section at all.
+        # States on the motion need not return to it; an equilibrium meets no section at all.
         off = self.distance(here) > 0
         verdict = np.where(off | (self.begin > 0), ELSEWHERE, RETURNS)
         goes_on &= verdict == ELSEWHERE
@@ -128,7 +128,7 @@ class Settling:
             there, good, bad_start = self._advanced(here, step, goes_on, begin)
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
-            # What repeats has settled: to go on would cost, and end an equilibrium in noise.
+            # A state that repeats has settled: more cycles take time and end an equilibrium in noise.
             moves = (self.distance_to(there, here) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
@@ -142,15 +142,15 @@ class Settling:
     def _advanced(
         self, rows: Rows, cycles: int, wanted: Bool[np.ndarray, " lanes"], begin: float
     ) -> list[np.ndarray]:
-        """States so many cycles later, whether they got there, and whether they were no starts.
-        Only states are compared, so their modes must be those of a motion that begins there."""
+        """Return states so many cycles later, whether they got there, and whether the start is
+        invalid. Only states are compared, so their modes must be those of a motion from there."""
         numbers = (jnp.asarray(x) for x in (rows, cycles, wanted, begin))
         *found, other = (np.asarray(x) for x in _advanced(self.the_map, self.like, *numbers))
         _refuse_other_modes(other)
         return found
 
     def carried(self, rows: Rows, cycles: int) -> Rows:
-        """States so many cycles later; NaN for a start that does not get there."""
+        """Return states so many cycles later; NaN for a start that does not get there."""
         found = []
         for part, wanted in _filled(rows):
             there, good, _ = self._advanced(part, cycles, wanted, self.begin)
@@ -158,8 +158,8 @@ class Settling:
         return np.concatenate(found)
 
     def first_change(self, rows: Float[np.ndarray, "rays points states"]) -> tuple[Any, Any]:
-        """Of points in each row, the place of the first that does not come back, or their number;
-        and whether that one is elsewhere (not inadmissible)."""
+        """Return the index in each row of the first point that does not return, or the number of
+        points, and whether that point is elsewhere (not inadmissible)."""
         rays, points, states = rows.shape
         verdict = self.judge(rows.reshape(-1, states)).reshape(rays, points)
         left = verdict != RETURNS
@@ -168,7 +168,7 @@ class Settling:
         return first, (first < points) & (there == ELSEWHERE)
 
     def trail(self, rows: Rows, cycles: int) -> Float[np.ndarray, "lanes sections states"]:
-        """The section states of some motions, from their starts on."""
+        """Return the section states of some motions, from their starts on."""
         parts, here, begin = [rows[:, None]], rows, self.begin
         for _ in range(math.ceil(cycles / TRAIL)):
             later = _trail(self.the_map, self.like, jnp.asarray(here), jnp.asarray(begin))
@@ -177,8 +177,8 @@ class Settling:
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
-        """Two starts between two others, as close as this (by the motion's size), that comes back
-        and that does not. Fifteen points at once are judged between them."""
+        """Return two starts between two others, closer than `width` (by the motion's size), one
+        that returns and one that does not. Fifteen points between them are judged in a round."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
         while distance(outside, inside, self.unit) > width:
             between = inside + parts * (outside - inside)
@@ -190,7 +190,7 @@ class Settling:
         return inside, outside
 
     def settled_rows(self, start: Row, longest: int) -> Rows | None:
-        """The section states of one period of what a start settles on, of `longest` at most."""
+        """Return the section states of a start's final motion, of period at most `longest`."""
         last = self.carried(start[None], self.settle)
         if not np.isfinite(last).all():
             return None
@@ -201,12 +201,12 @@ class Settling:
         return None
 
     def settled_orbit(self, start: Row, longest: int) -> Orbit | None:
-        """The motion that a start settles on, made exact; `None` where none is found."""
+        """Return the motion that a start settles on, made exact, or `None`."""
         rows = self.settled_rows(start, longest)
         return None if rows is None else self.orbit_near(rows[0], len(rows), _NEAR)
 
     def orbit_near(self, row: Row, cycles: int, near: float) -> Orbit | None:
-        """The periodic motion that a search from a state finds, if it lies near to that."""
+        """Return the periodic motion that a search from a state finds, if it is `near` to that."""
         the_map = self.the_map
         orbit = find_orbit(the_map.machine, self.state(row), cycles, method=the_map.method)
         if not bool(orbit.successful):
@@ -215,7 +215,8 @@ class Settling:
         return orbit if self.distance_to(row, sections).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
-        """What judges starts so long after a section state of the motion, and the state then."""
+        """Return a judge of starts at `phase` after a section state of the motion, and the
+        state."""
         machine, method = self.the_map.machine, self.the_map.method
         if bool(stands_still(machine, self.state(start), machine.cycle, self.unit)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
@@ -232,7 +233,7 @@ class Settling:
                 f"got {phase:.9g}. See `cycle`."
             )
         if autonomous:
-            # At equal intervals it meets no section, and needs no clock.
+            # With equal intervals it meets no section, and needs no clock.
             every = machine.observed_every(phase)
             run = simulate(every, state, 1, method=method, record="sections")
             return self, in_row(bare(run.last))
@@ -264,8 +265,8 @@ def settling_on(
     name: str,
     cycle: int = 0,
 ) -> tuple[Settling, Row]:
-    """What judges starts by whether they come back to a motion, the argument `name`, and a state of
-    it: of an orbit that of the section `cycle`. Other arguments are those of `edge_state`."""
+    """Return a judge of starts by their return to the motion `name`, and a state of it; of an orbit
+    that on the section `cycle`. Other arguments are those of `edge_state`."""
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
@@ -291,7 +292,7 @@ def settling_on(
 
 
 def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:
-    """Rows in parts of as many as there are lanes, the last filled up; and which are wanted."""
+    """Yield rows in parts of as many as there are lanes, the last padded, and which are wanted."""
     for i in range(0, len(rows), _LANES):
         part = rows[i : i + _LANES]
         more = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
@@ -310,7 +311,7 @@ def _advanced(
 
 
 def _in_other_modes(the_map: CycleMap, states: State) -> Any:
-    """Whether the machine is in other modes in some states than a motion that begins there."""
+    """Return whether the machine's modes in some states differ from those of a new motion there."""
     modes, new = modes_of(states) or (), modes_of(begun(the_map.machine, bare(states), 1)) or ()
     pairs = zip(modes, new, strict=True) if modes else ()
     return sum((one != other for one, other in pairs), start=jnp.zeros((), bool))
@@ -328,7 +329,7 @@ def _runs(
     the_map: CycleMap, like: State, rows: Array, cycles: int, settle: Any, begin: Any,
     wanted: Array | None = None, until: Any = None,
 ) -> Run:  # fmt: skip
-    """Runs from some states, their sections recorded; with clocks for a machine with a drive."""
+    """Simulate from some states, with sections recorded; with clocks for a machine with a drive."""
     unravel = ravel_pytree(like)[1]
     driven = not is_autonomous(the_map.machine, like)
     options = RunOptions(
@@ -345,7 +346,7 @@ def _trail(the_map: CycleMap, like: State, rows: Array, begin: Array) -> Array:
 
 @compiled
 def _until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
-    """The state of a machine with a drive at a clock within the cycle that begins in a state."""
+    """Return the state of a driven machine at a clock within the cycle that begins in a state."""
     return in_rows(_runs(the_map, like, row[None], 1, 0, None, until=clock).sections, 2)[0, -1]
 
 
@@ -353,8 +354,8 @@ def _until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
 def images(
     the_map: CycleMap, like: State, rows: Array, cycles: Array, begin: Array
 ) -> tuple[Array, Array]:
-    """States so many cycles later (at least one), and their derivatives by the states, (lanes,
-    states, states). Another number of `cycles` is not another program."""
+    """Return states so many cycles later (at least one), and their derivatives with respect to the
+    states, (lanes, states, states). Another number of `cycles` needs no compilation."""
 
     def ends(rows):
         return in_rows(_runs(the_map, like, rows, 1, cycles - 1, begin).sections, 2)[:, -1]
