@@ -295,7 +295,7 @@ def minors(matrix: Array | np.ndarray) -> Array:
 
 
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Return whether a double multiplier has one eigenvector only, as at a resonance."""
+    """Return whether a double multiplier has one eigenvector only: a complex pair can begin."""
     sizes, M = np.asarray(problem.sizes)[1:], step.seen.monodromy
     values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
     return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])

@@ -83,7 +83,7 @@ def continue_orbit(
 
     **Returns:** a `Branch`.
 
-    **Raises:** `ValueError` for an unknown name, or an orbit that was not found, does not list all
+    **Raises:** `ValueError` for an unknown name; for an orbit that was not found, does not list all
     its impacts, lies outside the bounds, or rests on a stop of a machine with a section, `renewed`
     or friction on a stop. On Ctrl-C `Interrupted`, whose `partial` is the branch so far.
     """

@@ -107,8 +107,7 @@ class CycleMap(eqx.Module):
     """True if the body may come to rest on a stop."""
 
     def __call__(self, state: State) -> State:
-        """Return the state `cycles` drive cycles later; a `HybridState` if the machine has
-        modes."""
+        """Return the state `cycles` drive cycles later; a `HybridState` with discrete modes."""
         return _end(self, adopted(self.machine, state))
 
     def residual(self, state: State) -> State:

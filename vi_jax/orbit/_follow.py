@@ -32,8 +32,9 @@ INTERRUPTED, STALLED, CLOSED, BOUNDS = "interrupted", "stalled", "closed", "boun
 # In place of the reason to end if a step has led to another curve: the step is repeated, shorter.
 SHORTER = "shorter"
 
-# The numbers below are choices where no measurement is given. The tangents of two points close to
-# each other on one curve have at least this product.
+# The numbers below are choices where no measurement is given.
+
+# The tangents of two points close to each other on one curve have at least this product.
 SAME_CURVE = 0.9
 
 # A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
@@ -41,15 +42,15 @@ SAME_CURVE = 0.9
 # beyond a jump of the equations, or another part. Steps up to the second number are rounding.
 _ASIDE, _TINY = 0.9, 1e-6
 
-# A walk stalls if its steps must be shorter than this share of the longest. The branches of the
-# tests need 2e-3 of it at least.
+# A walk stalls if its steps must be shorter than this share of the longest. The shortest
+# steps that the branches of the tests need are 2e-3 of it.
 _SHORTEST = 1e-6
 
 # After a cut, this many steps keep their length before it grows again.
 _STEADY = 3
 
-# A test has changed its sign at a place if it does so within this share of the way to it, or falls
-# to this share of its first value: above the errors of tests near singular equations.
+# Events within the first share of the way before a place coincide with it. An earlier event's test
+# must be below minus the second share of its first value: above errors near singular equations.
 _SHORT, _NOISE = 1e-4, 1e-3
 
 # A warning is given for points whose states change by more than this with twice the steps, if more

@@ -243,7 +243,7 @@ def touched(
 
 @on_host
 def _at_touch(problem: Shooting, x, along, number: int, leg, s):
-    """Return the state, ∂h, a, dh/dparameter, the gradient of dh/ds, and the kick, at a touch."""
+    """Return the state, ∂h, a, h's derivative in the parameter, ∂(dh/ds), the kick at a touch."""
 
     def distance(machine, s, u):
         return -guard_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))

@@ -71,8 +71,9 @@ from ._words import (
 from .results import NEUTRAL, Orbit
 from .special import Point, further_of, point_at
 
-# These thresholds are choices; measured ones have the figure in the comment. Events before the
-# place where a branch begins are located on this share of the way.
+# These thresholds are choices; measured ones have the figure in the comment.
+
+# Events before the place where a branch begins are located on this share of the way.
 _SHORT = 0.999
 
 # The same share before a lost impact, where the monodromy matrix has a pole.

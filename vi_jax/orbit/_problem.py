@@ -293,7 +293,7 @@ def _followed(
             u = _carry(blank, modes, s, place, u)
         states.append(np.asarray(u))
         here = blank.unravel(u)
-        if (place, event.cycle) != (0.0, 0):  # an orbit's state is after this event
+        if (place, event.cycle) != (0.0, 0):  # the orbit's state is after that one
             here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place

@@ -66,7 +66,7 @@ class Observed(NamedTuple):
     pull: Nearest
     """The least extremum of the force on a resting body; its `room` is that force."""
     order: Scalar
-    """1 if each switch changes here to the mode that follows in the order of events, else -1."""
+    """1 if each event puts its switch into the mode of its leg, else -1."""
     order_margin: Scalar
     """Margin until the order of events changes: the least time between consecutive events, or the
     least distance, at an event, to another one that does not occur there. Negative if the machine
@@ -82,7 +82,7 @@ class Observed(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Return the length by which distances are judged, the extent of the motion; host-side."""
+        """The extent of the motion, by which distances are judged; host-side."""
         y_min, y_max = float(self.y_min), float(self.y_max)
         return max(y_max - y_min, abs(y_min), abs(y_max))
 
@@ -351,7 +351,7 @@ class Shooting(eqx.Module):
         return end, passed, path
 
     def _landing(self, leg: Leg) -> list[tuple[int, Array]]:
-        """Return the stops on which bodies come to rest, and for each if one does in this leg."""
+        """Return the stops on which bodies come to rest, and whether one does in a leg."""
         numbers = [event.number if event.use == LANDS else -1 for event in self.events]
         numbers = numbers or [int(x) - 1 for x in self.held]
         return [(n, jnp.asarray(numbers)[leg] == n) for n in sorted(set(numbers) - {-1})]

@@ -136,7 +136,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     force, _, away = holding_force(problem, at, leg, number, place)
     if not mode:
         return Change(number, place, (0.0, away, 0.0), False)
-    # Without the other side's field towards it, a surface does not hold a motion that touches it.
+    # A surface holds a motion that touches it only if the field of the other side points to it.
     is_held = force < _ZERO * _unit(problem, at, held=True)
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 

@@ -72,7 +72,7 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
-    """Return derivative and value, also where loops make `jax.jacfwd` return several values."""
+    """Return derivative and value; with loops `jax.jacfwd` gives no common value of its columns."""
 
     def along(direction):
         return jax.jvp(function, (x,), (direction,))

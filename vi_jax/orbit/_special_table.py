@@ -63,9 +63,10 @@ from ._words import (
 )
 from .special import Point, point_at
 
-# The thresholds here are choices. A test that changes its sign without coming this near to zero (as
-# a share of its neighbours) has a pole. The second is for entries of the local map; entries this
-# small are zero.
+# The thresholds here are choices.
+
+# A test that changes its sign without coming this near to zero (as a share of its neighbours) has a
+# pole. The second is for entries of the local map; entries this small are zero.
 _ZERO, _ENTRY = 1e-6, 1e-4
 
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.

@@ -286,7 +286,7 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
     sizes = np.asarray(problem.sizes)[1:]
 
     def deep(n: int) -> float:
-        """Return the depth of an impact whose kick is as large n periods later."""
+        """Return the depth of an impact that equals its kick's remainder n periods later."""
         left = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
         return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(left / sizes))
 

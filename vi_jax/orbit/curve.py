@@ -451,7 +451,7 @@ class Boundary(Curve):
 
 
 def branch_hits_in_words(branch: Branch) -> str:
-    """Describe the impacts of a branch's motions, or their rests, with which the impacts vary."""
+    """Describe the impacts of a branch's motions, or that they rest: then the number varies."""
     if branch.problem.rests:
         return "rest on a stop"
     return so_many(branch.impact_speed.shape[1], "impact")

@@ -48,7 +48,7 @@ from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest
 def _missing(
     arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
 ) -> Float[Array, "arcs states"]:
-    """Return F: from each arc's end to the next arc's begin; the first follows the last."""
+    """Return F, each arc's end minus the next arc's begin; the first arc follows the last."""
     ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
     angles, after = angles_in(arc.machine, bare(unravel(arcs[0]))), jnp.roll(arcs, -1, axis=0)
     return nearest_images(angles, ends, after) - after
@@ -75,8 +75,8 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
 
 
 def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Array, "all all"]:
-    """Return ∂F/∂x from the derivatives of each arc's end with respect to its start: these on the
-    diagonal, and beside each -1 for the next arc's start."""
+    """Return ∂F/∂x. Its diagonal holds the derivatives of each arc's end with respect to its start;
+    next to it are entries -1 for the next arc's start."""
     arcs, states, _ = jacobians.shape
     following = jnp.kron(jnp.roll(jnp.eye(arcs), 1, axis=1), jnp.eye(states))
     return block_diag(*jacobians) - following.astype(jacobians.dtype)
@@ -85,7 +85,7 @@ def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arra
 def _start_change(
     jacobians: Float[Array, "arcs states states"], missing: Vector, sizes: Vector
 ) -> Vector:
-    """Return the smallest change of the arcs' starts that changes F by `missing`, in `sizes`."""
+    """Return the smallest change (by `sizes`) of the arcs' starts that changes F by `missing`."""
     sizes = jnp.tile(sizes, len(jacobians))
     matrix = shooting_matrix(jacobians) * sizes / sizes[:, None]
     return sizes * smallest_solution(matrix, missing / sizes)
@@ -108,7 +108,7 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 
 def _places(the_map: CycleMap, state: State) -> int:
-    """Return the places of a cycle at which the state is sampled; one for an autonomous machine."""
+    """Return the number of samples of the state in a cycle; 1 for an autonomous machine."""
     return 1 if is_autonomous(the_map.machine, bare(state)) else _PLACES
 
 
@@ -225,7 +225,7 @@ def found_and_seen(
 
     The derivative with respect to the numbers p of `arc` is that of the root x(p) of F, dx/dp =
     -(∂F/∂x)⁻¹ ∂F/∂p, by the implicit function theorem; the search is not differentiated. One
-    program computes all derivatives, those of the observations.
+    program computes the derivatives of all observations.
     """
     root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
     see = lambda x: observe_arc(arc, unravel(x), impact_log, second)
@@ -476,7 +476,7 @@ def _judged(
     found = (root.converged > 0) & again & ~still & close
     y_min = jnp.min(jnp.where(within, seen.y_min, jnp.inf))
     y_max = jnp.max(jnp.where(within, seen.y_max, -jnp.inf))
-    # Speed of a harmonic motion of this extent, once in a cycle, and a turn of that curvature.
+    # Speeds of a harmonic motion of this extent, once in a cycle: the greatest, and at `clearance`.
     fast = jnp.pi * (y_max - y_min) * least / duration
     slow = fast * jnp.sqrt(4 * jnp.maximum(clearance, 0) / (y_max - y_min))
     slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))

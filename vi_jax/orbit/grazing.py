@@ -451,7 +451,7 @@ class Grazing(Summarized):
     order: Float[np.ndarray, " m"]
     """1/2 for rigid and prestressed stops, 3/2 for a spring without prestress."""
     slope: Float[np.ndarray, " m"]
-    """Derivative of the least distance along the motion without impact, d/dparameter."""
+    """Derivative of the least distance in the parameter, along the motion without impact."""
     entries: Float[np.ndarray, " 12"]
     """eₙ = ∂h Nⁿ kick, n = 1, 2, …: the change of the distance n periods after an impact of depth
     one. A motion with one impact in n periods needs eⱼ > 0 for 0 < j < n."""
@@ -557,8 +557,8 @@ def grazing(
     **Returns:** a `Grazing`.
 
     **Raises:** `TypeError` if `point` is no special point. `ValueError` if it is of another kind or
-    nothing is touched; if the jump of the touched event does not vanish with the speed; at a fold of
-    the motion without the impact. On Ctrl-C `Interrupted`; its `partial` is the result of
+    nothing is touched; if the touched event's jump does not vanish with the speed; at a fold of the
+    motion without the impact. On Ctrl-C `Interrupted`; its `partial` is the result of
     `check=False`.
     """
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
@@ -586,7 +586,7 @@ def grazing(
 def _within(
     found: Grazing, graze: Graze, settles: Settled, checked: tuple[float, float]
 ) -> Grazing:
-    """Name the scenario for the values at which the machine agrees only: elsewhere the local map
+    """Name the scenario from those values only at which the machine agrees: elsewhere the local map
     may have other attractors than the machine."""
     size = np.abs(found.forecast.offset)
     inside = (size >= checked[0]) & (size <= checked[1])

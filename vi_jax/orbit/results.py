@@ -159,7 +159,7 @@ class Orbit(Summarized):
     """The machine, in the phase clock."""
     method: AbstractMethod
     state: State
-    """State on the section, a pytree like a start; a `HybridState` for a machine with modes."""
+    """State on the section, a pytree like a start; a `HybridState` with discrete modes."""
     sections: State
     """States on the sections of all cycles of the search; leaves (cycles,)."""
     cycles: Int[Array, "..."]
@@ -365,7 +365,7 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
 
 
 class InWords:
-    """A mixin for display: the text of `__str__`; in notebooks a table above a row of numbers."""
+    """A mixin for display: `__str__` as text; in notebooks a table, with a curve of `y_min`."""
 
     def __repr__(self) -> str:
         return str(self)

@@ -160,7 +160,7 @@ class Gradient(AbstractRootFinder):
         return self._optimiser.init(x)
 
     def step(self, residual, x, memory):
-        """Make one step of the optimiser; the returned residual is that of its begin."""
+        """Make one step of the optimiser; the returned residual is that at its start."""
 
         def loss(x):
             missing = residual(x)

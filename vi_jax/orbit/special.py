@@ -55,7 +55,7 @@ class Point(InWords):
     curve: str | None = None
     """The kind of the boundary on which it lies; `None` on a branch."""
     springs: bool = False
-    """True if the branch begins here at another motion, then in `orbit`: one of half its period, or
+    """True if the branch begins here at another motion, that of `orbit`: one of half its period, or
     one without the flight that divides a rest."""
     quantity: str | None = None
     """Name of the quantity of an extremum or a watched zero."""

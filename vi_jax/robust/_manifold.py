@@ -30,8 +30,7 @@ _ARC, _HALF, _ROUNDS, _WIDER = 64, 2.9, 6, 0.25
 # growth of a difference until then. Choices.
 _REACH, _FAR, _GROWTH = 0.1, 0.2, 1e6
 
-# An unstable manifold has reached an attractor if it grows in a period by less than this share of
-# `spacing`: a choice.
+# An unstable manifold has ended if a period adds less than this part of `spacing`. A choice.
 _ENDED = 1e-3
 
 # Two neighbours closer than this share of a period's stretch of an unstable manifold are on both

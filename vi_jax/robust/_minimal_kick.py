@@ -144,8 +144,8 @@ def first_exits(
 ) -> Exits:
     """Return the exits of rays in all directions from the basin, each to some bits.
 
-    The rays grow until one leaves. Then as many points are set on the rays up to the shortest exit,
-    until this is not shortened any more.
+    The rays grow until one leaves. Then as many points are set on the rays up to the
+    shortest exit. This is repeated while it shrinks to less than half.
     """
     rays = spread(directions, kick.size, seed)
     reach = largest
@@ -171,7 +171,7 @@ def first_exits(
 
 def nearest_first(found: Exits, most: int) -> list[int]:
     """Return the rays with earlier exits than their neighbours', the earliest first, at most so
-    many: of two neighbours around a circle, of three per dimension (a choice) in more."""
+    many. A ray has two neighbours around a circle, three per dimension (a choice) in more."""
     units, size = found.directions, found.directions.shape[1]
     neighbours = 3 * size if size > 2 else 2 * (size - 1)
     near = np.argsort(-(units @ units.T), axis=1, kind="stable")[:, 1 : neighbours + 1]
@@ -219,7 +219,7 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
 # until a kick moves by less than the second number, relative to its norm. Choices.
 _BEGINS, _STANDS = 0.05, 1e-11
 
-# A change below this, relative to the norm, is the method's error if it is no smaller than the one
+# A change below this, relative to the norm, is the method's error if it exceeds half the one
 # before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
 _NOISE = 1e-7
 

@@ -60,7 +60,7 @@ TRAIL = 16
 
 
 class Settling:
-    """A judge of starts by their return to a motion.
+    """A classifier of starts by their return to a motion.
 
     A start has returned once a section state of its motion lies within `tolerance` (relative to the
     motion's size) of one of the motion's. This is tested after 1, 2, 3, 4, 5, 6, … cycles, each
@@ -128,7 +128,7 @@ class Settling:
             there, good, bad_start = self._advanced(here, step, goes_on, begin)
             if not done:
                 verdict[goes_on & bad_start] = INADMISSIBLE
-            # A state that repeats has settled: more cycles take time and end an equilibrium in noise.
+            # A repeating state has settled: more cycles cost time, and end an equilibrium in noise.
             moves = (self.distance_to(there, here) > _STAYS) | (begin > 0)
             here = np.where((goes_on & good)[:, None], there, here)
             goes_on &= good
@@ -177,8 +177,8 @@ class Settling:
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
-        """Return two starts between two others, closer than `width` (by the motion's size), one
-        that returns and one that does not. Fifteen points between them are judged in a round."""
+        """Return two starts between two others, `width` apart (by the motion's size), one that
+        returns and one that does not. Fifteen points between them are judged in a round."""
         parts = np.linspace(0, 1, 17)[1:-1, None]
         while distance(outside, inside, self.unit) > width:
             between = inside + parts * (outside - inside)
@@ -190,7 +190,7 @@ class Settling:
         return inside, outside
 
     def settled_rows(self, start: Row, longest: int) -> Rows | None:
-        """Return the section states of a start's final motion, of period at most `longest`."""
+        """Return the section states of a start's final motion, one period, at most `longest`."""
         last = self.carried(start[None], self.settle)
         if not np.isfinite(last).all():
             return None
@@ -206,7 +206,7 @@ class Settling:
         return None if rows is None else self.orbit_near(rows[0], len(rows), _NEAR)
 
     def orbit_near(self, row: Row, cycles: int, near: float) -> Orbit | None:
-        """Return the periodic motion that a search from a state finds, if it is `near` to that."""
+        """Return the periodic motion that a search from a state finds, if within `near` of it."""
         the_map = self.the_map
         orbit = find_orbit(the_map.machine, self.state(row), cycles, method=the_map.method)
         if not bool(orbit.successful):
@@ -215,7 +215,7 @@ class Settling:
         return orbit if self.distance_to(row, sections).min() <= near else None
 
     def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
-        """Return a judge of starts at `phase` after a section state of the motion, and the
+        """Return a classifier of starts `phase` after a section state of the motion, and that
         state."""
         machine, method = self.the_map.machine, self.the_map.method
         if bool(stands_still(machine, self.state(start), machine.cycle, self.unit)):
@@ -265,8 +265,9 @@ def settling_on(
     name: str,
     cycle: int = 0,
 ) -> tuple[Settling, Row]:
-    """Return a judge of starts by their return to the motion `name`, and a state of it; of an orbit
-    that on the section `cycle`. Other arguments are those of `edge_state`."""
+    """Return a classifier of starts by their return to a motion, and a state of the motion (for an
+    orbit that on section `cycle`). `name` is the argument's name, others are as in
+    `edge_state`."""
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
