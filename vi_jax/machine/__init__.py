@@ -1,4 +1,4 @@
-"""What a machine is: states, coordinates, contacts, events, drives, and the paper's scene."""
+"""Machines: states, coordinates, contacts, events, drives, and the paper's scene."""
 
 from ..lanes import horner as horner
 from ..lanes import sincos as sincos

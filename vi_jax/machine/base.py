@@ -1,9 +1,8 @@
-"""What every verb asks of a machine: a class of your own with these few methods runs like ours. And
-its contacts and events, sorted into what a step asks for.
+"""The base class of all machines, and their contacts and events sorted by kind.
 
-A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, kinds of
-one's own), each with the coordinate that it acts on. A step asks for the stops, for the switches,
-for the other events, and for the coordinates that stops limit, by number.
+A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, kinds that
+the user defines), each with the coordinate that it acts on. A time step needs the stops, the
+switches, the other events, and by index the coordinates that stops limit.
 """
 
 import abc
@@ -41,7 +40,7 @@ from .own import (
 )
 from .stop import RigidStop, SoftStop, Wall
 
-# What a machine must say, and how.
+# Required members, each with advice for an error message.
 _MUST_SAY = {
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
@@ -49,14 +48,14 @@ _MUST_SAY = {
 
 
 def listed(parts: object) -> tuple[Any, ...]:
-    """Contacts or events as a tuple, of which one may be given without."""
+    """Return contacts or events as a tuple; a single one may be given without a tuple."""
     single = isinstance(parts, AbstractEvent)
     return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
 
 
 def once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
-    """A function of a machine that is called once while JAX traces a function. A step asks for the
-    parts of a machine some hundred times, and each of a user's contacts takes a millisecond."""
+    """Cache a function of a machine while JAX traces another. A step reads the parts of a machine
+    some hundred times, and each contact that a user defines takes a millisecond."""
 
     @wraps(found)
     def kept(machine: Machine) -> Any:
@@ -69,19 +68,18 @@ def once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
     return kept
 
 
-# Where a machine keeps what `once_a_trace` found; it is no field, and no part of a copy.
+# The attribute with the cache of `once_a_trace`. It is not a field, and copies leave it out.
 _MEMORY = "_found_in_a_trace"
 
 
 @once_a_trace
 def contacts_in(machine: Machine) -> tuple[Any, ...]:
-    """The contacts that a machine lists."""
+    """Return the contacts of a machine as a tuple."""
     return listed(machine.contacts)
 
 
 @once_a_trace
 def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
-    """The rigid stops among a machine's contacts."""
     contacts = contacts_in(machine)
     places = _places(contacts)
     return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
@@ -89,8 +87,7 @@ def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
 
 @once_a_trace
 def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
-    """The soft stops and frictions among a machine's contacts, which act by themselves, and the
-    switches among its events."""
+    """Return the soft stops and frictions among contacts, marked `acts`, then the switches."""
     contacts, found = contacts_in(machine), []
     places, at = _places(contacts), 0
     for x in contacts:
@@ -105,7 +102,7 @@ def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
 
 @once_a_trace
 def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """The events of a machine that are no switches, and the turn that ends its cycles."""
+    """Return the events that are not switches, then the turn that ends the cycles."""
     found = []
     for event in listed(machine.events):
         if not isinstance(event, AbstractSwitch):
@@ -115,7 +112,7 @@ def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
 
 
 def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
-    """The coordinates on which a machine's contacts act, in the order of `_places`."""
+    """Return the coordinates on which contacts act, in the order of `_places`."""
     contacts = contacts_in(machine)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
@@ -124,8 +121,8 @@ def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
 
 
 def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
-    """The number of each coordinate by what names it: those of rigid stops, of soft ones, then
-    those along which rigid ones rub."""
+    """Return the index of each coordinate by its `on`: those of rigid stops, then of soft stops,
+    then those along which rigid stops have friction."""
     rigid = [x for x in contacts if isinstance(x, RigidStop)]
     named = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
     named += [x.along for x in rigid if x.friction is not None]
@@ -134,8 +131,8 @@ def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
 
 
 def _known_as(on: Any) -> Any:
-    """What names a coordinate, or of a gap what it computes: the same one is often written for both
-    sides, and two coordinates cost twice as much as one."""
+    """Return a key for a coordinate: its name, or the code and closure of a gap function. The same
+    gap is often written for both sides, and two coordinates cost twice as much as one."""
     if not isinstance(on, FunctionType):
         return on
     code, cells = on.__code__, on.__closure__ or ()
@@ -145,8 +142,8 @@ def _known_as(on: Any) -> Any:
 
 
 def number_on(machine: Machine, name: str) -> int | None:
-    """The number of the coordinate that contacts name so, as one or by its position; `None` if no
-    contact acts on it."""
+    """Return the index of the coordinate that contacts name `name`, alone or as its position;
+    `None` if no contact acts on it."""
     for on, k in _places(contacts_in(machine)).items():
         if on == name or (isinstance(on, tuple) and on[0] == name):
             return k
@@ -154,8 +151,8 @@ def number_on(machine: Machine, name: str) -> int | None:
 
 
 def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
-    """The names in the state of the position and the velocity of a coordinate, by its number;
-    `None` where contacts do not name it by them."""
+    """Return the names of a coordinate's position and velocity in the state, by its index; `None`
+    if contacts do not name them, or the machine defines `coordinates`."""
     if says(machine, "coordinates"):
         return None
     on = next((on for on, k in _places(contacts_in(machine)).items() if k == number), None)
@@ -163,7 +160,7 @@ def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
 
 
 def _at(stop: Any, places: dict[Any, int]) -> Any:
-    """A stop with the number of its coordinate."""
+    """Return a stop with the index of its coordinate."""
     if stop.on is None and stop.coordinate:
         return stop
     return with_static(stop, coordinate=places[stop.on])
@@ -180,7 +177,8 @@ def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> Contac
 
 
 def _unlisted(kind: type) -> str | None:
-    """The name under which a class that lists neither contacts nor events has one, as `stops`."""
+    """Return the name, such as `stops`, of an attribute with contacts or events, of a class without
+    `contacts` and `events`."""
     fields = getattr(kind, "__dataclass_fields__", {})
     if any(name in fields or hasattr(kind, name) for name in ("contacts", "events")):
         return None
@@ -205,19 +203,19 @@ def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> S
 
 
 def _plain(machine: "AbstractMachine") -> Coordinate:
-    """That of a state with the fields `Y` and `V`, or of a machine without stops."""
+    """Return the coordinate of a state with fields `Y` and `V`, or of a machine without stops."""
     return Coordinate(*(partial(function, machine) for function in (_position, _velocity, _placed)))
 
 
 class AbstractMachine(Shown):
     """A machine: smooth motion between events, observed cycle by cycle.
 
-    Its independent variable is called `s`. The machine is driven, and its field periodic in `s`
-    (`s` restarts from zero in each cycle); or it is autonomous, and an event ends its cycles.
+    Its independent variable is called `s`. The field of a driven machine is periodic in `s`, which
+    restarts from zero in each cycle. The cycles of an autonomous machine end with an event.
 
-    A subclass defines `cycle` and `field`, and lists its `contacts` and `events`. All else has a
-    default. Contacts name the components of the state that they act on. Without names they act on
-    the fields `Y` and `V`. Extremes of a machine without contacts are those of its first component.
+    A subclass defines `cycle` and `field`, and lists its `contacts` and `events`. Everything else
+    has a default. Contacts name the components of the state that they act on, by default the fields
+    `Y` and `V`. Without contacts, extremes are those of the first component.
 
     | definition | meaning |
     |---|---|
@@ -228,17 +226,17 @@ class AbstractMachine(Shown):
     | `events` | switches, resets, other kinds of events; `()` by default |
     | `modes` | discrete modes by name, which events change |
     | `position`, `velocity`, `placed` | the coordinate of contacts that name none |
-    | `coordinates` | several coordinates by number |
+    | `coordinates` | several coordinates by index |
     | `averages` | means over a cycle: a power, a mean force |
-    | `quantities` | functions of the state, by name, shown in results |
+    | `quantities` | functions of the state, by name, included in results |
     | `renewed` | a drifting component, set back in each cycle |
     | `mirrored` | the symmetry of the machine, for branches |
-    | `step_limit`, `relaxation` | steps that fit time scales shorter than the cycle |
+    | `step_limit`, `relaxation` | limits of time steps, for time scales shorter than the cycle |
     | `pace` | d(time)/ds, if `s` is not time |
-    | `labels`, `units` | words of pictures and messages |
+    | `labels`, `units` | names and units in pictures and messages |
 
-    `machine.observed_every(interval)` is the same machine observed at equal intervals. Ready
-    machines, each written in this way, are in `vi_jax.machines`.
+    `machine.observed_every(interval)` is the same machine observed at equal intervals. The machines
+    in `vi_jax.machines` are written in this way.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -264,7 +262,7 @@ class AbstractMachine(Shown):
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:
-        """`field(s, state)`: d(state)/ds between events, a pytree like `state`.
+        """Return d(state)/ds between events, a pytree like `state`: `field(s, state)`.
 
         With switches or discrete `modes` it is `field(s, state, mode, ...)`.
         """
@@ -280,38 +278,39 @@ class AbstractMachine(Shown):
         @property
         @abc.abstractmethod
         def cycle(self) -> Scalar | float:
-            """Length of one cycle in `s`; where an event ends a cycle, its usual length, by which
-            steps are sized."""
+            """The length of a cycle in `s`. If an event ends cycles, their usual length, from which
+            the lengths of steps follow."""
 
         @derived
         def contacts(self) -> Any:
-            """Rigid and soft stops, dry friction: a tuple, or one of them."""
+            """The rigid and soft stops and dry frictions: a tuple, or one of them."""
             return ()
 
         @derived
         def events(self) -> Any:
-            """Switches, resets, and other kinds of events: a tuple, or one of them."""
+            """The switches, resets and other events: a tuple, or one of them."""
             return ()
 
         @derived
         def modes(self) -> Mapping[str, float]:
-            """The discrete modes, by name, in which a motion begins. The field receives them after
-            the state, and events change them. A method `modes(s, state)` returns those of a motion
-            that begins in `state`: a number, a tuple or a dictionary. A start that is a
-            `HybridState`, as `Run.last` is, has its own instead."""
+            """The initial discrete modes, by name. The field receives them after the state, and
+            events change them. Initial modes that depend on the state are returned by a method
+            `modes(s, state)`: a number, a tuple or a dictionary. A start that is a `HybridState`,
+            such as `Run.last`, has its own."""
             return {}
 
         @derived
         def coordinates(self) -> tuple[Coordinate, ...]:
-            """The coordinates that contacts act on, by number as `RigidStop.coordinate` names them;
-            extremes are recorded of the first. By default those that contacts name by `on`, and
-            where none does one, the machine's `position`, `velocity` and `placed`."""
+            """The coordinates that contacts act on, in the order of `RigidStop.coordinate`.
+            Extremes are those of the first. The default is the coordinates that contacts name by
+            `on`; a contact without `on` acts on the machine's `position`, `velocity` and
+            `placed`."""
             return _coordinates_in(self)
 
     def start(self) -> State:
-        """The state to begin from where none is given.
+        """Return the default start.
 
-        **Raises:** `ValueError` where this machine has none.
+        **Raises:** `ValueError` for a machine without a default start.
         """
         raise ValueError(
             f"Argument `start` is missing, and {type(self).__name__} has no method `start`. Pass a "
@@ -320,25 +319,23 @@ class AbstractMachine(Shown):
 
     @by_default
     def position(self, state: State) -> Scalar:
-        """The coordinate that stops limit: by default the first of `coordinates`, or `state.Y`; for
-        a machine without stops whose state has no `Y` the first component, of which extremes are
-        recorded."""
+        """Return the coordinate that stops limit: by default the first of `coordinates`, or
+        `state.Y`. Without stops and `Y` it is the first component. Extremes are recorded of it."""
         return self._first.position(state)
 
     @by_default
     def velocity(self, state: State) -> Scalar:
-        """The velocity that an impact reverses; of the sign of d(position)/ds. For a machine
-        without stops whose state has no `V`, the second component, which pictures draw over the
-        position."""
+        """Return the velocity that an impact reverses; it has the sign of d(position)/ds. Without
+        stops and `V` it is the second component, which pictures draw over the position."""
         return self._first.velocity(state)
 
     @by_default
     def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
-        """`state` with this position and velocity: how a landing and a rebound are applied."""
+        """Return `state` with this position and velocity, as after a landing or a rebound."""
         return self._first.placed(state, Y, V)
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
-        """An autonomous machine observed at equal intervals of `s` instead of on its section."""
+        """Return an autonomous machine observed at equal intervals of `s`, not on its section."""
         if counter_of(self) is None and not any(x.ends_cycle for x in _events_in(self)):
             raise ValueError(
                 f"`observed_every` needs a machine without a drive, but a {type(self).__name__} is "
@@ -349,36 +346,36 @@ class AbstractMachine(Shown):
 
     @by_default
     def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """`averages(s, state)`: by name, quantities whose means over time are wanted.
+        """Return quantities, by name, whose means over time are computed: `averages(s, state)`.
 
         Each is integrated along with the state, with the method's accuracy, and divided by the
-        time: `Run.averages` of each cycle, `Orbit.averages` and columns of a `Branch` over the
-        period. Impulses of impacts are not included. `units` may have the unit under the same name.
-        As the field, it receives the discrete modes. Nothing is integrated with
-        `record="sections"`."""
+        time. The means over a cycle are in `Run.averages`, those over the period in
+        `Orbit.averages` and in columns of a `Branch`. Impulses of impacts are not included.
+        Discrete modes are further arguments, as of the field. `units` may have the unit under the
+        same name. `record="sections"` omits averages.
+        """
         return {}
 
     @by_default
     def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """`quantities(s, state)`: functions of the state, by name, which results contain as well:
-        on sections, in samples, along branches. `s` counts from the section; it is 0 for autonomous
-        machines, and if the state contains the clock."""
+        """Return functions of the state, by name, that results include: `quantities(s, state)`.
+        They are evaluated on sections, in samples and along branches. `s` counts from the section;
+        it is 0 for autonomous machines, and if the state contains the clock."""
         return {}
 
     @by_default
     def renewed(self, state: State) -> State:
-        """The state at the beginning of the next cycle, for a component that drifts: set back to
-        zero here, it is the progress in each cycle."""
+        """Return the state at the beginning of the next cycle. A drifting component that is set to
+        zero here is the progress in each cycle."""
         return state
 
     def mirrored(self, state: State) -> State | None:
-        """The image of a state under the symmetry of this machine, by which every motion has an
-        image half a cycle later; `None` without such a symmetry."""
+        """Return the image of a state under the symmetry of this machine, or `None` without a
+        symmetry. The image of a motion is a motion half a cycle later."""
         return None
 
     def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """The longest step, in which the motion has at most one extremum: `cycle`/5, less near a
-        soft stop."""
+        """Return the longest step, with at most one extremum: `cycle`/5, less near a soft stop."""
         counter = counter_of(self)
         limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
         for stop in switches_of(self):
@@ -388,32 +385,31 @@ class AbstractMachine(Shown):
         return limit
 
     def relaxation(self, s: Scalar, state: State) -> Scalar | None:
-        """The shortest time constant (in `s`) of what decays, `None` if nothing does. Explicit
-        Runge–Kutta methods are unstable with much longer steps."""
+        """Return the shortest time constant of a decay (in `s`), or `None` if nothing decays.
+        Explicit Runge–Kutta methods are unstable with much longer steps."""
         return None
 
     def pace(self, s: Scalar, state: State) -> Scalar | None:
-        """d(time)/ds; `None` if `s` is the time."""
+        """Return d(time)/ds, or `None` if `s` is the time."""
         return None
 
     @property
     def labels(self) -> tuple[str, str]:
-        """The names of position and velocity in pictures, with units; by default those in the
-        state, if contacts name the first coordinate by them."""
+        """The labels of position and velocity in pictures, with units; by default their names in
+        the state, if contacts name the first coordinate by them."""
         return (not is_own(type(self).position) and names_on(self, 0)) or PLAIN
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units by name: of `position`, `velocity`, `time`, `rate` (of exponents), `energy`,
-        `power`, and of each parameter and component of the state under its own name. "1" is without
-        unit; the name "" stands for all others. By default those of `labels`, in brackets, and of
-        the fields' metadata."""
+        """The units by name: of `position`, `velocity`, `time`, `rate` (of exponents), `energy`,
+        `power`, and of each parameter and component of the state. "1" is dimensionless, and "" is
+        the name of all others. The default is those in brackets in `labels` and in fields'
+        metadata."""
         found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
         own = {**dict(found), **fields_with(type(self), "unit")}
         return {x: unit for x, unit in own.items() if unit}
 
-    # The parts as a step asks for them (`stops_of` and the others). Machines of this room that sort
-    # them in another way have their own.
+    # The parts by kind (see `stops_of`). Some subclasses in this package sort them in another way.
     _stops = property(_stops_in)
     _switches = property(_switches_in)
     _others = property(_other_events)
@@ -428,11 +424,8 @@ class AbstractMachine(Shown):
         return None
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
-        """The coordinate that a contact names by its `on`; of a contact that names none the
-        machine's own.
-
-        **Arguments:** `mass`, what acts there, 1 if it is `None`.
-        """
+        """Return the coordinate that a contact names by its `on`, with this effective mass (1 if
+        `None`). If `on` is `None`, it is the machine's own coordinate."""
         if on is not None:
             return coordinate_by_name(on, mass)
         methods = ("position", "velocity", "placed")
@@ -440,13 +433,13 @@ class AbstractMachine(Shown):
         return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
-        """The names of position and velocity in the `on` of a contact; `None` where it has none."""
+        """Return the names of position and velocity in a contact's `on`, or `None`."""
         return on if isinstance(on, tuple) else None
 
     @property
     def _first(self) -> Coordinate:
-        """What `position`, `velocity` and `placed` are where the machine does not say it by them:
-        the first of its own `coordinates`, if it has some."""
+        """The coordinate of the default `position`, `velocity` and `placed`: the first of the
+        machine's `coordinates`, if it defines some."""
         return self.coordinates[0] if names_coordinates(self) else _plain(self)
 
 
@@ -455,13 +448,13 @@ def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
 
 
 def has_velocity(machine: AbstractMachine, state: State) -> bool:
-    """Whether a machine's `velocity` is one; it need not be where there is nothing to meet."""
+    """Return whether `velocity` is one. Without stops it may be another component."""
     own = is_own(type(machine).velocity) or names_coordinates(machine)
     return own or bool(stops_of(machine)) or hasattr(state, "V")
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:
-    """Whether a machine defines coordinates, itself or by the names in its contacts."""
+    """Return whether a machine has `coordinates`, or contacts that name coordinates."""
     if says(machine, "coordinates"):
         return True
     walls = (x for x in contacts_in(machine) if isinstance(x, Wall))
@@ -469,5 +462,5 @@ def names_coordinates(machine: AbstractMachine) -> bool:
 
 
 def renews(machine: AbstractMachine) -> bool:
-    """Whether a machine begins each cycle with something set back."""
+    """Return whether a machine defines `renewed`."""
     return is_own(type(machine).renewed)

@@ -1,5 +1,5 @@
-"""What only some machines of the library define, asked of any: several clocks, words of a crank
-angle, another form for a run."""
+"""Properties that only some machines define, for any machine: several clocks, crank angles in
+words, another form for a run."""
 
 from math import pi
 from typing import Any
@@ -29,13 +29,13 @@ def in_clock(machine: Machine, clock: str) -> Machine:
 
 
 def in_cycle_clock(machine: Machine) -> Machine:
-    """Return the same machine with what counts its cycles as its independent variable: by time the
-    section would be an event, and the angle of a shaft one more state."""
+    """Return a machine with a shaft in its phase clock, and any other as it is. In the time clock
+    the section would be an event, and the angle of the shaft one more component of the state."""
     return machine.in_clock("phase") if isinstance(machine, ShaftMachine) else machine
 
 
 def at_section(machine: Machine, phase: Number) -> Machine:
-    """Return the same machine observed elsewhere in its cycle.
+    """Return the same machine with its section elsewhere in the cycle.
 
     **Raises:** `ValueError` for a machine whose section cannot be moved.
     """
@@ -48,8 +48,7 @@ def at_section(machine: Machine, phase: Number) -> Machine:
 
 
 def phase_at(machine: Machine, since_section: Number) -> Any:
-    """Return the reading of the clock so much after the section: a crank angle may begin elsewhere
-    than at 0."""
+    """Return the clock reading this long after the section; a crank angle need not begin at 0."""
     return machine.phase_at(since_section) if isinstance(machine, Scene) else since_section
 
 
@@ -62,8 +61,8 @@ def adopt(machine: Machine, start: State) -> State:
 
 
 def in_cycle_state(machine: Machine, name: str, state: State) -> State:
-    """Return a state on the section, made for any clock of a machine, as the machine of
-    `in_cycle_clock` needs it; `name` is the argument that messages blame."""
+    """Return a section state of any clock in the form for `in_cycle_clock`; `name` is the
+    argument's name in error messages."""
     if isinstance(machine, ShaftMachine | LinearMachine):
         return machine.in_cycle_state(name, state)
     return state
@@ -75,22 +74,22 @@ def rewound(machine: Machine, state: State) -> State:
 
 
 def cycle_time(machine: Machine) -> Scalar | float:
-    """Return the duration of a cycle, where it is fixed."""
+    """Return the duration of a cycle, if it is fixed."""
     return machine.period if isinstance(machine, Scene) else machine.cycle
 
 
 def logged_turn(machine: Machine) -> Scalar | float:
-    """Return the length of a cycle as an impact log counts it."""
+    """Return the length of a cycle in the unit of an impact log."""
     return 2 * pi if isinstance(machine, Scene) else machine.cycle
 
 
 def as_logged(machine: Machine, clock: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return what an impact log contains for a reading of what counts the cycles."""
+    """Return the value in an impact log for a reading of the clock that counts cycles."""
     return machine.as_logged(clock) if isinstance(machine, Scene) else clock
 
 
 def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
-    """Return the mean speed of the drive over cycles of these durations; `None` without one."""
+    """Return the mean speed of the drive over cycles of these durations; `None` without a drive."""
     if isinstance(machine, Scene):
         return machine.frequency_ratio(duration)
     turns = isinstance(machine, ShaftMachine) or isinstance(counter_of(machine), Turn)
@@ -98,12 +97,12 @@ def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
 
 
 def cycles_in_words(machine: Machine, cycles: int) -> str:
-    """Return a duration of so many cycles in words: 2 cycles, or 4π."""
+    """Return the duration of a number of cycles in words: 2 cycles, or 4π."""
     return f"{2 * cycles}π" if isinstance(machine, Scene) else so_many(cycles, "cycle")
 
 
 def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
-    """Return a reading of the clock within a motion of so many cycles in words."""
+    """Return a clock reading in words, within a motion of this number of cycles."""
     if isinstance(machine, Scene):
         angle = float(machine.phase_at(since_section))
         return f"crank angle φ = {angle:.6g} of {2 * cycles}π"
@@ -112,33 +111,33 @@ def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
 
 
 def scales_known(machine: Machine) -> bool:
-    """Whether the usual number of fixed steps in a cycle is known to be enough: not with soft
-    stops, whose contacts may be much briefer than a cycle; static."""
+    """Return whether the default number of fixed steps in a cycle is known to be enough. Contacts
+    with soft stops may be much briefer than a cycle. Static."""
     return isinstance(machine, Scene) and not machine.soft_stops
 
 
 def is_alive(machine: Machine, state: State) -> Flag | None:
-    """Return whether the motion can go on: false where a crank stops in the phase clock; `None`
-    where no clock can break down."""
+    """Return whether the motion can continue: false if a crank stops in the phase clock; `None` if
+    the clock cannot fail."""
     return machine.alive(state) if isinstance(machine, ShaftMachine) else None
 
 
 def may_rest(machine: Machine) -> bool:
-    """Whether a body can come to rest on a stop, as far as is known; static."""
+    """Return whether a body may come to rest on a stop, as far as is known; static."""
     return machine.may_rest() if isinstance(machine, Scene) else bool(stops_of(machine))
 
 
 def is_in_range(machine: Machine, start: State) -> Flag:
-    """Whether the numbers of a machine and of its start, traced ones too, are in their ranges, and
-    the start is not beyond its section."""
+    """Return whether the numbers of a machine and of its start, also traced ones, are in their
+    ranges, and the start is not beyond its section."""
     good = in_range((machine, stops_of(machine), switches_of(machine), start))
     clock = clock_of(machine, start)
     return good if clock is None else good & (clock < machine.cycle)
 
 
 def prepared(machine: Machine) -> Prepared:
-    """Return a machine in the form in which a run follows it (natural modes), and the ways from its
-    own states to those, and back."""
+    """Return a machine in the form for a run (a linear one in natural modes), and the functions
+    that convert states to that form and back."""
     if isinstance(machine, LinearMachine):
         return machine.prepared()
     return Prepared(machine)

@@ -1,9 +1,9 @@
-"""The field of a machine in its modes, with the forces of its contacts; and what contacts that
-share bodies do to each other, in an impact and at rest.
+"""The field of a machine with the forces of its contacts, and the coupling of contacts that share
+bodies, in impacts and at rest.
 
-The force of a contact changes the state as `Coordinate.placed` does with its velocity; so much of
-it as changes that velocity by one is its *push*. How much of each there is, so that the velocities
-of several contacts become what they are to be, is a linear system as large as there are contacts.
+The force of a contact changes the state as `Coordinate.placed` does with its velocity. The *push*
+of a contact is the change of the state for a unit change of that velocity. The amounts of pushes
+that give several contacts the required velocities solve a linear system with a row per contact.
 """
 
 import inspect
@@ -21,15 +21,14 @@ from .._types import Flag, Machine, Scalar, Scalars, State
 from .own import stops_of, switches_of
 from .state import like
 
-# A pivot smaller than this (its row's begins as 1) is that of a contact whose velocity the others
-# have settled already, as that of the fourth leg of a table: it gets no force. A choice, far above
+# A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other
+# contacts determine, such as the fourth leg of a table: it gets no force. A choice, far above
 # rounding and far below the pivots of contacts that matter.
 _REDUNDANT = 1e-9
 
 
 def push_of(coordinate: Any, state: State) -> State:
-    """A contact's push: how the state changes by as much of its force as changes its velocity by
-    one."""
+    """Return a contact's push: the change of the state for a unit change of its velocity."""
     if coordinate.push is not None:
         return coordinate.push(state)
     place, velocity = coordinate.position(state), coordinate.velocity(state)
@@ -38,22 +37,22 @@ def push_of(coordinate: Any, state: State) -> State:
 
 
 def gained(coordinate: Any, state: State, change: State) -> Scalar:
-    """By how much a coordinate's velocity changes as the state does."""
+    """Return the change of a coordinate's velocity for this change of the state."""
     return jnp.asarray(jax.jvp(coordinate.velocity, (state,), (change,))[1])
 
 
 def shares(coordinates: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
-    """By how much each coordinate's velocity changes with each push: a row for each coordinate."""
+    """Return the change of each coordinate's velocity (row) by each push (column)."""
     return [[gained(coordinate, state, push) for push in pushes] for coordinate in coordinates]
 
 
 def forces(
     gains: Sequence[Sequence[Scalar]], acting: Sequence[Flag], wanted: Sequence[Scalar]
 ) -> list[Scalar]:
-    """How much of each push there is, so that the velocities of those contacts that are `acting`
-    change as `wanted`; none of the others'.
+    """Return the amount of each push that changes the velocities of the `acting` contacts as
+    `wanted`; 0 for the others.
 
-    **Arguments:** `gains` as from `shares`, and the other two of each contact.
+    **Arguments:** `gains`, from `shares`; `acting` and `wanted`, with an entry for each contact.
     """
     rows = []
     for j, row in enumerate(gains):
@@ -67,8 +66,8 @@ def forces(
 
 
 def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
-    """The solution of a small linear system, its right side as the last column. Its matrix is that
-    of contacts' inverse masses, which needs no pivoting."""
+    """Solve a small linear system whose last column is the right side. Its matrix, of inverse
+    masses of contacts, needs no pivoting."""
     n = len(rows)
     for i in range(n):
         pivot = rows[i][i]
@@ -82,10 +81,10 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
 
 
 def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
-    """A tree to which each change is added, multiplied by its amount."""
+    """Return a tree plus each change times its amount."""
 
     def one(amount: Scalar, a: Any, b: Any) -> Any:
-        known = isinstance(b, np.ndarray)  # in a push: its places, and its own velocity
+        known = isinstance(b, np.ndarray)  # in a push: its positions, and its own velocity
         if known and not b.any():
             return a
         return a + (amount if known and (b == 1).all() else amount * b)
@@ -96,23 +95,23 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
 
 
 class FrictionImpulse(NamedTuple):
-    """The state behind an impact with friction, and the impulses of it."""
+    """The state after an impact with friction, and its impulses."""
 
     state: State
     pushed: Scalar
-    """How much of the contact's push there is, and of the push along it."""
+    """The amount of the stop's push."""
     dragged: Scalar
 
 
 def with_friction_impulse(
     machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
 ) -> FrictionImpulse:
-    """An impact on stop `number` as Coulomb's friction has it: the body sticks, its velocity along
-    the stop reversed and scaled by the tangential restitution, if the impulse that this takes is at
-    most `level` times that of the stop; else it slips against that much.
+    """Return the result of an impact on stop `number` with Coulomb friction. The body sticks if the
+    required impulse is at most `level` times that of the stop: its velocity along the stop is
+    reversed and scaled by the tangential restitution. Otherwise it slips against that impulse.
 
     **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
-    impact and after one without friction, whose velocity towards the stop is kept.
+    impact and after one without friction, whose velocity normal to the stop is kept.
     """
     stop = stops_of(machine)[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
@@ -125,7 +124,7 @@ def with_friction_impulse(
     ratio = body.mass_at(s, before) / along.mass_at(s, before)
     level, away = friction.level * ratio, -float(stop.sign)
     slips = jnp.abs(sticking[1]) > level * jnp.maximum(away * sticking[0], 0.0)
-    # Forward or backward, as it slips then: the stop's push drags along, too.
+    # The direction of slip after the impact decides; the stop's push changes the slip, too.
     forward = _slipping(gains, wanted, -away * level)
     backward = _slipping(gains, wanted, away * level)
     left = slip + gains[1][0] * forward[0] + forward[1]
@@ -140,36 +139,35 @@ def with_friction_impulse(
 
 
 def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-    """How much there is of both pushes, the stop's and that along it, if the velocity towards the
-    stop changes as wanted and the push along it is `ratio` times the stop's."""
+    """Return the amounts of the stop's push and of the push along it, which is `ratio` times as
+    large, for the change `wanted` of the velocity normal to the stop."""
     pushed = wanted / (1 + ratio * gains[0][1])
     return pushed, ratio * pushed
 
 
 class Held(NamedTuple):
-    """What holds the bodies that rest on stops: a row for each coordinate that stops limit, in
-    their order, then one for each friction on a stop."""
+    """The constraints of bodies at rest on stops: a row for each coordinate that stops limit, in
+    their order, then a row for each friction on a stop."""
 
     coordinates: list[Any]
-    """Whose velocity is held; of a friction that along the stop."""
+    """The coordinates whose velocities are held; for a friction the one along the stop."""
     pushes: list[State]
-    """How the state changes by its force; of a stop with the drag of a body that slips on it."""
+    """The change of the state by each force; for a stop with the friction on a slipping body."""
     acts: list[Flag]
-    """Whether it holds; a friction holds while the body sticks."""
+    """True in the rows that hold; a friction holds while the body sticks."""
     rubbing: list[tuple[int, Any, int, Scalar]]
-    """For each friction on a stop: its place among the switches, the friction, the row of its stop,
+    """For each friction on a stop: its index among the switches, the friction, the row of its stop,
     and the share of the friction's push in the stop's."""
     masses: list[Any]
-    """What a force of each row acts on; empty without friction on stops."""
+    """The effective mass of each row; empty without friction on stops."""
 
 
 def held_by(
     machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
 ) -> Held:
-    """What holds the bodies that rest on stops.
+    """Return the constraints of bodies at rest on stops.
 
-    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`, empty
-    where nothing is known to rest.
+    **Arguments:** `modes`, those of switches first; `contact`, as in `Around`, or empty.
     """
     limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
@@ -184,7 +182,7 @@ def held_by(
         stop = stops[friction.friction_stop]
         at = limited.index(stop.coordinate)
         here = contact[stop.coordinate] == 1.0 + friction.friction_stop
-        # The stop pushes a body away from it, and friction against the way it slips.
+        # The stop pushes the body away, and friction acts against the slip.
         ratio = masses[stop.coordinate] / masses[friction.along]
         ratio = modes[i] * friction.level * stop.sign * ratio
         slips = jnp.where(here, ratio, 0.0)
@@ -199,20 +197,19 @@ def held_flow(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:  # fmt: skip
-    """The rate at which a state changes along `flow` while those coordinates that rest keep their
-    velocities, all at once: contacts that share a body are held by forces that depend on each
-    other, and on the friction there.
+    """Return the rate of the state along `flow`, corrected so that resting coordinates keep their
+    velocities. Forces on shared bodies depend on each other and are solved for together.
 
-    **Arguments:** `modes`, those of the machine's switches first; `contact` as in `Around`.
+    **Arguments:** `modes`, those of the switches first; `contact`, as in `Around`.
 
-    **Returns:** the rate, and of each friction, by its place among the switches, the force along
-    the surface, that which presses on it (of one on a stop), and the mass that it acts on.
+    **Returns:** the rate; and for each friction, by its index among the switches, the force along
+    the surface, the normal force (`None` without a stop), and the effective mass.
     """
     bodies, pushes, acts, rubbing, masses = held_by(machine, s, state, modes, contact)
     wanted = [-gained(body, state, flow) for body in bodies]
     first, dry = len(bodies), []
     for i, friction in enumerate(switches_of(machine)):
-        if friction.is_dry:  # no part of an impact: its forces are finite
+        if friction.is_dry:  # not in impacts: its forces are finite
             push, mass = friction.row(machine, s, state)
             dry.append((i, mass))
             bodies.append(friction.as_velocity(machine, s))
@@ -231,8 +228,8 @@ def held_flow(
 
 
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
-    """The modes that a machine's own functions get: all but those of contacts that act by
-    themselves. The modes of switches come first, in their order."""
+    """Return the modes that a machine's own functions receive: all but those of contacts, which add
+    their forces themselves. The modes of switches come first, in their order."""
     hidden = {i for i, x in enumerate(switches_of(machine)) if x.acts}
     return tuple(mode for i, mode in enumerate(modes) if i not in hidden)
 
@@ -240,10 +237,10 @@ def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
 def check_takes(
     function: Callable[..., Any], whose: str, first: str, arguments: tuple[Any, ...], modes: int
 ) -> None:
-    """**Raises:** `TypeError` for a function of a user's that does not take these arguments.
+    """Raise `TypeError` if a user's function does not accept these arguments.
 
     **Arguments:** `whose`, the function in words; `first`, the arguments before the modes in words;
-    how many of them are modes.
+    `modes`, how many arguments are modes.
     """
     try:
         inspect.signature(function).bind(*arguments)
@@ -255,9 +252,9 @@ def check_takes(
 
 
 def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
-    """Return what a function of a machine's event returns.
+    """Return the result of a function of a machine's event.
 
-    **Raises:** `TypeError` that names the function, `whose`, if it takes other arguments.
+    **Raises:** `TypeError` with the function's name `whose`, if it takes other arguments.
     """
     try:
         return function(*arguments)
@@ -267,8 +264,7 @@ def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
 
 
 def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:
-    """The machine's field in these modes, with the forces of soft stops and of friction on bodies
-    that slide."""
+    """Return the machine's field in these modes, with the forces of its contacts that act."""
     flow = machine.field(s, state, *shown_modes(machine, modes))
     flow = like(state, flow, f"`field` of a {type(machine).__name__}")
     pace = machine.pace(s, state)
@@ -281,10 +277,10 @@ def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:
 
 
 def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int = 0) -> State:
-    """The machine's field in these modes; on the surfaces along which it slides, the mean of those
-    on both sides.
+    """Return the machine's field in these modes. On a surface along which the motion slides, it is
+    the weighted mean of the fields on both sides.
 
-    **Arguments:** switches before number `first` are in mode +1 or -1.
+    **Arguments:** `first`, the first switch that may be in mode 0.
     """
     switches = switches_of(machine)
     found = [i for i, x in enumerate(switches) if x.blends and i >= first]
@@ -300,11 +296,11 @@ def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int =
     rises, falls = (rate_of(switches[i].function, machine, s, state, x) for x in (up, down))
     apart = falls - rises
     share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
-    # Not kept within [0, 1]: a step ends where it leaves that, and sees a smooth field till then.
+    # Not clipped to [0, 1]: the field is smooth until the step ends, where the share leaves it.
     return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)
 
 
 def rate_of(function: Any, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-    """d/ds of a function of machine, `s` and state along a flow."""
+    """Return d/ds of a function of machine, `s` and state along a flow."""
     along = (s, state), (jnp.ones_like(s), flow)
     return jax.jvp(lambda s, state: function(machine, s, state), *along)[1]

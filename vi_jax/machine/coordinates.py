@@ -1,5 +1,5 @@
-"""Coordinates that contacts act on, numbers of a state by their names, and angles that grow: whole
-turns are taken off at the end of a cycle, and left out where states are compared."""
+"""Coordinates that contacts act on, components of a state by name, and angles that grow. Whole
+turns are removed at the end of a cycle, and ignored where states are compared."""
 
 import functools
 from collections.abc import Callable
@@ -20,10 +20,9 @@ class Coordinate(NamedTuple):
 
     position: Callable[[State], Scalar]
     velocity: Callable[[State], Scalar]
-    """The velocity that an impact reverses; of the sign of d(position)/ds."""
+    """The velocity that an impact reverses; it has the sign of d(position)/ds."""
     placed: Callable[[State, Any, Any], State]
-    """The state with another position and velocity, and with everything else that an impact
-    changes."""
+    """The state with another position and velocity, and all other changes by an impact."""
     mass: Any = 1.0
     """The effective mass of an impact, in the machine's unit of mass: for two bodies the reduced
     mass. A number, or a function `mass(s, state)`."""
@@ -32,15 +31,15 @@ class Coordinate(NamedTuple):
     derivative of `placed` with respect to the velocity."""
 
     def mass_at(self, s: Scalar, state: State) -> Any:
-        """The mass in a state."""
+        """Return the mass in a state."""
         return self.mass(s, state) if callable(self.mass) else self.mass
 
 
 def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
-    """The coordinate of a state's components.
+    """Return the coordinate of these components of a state.
 
-    **Arguments:** `on`, the names of position and velocity, or that of a velocity alone; `mass`,
-    as `Coordinate.mass`, 1 if it is `None`.
+    **Arguments:** `on`, the names of position and velocity, or of a velocity alone; `mass`, as
+    `Coordinate.mass`, 1 if it is `None`.
     """
     position, velocity = (on, on) if isinstance(on, str) else on
     get = functools.partial(component, position), functools.partial(component, velocity)
@@ -49,11 +48,11 @@ def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
 
 
 def component(name: str, state: State) -> Any:
-    """The number of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
+    """Return a component of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
     base, place = split_place(name)
     found = functools.reduce(getattr, base.split("."), state)
     if not place:
-        return found  # a leaf itself, so that a stop can set it exactly
+        return found  # the leaf itself, so that a stop can set it exactly
     shape = jnp.shape(found)
     if len(place) != len(shape) or any(not -n <= i < n for i, n in zip(place, shape, strict=True)):
         raise LookupError(f"The state has no component {name!r}; {base!r} has the shape {shape}.")
@@ -61,7 +60,7 @@ def component(name: str, state: State) -> Any:
 
 
 def has_component(name: str, state: State) -> bool:
-    """Whether the state has a number of this name."""
+    """Return whether the state has a component of this name."""
     try:
         component(name, state)
     except (AttributeError, LookupError):
@@ -70,7 +69,7 @@ def has_component(name: str, state: State) -> bool:
 
 
 def with_component(name: str, state: State, value: Any) -> State:
-    """The state with another number under this name."""
+    """Return the state with another value of this component."""
     base, place = split_place(name)
     if place:
         value = component(base, state).at[place].set(value)
@@ -84,14 +83,14 @@ def _placed(position: str, velocity: str, state: State, Y: Scalar, V: Scalar) ->
 
 
 def wrap_angles(*names: str) -> Callable[[Any, State], State]:
-    """Return a method `renewed` for a machine with angles that grow by whole turns:
-    `renewed = vi.wrap_angles("phi")`.
+    """Return a method `renewed` for a machine with angles that grow by whole turns: `renewed =
+    vi.wrap_angles("phi")`.
 
-    At the end of each cycle an angle is set back into [-π, π], so that a rotation is a periodic
-    motion. Orbits and branches close up to whole turns, and may pass ±π; basins and kicks compare
+    At the end of each cycle an angle is reduced to [-π, π], so that a rotation is a periodic
+    motion. Orbits and branches close up to whole turns, and may pass ±π. Basins and kicks compare
     angles in the same way.
 
-    **Arguments:** `names`, of the angles in the state (radians).
+    **Arguments:** `names`, the names of the angles in the state (radians).
     """
 
     def renewed(machine: Any, state: State) -> State:
@@ -105,14 +104,14 @@ def wrap_angles(*names: str) -> Callable[[Any, State], State]:
 
 
 def without_turns(angle: Any) -> Any:
-    """An angle, or a difference of angles, in [-π, π]."""
+    """Return an angle, or a difference of angles, reduced to [-π, π]."""
     if isinstance(angle, np.ndarray):
         return angle - 2 * pi * np.round(angle / (2 * pi))
     return angle - 2 * pi * stop_gradient(jnp.round(angle / (2 * pi)))
 
 
 def is_angle(machine: Machine, name: str) -> bool:
-    """Whether a number of the state is an angle of `wrap_angles`, by its name or its array's."""
+    """Return whether a component, or its array, is an angle of `wrap_angles`."""
     return not {name, split_place(name)[0]}.isdisjoint(_angles(machine))
 
 
@@ -121,7 +120,7 @@ def _angles(machine: Machine) -> frozenset[str]:
 
 
 def angles_in(machine: Machine, like: State) -> np.ndarray | None:
-    """Which numbers of a state are angles of `wrap_angles`; `None` if none is.
+    """Return which components of a state are angles of `wrap_angles`, or `None` without angles.
 
     **Arguments:** `like`, one state, without modes.
     """
@@ -131,9 +130,9 @@ def angles_in(machine: Machine, like: State) -> np.ndarray | None:
 
 
 def nearest_images(angles: np.ndarray | None, here: Any, there: Any) -> Any:
-    """States moved by whole turns of their angles to where they are nearest to other states.
+    """Return the images of `here`, under whole turns of angles, that are nearest to `there`.
 
-    **Arguments:** `angles`, of `angles_in`; states as rows of numbers, the last axis.
+    **Arguments:** `angles`, from `angles_in`; states as rows of numbers, the last axis.
     """
     if angles is None:
         return here

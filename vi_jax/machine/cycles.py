@@ -1,5 +1,5 @@
-"""What ends a cycle where time does not, a turn of an angle or a velocity that passes zero; and the
-same machine observed at equal intervals instead."""
+"""Cycles that end with a turn of an angle or a zero of a function, not with time; and machines
+observed at equal intervals instead."""
 
 import dataclasses
 import functools
@@ -19,8 +19,8 @@ from .own import with_static
 
 
 class Counter:
-    """What counts the cycles of a machine, as its `cycle`: the class has it, an instance has the
-    usual length of a cycle instead."""
+    """The counter of a machine's cycles, its class attribute `cycle`. The `cycle` of an instance is
+    the usual length of a cycle."""
 
     def __init__(self, name: Any, usual: Any):
         self.name, self.usual = name, usual
@@ -29,7 +29,7 @@ class Counter:
         return self if machine is None else self.length(machine)
 
     def length(self, machine: Any) -> Any:
-        """The usual length of a cycle, by which steps are sized."""
+        """Return the usual length of a cycle, from which the lengths of steps follow."""
         if self.usual is not None:
             return self.usual(machine) if callable(self.usual) else self.usual
         raise ValueError(
@@ -39,14 +39,14 @@ class Counter:
 
 
 class Turn(Counter):
-    """An angle whose full turns are the cycles."""
+    """Cycles that are full turns of an angle."""
 
     def __init__(self, name: str, start: Any = 0.0, usual: Any = None):
         super().__init__(name, usual)
         self.start = start
 
     def length(self, machine: Any) -> Any:
-        """As long as a turn takes at the speed at which the machine starts."""
+        """Return `usual`, or by default the duration of a turn at the speed of `start`."""
         if self.usual is not None:
             return super().length(machine)
         speed = self.speed(machine.start())
@@ -57,22 +57,22 @@ class Turn(Counter):
                 f"{type(machine).__name__}, about how long a turn takes, because its `start` does "
                 "not turn."
             )
-        return 2 * pi / abs(speed)  # a plain number of a plain one: nothing to compile
+        return 2 * pi / abs(speed)  # plain numbers stay plain: nothing to compile
 
     def speed(self, state: State) -> Any:
-        """How fast the angle turns, where the state has that; `None` where it has not."""
+        """Return the speed of the angle, or `None` if the state does not contain it."""
         name = f"v.{self.name}"
         return component(name, state) if has_component(name, state) else None
 
     def longest_step(self, machine: Any, state: State) -> Any:
-        """A fifth of the usual turn, or of one at the present speed."""
+        """Return a fifth of the usual turn, less if the angle turns faster."""
         speed, usual = self.speed(state), self.length(machine)
         if speed is None:
             return usual / 5
         return 0.2 * usual / jnp.maximum(1.0, usual * jnp.abs(speed) / (2 * pi))
 
     def event(self) -> Reset:
-        """A full turn is taken off the angle, and a cycle ends."""
+        """Return the reset that subtracts a full turn from the angle and ends a cycle."""
 
         def guard(machine: Any, s: Scalar, state: State, *modes: Any) -> Any:
             return component(self.name, state) - (self.start + 2 * pi)
@@ -84,73 +84,70 @@ class Turn(Counter):
 
 
 class _TurnOver(Reset):
-    """The end of a turn. Its guard is an angle, which falls by a whole turn there."""
+    """The end of a turn. Its guard, an angle, falls by a whole turn there."""
 
     from_below: ClassVar = False
-    looked_at_within: ClassVar = False  # a shaft does not turn to and fro within a step
+    looked_at_within: ClassVar = False  # a shaft does not reverse twice in a step
 
 
 class Passing(Counter):
-    """A number of the state, or a function of it, that ends a cycle where it passes through
-    zero."""
+    """Cycles that end where a component, or a function of the state, passes through zero."""
 
     def __init__(self, name: Any, sign: float, usual: Any = None):
         super().__init__(name, usual)
         self.sign = sign
 
     def section(self, machine: Any, state: State) -> Any:
-        """The function that rises through zero at the end of a cycle."""
+        """Return the function that rises through zero at the end of a cycle."""
         where: Any = self.name
         value: Any = where(machine, state) if callable(where) else component(where, state)
         return value if self.sign > 0 else -value
 
 
 def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
-    """Count the cycles of a machine by the turns of an angle, as its `cycle`:
-    `cycle = vi.turn_of("phi")`.
+    """Count the cycles of a machine by the turns of an angle: `cycle = vi.turn_of("phi")`.
 
-    At a full turn of the angle beyond `start`, a cycle ends and 2π is taken off. The machine may
-    start from rest in time; its orbits, branches and exponents are those of its turns. An angle
-    that turns backward ends no cycle.
+    At a full turn of the angle beyond `start`, a cycle ends and 2π is subtracted from the angle.
+    The machine may start from rest in time; its orbits, branches and exponents are those of its
+    turns. An angle that turns backward ends no cycle.
 
-    **Arguments:** `name`, of the angle in the state, in a `Mechanical` a coordinate; `start`, the
-    angle (radians) at which a cycle begins; `usual`, about how long a turn takes, by default as
-    long as at the speed with which the machine's own `start` turns.
+    **Arguments:** `name`, the angle in the state, in a `Mechanical` a coordinate; `start`, the
+    angle (radians) at which a cycle begins; `usual`, the approximate duration of a turn, by default
+    that at the speed of the machine's own `start`.
     """
     return Turn(name, start, usual)
 
 
 def rising(name: str | Callable[..., Any], *, usual: Any) -> Any:
-    """End the cycles of a machine where a number of its state rises through zero, as its `cycle`:
-    `cycle = vi.rising("v", usual=6.3)`.
+    """End the cycles of a machine where a component of its state rises through zero: `cycle =
+    vi.rising("v", usual=6.3)`.
 
-    **Arguments:** `name`, of the number, or a function: `lambda m, z: z.x - m.level`; `usual`,
-    about how long a cycle takes, for the length of steps: a number, or a function of the machine.
+    **Arguments:** `name`, the component, or a function: `lambda m, z: z.x - m.level`; `usual`, the
+    approximate length of a cycle, for the lengths of steps: a number, or a function of the machine.
     """
     return Passing(name, 1.0, usual)
 
 
 def falling(name: str | Callable[..., Any], *, usual: Any) -> Any:
-    """End the cycles of a machine where a number of its state falls through zero; as `rising`."""
+    """End the cycles of a machine where a component falls through zero (see `rising`)."""
     return Passing(name, -1.0, usual)
 
 
 def counter_of(machine: Any) -> Counter | None:
-    """What counts the cycles of a machine, `None` where it says so in another way."""
+    """Return the counter of a machine's cycles, or `None` without a counter."""
     found = getattr(type(machine), "cycle", None)
     return found if isinstance(found, Counter) else None
 
 
 def at_intervals(machine: Any, interval: Any) -> Any:
-    """The same machine with cycles of equal length, which no event ends."""
+    """Return the same machine with cycles of equal length, which no event ends."""
     kind = type(machine)
     observed = {"observed_usual": machine.cycle, "observed_interval": interval}
     return _as_kind(_observed_kind(kind), kind, machine, interval, **observed)
 
 
 def _as_kind(new_kind: type, kind: type, machine: Any, cycle: Any, **others: Any) -> Any:
-    """A machine of another class with the fields that `kind` has; `cycle` takes the place of a
-    field of that name."""
+    """Return a machine as another class, with the fields of `kind` except a field `cycle`."""
     values = {name: getattr(machine, name) for name in _fields(kind)} | others
     if "cycle" in values:
         values["cycle"] = cycle
@@ -163,7 +160,7 @@ def _fields(kind: Any) -> list[str]:
 
 @functools.lru_cache(maxsize=64)
 def _observed_kind(kind: type) -> type:
-    """The class of a machine observed at equal intervals."""
+    """Return the class of a machine observed at equal intervals."""
 
     def original(self: Any) -> Any:
         return _as_kind(kind, kind, self, self.observed_usual)
@@ -190,5 +187,5 @@ def _observed_kind(kind: type) -> type:
 
 
 def _goes_on(event: AbstractEvent) -> AbstractEvent:
-    """The same event, with which no cycle ends."""
+    """Return the same event without the end of a cycle."""
     return with_static(event, ends_cycle=False) if event.ends_cycle else event

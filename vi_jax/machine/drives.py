@@ -1,4 +1,4 @@
-"""What drives the paper's scene: cranks, drives of unlimited and of limited power, and states."""
+"""Cranks, drives of unlimited and of limited power, and states of the paper's scene."""
 
 import abc
 import dataclasses
@@ -16,7 +16,7 @@ from ..lanes import sincos
 from .numbers import Shown
 from .own import by_default, is_own
 
-# The units of the paper's scene, by names of quantities, of components of a state and of numbers.
+# The units of the paper's scene, by the names of quantities, components and parameters.
 UNITS: Mapping[str, str] = MappingProxyType({
     "position": "a", "velocity": "a ω", "time": "1/ω", "rate": "ω", "energy": "m_C a² ω²",
     "power": "m_C a² ω³", "Y": "a", "V": "a ω", "W": "ω", "M": "J ω²", "phase": "rad",
@@ -28,7 +28,7 @@ Number = Float[Array, "..."]
 
 
 class OscillatorState(Shown):
-    """State of an ideally driven scene, or of another machine, whose units are its own."""
+    """State of an ideally driven scene, or of another machine, in the machine's units."""
 
     Y: Number
     """Position of the body (unit: a)."""
@@ -66,7 +66,7 @@ class TimedDCMotorState(DCMotorState):
 
 
 class Slide(NamedTuple):
-    """The slider's displacement U and its first two derivatives by the crank angle (unit: a)."""
+    """The slider's displacement U, dU/dφ and d²U/dφ², with the crank angle φ (unit: a)."""
 
     U: Float[Array, "..."]
     U_phi: Float[Array, "..."]
@@ -78,17 +78,17 @@ class AbstractCrank(Shown):
 
     @property
     def is_odd(self) -> bool:
-        """Whether the slider is at the opposite place half a turn later: U(φ + π) = -U(φ)."""
+        """True if the slider is at the opposite place half a turn later: U(φ + π) = -U(φ)."""
         return False
 
     @property
     def drawn_rod(self) -> Scalar | float:
-        """Length of the rod in pictures (unit: a)."""
+        """The length of the rod in pictures (unit: a)."""
         return 3.0
 
     @abc.abstractmethod
     def slide(self, phase: Float[Array, "..."]) -> Slide:
-        """The slider's displacement at crank angle `phase` (radians), in units of the crank a."""
+        """Return the slider's displacement at crank angle `phase` (radians), in crank radii."""
 
 
 class CosineCrank(AbstractCrank):
@@ -101,7 +101,7 @@ class CosineCrank(AbstractCrank):
 
     @by_default
     def slide(self, phase: Float[Array, "..."]) -> Slide:
-        """U = cos φ and its derivatives (dimensionless)."""
+        """Return U = cos φ and its derivatives (dimensionless)."""
         sine, cosine = sincos(phase)
         return Slide(cosine, -sine, -cosine)
 
@@ -118,11 +118,11 @@ class SliderCrank(AbstractCrank):
 
     @property
     def drawn_rod(self):
-        """Length of the rod in radii of the crank, 1/λ, for drawings."""
+        """The length of the rod in crank radii, 1/λ, for drawings."""
         return 1 / self.ratio
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
-        """Exact U and its derivatives (dimensionless)."""
+        """Return the exact U and its derivatives (dimensionless)."""
         sine, cosine = sincos(phase)
         inverse = 1 / (1 - (self.ratio * sine) ** 2) ** 0.5
         # (r - 1)/λ as -λ sin²/(1 + r): no cancellation for a long rod.
@@ -132,7 +132,7 @@ class SliderCrank(AbstractCrank):
         return Slide(cosine - lag, -sine - slope, -cosine - bend)
 
 
-# Why a drive has no such component, where there is more to say than that it has none.
+# Reasons for the absence of a component, for error messages.
 _WITHOUT = {
     "W": "an ideal drive turns at its frequency ratio",
     "M": "only a `DCMotor` has a torque of its own",
@@ -142,46 +142,45 @@ _WITHOUT = {
 class AbstractDrive(Shown):
     """The drive of the crank of a `Scene`.
 
-    A subclass defines the motion of body and shaft (`field`) and the class of its states. Their
-    components are `Y` and `V` of the body, then those of the drive: the crank speed `W` is one of
+    A subclass defines the equations of body and shaft (`field`) and the class of its states. States
+    have `Y` and `V` of the body, then the components of the drive. The crank speed `W` is one of
     them, unless `fixed_speed` returns it.
     """
 
     state: ClassVar[type]
-    """Of its states, by crank angle."""
+    """The class of its states by crank angle."""
     timed_state: ClassVar[type | None] = None
-    """By time, with the crank angle `phase` as one more component at the end; `None` where time
-    itself tells the angle."""
+    """The class of its states by time, with the crank angle `phase` as last component; `None` if
+    the angle is a function of time."""
     caption: ClassVar[str] = "drive"
-    """What pictures write beside the crank."""
+    """The label of the crank in pictures."""
 
     @property
     def fixed_speed(self) -> Float[Array, "..."] | None:
-        """The speed of the crank (unit: ω) where it is no part of the state."""
+        """The crank speed (unit: ω), if it is not part of the state; else `None`."""
         return None
 
     @abc.abstractmethod
     def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
-        """d(state)/ds, by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
+        """Return d(state)/ds by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
 
-        **Arguments:** the scene, for its `crank`, `phase_at` and `pull`; s, the state, and what
-        compliant stops add to the body's acceleration.
+        **Arguments:** `scene`, for its `crank`, `phase_at` and `pull`; `s`; `state`; `pushes`, the
+        accelerations of the body by compliant stops.
         """
 
     def rate(self) -> Float[Array, "..."] | None:
-        """The fastest rate of decay in the drive, with respect to τ; `None` if nothing decays."""
+        """Return the fastest decay rate with respect to τ, or `None` if nothing decays."""
         return None
 
     def usual(self, name: str, known: dict[str, Any]) -> Any:
-        """The value of a component of the drive that a start leaves out; `known` are the components
-        before it."""
+        """Return a component that a start leaves out; `known` are the components before it."""
         raise ValueError(
             f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
             "no `usual` for it."
         )
 
     def check(self) -> None:
-        """**Raises:** `TypeError` for a drive that lacks what a scene asks of it."""
+        """Raise `TypeError` for a drive without a member that a scene needs."""
         kind, state = type(self), getattr(self, "state", None)
         if not isinstance(state, type):
             raise TypeError(
@@ -194,10 +193,10 @@ class AbstractDrive(Shown):
             )
 
     def begin(self, **given: Any) -> dict[str, Any]:
-        """The drive's components of a start, by name; a component that is not given, or `None`, has
-        its `usual` value.
+        """Return the drive's components of a start, by name. A component that is not given, or
+        `None`, has its `usual` value.
 
-        **Raises:** `ValueError` if a number is not finite, or no component of its state.
+        **Raises:** `ValueError` if a number is not finite, or not a component of its state.
         """
         names = [part.name for part in dataclasses.fields(self.state)][2:]
         for name, value in given.items():
@@ -217,7 +216,7 @@ class AbstractDrive(Shown):
         return found
 
     def speed(self, state: State) -> Float[Array, "..."]:
-        """How fast the crank turns (unit: ω), without sign."""
+        """Return the absolute speed of the crank (unit: ω)."""
         fixed = self.fixed_speed
         return jnp.abs(state.W) if fixed is None else fixed
 
@@ -236,11 +235,11 @@ class IdealDrive(AbstractDrive):
 
     @property
     def fixed_speed(self):
-        """ζ, the frequency ratio, at which an ideal drive turns under any load."""
+        """The frequency ratio ζ, the speed of the crank under any load."""
         return self.frequency_ratio
 
     def field(self, scene, s, state, pushes):
-        """d(state)/ds of the body alone, by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""
+        """Return d(state)/ds of the body by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""
         zeta = self.frequency_ratio
         timed = scene.clock_name == "time"
         slide = scene.crank.slide(scene.phase_at(zeta * s if timed else s))
@@ -251,7 +250,7 @@ class IdealDrive(AbstractDrive):
 
 
 class Motor(AbstractDrive):
-    """A DC motor of limited power with a straight torque-speed line (Eq. 3 of the paper).
+    """A DC motor of limited power with a linear torque-speed characteristic (Eq. 3 of the paper).
 
     (1 + μ U_φ²) φ'' + μ U_φ U_φφ φ'² = τ0 (κ - φ'/w0) + ε U_φ (Y - U)
     """
@@ -281,11 +280,10 @@ class Motor(AbstractDrive):
         require_ranges(self)
 
     def field(self, scene, s, state, pushes):
-        """d(state)/ds of body and shaft: by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5
-        to 7)."""
+        """Return d(state)/ds by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5 to 7)."""
         by_angle = scene.clock_name == "phase"
         slide = scene.crank.slide(scene.phase_at(s if by_angle else state.phase))
-        # By angle all is divided by W. Products with 1/W are shared: a power series pays for each.
+        # Rates by angle are divided by W. Products with 1/W are shared: each costs in power series.
         pace = 1 / state.W if by_angle else None
 
         def paced(x):
@@ -302,57 +300,52 @@ class Motor(AbstractDrive):
     def torque(
         self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
-        """The motor's torque (per J ω²), and the rates of its components after W. By crank angle
-        they are divided by W, which `paced` does."""
+        """Return the motor's torque (per J ω²), and the rates of the components after W. By crank
+        angle, `pace` is 1/W, and the function `paced` divides both by W."""
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):
-        """A speed that a start leaves out is the no-load speed κ w0."""
+        """Return the default of `W`, the no-load speed κ w0."""
         return self.control * self.no_load_speed
 
     def rate(self):
-        """The rate, by τ, at which the shaft comes back to speed."""
+        """Return the rate, with respect to τ, at which the shaft returns to its speed."""
         return self.strength / self.no_load_speed
 
     def line(self, W: Number, pace: Number | None = None) -> Number:
-        """The straight line: the motor's steady torque at speed `W`, per J ω²; with `pace` 1/W,
-        divided by W."""
+        """Return the motor's steady torque at speed `W`, per J ω²; divided by W if `pace` = 1/W."""
         slope = 1 / self.no_load_speed
         if pace is None:
             return self.strength * (self.control - W * slope)
         return self.strength * (self.control * pace - slope)
 
     def shaft(self, slide: Slide, torque: Number, stretch: Number, square: Number) -> Number:
-        """dW/dτ from the motor's torque (per J ω²), U - Y and W² at this place of the slider.
-
-        It is linear in these three: divided by W they give dW/dφ.
-        """
+        """Return dW/dτ from the motor's torque (per J ω²), U - Y and W². It is linear in these
+        three: divided by W they give dW/dφ."""
         load = self.coupling * stretch + self.slider_inertia * slide.U_phiphi * square
         return (torque - slide.U_phi * load) / self.inertia(slide)
 
     def inertia(self, slide: Slide) -> Number:
-        """Inertia that the shaft feels, per J."""
+        """Return the effective inertia of the shaft, per J."""
         return 1 + self.slider_inertia * slide.U_phi**2
 
 
 class DCMotor(Motor):
     """A DC motor with the inductance of its armature, at a constant voltage.
 
-    With the armature's L i' + R i + K_e φ' = u and the torque K_t i (primes: d/dt), and the torque
-    M = K_t i/(J ω²) as one more component of the state, it has
+    The armature has L i' + R i + K_e φ' = u and the torque K_t i (primes: d/dt). The state has one
+    more component, the torque M = K_t i/(J ω²), with
 
-        τe dM/dτ = τ0 (κ - W/w0) - M
-
-    and `Motor`'s equation of the shaft with M in the line's place, where
-
+        τe dM/dτ = τ0 (κ - W/w0) - M,
         τe = ω L/R,  κ τ0 = K_t u/(R J ω²),  κ w0 = u/(K_e ω).
 
-    Its steady torque is `Motor`'s line, which it approaches at first order in τe as τe → 0. In
-    units of J ω² (and J ω³) the source gives the power κ w0 M, the armature turns the power
-    M² w0/τ0 into heat and holds the energy τe M² w0/(2 τ0), and the shaft gets the power M W.
+    M replaces the steady torque in `Motor`'s equation of the shaft. As τe → 0, the motor becomes a
+    `Motor`, with a difference of first order in τe. The source gives the power κ w0 M, the armature
+    turns M² w0/τ0 into heat, and the shaft gets M W (unit: J ω³). The armature holds the energy τe
+    M² w0/(2 τ0) (unit: J ω²).
 
-    Explicit methods are kept to steps of about τe, so that a motor of small τe costs more the
-    smaller it is: below 0.05 use `Motor`, unless you need the current itself.
+    Explicit methods are limited to steps of about τe, so that a small τe is expensive: below 0.05
+    use `Motor`, unless you need the current itself.
     """
 
     electrical_time: Float[Array, "..."] = eqx.field(
@@ -364,21 +357,19 @@ class DCMotor(Motor):
     timed_state: ClassVar = TimedDCMotorState
 
     def torque(self, state, pace, paced):
-        """The torque M of the state, and how fast it builds up."""
+        """Return the torque M of the state, and its rate."""
         return paced(state.M), (paced(self.build_up(state.W, state.M)),)
 
     def usual(self, name, known):
-        """A torque that a start leaves out is the steady one at its speed."""
+        """Return the default of `W`, or of `M` the steady torque at that speed."""
         return self.line(known["W"]) if name == "M" else super().usual(name, known)
 
     def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:
-        """dM/dτ at this speed and torque."""
+        """Return dM/dτ at this speed and torque."""
         return (self.line(W) - M) / self.electrical_time
 
     def rate(self) -> Float[Array, "..."]:
-        """The fastest rate of shaft and armature together, by τ.
-
-        1/τe of the current, or where that is slow √(τ0/(w0 τe)), at which speed and current swing.
-        """
+        """Return the fastest rate of shaft and armature together, with respect to τ: 1/τe of the
+        current or, if that is slow, √(τ0/(w0 τe)) of the oscillation of speed and current."""
         own = 1 / self.electrical_time
         return jnp.maximum(own, jnp.sqrt(own * self.strength / self.no_load_speed))

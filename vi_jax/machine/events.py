@@ -1,7 +1,7 @@
-"""The events of a machine by their numbers: their guards, what happens then; and its modes, in a
-state or beside it; switches and resets that a user writes by functions.
+"""The events of a machine by number: their guards, their jumps, their modes; and the switches and
+resets that users define by functions.
 
-An argument `number` is that of an event, `modes` are all of the machine, before the event, and
+An argument `number` is that of an event. `modes` are all of the machine, before the event, and
 `contact` is as in `Around`.
 """
 
@@ -27,26 +27,25 @@ from .state import changed
 
 
 def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """All events of a machine, in the order in which they are numbered: its stops, its switches,
-    its other events, its section."""
+    """Return all events by number: stops, switches, other events, and the section."""
     return (*stops_of(machine), *switches_of(machine), *others_of(machine), Section())
 
 
 def is_autonomous(machine: Machine, state: State) -> bool:
-    """Whether an event ends the cycles of a machine, instead of its clock."""
+    """Return whether an event, not the clock, ends the cycles of a machine."""
     ends = any(event.ends_cycle for event in events_of(machine)[:-1])
     return ends or machine._section(state) is not None
 
 
 def section_number(machine: Machine) -> int:
-    """The section's number among the machine's events: the last."""
+    """Return the number of the section, the last of the machine's events."""
     return len(events_of(machine)) - 1
 
 
 def guard_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalar:
-    """The guard of one of a machine's events, which rises through zero where it happens."""
+    """Return the guard of an event, which rises through zero where the event happens."""
     event, own, more = event_of(machine, number, modes, contact)
     return event.guard(machine, s, state, *modes[own], **more)
 
@@ -54,26 +53,26 @@ def guard_of(
 def sides_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalars:
-    """Smooth functions of which the greatest is the guard of one of a machine's events."""
+    """Return smooth functions whose maximum is the guard of an event."""
     event, own, more = event_of(machine, number, modes, contact)
     return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[own], **more)))
 
 
 def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
-    """The state after one of a machine's events as a smooth function of that before it (see
-    `AbstractEvent.jump`)."""
+    """Return the state after an event as a smooth function of that before it
+    (`AbstractEvent.jump`)."""
     event, own, _ = event_of(machine, number, modes, ())
     return _with_friction(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
 
 
 def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """Whether one of a machine's events happens where its guard has risen; `None` if always."""
+    """Return whether an event happens when its guard rises through zero; `None` for always."""
     event, own, _ = event_of(machine, number, modes, ())
     return event.happens(machine, s, state, *modes[own])
 
 
 def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """What the log of events keeps of one of a machine's events."""
+    """Return the value of an event in the event log."""
     event, own, _ = event_of(machine, number, modes, ())
     return event.value(machine, s, state, *modes[own])
 
@@ -81,7 +80,7 @@ def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Mode
 def after_event(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> tuple[State, Modes]:
-    """State and modes after one of a machine's events."""
+    """Return state and modes after an event."""
     event, own, more = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[own], **more)
     if event.holds_mode:
@@ -100,32 +99,31 @@ def _with_friction(machine: Machine, number: int, s: Scalar, before: State, afte
 
 
 def friction_on(machine: Machine, number: int) -> Any:
-    """The friction on stop number `number`, or `None`."""
+    """Return the friction on stop number `number`, or `None`."""
     if number >= len(stops_of(machine)):
         return None
     return next((x for x in switches_of(machine) if x.friction_stop == number), None)
 
 
 def has_contact_friction(machine: Machine) -> bool:
-    """Whether there is friction on one of its stops."""
+    """Return whether there is friction on a stop."""
     return any(x.friction_stop is not None for x in switches_of(machine))
 
 
 def mode_number(machine: Machine, number: int) -> int:
-    """The place among the machine's modes of the one that an event holds."""
+    """Return the index of an event's mode among the machine's modes."""
     return sum(event.holds_mode for event in events_of(machine)[:number])
 
 
 def own_modes(machine: Machine, modes: Modes) -> Modes:
-    """Return those of a machine's modes that no event holds: its own."""
+    """Return the modes of the machine that belong to no event."""
     return modes[mode_number(machine, len(events_of(machine))) :]
 
 
 def event_of(
     machine: Machine, number: int, modes: Modes, contact: Scalars
 ) -> tuple[AbstractEvent, slice, dict[str, Around]]:
-    """An event, which of the machine's modes its methods get (its own or all), and what keyword
-    arguments besides."""
+    """Return an event, the slice of the modes that its methods receive, and their keywords."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
@@ -137,14 +135,14 @@ def event_of(
 def begin_modes(
     machine: Machine, s: Scalar, state: State, own: Sequence[Any] | None = None
 ) -> Modes:
-    """The modes of a motion that begins in `state`: those that events hold, in their order, then
-    the machine's own, which are `own` where that is given."""
+    """Return the initial modes of a motion in `state`: those of events, in their order, then the
+    machine's own, which are `own` if that is given."""
     state = jtu.tree_map(jnp.asarray, state)  # a start may hold Python's numbers
     held = [event for event in events_of(machine) if event.holds_mode]
     own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in held), *own]
     modes = settled_modes(modes, s)
-    if any(event.sees_around for event in held):  # which looks at the other modes
+    if any(event.sees_around for event in held):  # whose mode depends on the others
         modes = struck_modes(machine, s, state, modes)
     return modes
 
@@ -153,7 +151,7 @@ def struck_modes(
     machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
     contact: Scalars = (),
 ) -> Modes:  # fmt: skip
-    """The modes after the state has jumped to this one, the machine's own as they are or `own`."""
+    """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
     held = []
     together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
@@ -170,26 +168,25 @@ def struck_modes(
 
 
 def holds_anywhere(machine: Machine) -> bool:
-    """Whether there is friction that may hold a body wherever that is."""
+    """Return whether there is friction that may hold a body anywhere."""
     return any(x.is_dry for x in switches_of(machine))
 
 
 def modes_at_start(machine: Machine, s: Scalar, state: State) -> tuple[Any, ...]:
-    """The machine's own modes of a motion that begins in `state`."""
+    """Return the machine's own initial modes of a motion that begins in `state`."""
     modes = machine.modes
     return _values(modes(s, state) if callable(modes) else declared_modes(machine))
 
 
 def _values(modes: Any) -> tuple[Any, ...]:
-    """Modes as a user gives them, one, several or by name, in a tuple."""
     if isinstance(modes, Mapping):
         return tuple(modes.values())
     return tuple(modes) if isinstance(modes, tuple | list) else (modes,)
 
 
 def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
-    """The machine's own modes after an event, of which a user's function, `whose`, returned all, or
-    a dictionary of those that change.
+    """Return the machine's own modes after an event, for which a user's function `whose` returned
+    `found`: all, or a dictionary of those that change.
 
     **Raises:** `TypeError` for a name that the machine does not declare.
     """
@@ -207,7 +204,7 @@ def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple
 
 
 def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:
-    """Modes as the loop carries them: floats, which nothing is differentiated by."""
+    """Return modes as floats without derivatives, as the loop carries them."""
     return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)
 
 
@@ -215,8 +212,8 @@ class HybridState(Shown):
     """A state together with the machine's discrete modes, a start that continues another motion.
 
     A machine with discrete modes (`AbstractMachine.modes`) is not determined by its state alone.
-    `Run.last` and `Orbit.state` of such a machine are of this class. Its components are those of
-    `state`: `run.last.Y` is `run.last.state.Y`.
+    Its `Run.last` and `Orbit.state` are of this class. The components are those of `state`:
+    `run.last.Y` is `run.last.state.Y`.
 
     **Arguments:**
 
@@ -237,30 +234,30 @@ class HybridState(Shown):
 
 
 def bare(state: State) -> State:
-    """The state without modes."""
+    """Return the state without modes."""
     return state.state if isinstance(state, HybridState) else state
 
 
 def modes_of(state: State) -> tuple[Any, ...] | None:
-    """The machine's own modes in a state; `None` if it says nothing of them."""
+    """Return the machine's own modes in a state, or `None` if it contains no modes."""
     return state.modes if isinstance(state, HybridState) else None
 
 
 def with_modes(state: State, modes: tuple[Any, ...] | None) -> State:
-    """Return the state in these modes of the machine's own; as it is if there are none."""
+    """Return the state with these own modes of the machine; unchanged without modes."""
     return HybridState(state, modes) if modes else state
 
 
 def replaced(state: State, new: State) -> State:
-    """Another state in the same modes."""
+    """Return another state in the same modes."""
     return HybridState(new, state.modes) if isinstance(state, HybridState) else new
 
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:
-    """The state with the modes of a motion that begins in it; as it is if it has some, or the
-    machine has none of its own.
+    """Return the state with the initial modes of a motion that begins in it; unchanged if it has
+    modes, or the machine has none.
 
-    **Arguments:** `axes`, how many axes the state has in front.
+    **Arguments:** `axes`, the number of leading axes of the state.
     """
     if isinstance(state, HybridState) or not has_own_modes(machine):
         return state
@@ -275,7 +272,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
 
 def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:
-    """`ravel_pytree` of a state whose modes stay what they are: they are no unknowns."""
+    """Return `ravel_pytree` of a state whose modes are no unknowns: they stay unchanged."""
     row, unravel = ravel_pytree(bare(state))
     return row, lambda row: replaced(state, unravel(row))
 
@@ -283,14 +280,13 @@ def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:
 class Switch(AbstractSwitch):
     """A mode that is the sign of a function: +1 where `function(machine, s, state)` is positive.
 
-    At zero it is the sign of `rate(machine, s, state)`, the derivative of the function, if that is
-    given, else +1.
+    At zero it is the sign of `rate(machine, s, state)`, its derivative, or +1 without it.
 
     If the fields of both modes point at the surface on which the function vanishes, the motion
-    cannot leave it. With `slides=True` it slides along (mode 0) by Filippov's rule: its field is
-    the mean of the two, weighted between 0 and 1, that keeps the function at zero. It leaves when
-    one of the two points away. Otherwise such a lane ends as `RESULTS.sliding`. The machine's field
-    is never called with mode 0.
+    cannot leave it. With `slides=True` it slides along the surface (mode 0) by Filippov's rule. Its
+    field is then the weighted mean of the two, with weights in [0, 1], that keeps the function at
+    zero. It leaves when one of the two points away. Without `slides` such a lane ends as
+    `RESULTS.sliding`. The machine's field is never called with mode 0.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
@@ -299,21 +295,21 @@ class Switch(AbstractSwitch):
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
-        """True if it has no mode for that."""
+        """True if the switch has no mode for sliding."""
         return not self.slides
 
     @property
     def blends(self) -> bool:  # pyright: ignore
-        """Whether it slides: then mode 0 is the motion along its surface."""
+        """True if mode 0 is sliding along the surface."""
         return self.slides
 
     @property
     def sees_around(self) -> bool:  # pyright: ignore
-        """True if it slides: the directions of both fields depend on the other modes."""
+        """True if it slides: the fields on both sides depend on the other modes."""
         return self.slides
 
     def begin(self, machine, s, state):
-        """The sign of the function."""
+        """Return the sign of the function."""
         whose = f"The function of {self.name or 'a Switch'} of a {type(machine).__name__}"
         value = called(self.function, whose, machine, s, state)
         rate = jnp.ones_like(value) if self.rate is None else self.rate(machine, s, state)
@@ -321,8 +317,8 @@ class Switch(AbstractSwitch):
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The mode after an impact or another jump: the sign of the function; 0 on a surface that
-        both fields point at."""
+        """Return the mode after an impact or another jump: the sign of the function, or 0 on a
+        surface that both fields point at."""
         side = self.begin(machine, s, state)
         if around is None:
             return side
@@ -335,8 +331,8 @@ class Switch(AbstractSwitch):
         return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
-        """The function, falling from above or rising from below; while the motion slides, the rate
-        of the field that points away first."""
+        """Return the function, with the sign for which it rises at the event. While the motion
+        slides, return the rate of the field that points away first."""
         value = -mode * self.function(machine, s, state)
         if around is None:
             return value
@@ -344,7 +340,7 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, jnp.maximum(up, -down), value)
 
     def sides(self, machine, s, state, mode, *, around: Around | None = None):
-        """The guard; of a motion that slides the two of which it is the greater."""
+        """Return the guard; while the motion slides, the two rates of which it is the maximum."""
         value = -mode * self.function(machine, s, state)
         if around is None:
             return (value,)
@@ -352,7 +348,7 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, up, value), jnp.where(mode == 0, -down, value)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        """On the other side, or along the surface."""
+        """Return the state, and the mode of the other side or of sliding along the surface."""
         if around is None:
             return state, -mode
         up, down = self._rates(machine, s, state, around)
@@ -361,7 +357,6 @@ class Switch(AbstractSwitch):
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
     def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
-        """d/ds of the function in the modes +1 and -1."""
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
         return tuple(rate_of(self.function, machine, s, state, x) for x in (up, down))
 
@@ -370,31 +365,30 @@ class Reset(AbstractEvent):
     """A jump of the state where a guard rises through zero: a walker's heel strike, an impact with
     friction, a switch that is thrown.
 
-    All functions get `(machine, s, state, *modes)`, with the modes as the machine's field gets
-    them. A reset happens where its guard rises through zero, once it has been negative since the
-    last time. A motion that begins on the guard's surface begins after the event.
+    All functions have the arguments `(machine, s, state, *modes)`, with the modes as for the
+    machine's field. After a reset, its guard must become negative before it can trigger again. A
+    motion that begins on the guard's surface begins after the event.
 
     Events of one instant happen in the order in which the machine lists them. A jump that takes a
-    guard from below zero to above triggers that event at the same instant. An event does not
+    guard from negative to positive triggers that event at the same instant. An event does not
     trigger itself, and a jump onto the surface triggers nothing. Two resets with the same guard
-    both happen, the second in the state that the first leaves. An event that is listed after one
-    that ends a cycle belongs to the next cycle.
+    both happen, the second in the state after the first. An event that is listed after one that
+    ends a cycle belongs to the next cycle.
 
-    A guard may jump, such as `where(x > 1, 1.0, -1.0)`. The place is found by bisection, to 1e-12
-    in `s`, in many steps; its time has no derivative.
+    A guard may jump, such as `where(x > 1, 1.0, -1.0)`. Its zero is found by bisection, to 1e-12 in
+    `s`, in many steps; the time of such an event has no derivative.
 
     **Arguments:**
 
     - `guard`: the function that rises through zero: negative before the event, positive after it.
-    - `reset`: the state afterwards, or a dictionary of the components that change; the state stays
-      as it is if left out.
+    - `reset`: the state after the event, or a dictionary of the components that change; by default
+      the state is unchanged.
     - `when`: a flag, evaluated only at the instant at which the guard rises through zero. If it is
-      false the reset does not happen, and the guard must fall below zero before it can rise again.
-      For a reset as soon as two conditions hold take the smaller of two guards, or of a mode and a
+      false, the reset does not happen, and the guard must become negative before it can rise again.
+      For a reset as soon as two conditions hold, use the smaller of two guards, or of a mode and a
       guard: `jnp.where(on == 1, z.T - 296, -1.0)`.
-    - `modes`: the machine's discrete modes afterwards: one number, a tuple, or a dictionary of
-      those that change; by default all stay. Switches then have the modes that they have after an
-      impact.
+    - `modes`: the machine's discrete modes after the event: one number, a tuple, or a dictionary of
+      those that change; by default unchanged. Switches then have their modes after an impact.
     - `value`: a number for the event log, a function of the state before.
     - `ends_cycle`: whether a cycle ends with it.
     - `ends`: the name of an outcome with which the motion ends there, such as `"overturned"`.
@@ -429,18 +423,18 @@ class Reset(AbstractEvent):
         self.direction = one_of("direction", direction, ("rising", "falling", "both"))
 
     def guard(self, machine, s, state, *modes):
-        """The function `guard` of this state."""
+        """Return the function `guard`, with the opposite sign if the direction is falling."""
         found = self._called("guard", self._guard, machine, s, state, modes)
         return -found if self.direction == "falling" else found
 
     def one_way(self) -> "tuple[Reset, ...]":
-        """The same event as one for each direction."""
+        """Return one event for each direction."""
         if self.direction != "both":
             return (self,)
         return tuple(with_static(self, direction=way) for way in ("rising", "falling"))
 
     def after(self, machine, s, state, *modes):
-        """As `reset` and `modes` say."""
+        """Return the results of `reset` and `modes`."""
         own = None
         if self._modes is not None:
             found = self._called("modes", self._modes, machine, s, state, modes)
@@ -449,7 +443,7 @@ class Reset(AbstractEvent):
         return new, struck_modes(machine, s, new, modes, own)
 
     def jump(self, machine, s, state, *modes):
-        """The state that the function `reset` makes of this one."""
+        """Return the state after the function `reset`."""
         if self._reset is None:
             return state
         found = self._called("reset", self._reset, machine, s, state, modes)
@@ -463,13 +457,13 @@ class Reset(AbstractEvent):
         return f"`{part}` of {self.name or 'a Reset'} of a {type(machine).__name__}"
 
     def happens(self, machine, s, state, *modes):
-        """The result of the function `when` for this state, `None` without one."""
+        """Return the result of the function `when`, or `None` without one."""
         if self._when is None:
             return None
         return self._called("when", self._when, machine, s, state, modes)
 
     def value(self, machine, s, state, *modes):
-        """The function `value` of this state, NaN without one."""
+        """Return the result of the function `value`, or NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
         return self._called("value", self._value, machine, s, state, modes)

@@ -32,9 +32,9 @@ from .event import AbstractSwitch, Around
 from .own import stops_of, switches_of
 from .state import with_components
 
-# Of a set of modes that is looked for, a force may point the wrong way by this share of what
-# friction can hold: a choice, far above the accuracy of an event, at which a force is what friction
-# holds and the body does not accelerate yet.
+# In a tried set of modes, a force may have the wrong sign up to this share of the largest friction
+# force: a choice, far above the accuracy of an event, at which the force equals the largest
+# friction and the body does not accelerate yet.
 _STILL = 1e-6
 
 
@@ -42,65 +42,61 @@ class Friction(AbstractSwitch):
     """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
 
     roundings: ClassVar[int]
-    """So many roundings of the state count as no slip."""
+    """A slip below this number of roundings of the state counts as zero."""
 
-    sees_around: ClassVar = True  # the force that holds a body depends on all that holds others
-    may_slide: ClassVar = False  # where both sides point at its surface, the body sticks
+    sees_around: ClassVar = True  # a holding force depends on all other forces
+    may_slide: ClassVar = False  # there the body sticks
 
     @abc.abstractmethod
     def speed_of_slip(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """The velocity against what it rubs on."""
+        """Return the velocity relative to the surface."""
 
     @abc.abstractmethod
     def held(
         self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
     ) -> tuple[Any, Any, Any]:
-        """The force that holds a body, the largest that can, and the mass that it acts on.
+        """Return the force that holds a body, the largest possible one, and the effective mass.
 
-        **Arguments:** `contact` as in `Around`; `found`, of `held_flow`.
+        **Arguments:** `contact`, as in `Around`; `found`, from `held_flow`.
         """
 
     def touches(self, machine: Machine, contact: Scalars) -> Flag:
-        """Whether the body is on what it rubs on.
-
-        **Arguments:** `contact` as in `Around`.
-        """
+        """Return whether the body touches the surface; `contact` is as in `Around`."""
         return jnp.ones((), bool)
 
     def is_known(self, around: Around | None) -> bool:
-        """Whether it is known what else acts on the body."""
+        """Return whether the other forces on the body are known."""
         return around is not None
 
     def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
-        """The rate by s at which the slip changes along a flow."""
+        """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
     def slip_sign(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """The sign of the slip; zero where that is rounding."""
+        """Return the sign of the slip; zero if the slip is rounding."""
         slip = self.speed_of_slip(machine, s, state)
         size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
         least = stop_gradient(self.roundings * jnp.finfo(slip.dtype).eps * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
-        """The mode of a motion that begins: the sign of the slip, sticking without any."""
+        """Return the initial mode: the sign of the slip, sticking without slip."""
         return self.slip_sign(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: Around | None = None):
-        """The mode after an impact or another jump: the way that the body slips, or would begin
-        to."""
+        """Return the mode after an impact or another jump: the direction of slip or its onset."""
         slips = self.slip_sign(machine, s, state)
         if not self.is_known(around):
             return slips
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around, True), slips)
 
     def guard(self, machine, s, state, mode, *, around: Around | None = None):
-        """The slip coming to zero; or the force coming to what friction can hold. Nothing happens
-        where a body does not rest on the stop that it rubs on."""
+        """Return the guard of slip that vanishes, or of a force that exceeds friction. It is
+        negative for a body that does not rest on the stop with this friction."""
         return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
 
     def sides(self, machine, s, state, mode, *, around: Around | None = None):
-        """The guard for a force forward and for one backward."""
+        """Return the guard for a force forward and for one backward."""
         slows = -mode * self.speed_of_slip(machine, s, state)
         if around is None or not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
@@ -110,16 +106,16 @@ class Friction(AbstractSwitch):
             pull, most = self._balance(machine, s, state, around, mode)
             return pull - most, -pull - most
 
-        # Of a body that slips, or does not touch, no force is asked.
+        # Without sticking, no force is computed.
         free = jnp.where(touches, slows, -1.0)
         return jax.lax.cond((mode == 0) & touches, forces, lambda: (free, free))
 
     def _balance(
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
     ) -> tuple[Any, Any]:
-        """The force that friction balances on a body that sticks, and the largest that it can.
+        """Return the force that friction balances on a body that sticks, and the largest one.
 
-        **Arguments:** `around`, the other modes and who rests where; `mode`, its own.
+        **Arguments:** `around`, the other modes and the resting contacts; `mode`, its own.
         """
         once: Any = _held
         _, found = once(machine, s, state, around.instead(mode), around.contact)
@@ -129,8 +125,8 @@ class Friction(AbstractSwitch):
     def _from_rest(
         self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
     ) -> Scalar:
-        """The mode of a body without slip: sticking where the force is not too large, else the way
-        that it pulls.
+        """Return the mode of a body without slip: sticking if the force is not too large, else the
+        direction of the force.
 
         **Arguments:** `sticks`, whether the body may stick at all.
         """
@@ -145,34 +141,32 @@ class Friction(AbstractSwitch):
 def _held(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
-    """`held_flow` as a jitted function: a step calls it many times, and JAX traces and
-    differentiates it once."""
+    """Jit-compile `held_flow`: a step calls it many times, and JAX traces it once."""
     return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)
 
 
 class DryFriction(Friction):
     """Coulomb friction on a body: it slides against a force, or sticks.
 
-    While the body slides, friction is `level` against the motion. At zero slip the body sticks as
-    long as the force that holds it is at most `static_ratio` times the level at no speed; otherwise
-    it goes through, or off. The machine's field does not contain it. Several frictions that stick
-    at once are solved for together, also with bodies held on rigid stops.
+    While the body slides, the friction force is `level`, against the motion. At zero slip the body
+    sticks as long as the force that holds it is at most `static_ratio` times the level at zero
+    speed. Otherwise it slides on, or begins to slide. The machine's field does not contain the
+    friction. Several sticking frictions are solved for together, also with contacts at rest.
 
     **Arguments:**
 
-    - `level`: μN in the machine's unit of force, not negative; or a function of the speed of
-      sliding (Stribeck's curve), smooth from a little below zero on. A function with parameters is
-      a pytree, an `equinox.Module` with `__call__`.
+    - `level`: μN in the machine's unit of force, not negative; or a function of the sliding speed
+      (Stribeck's curve), smooth from a little below zero on. A function with parameters is a
+      pytree, an `equinox.Module` with `__call__`.
     - `on`: the name of the velocity that it acts on, `"u"`; of a `Mechanical` a coordinate, or a
       function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
-    - `mass`: of that body, 1 by default; a `Mechanical` knows it.
-    - `slip(z)` or `slip(t, z)`: the velocity relative to a surface that moves, such as
-      `slip=lambda z: z.u - belt`. It may jump where a cycle begins, not within one.
+    - `mass`: the mass of that body, 1 by default; a `Mechanical` computes it.
+    - `slip(z)` or `slip(t, z)`: the velocity relative to a surface that moves, such as `slip=lambda
+      z: z.u - belt`. It may jump where a cycle begins, not within one.
     - `push`: instead of `on` and `mass`, the change of the rate of each component by a unit of
       force, by name, if the friction acts on several.
-    - `load(z)`, `load(t, z)` or `load(machine, t, z)`: what the level is multiplied by, not
-      negative: the force N that presses the surfaces together, if it varies; `level` is then μ. 1
-      by default.
+    - `load(z)`, `load(t, z)` or `load(machine, t, z)`: a factor of the level, not negative: the
+      normal force N, if it varies; `level` is then μ. 1 by default.
     - `static_ratio`: μ_s/μ, at least 1.
     """
 
@@ -208,8 +202,7 @@ class DryFriction(Friction):
         return machine._coordinate_on(self.on, self.mass).velocity(state)
 
     def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
-        """The change of the state by an impulse that changes the slip by one, and the mass that the
-        force acts on."""
+        """Return the change of the state by an impulse of unit slip, and the effective mass."""
         if self.push is None:
             body = machine._coordinate_on(self.on, self.mass)
             push, mass = push_of(body, state), body.mass_at(s, state)
@@ -224,11 +217,11 @@ class DryFriction(Friction):
 
     @property
     def slip_takes_time(self) -> bool:
-        """Whether the surface may move by the clock; static."""
+        """True if the surface may move as a function of time; static."""
         return self.slip is not None and _argument_count(self.slip) > 1
 
     def as_velocity(self, machine: Machine, s: Scalar) -> Any:
-        """The slip in the place of a coordinate's velocity."""
+        """Return an object with the slip as the velocity of a coordinate."""
         return SimpleNamespace(velocity=lambda state: self.speed_of_slip(machine, s, state))
 
     def held(self, machine, s, state, contact, found):
@@ -236,19 +229,19 @@ class DryFriction(Friction):
         return force, self.sticking(machine, s, state), mass
 
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
-        """The friction force on a body that slides forward or backward; in mode 0 on one that
-        begins to slide."""
+        """Return the friction force on a body that slides forward or backward; in mode 0 on one
+        that begins to slide."""
         level = self.level
         if callable(level):
             level = level(mode * self.speed_of_slip(machine, s, state))
         return level if self.load is None else level * asked(self.load, machine, s, state)
 
     def sticking(self, machine: Machine, s: Scalar, state: State) -> Any:
-        """The largest force that friction can balance on a body at rest."""
+        """Return the largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
     def push_in(self, machine, s, state, mode):
-        """The change of the slip by the force on a body that slides, and its push."""
+        """Return the change of the slip by the force on a body that slides, and its push."""
         push, mass = self.row(machine, s, state)
         return -mode * self.sliding(machine, s, state, mode) / mass, push
 
@@ -257,7 +250,7 @@ class DryFriction(Friction):
         return new, self._from_rest(machine, s, new, around, mode != 0)
 
     def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
-        """The state without slip, which vanishes to rounding."""
+        """Return the state with a slip of zero, where it vanishes to rounding."""
         if self.slip is None and self.push is None:
             body = machine._coordinate_on(self.on, self.mass)
             velocity = body.velocity(state)
@@ -271,21 +264,20 @@ class ContactFriction(Friction):
 
     In an impact the body sticks or slips along the stop. It sticks if the required impulse is at
     most `level` times that of the stop; its velocity along the stop is then reversed and scaled by
-    `restitution`. Otherwise it slips against `level` times the stop's impulse. While it rests on
-    the stop, it slips forward or backward (mode +1, -1) against `level` times the force that
-    presses it on, or sticks (mode 0), which may jam it. That force follows from all other forces
-    and contacts. The machine's field does not contain the friction, and receives the mode like
-    those of all switches.
+    `restitution`. Otherwise it slips against `level` times the stop's impulse. A body that rests on
+    the stop slips forward or backward (mode +1, -1) against `level` times the normal force, or
+    sticks (mode 0), which may jam it. The normal force follows from all other forces and contacts.
+    The machine's field does not contain the friction.
 
     Newton's and Coulomb's laws together may gain energy where the velocities across and along a
-    stop are coupled (T. R. Kane): such an impact ends its lane as `RESULTS.bad_impact`.
+    stop are coupled (T. R. Kane). Such an impact ends its lane as `RESULTS.bad_impact`.
 
     **Arguments:**
 
     - `level`: μ, not negative.
-    - `stop`: the number of the stop among the machine's.
-    - `along`: the number of the coordinate that the body slips along, with its `mass`. No stop need
-      limit it, and its position is not used.
+    - `stop`: the index of the stop among the machine's.
+    - `along`: the index of the coordinate that the body slips along, with its `mass`. It need not
+      be limited by a stop, and its position is not used.
     - `restitution`: along the stop, in [0, 1].
     """
 
@@ -308,18 +300,18 @@ class ContactFriction(Friction):
 
     @property
     def friction_stop(self) -> int:  # pyright: ignore
-        """The number of the stop that it is friction on."""
+        """The index of the stop that it is friction on."""
         return self.stop
 
     def is_known(self, around):
-        """Whether it is known who rests where."""
+        """Return whether the resting contacts are known."""
         return around is not None and bool(around.contact)
 
     def speed_of_slip(self, machine, s, state):
         return machine.coordinates[self.along].velocity(state)
 
     def after(self, machine, s, state, mode, *, around: Around | None = None):
-        # It vanishes to rounding; and with it what that would give to the velocity on the stop.
+        # The slip vanishes to rounding. Its correction must not change the velocity at the stop.
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
         pushes = [push_of(body, state) for body in both]
@@ -339,12 +331,12 @@ class ContactFriction(Friction):
         return force, self.level * pressing, mass
 
     def push_in(self, machine, s, state, mode):
-        """`None`, since the force is solved for together with that of the stop (`held_flow`)."""
+        """Return `None`: the force is solved for together with that of the stop (`held_flow`)."""
         return None
 
 
 def asked(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:
-    """What a function of the state, of time and state, or of machine, time and state says."""
+    """Call a function of the state, of time and state, or of machine, time and state."""
     return function(*(machine, s, state)[3 - _argument_count(function) :])
 
 
@@ -352,7 +344,7 @@ def _argument_count(function: Callable[..., Any]) -> int:
     try:
         known = inspect.signature(function).parameters.values()
         many = sum(x.default is x.empty and x.kind < x.VAR_POSITIONAL for x in known)
-    except (TypeError, ValueError):  # of a function that is not Python's
+    except (TypeError, ValueError):  # not a Python function
         many = 1
     return min(max(many, 1), 3)
 
@@ -361,19 +353,19 @@ def chosen_together(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: tuple[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
-    """The modes of several frictions, one of which has changed: the first set that no force
-    contradicts, of those with as much sticking as can be.
+    """Return the modes of several frictions after one has changed: the first set that is consistent
+    with all forces, in the order of decreasing numbers of sticking bodies.
 
-    What slips goes on as it does. Each of the others sticks, or slips one way or the other.
+    A friction with slip keeps its direction. Each of the others sticks or slips either way.
 
-    **Arguments:** `modes`, all of the machine; `contact` as in `Around`; `released`, the place of
-    one that does not stick again, with whether that is so.
+    **Arguments:** `modes`, all of the machine; `contact`, as in `Around`; `released`, the index of
+    a friction that does not stick again, and whether this holds.
     """
     places = frictions_in(machine)
     switches = switches_of(machine)
     signs = [switches[i].slip_sign(machine, s, state) for i in places]
     slips = [x != 0 for x in signs]
-    if released is not None:  # what sticks has no slip but rounding
+    if released is not None:  # the slip of a sticking body is rounding
         slips = [
             x & (modes[i] != 0) & (i != released[0]) if switches[i].is_dry else x
             for i, x in zip(places, slips, strict=True)
@@ -398,7 +390,7 @@ def chosen_together(
 
 
 def frictions_in(machine: Machine) -> list[int]:
-    """The places among a machine's switches of its frictions."""
+    """Return the indices of the frictions among a machine's switches."""
     switches = enumerate(switches_of(machine))
     return [i for i, x in switches if x.is_dry or x.friction_stop is not None]
 
@@ -407,14 +399,14 @@ def _consistent(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     places: list[int], slips: list[Flag], released: tuple[int, Flag] | None,
 ) -> Flag:  # fmt: skip
-    """Whether no force contradicts these modes: what sticks is held, what begins to slip is
-    accelerated that way."""
+    """Return whether all forces agree with these modes: sticking bodies are held, and bodies that
+    begin to slip are accelerated in that direction."""
     once: Any = _held
     total, forces = once(machine, s, state, modes, contact)
     good = jnp.ones((), bool)
     for i, slip in zip(places, slips, strict=True):
         friction, mode = switches_of(machine)[i], modes[i]
-        if i not in forces:  # on a stop where nothing is known to rest
+        if i not in forces:  # on a stop without a resting body
             continue
         force, holds, mass = friction.held(machine, s, state, contact, forces[i])
         rate = friction.slip_rate(machine, s, state, total)

@@ -1,9 +1,9 @@
 """Machines that are linear between impacts: M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs.
 
-A run follows them in their natural modes, in which a step costs O(n) and is a closed form. With
-M = L Lᵀ and L⁻¹ K L⁻ᵀ = U κ Uᵀ the modes are the columns of L⁻ᵀ U: x = σ⁻¹ L⁻ᵀ U q makes of
-M x'' + C x' + K x = f the equations q'' + c q' + κ q = σ² Tᵀ f, T = σ⁻¹ L⁻ᵀ U, one for each mode
-but for what is left off the diagonal of c. One length σ makes the largest number of all shapes 1.
+A run uses their natural modes, in which a step costs O(n) and is a closed form. With M = L Lᵀ and
+L⁻¹ K L⁻ᵀ = U κ Uᵀ, the columns of T = σ⁻¹ L⁻ᵀ U are the modes. The length σ makes their largest
+number 1. With x = T q, M x'' + C x' + K x = f becomes q'' + c q' + κ q = σ² Tᵀ f. These are
+separate equations for the modes, but for the off-diagonal part of c.
 """
 
 import abc
@@ -27,17 +27,16 @@ from .stop import RigidStop
 Numbers = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 
-# Off the diagonal of the damping, what is below so many roundings of its largest number is that of
-# the modes: damping in proportion to mass and stiffness leaves 6 with 40 modes, the more the more
-# masses differ.
+# Off-diagonal damping below this number of roundings of the largest entry counts as zero. Damping
+# in proportion to mass and stiffness leaves 6 with 40 modes, and more if masses differ more.
 _UNCOUPLED = 500
-# A mode whose κ is below this many roundings of the largest one is a motion as a rigid body, of
-# κ = 0: a choice, by the error of the eigenvalues.
+# A mode whose κ is below this number of roundings of the largest is a rigid-body motion, with κ =
+# 0: a choice, by the error of the eigenvalues.
 _RIGID = 16
-# Closer to a resonance than this, |κ - ω² + iωc| over κ + ω², the steady response and the free one
-# cancel in more than three digits.
+# Closer to a resonance than this, |κ - ω² + iωc| over κ + ω², the steady response and the free
+# motion cancel in more than three digits.
 _RESONANT = 1e-3
-# Likewise for a constant force, κ over ω².
+# The same for a constant force, κ over ω².
 _LOOSE = 1e-3
 
 
@@ -45,46 +44,46 @@ class Coupling(NamedTuple):
     """Parts of stiffness and damping that couple one mode with another."""
 
     stiffness: Matrix
-    """Zero, but for its derivatives."""
+    """Zero, with nonzero derivatives."""
     damping: Matrix
     on: Scalar
-    """1 where there is any, or derivatives by it are asked for; else 0."""
+    """1 with coupling, or if derivatives with respect to it are needed; else 0."""
 
 
 class ModalMachine(AbstractMachine):
-    """A linear machine in its modes. Its state is a `StructureState` of modal numbers."""
+    """A linear machine in its natural modes, with a `StructureState` of modal components."""
 
     stops: tuple[RigidStop, ...]  # pyright: ignore
     frequency: Scalar
     stiffness: Numbers
-    """κ of each mode, per unit of its mass."""
+    """κ of each mode, per unit of mass."""
     damping: Numbers
     """Diagonal of the damping c, per unit of mass."""
     pace_of: Numbers
-    """√|κ|, how fast each mode is."""
+    """√|κ|, the frequency of each mode."""
     slowness: Numbers
-    """Its inverse; 1 of a rigid body's motion."""
+    """1/√|κ|; 1 for a rigid-body motion."""
     swing: Numbers
-    """√(κ - c²/4), at which a mode oscillates; 1 if it does not. A constant for derivatives."""
+    """√(κ - c²/4), the frequency of a damped mode; 1 without oscillation. It has no derivative."""
     swing_time: Numbers
-    """Its inverse."""
+    """1/`swing`."""
     oscillates: Scalar
-    """1 if all modes do, else 0."""
+    """1 if all modes oscillate, else 0."""
     fades: Scalar
     """1 if all modes oscillate and none grows, else 0."""
     fastest: Scalar
-    """A bound of how fast anything changes."""
+    """A bound of all rates."""
     coupling: Coupling | None
     forces: tuple[Numbers | None, Numbers | None, Numbers | None]
-    """Constant, cosine and sine, per unit of mass."""
+    """The constant, cosine and sine forces, per unit of mass."""
     steady: tuple[Numbers, Numbers, Numbers] | None
     """The steady response: constant, cosine and sine; `None` without forces."""
     plain: Scalar
-    """1 where free flight is the closed form: modes uncoupled, none in resonance; else 0."""
+    """1 if free flight is the closed form: modes uncoupled, none in resonance; else 0."""
     rows: tuple[Numbers, ...]
-    """Of each coordinate, by how much of each mode it consists."""
+    """The coefficient of each mode in each coordinate."""
     pushes: tuple[Numbers, ...]
-    """How velocities change as the coordinate's changes by one."""
+    """The change of the velocities for a unit change of each coordinate's velocity."""
     masses: Scalars
 
     @property
@@ -98,15 +97,15 @@ class ModalMachine(AbstractMachine):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The machine's coordinates, read from the modes instead of the displacements."""
+        """The machine's coordinates as functions of the modes."""
         return tuple(along(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
 
     def force(self, s: Scalar) -> Numbers:
-        """The forces on the modes, per unit of mass."""
+        """Return the forces on the modes, per unit of mass."""
         return harmonic(self.forces, self.frequency * s, self.stiffness)
 
     def coupled(self, q: Numbers, p: Numbers) -> Numbers:
-        """What modes do to each other."""
+        """Return the coupling forces between modes."""
         if self.coupling is None:
             return jnp.zeros_like(q)
         found = self.coupling
@@ -118,24 +117,24 @@ class ModalMachine(AbstractMachine):
         )  # fmt: skip
 
     def field(self, s: Scalar, state: State) -> Any:
-        """d(state)/ds between impacts."""
+        """Return d(state)/ds between impacts."""
         q, p = state.displacement, state.velocity
         pull = self.force(s) - self.stiffness * q - self.damping * p - self.coupled(q, p)
         return type(state)(p, pull)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """A fifth of the shortest period, of the modes or the force."""
-        # A fifth is a choice, as for soft stops (`SoftStop.longest_step`).
+        """Return a fifth of the shortest period, of the modes or the force."""
+        # A choice, as for soft stops (`SoftStop.longest_step`).
         return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.pace_of), self.frequency)
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
-        """The shortest time constant with which a mode fades."""
+        """Return the shortest time constant of a mode's decay."""
         tiny = 1e-6 / self.cycle
         return 1 / jnp.maximum(jnp.max(jnp.abs(self.damping)), tiny)
 
 
 def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
-    """The coordinate c·x of a state.
+    """Return the coordinate c·x of a state.
 
     **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`, 1/(cᵀM⁻¹c).
     """
@@ -153,7 +152,7 @@ def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
 
 
 def harmonic(parts: Any, angle: Scalar, like: Numbers) -> Numbers:
-    """A constant, and multiples of the angle's cosine and sine; any of them may be `None`."""
+    """Return the sum of a constant and multiples of cosine and sine; each may be `None`."""
     total = jnp.zeros_like(like)
     steady, cosine, sine = parts
     total = total if steady is None else total + steady
@@ -162,32 +161,32 @@ def harmonic(parts: Any, angle: Scalar, like: Numbers) -> Numbers:
 
 
 def times(matrix: Any, x: Numbers) -> Numbers:
-    """A matrix, or the diagonal of one, times a vector."""
+    """Return the product of a matrix, or of the diagonal of one, with a vector."""
     return matrix * x if matrix.ndim == 1 else matrix @ x
 
 
 def solved(matrix: Any, x: Numbers) -> Numbers:
-    """A matrix, or the diagonal of one, into a vector."""
+    """Solve a linear system with a matrix, or the diagonal of one."""
     return x / matrix if matrix.ndim == 1 else jnp.linalg.solve(matrix, x)
 
 
 class Modes(NamedTuple):
-    """A linear machine in its modes, and the way there and back."""
+    """A linear machine in its modes, and the transformations to them and back."""
 
     machine: ModalMachine
     into: Callable[[Numbers], Numbers]
-    """Modal numbers of displacements, or of velocities."""
+    """Returns modal components of displacements, or of velocities."""
     out_of: Callable[[Numbers], Numbers]
 
 
 class _Basis(NamedTuple):
-    """Modes, and the equation in them."""
+    """Modes, and the equations in them."""
 
     shapes: Matrix | None
-    """Their shapes in columns; `None` where the machine's coordinates are its modes."""
+    """The shapes of the modes as columns; `None` if the machine's coordinates are its modes."""
     into: Matrix | None
     inverse: Numbers
-    """What forces on modes are multiplied by."""
+    """The factors of forces on modes."""
     stiffness: Numbers
     damping: Numbers
     coupling: Coupling | None
@@ -195,13 +194,13 @@ class _Basis(NamedTuple):
 
 
 def modal(machine: Any) -> Modes:
-    """A linear machine in its modes (see the top of this file)."""
+    """Return a linear machine in its natural modes (see the top of this file)."""
     loss = machine.damping
     both = machine.mass, jnp.zeros(machine.size) if loss is None else loss, machine.stiffness
     found = _as_it_is(*both) if all(x.ndim == 1 for x in both) else _diagonalized(*both)
     omega = machine.frequency
 
-    def onto(f: Any) -> Any:  # a force, or a row, as it acts on the modes
+    def onto(f: Any) -> Any:  # a force, or a row, in modal components
         return f if f is None or found.shapes is None else f @ found.shapes
 
     acting = [None if f is None else found.inverse * onto(f) for f in machine.forces]
@@ -245,19 +244,19 @@ def modal(machine: Any) -> Modes:
 
 
 def without_row(stop: RigidStop) -> RigidStop:
-    """The same stop without its `at`."""
+    """Return the same stop without its `at`."""
     return stop if stop.at is None else eqx.tree_at(lambda x: x.at, stop, None)
 
 
 def _as_it_is(mass: Numbers, damping: Numbers, stiffness: Numbers) -> _Basis:
-    """Of a machine whose matrices are diagonal: its coordinates are its modes."""
+    """Return the basis of a machine with diagonal matrices: its coordinates are its modes."""
     kappa, c = stiffness / mass, damping / mass
     fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.max(jnp.abs(c))
     return _Basis(None, None, 1 / mass, kappa, c, None, fastest)
 
 
 def _diagonalized(mass: Any, damping: Any, stiffness: Any) -> _Basis:
-    """The modes of mass and stiffness, with all that couples them."""
+    """Return the modes of mass and stiffness, with all coupling between them."""
     M, C, K = (jnp.diag(x) if x.ndim == 1 else x for x in (mass, damping, stiffness))
     n, eps = M.shape[0], jnp.finfo(M.dtype).eps
     L = jnp.linalg.cholesky(M)
@@ -284,8 +283,8 @@ def _diagonalized(mass: Any, damping: Any, stiffness: Any) -> _Basis:
 
 @jax.custom_jvp
 def _asked(*matrices: Any) -> Scalar:
-    """1 where derivatives by a machine's matrices are asked for, else 0: the modes are coupled
-    then, by zeros that have derivatives."""
+    """Return 1 under differentiation with respect to a machine's matrices, else 0. The modes are
+    then coupled by zeros with nonzero derivatives."""
     return jnp.zeros((), matrices[0].dtype)
 
 
@@ -296,8 +295,8 @@ def _(matrices, _):
 
 
 def _steady(forces: Any, found: _Basis, omega: Scalar) -> tuple[Any, Flag]:
-    """The steady response to constant, cosine and sine, and whether a mode is so close to resonance
-    that it would cancel against the free motion; zero in such a mode."""
+    """Return the steady response to constant, cosine and sine, and whether a mode is so close to
+    resonance that the response cancels against the free motion. There it is zero."""
     if all(f is None for f in forces):
         return None, jnp.zeros((), bool)
     kappa, c = found.stiffness, found.damping
@@ -319,7 +318,7 @@ def _steady(forces: Any, found: _Basis, omega: Scalar) -> tuple[Any, Flag]:
 
 
 class StructureState(Shown):
-    """Displacements and velocities of a machine of n degrees of freedom."""
+    """Displacements and velocities of a machine with n degrees of freedom."""
 
     displacement: Float[Array, "..."]
     """x, one number for each degree of freedom."""
@@ -328,7 +327,7 @@ class StructureState(Shown):
 
 
 class Prepared(NamedTuple):
-    """A machine as a run follows it, and states on the way in and out."""
+    """A machine in the form for a run, and the conversions of its states to that form and back."""
 
     machine: Any
     inward: Callable[[State], State] = lambda state: state
@@ -336,7 +335,7 @@ class Prepared(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What a machine with rules of its own is asked for in each step, worked out beforehand."""
+    """Values for each step of a machine with a subclass's methods, computed once."""
 
     inverse: Float[Array, "n n"] | None
     """M⁻¹; `None` for a diagonal M."""
@@ -344,7 +343,7 @@ class _Known(NamedTuple):
     """The longest step, a fifth of the shortest period of the modes or the force."""
 
 
-# What a run asks of a machine and the machine in its modes does not take over from a subclass.
+# Members that `ModalMachine` does not take over from a subclass.
 _IN_MODES = (
     "field", "_accelerated", "events", "averages", "renewed", "coordinates", "position",
     "velocity", "placed", "cycle", "pace", "step_limit", "relaxation",
@@ -357,17 +356,15 @@ class LinearMachine(AbstractMachine):
         M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs
 
     with M symmetric and positive definite, C and K symmetric. Time is the independent variable s, a
-    cycle 2π/ω. Stops limit sums c·x of the displacements. A restitution k takes v to
-    v - (1 + k) (c·v) M⁻¹c/(cᵀM⁻¹c), so that an impact acts on the mass 1/(cᵀM⁻¹c).
+    cycle 2π/ω. Stops limit sums c·x of the displacements. A restitution k takes v to v - (1 + k)
+    (c·v) M⁻¹c/(cᵀM⁻¹c), so that the effective mass of an impact is 1/(cᵀM⁻¹c).
 
-    It is followed in its natural modes, which are worked out once for each run (`prepared`).
-    `ExactFlight` has no step error; every other method takes the field (`Taylor` only where the
-    matrices are diagonal).
+    A run uses the natural modes, which are computed once for each run (`prepared`). `ExactFlight`
+    has no step error; every other method uses the field (`Taylor` only with diagonal matrices).
 
-    Subclasses give `mass`, `damping` and `stiffness`, each (n, n), or (n,) for a diagonal one (no
-    damping may be `None`); `forces`; `frequency`; and `contacts`, stops of which each has its c in
-    `RigidStop.at`, or, where that is `None`, the number of an earlier one's in
-    `RigidStop.coordinate`.
+    Subclasses define `mass`, `damping` and `stiffness`, each (n, n), or (n,) for a diagonal one
+    (`damping` may be `None`); `forces`; `frequency`; and `contacts`, a tuple of stops. Each has its
+    c in `RigidStop.at`, or `None` and the number of an earlier c in `RigidStop.coordinate`.
     """
 
     mass: eqx.AbstractVar[Float[Array, "..."]]
@@ -381,11 +378,11 @@ class LinearMachine(AbstractMachine):
     @property
     @abc.abstractmethod
     def forces(self) -> tuple[Any, Any, Any]:
-        """f₀, f₁ and f₂, each (n,), or `None` for none."""
+        """f₀, f₁ and f₂, each (n,), or `None`."""
 
     @property
     def size(self) -> int:
-        """n, the number of degrees of freedom."""
+        """The number n of degrees of freedom."""
         return jnp.shape(self.mass)[-1]
 
     @property
@@ -394,13 +391,13 @@ class LinearMachine(AbstractMachine):
 
     @property
     def rows(self) -> list[Float[Array, " n"]]:
-        """c of each coordinate; without contacts the first displacement is what extremes are of."""
+        """c of each coordinate; without contacts the first displacement, for extremes."""
         rows = [stop.at for stop in self.contacts if stop.at is not None]
         return rows or [jnp.eye(1, self.size)[0]]
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """One for each contact: the sum c·x of displacements that it limits."""
+        """One coordinate for each c: the sum c·x of displacements that stops limit."""
         mobile = [self._accelerated(c) for c in self.rows]
         masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, mobile, strict=True)]
         pushes = [m * one for m, one in zip(mobile, masses, strict=True)]
@@ -413,11 +410,11 @@ class LinearMachine(AbstractMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity."""
+        """The axis labels of position and velocity."""
         return ("x of contact 0", "dx/ds") if self.contacts else ("x[0]", "dx[0]/ds")
 
     def field(self, s: Scalar, state: StructureState) -> StructureState:
-        """d(state)/ds between impacts."""
+        """Return d(state)/ds between impacts."""
         x, v = state.displacement, state.velocity
         pull = harmonic(self.forces, self.frequency * s, x) - times(self.stiffness, x)
         if self.damping is not None:
@@ -425,12 +422,12 @@ class LinearMachine(AbstractMachine):
         return StructureState(v, self._accelerated(pull))
 
     def _accelerated(self, force: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The accelerations M⁻¹ f that a force on the displacements causes."""
+        """Return the accelerations M⁻¹ f by a force on the displacements."""
         known = None if self._known is None else self._known.inverse
         return solved(self.mass, force) if known is None else known @ force
 
     def start(self, *, displacement: Number = 0.0, velocity: Number = 0.0) -> StructureState:
-        """A state; at rest in x = 0 by default.
+        """Return a state; at rest in x = 0 by default.
 
         **Arguments:** (n,) each, or one number for all.
 
@@ -449,11 +446,11 @@ class LinearMachine(AbstractMachine):
         return StructureState(*found)
 
     def adopt(self, start: State) -> StructureState:
-        """**Raises:** `TypeError` for a state of another kind, `ValueError` for one of other n."""
+        """**Raises:** `TypeError` for a state of another class, `ValueError` for one of other n."""
         return self.in_cycle_state("start", start)
 
     def in_cycle_state(self, name: str, state: State) -> StructureState:
-        """A state of this machine; `name` is the argument that messages blame."""
+        """Return a checked state of this machine; `name` is the argument's name in errors."""
         if not isinstance(state, StructureState):
             raise TypeError(
                 f"Argument `{name}` must be a state of a {type(self).__name__}, from its "
@@ -468,13 +465,13 @@ class LinearMachine(AbstractMachine):
         return state
 
     def step_limit(self, s: Scalar, state: StructureState) -> Scalar:
-        """A fifth of the shortest period, of the modes or the force."""
+        """Return a fifth of the shortest period, of the modes or the force."""
         if self._known is not None:
             return self._known.longest
         return self.natural_modes().machine.step_limit(s, state)
 
     def mirrored(self, state: StructureState) -> StructureState | None:
-        """x → -x half a cycle later, where no constant force acts and each stop has its image."""
+        """Return -x half a cycle later, if no constant force acts and each stop has its image."""
         steady, alike = self.forces[0], [without_row(stop) for stop in self.contacts]
         pressed = None if steady is None else concrete(steady)
         if steady is not None and (pressed is None or pressed.any()):
@@ -486,26 +483,25 @@ class LinearMachine(AbstractMachine):
         return StructureState(-state.displacement, -state.velocity)
 
     def natural_modes(self) -> Modes:
-        """The natural modes, and the machine in them."""
+        """Return the machine in its natural modes."""
         return modal(self)
 
     def prepared(self) -> Prepared:
-        """The machine in its natural modes, unless a subclass moves, or meets events, by rules of
-        its own."""
+        """Return the machine in its modes, or as it is if a subclass overrides `_IN_MODES`."""
         if changed(self, LinearMachine, _IN_MODES):
             return Prepared(self._with_known())
         return self.prepared_modes()
 
     def _with_known(self) -> "LinearMachine":
-        """The machine with what none of its steps has to work out: in a lane's steps there is no
-        vector code for eigenvalues, and to solve by M takes its cube each time."""
+        """Return the machine with values that its steps would compute: a lane's steps have no
+        vector code for eigenvalues, and to solve by M takes n³ operations each time."""
         longest = stop_gradient(self.step_limit(jnp.zeros(()), self.start()))
         inverse = None if self.mass.ndim == 1 else jnp.linalg.inv(self.mass)
         known = _Known(inverse, longest)
         return eqx.tree_at(lambda m: m._known, self, known, is_leaf=lambda x: x is None)
 
     def prepared_modes(self) -> Prepared:
-        """The machine in its natural modes, and the ways there and back."""
+        """Return the machine in its natural modes, with the conversions of states."""
         found = self.natural_modes()
 
         def inward(state: StructureState) -> StructureState:

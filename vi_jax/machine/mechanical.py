@@ -1,9 +1,9 @@
-"""Machines of masses: what acts on them is written down, and what follows from the masses is not.
+"""Machines defined by masses and applied forces; inertial terms follow from the masses.
 
-With coordinates q, velocities v and the mass matrix M(q), kinetic energy ½ vᵀMv, Lagrange's
-equations are M v' + h = f for the applied forces f, where h_i = Σ_k v_k (∂M/∂q_k v)_i - ½ vᵀ
-(∂M/∂q_i) v. A contact of gap g(q) has J = ∇g; its force acts along M⁻¹Jᵀ, and on the mass
-1/(J M⁻¹ Jᵀ).
+With coordinates q, velocities v, the mass matrix M(q) and kinetic energy ½ vᵀMv, Lagrange's
+equations are M v' + h = f. Here f are the applied forces, and h_i = Σ_k v_k (∂M/∂q_k v)_i - ½
+vᵀ(∂M/∂q_i) v. A contact with gap g(q) has J = ∇g. Its force acts along M⁻¹Jᵀ with the effective
+mass 1/(J M⁻¹ Jᵀ).
 """
 
 import abc
@@ -26,32 +26,32 @@ from .own import with_static
 from .state import State as Named
 from .state import like
 
-# Entries of a mass matrix: rows of numbers, `None` where they are zero.
+# A mass matrix as rows of numbers.
 Matrix = list[list[Any]]
 
-# Errors in the place of a prescribed coordinate fade by exp(-2π), 2e-3, in a cycle. A choice: twice
-# as fast takes half again as many steps.
+# Errors of the position of a prescribed coordinate decay by exp(-2π), 2e-3, in a cycle. A choice: a
+# rate of twice that takes half again as many steps.
 _FADES = 2 * pi
 
 
 class Mechanical(AbstractMachine):
     """A machine of masses, defined by coordinates, masses and the forces between contacts.
 
-    Its state has the coordinates by their names, and their velocities as `v`: `z.y`, `z.v.y`;
-    `machine.at(y=0.1, v=dict(y=1.0))` makes one.
+    Its state has the coordinates by name, and their velocities as `v`: `z.y`, `z.v.y`. Method `at`
+    returns a state: `machine.at(y=0.1, v=dict(y=1.0))`.
 
     | definition | meaning |
     |---|---|
     | `q` | the names of its coordinates; `"x[40]"` is an array of 40, `x` |
     | `mass` | the mass of each, or a mass matrix: numbers, or a method `mass(q)` |
     | `force(t, q, v)` | the applied force on each, by name |
-    | `prescribed(t)` | the places of coordinates whose motion is given, by name: moving walls |
+    | `prescribed(t)` | the positions of coordinates with given motion, by name: moving walls |
     | `cycle`, `contacts`, `events`, `modes` | as of every machine |
 
     A contact is `on` a coordinate, `on="y"`, or a gap of several, `on=lambda q: q.left - q.right`.
-    The momentum of an impact, the mass that it acts on (`Run.impact_energy`) and inertial terms
-    follow from the masses. `mass` and `force` have entries only for coordinates whose motion is not
-    given.
+    The momentum of an impact, the effective mass (`Run.impact_energy`) and inertial terms follow
+    from the masses. `mass` and `force` have entries only for coordinates whose motion is not
+    prescribed.
 
     An array of coordinates has arrays of forces and masses, and contacts such as `on="x[39]"`. Then
     the masses cannot be a matrix.
@@ -59,25 +59,25 @@ class Mechanical(AbstractMachine):
 
     q: ClassVar[tuple[str, ...]]
     mass: ClassVar[Any]
-    # The components of a state that has no `v`, by the coordinates whose velocities they are.
+    # The components with the velocities of the coordinates, in a state without `v`.
     _velocity_names: ClassVar[Mapping[str, str]] = {}
 
     @abc.abstractmethod
     def force(self, *args: Any, **kwargs: Any) -> Any:
-        """`force(t, q, v)`: the applied force on each coordinate, by name. Discrete modes of the
-        machine are further arguments."""
+        """Return the applied force on each coordinate, by name: `force(t, q, v)`. Discrete modes of
+        the machine are further arguments."""
 
     def _applied(self, t: Scalar, q: Named, v: Named, *modes: Scalar) -> Any:
-        """`force`, also of a machine that has a number of this name."""
+        """Return `force`; a subclass with a field of that name overrides this."""
         return self.force(t, q, v, *modes)
 
     def prescribed(self, t: Scalar) -> dict[str, Any]:
-        """The places of coordinates whose motion is given, as functions of time."""
+        """Return the positions of the coordinates with given motion, as functions of time."""
         return {}
 
     def at(self, v: Any = None, **places: Any) -> Any:
-        """A state: each coordinate's place, and in `v` each velocity by name; 0 if not given, and
-        of those that are prescribed as at t = 0."""
+        """Return a state with these positions, and in `v` velocities, by name. Others are 0, or for
+        prescribed coordinates those at t = 0."""
         names = self.free_names
         wrong = [x for x in (*places, *(v or {})) if x not in names]
         if wrong:
@@ -85,7 +85,7 @@ class Mechanical(AbstractMachine):
         zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
         at, rate = zeros | places, zeros | dict(v or {})
         for name, zero in zeros.items():
-            if self.q_shapes[name]:  # one number is that of each
+            if self.q_shapes[name]:  # one number holds for all
                 at[name], rate[name] = zero + at[name], zero + rate[name]
         if len(names) < len(zeros):
             given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
@@ -95,7 +95,7 @@ class Mechanical(AbstractMachine):
         return Named(**at, v=Named(**rate))
 
     def start(self) -> Any:
-        """At rest with all coordinates zero."""
+        """Return the state at rest with all coordinates zero."""
         return self.at()
 
     @property
@@ -105,7 +105,7 @@ class Mechanical(AbstractMachine):
 
     @property
     def q_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shapes of the coordinates, by name: `()` of one number."""
+        """The shapes of the coordinates, by name; `()` for one number."""
         if not hasattr(self, "q"):
             raise TypeError(
                 f'A {type(self).__name__} must have `q`: write `q = ("x", "y")` in the class, the '
@@ -128,7 +128,7 @@ class Mechanical(AbstractMachine):
         return tuple(x for x in self.q_names if x not in given)
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
-        """The rate of the state: velocities, and accelerations by Lagrange's equations."""
+        """Return the rate of the state: velocities, and accelerations by Lagrange's equations."""
         q, v, names = self.places(state), self._velocities(state), self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
@@ -148,7 +148,7 @@ class Mechanical(AbstractMachine):
         return self._in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
 
     def _by_s(self, s: Scalar, state: State, *rates: Named) -> Sequence[Named]:
-        """Rates by `s`, which need not be time."""
+        """Return rates with respect to `s`, which need not be time."""
         pace = self.pace(s, state)
         if pace is None:
             return rates
@@ -160,8 +160,8 @@ class Mechanical(AbstractMachine):
         return jax.tree.map(lambda x: pace * x, rates)
 
     def _guided(self, t: Scalar, q: Named, v: Named) -> dict[str, Any]:
-        """The accelerations of prescribed coordinates. What errors of steps leave fades: else it
-        would add up, and an orbit would be neutral in them."""
+        """Return the accelerations of prescribed coordinates. They let errors of steps decay.
+        Otherwise errors would add up, and an orbit would be neutrally stable in them."""
         one, rate = jnp.ones_like(t), _FADES / self.cycle
 
         def moves(t: Scalar) -> Any:
@@ -176,24 +176,24 @@ class Mechanical(AbstractMachine):
         }
 
     def places(self, state: State) -> Named:
-        """The coordinates in a state, without velocities."""
+        """Return the coordinates in a state, without velocities."""
         return Named(**{name: getattr(state, name) for name in self.q_names})
 
     def _velocities(self, state: State) -> Named:
-        """The velocities in a state, by the names of their coordinates."""
+        """Return the velocities in a state, by the names of their coordinates."""
         if not self._velocity_names:
             return state.v
         return Named(**{q: getattr(state, self._velocity_names[q]) for q in self.q_names})
 
     def _in_state(self, state: Any, q: Named, v: Named) -> Any:
-        """The state with these places and velocities."""
+        """Return the state with these positions and velocities."""
         if isinstance(state, Named):
             return state.replace(**vars(q), v=v)
         speeds = {self._velocity_names[name]: x for name, x in vars(v).items()}
         return with_static(state, **vars(q), **speeds)
 
     def masses(self, q: Named) -> Matrix:
-        """The mass matrix in these coordinates, as rows of numbers."""
+        """Return the mass matrix at these coordinates, as rows of numbers."""
         given = _mass_of(self)
         if given is None:
             raise TypeError(
@@ -204,7 +204,7 @@ class Mechanical(AbstractMachine):
         return matrix_of(given(q) if callable(given) else given, shapes, type(self).__name__)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
-        """h, what the applied forces are diminished by; 0 where the masses are constant."""
+        """Return h of Lagrange's equations; 0 with constant masses."""
         names = self.free_names
         speeds = [getattr(v, name) for name in names]
         if not callable(_mass_of(self)):
@@ -241,7 +241,7 @@ def _mass_of(machine: Any) -> Any:
 
 
 def _named(machine: Mechanical, on: Any) -> str | None:
-    """The name of a coordinate, `None` of a gap."""
+    """Return the name of a coordinate, or `None` for a gap."""
     name = machine.q_names[0] if on is None else on
     if not isinstance(name, str):
         return None
@@ -269,7 +269,7 @@ def _speed(machine: Mechanical, on: Any, state: State) -> Any:
 
 
 def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
-    """J, the slopes of a gap; plain numbers where they are constant ones."""
+    """Return J, the gradient of a gap; its constant entries are plain numbers."""
     name, names = _named(machine, on), machine.q_names
     if name is not None:
         base, place = split_place(name)
@@ -281,7 +281,7 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
-    """The derivative of a function of the coordinates with respect to one of them."""
+    """Return the derivative of a function of the coordinates with respect to one of them."""
     here = getattr(q, name)
 
     def of_one(x: Any) -> Any:
@@ -293,8 +293,8 @@ def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
 
 
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
-    """M⁻¹Jᵀ/(J M⁻¹Jᵀ), how the velocities change where that of a gap changes by one, and
-    1/(J M⁻¹Jᵀ), the mass that its force acts on."""
+    """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity,
+    and the effective mass 1/(J M⁻¹Jᵀ)."""
     names = machine.free_names
     slopes = dict(zip(machine.q_names, _slopes(machine, on, q), strict=True))
     slopes = [slopes[name] for name in names]
@@ -326,8 +326,8 @@ def _pushed(machine: Mechanical, on: Any, state: State) -> Any:
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
-    """A gap's place and velocity changed by as little as can be, in the measure of the masses; a
-    coordinate by its name alone is put where it is to be."""
+    """Return the state with another position and velocity of a gap, by the least change in the norm
+    of the masses. A coordinate by name is set exactly."""
     name, q = _named(machine, on), machine.places(state)
     q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
     push, v = _push(machine, on, q)[0], machine._velocities(state)
@@ -348,13 +348,15 @@ def _moved(x: Named, push: list[Any], amount: Any) -> Named:
 
 
 def _is_zero(x: Any, zero: float = 0.0) -> bool:
-    """Whether a number is known to be zero, or another number, while a program is traced."""
+    """Return whether a number is a Python number equal to `zero`, which is known while tracing."""
     return isinstance(x, int | float) and x == zero
 
 
 def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> Matrix:
-    """Masses as a matrix, from one for each coordinate, by name or in their order, or rows of
-    them. **Raises:** `ValueError` for another number of them, or a matrix for arrays."""
+    """Return masses as a matrix, from one per coordinate, by name or in order, or from rows.
+
+    **Raises:** `ValueError` for a wrong number of them, or a matrix for arrays.
+    """
     n = len(shapes)
     if isinstance(given, Mapping):
         given = [given[x] for x in shapes]
@@ -381,14 +383,14 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
 
 
 def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
-    """Whether this is the mass of one coordinate, or those of an array of this shape."""
+    """Return whether this is the mass of one coordinate, or those of an array of this shape."""
     return not isinstance(x, list | tuple) and jnp.shape(x) in ((), shape)
 
 
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
-    """M⁻¹ right, of a symmetric matrix that is positive: elimination without pivots, which leaves
-    out what is known to be zero. A pivot is inverted, since that of constant masses is one number
-    for all stages of a step."""
+    """Return M⁻¹ right for a symmetric positive definite matrix: elimination without pivoting,
+    which omits known zeros. Pivots are inverted, since those of constant masses are the same in all
+    stages of a step."""
     n, rows, inverses = len(right), [[*row, x] for row, x in zip(M, right, strict=True)], []
     for i in range(n):
         inverses.append(1 / rows[i][i])
@@ -407,12 +409,12 @@ def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
 
 
 def _less(x: Any, factor: Any, y: Any) -> Any:
-    """x - factor·y, without what is known to be zero."""
+    """Return x - factor·y, without known zeros."""
     return x if _is_zero(factor) or _is_zero(y) else x - _times(factor, y)
 
 
 def _dot(xs: Sequence[Any], ys: Sequence[Any]) -> Any:
-    """The sum of the products of numbers and of arrays, without what is known to be zero."""
+    """Return the sum of the products of numbers and arrays, without known zeros."""
     both = zip(xs, ys, strict=True)
     return sum(jnp.sum(x * y) if jnp.ndim(x) else x * y for x, y in both if not _is_zero(x))
 

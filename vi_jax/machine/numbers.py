@@ -1,5 +1,5 @@
-"""Numbers of a machine by name, `"drive.frequency_ratio"` or `"stops.0.gap"`, their units, and how
-they are shown, as text and as a table."""
+"""Numbers of a machine by name, `"drive.frequency_ratio"` or `"stops.0.gap"`, their units, and
+their representation as text and as tables."""
 
 import dataclasses
 import difflib
@@ -21,20 +21,23 @@ from .._types import Machine, Scalar, State
 
 
 def leaf_names(tree: object) -> list[str]:
-    """Names of all numbers in a machine (or another pytree), in the order of its leaves."""
+    """Return the names of all numbers in a machine or another pytree, in the order of its
+    leaves."""
     return list(by_name(tree))
 
 
 def by_name(tree: object) -> dict[str, Any]:
-    """All numbers of a machine, a state or another pytree by their names, in the order of its
+    """Return all numbers of a machine, a state or another pytree by name, in the order of
     leaves."""
     leaves = ((path, x) for path, x in jtu.tree_leaves_with_path(tree) if eqx.is_array_like(x))
     return {jtu.keystr(path, simple=True, separator="."): x for path, x in leaves}
 
 
 def components(state: State, lead: int = 0) -> dict[str, Any]:
-    """All numbers of a state by their names, those of an array `name[i]`; of several states beside
-    each other, which have `lead` axes in front, rows of them."""
+    """Return all numbers of a state by name, those of an array as `name[i]`.
+
+    **Arguments:** `lead`, the number of leading axes of a batch of states, which the results keep.
+    """
     found = {}
     for name, x in by_name(state).items():
         for place in np.ndindex(*jnp.shape(x)[lead:]):
@@ -44,48 +47,50 @@ def components(state: State, lead: int = 0) -> dict[str, Any]:
 
 
 def in_rows(states: State, lead: int = 1) -> Array:
-    """Several states beside each other, which have `lead` axes in front, as rows of all their
-    numbers, in the order of `ravel_pytree`."""
+    """Return a batch of states as rows of all numbers, in the order of `ravel_pytree`.
+
+    **Arguments:** `lead`, the number of leading axes of the batch.
+    """
     leaves = [jnp.asarray(x) for x in jtu.tree_leaves(states)]
     return jnp.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
 
 
 def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
-    """The size of what a function of the state adds up where its numbers have these sizes."""
+    """Return the size of the terms of a function of the state whose components have these sizes."""
     slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
     each = jtu.tree_map(lambda slope, size: jnp.sum(jnp.abs(slope) * size), slopes, sizes)
     return sum(jtu.tree_leaves(each), start=jnp.zeros(()))
 
 
 def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
-    """The numbers of a state of any kind, in their units; of one with many the first few."""
-    # JAX sorts the names of a dictionary, but not of this one.
+    """Return the numbers of a state with their units, as text; of a long state the first few."""
+    # JAX sorts the names of a dictionary, but not those of an `OrderedDict`.
     parts = components(OrderedDict(state) if isinstance(state, Mapping) else state).items()
     return ", ".join(first_few([f"{k} = {in_unit(plain(x, digits), units, k)}" for k, x in parts]))
 
 
 def first_few(words: list[str]) -> list[str]:
-    """A list's words, of a long one the first few and how many more there are."""
+    """Return a list of words, or the first few of a long one and the number of the others."""
     return words if len(words) <= _MANY else [*words[:_FEW], f"and {len(words) - _FEW} more"]
 
 
-# What is printed of long lists: choices.
+# The length of a long list, and the number of its words that are printed: choices.
 _MANY, _FEW = 16, 8
 
 
 def plain(x: Any, digits: int) -> str:
-    """A number for print, where zero has no sign."""
+    """Return a number as text; zero has no sign."""
     return f"{float(x) + 0.0:.{digits}g}"
 
 
 def leaf(tree: object, name: str) -> Float[Array, "..."]:
-    """The number of that name. **Raises:** `ValueError` that lists the near names."""
+    """Return the number with this name. **Raises:** `ValueError` that lists similar names."""
     base, place = _place_in(tree, check_leaf(tree, name))
     return jnp.asarray(by_name(tree)[base])[place]
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:
-    """The same machine with another number in place of that name; traced values pass."""
+    """Return the same machine with another value of this number, which may be traced."""
     base, place = _place_in(tree, check_leaf(tree, name))
     index = leaf_names(tree).index(base)
     leaves, treedef = jtu.tree_flatten(tree)
@@ -93,7 +98,7 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
     old = leaves[arrays[index]]
     kind = jnp.result_type(old)
     if jnp.issubdtype(kind, jnp.integer) and jnp.issubdtype(jnp.result_type(value), jnp.floating):
-        kind = jnp.result_type(float)  # or else it would be cut off
+        kind = jnp.result_type(float)  # or else it would be truncated
     if place:
         leaves[arrays[index]] = jnp.asarray(old, kind).at[place].set(value)
     elif jnp.ndim(old) and not jnp.ndim(value):
@@ -107,20 +112,20 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
 
 
 def with_leaves(tree: Any, values: Mapping[str, Any]) -> Any:
-    """Replace several numbers of a machine, given by name."""
+    """Return the same machine with other values of several numbers, by name."""
     for name, value in values.items():
         tree = with_leaf(tree, name, value)
     return tree
 
 
 def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
-    """The array that a number's name begins with, and its place in it: none of the number itself or
-    of a whole array."""
+    """Return the name of a number's array and its index there; no index for a number or a whole
+    array."""
     return (name, ()) if name in by_name(tree) else split_place(name)
 
 
 def split_place(name: str) -> tuple[str, tuple[int, ...]]:
-    """An array's name and a place in it, of `"x[1, 2]"`; no place of a name without one."""
+    """Return an array's name and an index in it, from `"x[1, 2]"`; no index without brackets."""
     if not name.endswith("]"):
         return name, ()
     base, _, inner = name.removesuffix("]").rpartition("[")
@@ -128,15 +133,15 @@ def split_place(name: str) -> tuple[str, tuple[int, ...]]:
 
 
 def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
-    """`name`, if the machine has such a number, or such an array, whose numbers are called
+    """Return `name`, if the machine has such a number or array; numbers of an array are
     `name[i]`."""
     names = leaf_names(tree)
     return name if name in names else check_name(list(components(tree)), name, argument, tree)
 
 
 def check_name(names: list[str], name: str, argument: str, machine: object = None) -> str:
-    """`name`, if it is among the names of numbers of a machine, or another tree. **Raises:** as
-    `leaf`."""
+    """Return `name`, if it is among the names of numbers of a machine or another tree. **Raises:**
+    as `leaf`."""
     if name in names:
         return name
     untyped = getattr(type(machine), str(name), None)
@@ -155,7 +160,7 @@ def check_name(names: list[str], name: str, argument: str, machine: object = Non
 
 
 def check_again(machine: Machine) -> None:
-    """Run the machine's own checks: a number put in place of another has passed none."""
+    """Run the machine's own checks: a replaced number has not been checked."""
     parts = jtu.tree_leaves(
         machine, is_leaf=lambda x: isinstance(x, eqx.Module) and x is not machine
     )
@@ -168,25 +173,26 @@ def check_again(machine: Machine) -> None:
 NONE: Mapping[str, str] = MappingProxyType({})
 
 Stated = tuple[tuple[str, str], ...]
-"""What a machine states, as pairs of names and units: it can be compared, and so be static."""
+"""The units of a machine as pairs of names and units, comparable and therefore static."""
 
 
 PLAIN = "position", "velocity"
-"""What a machine calls them that has no other words."""
+"""The labels of a machine without others."""
 
 
 def unit_of(units: Mapping[str, str], name: str) -> str:
-    """The unit of a quantity, of a number by its last word too; "" where none is stated."""
+    """Return the unit of a quantity or a number, also by its last word; "" without a stated
+    unit."""
     last = name.split(".")[-1].split("[")[0]
-    for key in (name, "" if name.startswith("v.") else last, ""):  # `v.x` has another one than `x`
+    for key in (name, "" if name.startswith("v.") else last, ""):  # `v.x` and `x` differ
         if key in units:
             return units[key]
     return ""
 
 
 def units_of(machine: Machine) -> dict[str, str]:
-    """The units that a machine states. Those of position and velocity are by default those of the
-    numbers in the state that they are."""
+    """Return the units of a machine. Those of position and velocity are by default those of the
+    components of the same names."""
     units = dict(machine.units)
     for quantity, name in zip(PLAIN, machine.labels, strict=True):
         if name in units:
@@ -195,22 +201,22 @@ def units_of(machine: Machine) -> dict[str, str]:
 
 
 def stated(machine: Machine) -> Stated:
-    """The units of a machine."""
+    """Return the units of a machine as pairs."""
     return tuple(units_of(machine).items())
 
 
 def attributes(unit: str) -> dict[str, str]:
-    """The attribute of a variable in this unit; none where it is not known."""
+    """Return the attribute of a variable in this unit; empty for an unknown unit."""
     return {"units": unit} if unit else {}
 
 
 def in_unit(text: str, units: Mapping[str, str], name: str) -> str:
-    """A number of this name with its unit, if it has one."""
+    """Return a number with the unit of this name, if it has one."""
     return with_unit(text, unit_of(units, name))
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number with its unit, if it has one."""
+    """Return a number with its unit, if it has one."""
     return text if unit in ("", "1") else f"{text} {unit}"
 
 
@@ -221,13 +227,13 @@ QUANTITIES = {
     "log_phase": "phase", "impact_phase": "phase", "event_phase": "phase",
     "fastest_impact": "velocity", "slowest_impact": "velocity",
 }  # fmt: skip
-"""What the arrays of results are of."""
+"""The quantities that the arrays of results contain."""
 
 _PREFIXES = ("error_section_", "section_", "sample_", "error_", "start.")
 
 
 def quantity_of(name: str) -> str | None:
-    """What a variable of a data set is of: a quantity, a component of a state, or neither."""
+    """Return the quantity or the component of a state in a variable of a data set, or `None`."""
     for prefix in _PREFIXES:
         if name.startswith(prefix):
             inner = name.removeprefix(prefix)
@@ -236,8 +242,8 @@ def quantity_of(name: str) -> str | None:
 
 
 def with_units(data: Any, units: Mapping[str, str], named: Mapping[str, str] = NONE) -> Any:
-    """A data set whose variables say in which units they are; `named` are numbers of a machine by
-    other names than their own."""
+    """Return a data set with the units of its variables as attributes; `named` maps variables to
+    numbers of a machine with other names."""
     for name in data.variables:
         quantity = named.get(name) or quantity_of(str(name))
         if quantity is not None:
@@ -246,26 +252,26 @@ def with_units(data: Any, units: Mapping[str, str], named: Mapping[str, str] = N
 
 
 def in_brackets(words: str, unit: str) -> str:
-    """The name of an axis with its unit, if it has one."""
+    """Return the label of an axis with its unit, if it has one."""
     return words if unit in ("", "1") else f"{words} ({unit})"
 
 
 def unit_in(label: str) -> str:
-    """The unit at the end of a label such as "height (g/ω²)"."""
+    """Return the unit at the end of a label such as "height (g/ω²)"."""
     return label.partition(" (")[2].removesuffix(")")
 
 
 def name_in(label: str) -> str:
-    """The name at the beginning of a label such as "height (g/ω²)" or "Y = y/a"."""
+    """Return the name at the beginning of a label such as "height (g/ω²)" or "Y = y/a"."""
     return label.partition(" (")[0].partition(" = ")[0]
 
 
-# Longer texts go over several lines; of longer arrays only the range is shown.
+# The longest text in one line, and the longest array that is printed in full.
 _WIDTH, _LISTED = 88, 6
 
 
 class Shown(eqx.Module):
-    """A module that shows its numbers, in the units that its `units` state, if it has any."""
+    """A module whose representation has its numbers, with their units if it has `units`."""
 
     def __new__(cls, *args: Any, **kwargs: Any):
         fields = {field.name for field in dataclasses.fields(cls)}
@@ -291,14 +297,14 @@ class Shown(eqx.Module):
 
 
 class Summarized(eqx.Module):
-    """A result that says what it holds."""
+    """A result whose representation is a summary."""
 
     def summary(self) -> str:
-        """In words: a line, and further ones "name: value" that are indented."""
+        """Return a summary: a line of text, then indented lines "name: value"."""
         raise NotImplementedError
 
     def drawn(self) -> Any:
-        """A row of numbers to draw beside it, or `None`."""
+        """Return a row of numbers to draw with the summary, or `None`."""
         return None
 
     def __repr__(self) -> str:
@@ -309,19 +315,19 @@ class Summarized(eqx.Module):
 
 
 def known(tree: object) -> bool:
-    """Whether all numbers in a tree are there: none is traced, a placeholder, or given away."""
+    """Return whether all numbers in a tree are known: not traced, placeholders, or deleted."""
     return all(_is_shown(x) for x in jtu.tree_leaves(tree))
 
 
 def _is_shown(x: object) -> bool:
-    # JAX's own placeholder is a bare object; a solver's leaves may be functions and words.
+    # JAX's own placeholder is a bare object; a solver's leaves may be functions and strings.
     if isinstance(x, Tracer | jax.ShapeDtypeStruct) or type(x) is object:
         return False
     return not (isinstance(x, jax.Array) and x.is_deleted())
 
 
 def in_words(x: object, units: Mapping[str, str] = NONE, name: str = "", indent: int = 0) -> str:
-    """A module, a state or a number, as it would be written, each number with its unit."""
+    """Return a module, a state or a number as text, as in Python, with units."""
     if eqx.is_array_like(x) and not isinstance(x, bool):
         return number_in_words(x, unit_of(units, name) if name else "")
     opened, parts, closed = _parts(x)
@@ -337,11 +343,11 @@ def in_words(x: object, units: Mapping[str, str] = NONE, name: str = "", indent:
 
 
 def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
-    """How the text of something begins, what is in it, by name, and how the text ends."""
+    """Return the beginning of an object's text, its parts by name, and the end of the text."""
     name = f"{type(x).__name__}("
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         values = [(f.name, getattr(x, f.name, None)) for f in dataclasses.fields(x) if f.repr]
-        left_out = (type(None), tuple, str)  # what is not there, and what is empty
+        left_out = (type(None), tuple, str)  # absent or empty
         there = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
         return name, there, ")"
     if isinstance(x, tuple) and hasattr(x, "_fields"):
@@ -357,7 +363,7 @@ def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
 
 
 def number_in_words(x: object, unit: str = "") -> str:
-    """A number with its unit; of several, if they are many, their range and their shape."""
+    """Return a number with its unit; of a large array the range and the shape."""
     x = np.asarray(x)
     if not x.ndim:
         return with_unit(f"{x + 0.0:.9g}" if x.dtype.kind == "f" else str(x), unit)
@@ -371,7 +377,7 @@ def number_in_words(x: object, unit: str = "") -> str:
 
 
 def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
-    """Cells in HTML under a title."""
+    """Return an HTML table with these rows and a title."""
     cells = "".join(
         f"<tr>{''.join(f'<td style=text-align:left>{html.escape(x)}</td>' for x in row)}</tr>"
         for row in rows
@@ -381,7 +387,7 @@ def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
 
 
 def summary_table(text: str, row: object = None) -> str:
-    """A result in words as a table: its lines "name: value", the first one above."""
+    """Return a summary as an HTML table: the first line as title, then lines "name: value"."""
     first, *lines = text.splitlines()
     after = "" if row is None else sparkline(row)
     rows = (line.strip().rpartition(": ") if ": " not in line else line.strip().partition(": ")
@@ -390,7 +396,7 @@ def summary_table(text: str, row: object = None) -> str:
 
 
 def sparkline(row: object, width: int = 240, height: int = 40) -> str:
-    """A row of numbers as a small curve; nothing where fewer than two of them are finite."""
+    """Return a row of numbers as a small SVG curve; "" with fewer than two finite numbers."""
     y = np.asarray(row, float).ravel()
     good = np.isfinite(y)
     if good.sum() < 2:

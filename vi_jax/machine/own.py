@@ -1,4 +1,4 @@
-"""What a machine or one of its parts says itself, and what is said in its place."""
+"""Defaults of machines and their parts, and the members with which a user replaces them."""
 
 import copy
 import dataclasses
@@ -12,26 +12,25 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def by_default(method: Method) -> Method:
-    """Mark a method as what is said in the place of those who do not say it themselves."""
+    """Mark a method as a default, which subclasses may replace."""
     method.by_default = True  # pyright: ignore[reportFunctionMemberAccess]
     return method
 
 
 def is_own(method: object) -> bool:
-    """Whether a method or a property, as a class has it, is not marked by `by_default`."""
+    """Return whether a method or property of a class is not a default (`by_default`)."""
     return not hasattr(getattr(method, "fget", method), "by_default")
 
 
 def changed(part: object, base: type, names: Iterable[str]) -> str | None:
-    """The first of these methods and properties that the class of `part` does not share with
-    `base`; `None` if it shares all."""
+    """Return the first of these members that the class of `part` overrides, or `None`."""
     kind = type(part)
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x, None)), None)
 
 
 def with_own_defaults(kind: type) -> None:
     """Let a class replace fields of its parent without a type, which a dataclass ignores: a plain
-    value becomes the field's default, and a property takes the place of the field."""
+    value becomes the field's default, and a property replaces the field."""
     fields = getattr(kind, "__dataclass_fields__", {})
     types = dict(inspect.get_annotations(kind))
     for name in [x for x in vars(kind) if x in fields and x not in types]:
@@ -46,8 +45,8 @@ def with_own_defaults(kind: type) -> None:
 
 
 class derived:
-    """A property that a field of the same name in a subclass takes the place of, one without a
-    default too: of a class it is not there."""
+    """A property that a field of the same name in a subclass replaces, also one without a default.
+    The class does not have the attribute; instances do."""
 
     by_default = True
 
@@ -61,12 +60,12 @@ class derived:
 
 
 def says(part: object, name: str) -> bool:
-    """Whether a machine says by itself what is `derived` otherwise."""
+    """Return whether a machine itself defines a member that is otherwise `derived`."""
     return hasattr(type(part), name) or name in vars(part)
 
 
 def with_static(part: Any, **values: Any) -> Any:
-    """A copy of a part or a state with other values in some fields. Its own `__init__` may take
+    """Return a copy of a part or a state with other values of some fields. Its `__init__` may have
     other arguments."""
     new = copy.copy(part)
     for name, value in values.items():
@@ -75,14 +74,13 @@ def with_static(part: Any, **values: Any) -> Any:
 
 
 def declared_modes(machine: Any) -> Mapping[str, Any]:
-    """The discrete modes, by name, in which a motion begins, as the machine's class defines
-    them."""
+    """Return the initial discrete modes, by name, that the machine's class defines."""
     modes = machine.modes
-    return modes if isinstance(modes, Mapping) else {}  # of a beam it is a number of modes
+    return modes if isinstance(modes, Mapping) else {}  # for a beam `modes` is a number of modes
 
 
 def has_own_modes(machine: Any) -> bool:
-    """Whether a machine defines discrete modes."""
+    """Return whether a machine defines discrete modes."""
     return bool(declared_modes(machine)) or callable(machine.modes)
 
 
@@ -97,18 +95,18 @@ def switches_of(machine: Machine) -> tuple[Any, ...]:
 
 
 def others_of(machine: Machine) -> tuple[Any, ...]:
-    """Return the events of a machine that are no switches."""
+    """Return the events of a machine that are not switches."""
     return machine._others
 
 
 def clock_of(machine: Machine, state: State) -> Scalar | None:
-    """Return the component of the state that counts cycles; `None` where `s` itself does."""
+    """Return the component of the state that counts cycles; `None` if `s` does."""
     return machine._clock(state)
 
 
 def section_in(machine: Machine, state: State) -> Scalar | None:
-    """Return the function that rises through zero at the end of a cycle (see `rising`); `None`
-    where `s`, a clock or an event ends cycles."""
+    """Return the function that rises through zero at the end of a cycle (see `rising`); `None` if
+    `s`, a clock or an event ends cycles."""
     return machine._section(state)
 
 

@@ -1,4 +1,4 @@
-"""States by names, and what a user returns in the place of one."""
+"""States with named components, and states from the values that a user's function returns."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,9 +11,9 @@ from .numbers import in_words, known, number_in_words, split_place, table
 
 
 class State:
-    """A state with components of any names: `vi.State(x=0.0, u=1.0)`, then `z.x`.
+    """A state with components of any names: `vi.State(x=0.0, u=1.0)`, then `z.x`. It is a pytree.
 
-    A component is a number, an array, or another state. It is a pytree.
+    A component is a number, an array, or another state.
     """
 
     def __init__(self, **components: Any):
@@ -23,7 +23,7 @@ class State:
         self.__dict__.update(components)
 
     def replace(self, **components: Any) -> "State":
-        """Return the state with other components under these names.
+        """Return the state with other values of these components.
 
         **Raises:** `TypeError` for a name that the state does not have.
         """
@@ -37,7 +37,7 @@ class State:
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"A state cannot be changed. Use `state.replace({name}=...)`.")
 
-    def __getattr__(self, name: str) -> Any:  # of names that are not there
+    def __getattr__(self, name: str) -> Any:  # of missing names
         known = ", ".join(vars(self))
         raise AttributeError(f"The state has no component {name!r}; it has {known}.")
 
@@ -55,7 +55,7 @@ class State:
 
 
 def _state(components: Mapping[str, Any]) -> State:
-    """A state of components whatever they are, as JAX needs it."""
+    """Return a state with any components, also placeholders of JAX."""
     new = object.__new__(State)
     new.__dict__.update(components)
     return new
@@ -78,12 +78,12 @@ jtu.register_pytree_with_keys(
 
 
 def like(state: Any, found: Any, whose: str) -> Any:
-    """What a user returned, in the form of a state: a dictionary or a state by the names of its
-    components, plain numbers as arrays.
+    """Return the result of a user's function in the form of a state. The result may be a dictionary
+    or a state with the same names; plain numbers become arrays.
 
-    **Arguments:** `state`, of the form that is wanted; `whose`, what returned it, for messages.
+    **Arguments:** `state`, of the required form; `whose`, the function's name in messages.
 
-    **Raises:** `TypeError` that names a component which is missing, or which the state has not.
+    **Raises:** `TypeError` that names a missing or an unknown component.
     """
     if isinstance(found, State):
         return with_components(state, vars(found), whose, all_of_them=True)
@@ -95,7 +95,7 @@ def like(state: Any, found: Any, whose: str) -> Any:
 
 
 def changed(state: Any, found: Any, whose: str) -> Any:
-    """The state after a jump, of which a user returned the components that change.
+    """Return the state after a jump, for which a user's function returned the changed components.
 
     **Arguments and raises:** as `like`.
     """
@@ -105,7 +105,7 @@ def changed(state: Any, found: Any, whose: str) -> Any:
 
 
 def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool) -> Any:
-    """A state with these components, each like the one that it has.
+    """Return a state with these components, each with the type of the old one.
 
     **Arguments:** `all_of_them`, whether each component must be given.
 
@@ -133,7 +133,7 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
 
 
 def _in_arrays(parts: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Components of which some are given by one of their numbers, as `"x[3]"`."""
+    """Return components, of which some were given by single numbers such as `"x[3]"`."""
     found: dict[str, Any] = {}
     for name, value in given.items():
         base, place = (name, ()) if name in parts else split_place(name)
@@ -149,7 +149,7 @@ def _component(old: Any, new: Any, whose: str) -> Any:
 
 
 def _as_array(old: Any, new: Any) -> Any:
-    """A plain number as an array like another one; all else as it is."""
+    """Return a plain number as an array like `old`; all else unchanged."""
     if hasattr(new, "dtype") or not isinstance(new, int | float) or isinstance(new, bool):
         return new
     return jnp.full(jnp.shape(old), new, jnp.result_type(float, old))
