@@ -112,7 +112,6 @@ def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
 
 
 def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
-    """Return the coordinates on which contacts act, in the order of `_places`."""
     contacts = contacts_in(machine)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
@@ -160,7 +159,6 @@ def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
 
 
 def _at(stop: Any, places: dict[Any, int]) -> Any:
-    """Return a stop with the index of its coordinate."""
     if stop.on is None and stop.coordinate:
         return stop
     return with_static(stop, coordinate=places[stop.on])
@@ -403,8 +401,7 @@ class AbstractMachine(Shown):
     def units(self) -> Mapping[str, str]:
         """The units by name: of `position`, `velocity`, `time`, `rate` (of exponents), `energy`,
         `power`, and of each parameter and component of the state. "1" is dimensionless, and "" is
-        the name of all others. The default is those in brackets in `labels` and in fields'
-        metadata."""
+        the name of all others. By default they are those of `labels` and fields' metadata."""
         found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
         own = {**dict(found), **fields_with(type(self), "unit")}
         return {x: unit for x, unit in own.items() if unit}

@@ -160,8 +160,6 @@ def _fields(kind: Any) -> list[str]:
 
 @functools.lru_cache(maxsize=64)
 def _observed_kind(kind: type) -> type:
-    """Return the class of a machine observed at equal intervals."""
-
     def original(self: Any) -> Any:
         return _as_kind(kind, kind, self, self.observed_usual)
 
@@ -187,5 +185,4 @@ def _observed_kind(kind: type) -> type:
 
 
 def _goes_on(event: AbstractEvent) -> AbstractEvent:
-    """Return the same event without the end of a cycle."""
     return with_static(event, ends_cycle=False) if event.ends_cycle else event

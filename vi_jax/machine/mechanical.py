@@ -1,9 +1,8 @@
 """Machines defined by masses and applied forces; inertial terms follow from the masses.
 
 With coordinates q, velocities v, the mass matrix M(q) and kinetic energy ½ vᵀMv, Lagrange's
-equations are M v' + h = f. Here f are the applied forces, and h_i = Σ_k v_k (∂M/∂q_k v)_i - ½
-vᵀ(∂M/∂q_i) v. A contact with gap g(q) has J = ∇g. Its force acts along M⁻¹Jᵀ with the effective
-mass 1/(J M⁻¹ Jᵀ).
+equations are M v' + h = f. Here f are applied forces, and h_i = Σ_k v_k (∂M/∂q_k v)_i - ½
+vᵀ(∂M/∂q_i) v. The force of a contact with gap g(q), J = ∇g, acts along M⁻¹Jᵀ on a mass 1/(J M⁻¹Jᵀ).
 """
 
 import abc
@@ -50,8 +49,7 @@ class Mechanical(AbstractMachine):
 
     A contact is `on` a coordinate, `on="y"`, or a gap of several, `on=lambda q: q.left - q.right`.
     The momentum of an impact, the effective mass (`Run.impact_energy`) and inertial terms follow
-    from the masses. `mass` and `force` have entries only for coordinates whose motion is not
-    prescribed.
+    from the masses. Prescribed coordinates have no entries in `mass` and `force`.
 
     An array of coordinates has arrays of forces and masses, and contacts such as `on="x[39]"`. Then
     the masses cannot be a matrix.
@@ -180,13 +178,11 @@ class Mechanical(AbstractMachine):
         return Named(**{name: getattr(state, name) for name in self.q_names})
 
     def _velocities(self, state: State) -> Named:
-        """Return the velocities in a state, by the names of their coordinates."""
         if not self._velocity_names:
             return state.v
         return Named(**{q: getattr(state, self._velocity_names[q]) for q in self.q_names})
 
     def _in_state(self, state: Any, q: Named, v: Named) -> Any:
-        """Return the state with these positions and velocities."""
         if isinstance(state, Named):
             return state.replace(**vars(q), v=v)
         speeds = {self._velocity_names[name]: x for name, x in vars(v).items()}
@@ -383,14 +379,12 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
 
 
 def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
-    """Return whether this is the mass of one coordinate, or those of an array of this shape."""
     return not isinstance(x, list | tuple) and jnp.shape(x) in ((), shape)
 
 
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
-    """Return M⁻¹ right for a symmetric positive definite matrix: elimination without pivoting,
-    which omits known zeros. Pivots are inverted, since those of constant masses are the same in all
-    stages of a step."""
+    """Return M⁻¹ right for a symmetric positive definite matrix, by elimination without pivoting
+    and known zeros. Pivots are inverted: those of constant masses do not change in a step."""
     n, rows, inverses = len(right), [[*row, x] for row, x in zip(M, right, strict=True)], []
     for i in range(n):
         inverses.append(1 / rows[i][i])

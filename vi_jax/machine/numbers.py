@@ -21,23 +21,19 @@ from .._types import Machine, Scalar, State
 
 
 def leaf_names(tree: object) -> list[str]:
-    """Return the names of all numbers in a machine or another pytree, in the order of its
-    leaves."""
+    """Return the names of all numbers in a machine or a pytree, in the order of leaves."""
     return list(by_name(tree))
 
 
 def by_name(tree: object) -> dict[str, Any]:
-    """Return all numbers of a machine, a state or another pytree by name, in the order of
-    leaves."""
+    """Return all numbers of a machine or a pytree by name, in the order of leaves."""
     leaves = ((path, x) for path, x in jtu.tree_leaves_with_path(tree) if eqx.is_array_like(x))
     return {jtu.keystr(path, simple=True, separator="."): x for path, x in leaves}
 
 
 def components(state: State, lead: int = 0) -> dict[str, Any]:
-    """Return all numbers of a state by name, those of an array as `name[i]`.
-
-    **Arguments:** `lead`, the number of leading axes of a batch of states, which the results keep.
-    """
+    """Return all numbers of a state by name, those of an array as `name[i]`; with `lead` leading
+    axes those of a batch of states."""
     found = {}
     for name, x in by_name(state).items():
         for place in np.ndindex(*jnp.shape(x)[lead:]):
@@ -47,16 +43,13 @@ def components(state: State, lead: int = 0) -> dict[str, Any]:
 
 
 def in_rows(states: State, lead: int = 1) -> Array:
-    """Return a batch of states as rows of all numbers, in the order of `ravel_pytree`.
-
-    **Arguments:** `lead`, the number of leading axes of the batch.
-    """
+    """Return a batch of states with `lead` leading axes as rows, in the order of `ravel_pytree`."""
     leaves = [jnp.asarray(x) for x in jtu.tree_leaves(states)]
     return jnp.concatenate([x.reshape(*x.shape[:lead], -1) for x in leaves], axis=-1)
 
 
 def size_of(part: Callable[[State], Scalar], state: State, sizes: State) -> Scalar:
-    """Return the size of the terms of a function of the state whose components have these sizes."""
+    """Return the sum over the state of |∂part/∂x| times the size of x."""
     slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
     each = jtu.tree_map(lambda slope, size: jnp.sum(jnp.abs(slope) * size), slopes, sizes)
     return sum(jtu.tree_leaves(each), start=jnp.zeros(()))
@@ -119,13 +112,11 @@ def with_leaves(tree: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
-    """Return the name of a number's array and its index there; no index for a number or a whole
-    array."""
     return (name, ()) if name in by_name(tree) else split_place(name)
 
 
 def split_place(name: str) -> tuple[str, tuple[int, ...]]:
-    """Return an array's name and an index in it, from `"x[1, 2]"`; no index without brackets."""
+    """Return an array's name and an index in it, of `"x[1, 2]"`; `()` without brackets."""
     if not name.endswith("]"):
         return name, ()
     base, _, inner = name.removesuffix("]").rpartition("[")
@@ -133,15 +124,13 @@ def split_place(name: str) -> tuple[str, tuple[int, ...]]:
 
 
 def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
-    """Return `name`, if the machine has such a number or array; numbers of an array are
-    `name[i]`."""
+    """Return `name`, if it is that of a number, of an array, or of an array's number `name[i]`."""
     names = leaf_names(tree)
     return name if name in names else check_name(list(components(tree)), name, argument, tree)
 
 
 def check_name(names: list[str], name: str, argument: str, machine: object = None) -> str:
-    """Return `name`, if it is among the names of numbers of a machine or another tree. **Raises:**
-    as `leaf`."""
+    """Return `name`, if it is among the names of numbers. **Raises:** as `leaf`."""
     if name in names:
         return name
     untyped = getattr(type(machine), str(name), None)
@@ -181,8 +170,7 @@ PLAIN = "position", "velocity"
 
 
 def unit_of(units: Mapping[str, str], name: str) -> str:
-    """Return the unit of a quantity or a number, also by its last word; "" without a stated
-    unit."""
+    """Return the unit of a quantity or a number, also by its last word; "" if unknown."""
     last = name.split(".")[-1].split("[")[0]
     for key in (name, "" if name.startswith("v.") else last, ""):  # `v.x` and `x` differ
         if key in units:
@@ -191,8 +179,8 @@ def unit_of(units: Mapping[str, str], name: str) -> str:
 
 
 def units_of(machine: Machine) -> dict[str, str]:
-    """Return the units of a machine. Those of position and velocity are by default those of the
-    components of the same names."""
+    """Return the units of a machine. The default of position and velocity are the units of the
+    components that are their labels."""
     units = dict(machine.units)
     for quantity, name in zip(PLAIN, machine.labels, strict=True):
         if name in units:
@@ -242,8 +230,7 @@ def quantity_of(name: str) -> str | None:
 
 
 def with_units(data: Any, units: Mapping[str, str], named: Mapping[str, str] = NONE) -> Any:
-    """Return a data set with the units of its variables as attributes; `named` maps variables to
-    numbers of a machine with other names."""
+    """Return a data set with units as attributes; `named` has names of numbers by variables."""
     for name in data.variables:
         quantity = named.get(name) or quantity_of(str(name))
         if quantity is not None:

@@ -65,8 +65,7 @@ def says(part: object, name: str) -> bool:
 
 
 def with_static(part: Any, **values: Any) -> Any:
-    """Return a copy of a part or a state with other values of some fields. Its `__init__` may have
-    other arguments."""
+    """Return a copy of a part or a state with other values of fields, without its `__init__`."""
     new = copy.copy(part)
     for name, value in values.items():
         object.__setattr__(new, name, value)

@@ -1,5 +1,5 @@
-"""Machines whose cycle is a turn of a shaft, in the phase or the time clock; the paper's scene;
-and Table 1 of the paper in SI units, with the way from there to a scene and back."""
+"""Machines whose cycle is a turn of a shaft, in the phase or the time clock; the paper's scene; and
+Table 1 of the paper in SI units, with conversions to a scene and back."""
 
 import abc
 import dataclasses
@@ -50,17 +50,16 @@ from .numbers import Shown
 from .own import changed
 from .stop import RigidStop, SoftStop
 
-# A state that was carried to the section lies on it to rounding, in single precision too, where
-# that of a turn is 5e-7.
+# The largest error of a state on the section. In single precision, that of a turn is 5e-7.
 _ON_SECTION = 1e-5
 
 
 class ShaftMachine(AbstractMachine):
     """A machine driven by a shaft that turns once in a cycle.
 
-    Its clock is `"phase"`, with the angle of the shaft as the independent variable, or `"time"`. A
-    shaft whose speed W is part of the state must turn forward in the phase clock; by time it need
-    not, and its angle is a component `phase` of the state.
+    Its clock is `"phase"`, with the shaft's angle as independent variable, or `"time"`. If its
+    speed W is part of the state, the shaft must turn forward in the phase clock. In the time clock
+    it need not, and its angle is the component `phase` of the state.
     """
 
     clock_name: eqx.AbstractVar[str]
@@ -76,25 +75,24 @@ class ShaftMachine(AbstractMachine):
     @property
     @abc.abstractmethod
     def timed_type(self) -> type | None:
-        """That of the same state by time, with `phase` as one more component at the end; `None`
-        where the speed of the shaft is no part of it."""
+        """The class of a state in the time clock, with `phase` as last component; `None` if the
+        speed of the shaft is not part of the state."""
 
     def is_timed(self, state: State) -> bool:
-        """Whether the angle of the shaft is part of the state."""
+        """Return whether the angle of the shaft is part of the state."""
         return type(state) is self.timed_type
 
     def is_paced(self, state: State) -> bool:
-        """Whether time is not the independent variable, but passes by the speed of the shaft in the
-        state."""
+        """Return whether the angle is the independent variable, and dτ/dφ depends on the state."""
         return self.timed_type is not None and type(state) is self.state_type
 
     def in_clock(self, clock: str) -> Any:
-        """The same machine in the `"phase"` or the `"time"` clock."""
+        """Return the same machine in the `"phase"` or the `"time"` clock."""
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
 
     def adopt(self, start: State) -> State:
-        """A start made for either clock, as this machine's clock needs it."""
+        """Return a start made for either clock in the form of this machine's clock."""
         wanted = self.state_type
         if self.clock_name == "time" and self.timed_type is not None:
             if type(start) is wanted:
@@ -104,11 +102,10 @@ class ShaftMachine(AbstractMachine):
         return state_of_numbers("start", start)
 
     def in_cycle_state(self, name: str, state: State) -> State:
-        """A state on the section that was made for the time clock, without the angle of the shaft;
-        any other as it is.
+        """Return a section state without the shaft's angle, if it is of the time clock.
 
-        **Raises:** `ValueError` that names the argument if the angle is known and not 0,
-        `TypeError` for what is no state of this machine.
+        **Raises:** `ValueError` with the argument's name if the angle is known and not 0,
+        `TypeError` for another object than a state of this machine.
         """
         if not self.is_timed(state):
             _require_state(name, state, self.state_type)
@@ -125,16 +122,16 @@ class ShaftMachine(AbstractMachine):
         return state.phase if self.is_timed(state) else None
 
     def rewound(self, state: State) -> State:
-        """The state with a full turn taken off the angle."""
+        """Return the state with a full turn subtracted from the angle."""
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
 
     def alive(self, state: State) -> jax.Array | None:
-        """Whether the shaft turns forward, in the phase clock; `None` in another."""
+        """Return whether the shaft turns forward, in the phase clock; `None` in another."""
         return state.W > 0 if self.is_paced(state) else None
 
     def check_start(self, start: State) -> None:
-        """Raise a `ValueError` if the shaft does not turn forward in the phase clock, or is beyond
-        its section."""
+        """Raise `ValueError` if a start is beyond its section, or does not turn in the phase
+        clock."""
         if self.is_paced(start):
             speed = concrete(self.section_speed(start))
             if speed is not None and not (speed > 0).all():
@@ -151,12 +148,11 @@ class ShaftMachine(AbstractMachine):
                 )
 
     def section_speed(self, state: State) -> Any:
-        """W of a state on the section."""
+        """Return W of a state on the section."""
         return state.W
 
 
 def _require_state(name: str, state: object, wanted: type) -> None:
-    """**Raises:** `TypeError` if this argument is no state of the wanted class."""
     if type(state) is wanted:
         return
     parts = [x for x in ("last", "state") if type(getattr(state, x, None)) is wanted]
@@ -179,13 +175,13 @@ class Oscillator(Shown):
 
 
 class Scene(ShaftMachine):
-    """A body on a spring, shaken by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
+    """A body on a spring, driven by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
 
-    Every number is a leaf, so that it can be a `vmap` axis or be differentiated. Absent parts (a
-    stop, the drive's equation, a clock component) are left out of the compiled program.
+    Every number is a leaf, and may be a `vmap` axis or be differentiated. Absent parts (a stop, the
+    drive's equation, a clock component) are left out of the compiled program.
 
-    The clock is `"phase"` (crank angle as the independent variable: the drive cycle is exactly 2π
-    long, and the crank must keep turning forward) or `"time"` (any motion, also a start from rest).
+    The clock is `"phase"` (the crank angle is the independent variable: a drive cycle is exactly
+    2π, and the crank must keep turning forward) or `"time"` (any motion, also a start from rest).
     For an ideal drive both agree up to the factor ζ.
     """
 
@@ -204,7 +200,7 @@ class Scene(ShaftMachine):
     soft_stops: tuple[SoftStop, ...] = eqx.field(
         default=(), converter=lambda x: tuple_of("soft_stops", x, SoftStop)
     )
-    """Compliant stops; their stiffness in units of the body's own spring."""
+    """Compliant stops; the unit of their stiffness is that of the body's own spring."""
     ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi), "room": POSITIVE}
     units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
     labels: ClassVar = ("Y = y/a", "V = dY/dτ")  # pyright: ignore
@@ -237,12 +233,12 @@ class Scene(ShaftMachine):
         damping_ratio: Number = 0.0,
         crank: AbstractCrank | None = None,
     ) -> "Scene":
-        """An ideally driven scene with one stop on the right.
+        """Return an ideally driven scene with one stop on the right.
 
         **Arguments:** ζ, k, d (unit: a) and ξ, scalars or arrays of one shape to `vmap` over;
         `crank` defaults to `CosineCrank()`. `gap=None` leaves the stop out.
 
-        **Raises:** `ValueError` naming the argument that is out of range.
+        **Raises:** `ValueError` with the name of an argument that is out of range.
         """
         stops = () if gap is None else (RigidStop(gap, restitution),)
         return cls(
@@ -259,26 +255,26 @@ class Scene(ShaftMachine):
 
     @property
     def cycle(self) -> Scalar | float:
-        """2π of crank angle; in the time clock of an ideal drive 2π/ζ of time τ."""
+        """The cycle: 2π of crank angle, or in the time clock of an ideal drive 2π/ζ of time τ."""
         return self.period if self.clock_name == "time" else 2 * pi
 
     @property
     def period(self) -> Scalar | float:
-        """2π/ζ of time τ for an ideal drive; of another a turn of the crank."""
+        """The duration 2π/ζ of a cycle, in τ, of an ideal drive; 2π of crank angle for another."""
         speed = self.drive.fixed_speed
         return 2 * pi if speed is None else 2 * pi / speed
 
     def at_section(self, phase: Number) -> "Scene":
-        """The same scene, observed where the crank angle is `phase` (radians) instead of 0."""
+        """Return the same scene, observed at the crank angle `phase` (radians) instead of 0."""
         return dataclasses.replace(self, section_phase=phase)
 
     def observed_later(self, since_section: Number) -> "Scene":
-        """Observed so much crank angle (radians) after its own section."""
+        """Return the same scene, observed this crank angle (radians) after its section."""
         angle = self.phase_at(since_section)
         return self.at_section(jnp.where(angle > 2 * pi, angle - 2 * pi, angle))
 
     def phase_at(self, since_section: Number) -> Any:
-        """Crank angle from the one counted since the section."""
+        """Return the crank angle for an angle since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
 
     def start(
@@ -290,15 +286,15 @@ class Scene(ShaftMachine):
         M: Number | None = None,
         **others,
     ) -> State:
-        """A state on the section.
+        """Return a state on the section.
 
         `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
-        the steady torque at that speed; a motor that is being switched on has `W=0, M=0`.
+        the steady torque at that speed. A motor that is being switched on has `W=0, M=0`.
 
         **Arguments:** position `Y` (unit: a), velocity `V` (a ω), crank speed `W` (ω) and the
         torque `M` of a `DCMotor` (J ω²); `others` are further components of your own drive.
 
-        **Raises:** `ValueError` if a number is not finite, or is given to a drive that has none.
+        **Raises:** `ValueError` if a number is not finite, or the drive has no such component.
         """
         Y, V = number("Y", Y), number("V", V)
         require("Y", Y)
@@ -308,12 +304,12 @@ class Scene(ShaftMachine):
 
     @property
     def state_type(self) -> type:
-        """That of the drive's states."""
+        """The class of the drive's states."""
         return self.drive.state
 
     @property
     def timed_type(self) -> type | None:
-        """That of the drive's states by time."""
+        """The class of the drive's states in the time clock."""
         return self.drive.timed_state
 
     @property
@@ -325,40 +321,40 @@ class Scene(ShaftMachine):
         return self.soft_stops
 
     def field(self, s: Scalar, state: State, *modes: Scalar) -> State:
-        """d(state)/ds: by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
+        """Return d(state)/ds by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
         return self.drive.field(self, s, state, self._pushes(s, state, modes))
 
     def pull(self, stretch: Any, speed: Number, pushes: Iterable[Any]) -> Any:
-        """d²Y/dτ² from U - Y, V and what compliant stops add; from all three divided by W,
-        dV/dφ."""
+        """Return d²Y/dτ² from U - Y, V and the accelerations by compliant stops. With all three
+        divided by W, it is dV/dφ."""
         pull = stretch - 2 * self.damping_ratio * speed
         for push in pushes:
             pull = pull + push
         return pull
 
     def _pushes(self, s, state, modes):
-        """What each compliant stop adds to d²Y/dτ²."""
+        """Yield the contribution of each compliant stop to d²Y/dτ²."""
         for stop, mode in zip(self.soft_stops, modes, strict=True):
             yield stop.contribution(self, s, state, mode)
 
     def as_logged(self, clock: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The crank angle since the section, where time counts the cycles of an ideal drive."""
+        """Return the crank angle since the section for a reading of the clock."""
         speed = self.drive.fixed_speed
         return clock if speed is None or self.clock_name == "phase" else speed * clock
 
     def pace(self, s: Scalar, state: State) -> Scalar | None:
-        """dτ/dφ = 1/W in the phase clock of a motor."""
+        """Return dτ/dφ = 1/W in the phase clock of a motor."""
         return 1 / state.W if self.is_paced(state) else None
 
     def frequency_ratio(self, duration: Float[Array, "..."]) -> Float[Array, "..."]:
-        """ζ: mean crank speed over cycles of these durations (unit: ω)."""
+        """Return ζ, the mean crank speed over cycles of these durations (unit: ω)."""
         speed = self.drive.fixed_speed
         if speed is None:
             return 2 * pi / duration
         return jnp.broadcast_to(speed, duration.shape)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """A fifth of the shorter of the drive's turn and the body's natural period."""
+        """Return a fifth of the crank's turn or the body's period, less near a soft stop."""
         speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         for stop in self.soft_stops:
@@ -366,8 +362,8 @@ class Scene(ShaftMachine):
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
-        """1/2ξ of a strongly damped body, or what the drive says: the time w0/τ0 in which a motor
-        is back at speed, or in which the current of a `DCMotor` settles."""
+        """Return the shortest decay time: 1/2ξ of the body, or that of the drive: the time w0/τ0 in
+        which a motor returns to its speed, or in which the current of a `DCMotor` settles."""
         rate, of_drive = 2 * self.damping_ratio, self.drive.rate()
         if of_drive is not None:
             rate = jnp.maximum(rate, of_drive)
@@ -375,7 +371,7 @@ class Scene(ShaftMachine):
         return pace / jnp.maximum(rate, 1e-6)
 
     def mirrored(self, state: State) -> State | None:
-        """Y → -Y half a turn later, if both sides have the same stops and the crank is odd."""
+        """Return -Y half a turn later, if both sides have the same stops and the crank is odd."""
         for stops in (self.stops, self.soft_stops):
             if not all(any(stop.mirrors(other) for other in stops) for stop in stops):
                 return None
@@ -384,15 +380,15 @@ class Scene(ShaftMachine):
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     def may_rest(self) -> bool:
-        """Not if all gaps are known and beyond the crank's reach, so that nothing presses on."""
+        """Return False if all gaps are known and beyond the reach of the crank."""
         if not self._is_within_reach() or any(map(self._may_be_pressed, self.stops)):
             return True
         gaps = [concrete(stop.gap) for stop in self.stops]
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
     def _is_within_reach(self) -> bool:
-        """Whether the equations are the library's, whose slider stays within |U| ≤ 1 and alone
-        pulls at the body."""
+        """Return whether by the library's equations only a slider within |U| ≤ 1 pulls at the
+        body."""
         return (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
@@ -400,7 +396,7 @@ class Scene(ShaftMachine):
         )
 
     def _may_be_pressed(self, stop: RigidStop) -> bool:
-        """Whether a compliant stop may press the body on a rigid one."""
+        """Return whether a compliant stop may press the body on a rigid one."""
         for soft in self.soft_stops:
             depth = concrete(soft.beyond(stop.place))
             apart = depth is not None and bool((depth <= 0).all())
@@ -412,7 +408,7 @@ class Scene(ShaftMachine):
 
     @property
     def room(self) -> Any:
-        """Distance between two stops, of known gaps a known one; `None` with fewer."""
+        """The distance between two stops, known if the gaps are; `None` with fewer stops."""
         if len(self.stops) < 2:
             return None
         gaps: list[Any] = [concrete(stop.gap) for stop in self.stops]
@@ -420,9 +416,9 @@ class Scene(ShaftMachine):
         return one + other
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """The crank with its slider, the spring and the body between its stops."""
+        """Draw the crank with its slider, the spring and the body between its stops."""
         crank = self.crank
-        size = pen.size = max(0.8, 0.25 * pen.reach)  # beside a crank of radius 1
+        size = pen.size = max(0.8, 0.25 * pen.reach)  # the crank has radius 1
         rod = float(crank.drawn_rod)
         pin = cos(phase), sin(phase)
         slider = rod + float(crank.slide(jnp.asarray(phase)).U)
@@ -479,16 +475,16 @@ class Scene(ShaftMachine):
         pen.label(0.1, 1.45, self.drive.caption)
 
 
-# Crank radii from which a length is taken to be in another unit than metres: a choice. Table 1's
-# gap is 2 of them, and would be 2,000 if given in millimetres.
+# A length of this many crank radii is probably not in metres: a choice. Table 1's gap is 2 radii,
+# and would be 2,000 in millimetres.
 _LONG = 1000.0
 
-# A plain number is taken as well as an array of them to `vmap` over.
+# A plain number, or an array of them to `vmap` over.
 _Plain = Float[Array, "..."] | float
 
 
 def _si(name: str, unit: str, default: float | None, allowed: Range = REAL) -> Any:
-    """A field for a number in this unit, or for a quantity of `pint` that can be given in it."""
+    """Return a field for a number in this unit, or for a quantity of `pint` that converts to it."""
     convert = real(name) if default is not None else optional_real(name)
     return eqx.field(
         default=default,
@@ -503,7 +499,7 @@ def _magnitude(name: str, unit: str, value: Any) -> Any:
         return value
     try:
         return value.to(unit).magnitude
-    except Exception as error:  # of a kind that only its library knows
+    except Exception as error:  # of a class that only its library defines
         raise ValueError(
             f"Argument `{name}` must be in {unit or 'no unit'}, or in one that can be converted, "
             f"but got {value}."
@@ -515,9 +511,10 @@ class Parameters(Shown):
 
     Each number may be a quantity of `pint`, in any unit of its kind.
 
-    The dimensionless groups, with ω = √(k0/m_C): ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
-    ε = m_C a²/J, τ0 = T0/(J ω²), w0 = Ω0/ω, λ = a/l, and with `electrical_time`
-    τe = ωL/R. A motor of the constants K_t and K_e at the voltage u has κT0 = K_t u/R, κΩ0 = u/K_e.
+    The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J, ε =
+    m_C a²/J. Those of the motor are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`, τe =
+    ωL/R. The crank has λ = a/l. A motor with constants K_t and K_e at the voltage u has κT0 = K_t
+    u/R, κΩ0 = u/K_e.
     """
 
     body_mass: _Plain = _si("body_mass", "kg", 0.35, POSITIVE)
@@ -543,8 +540,8 @@ class Parameters(Shown):
     control: _Plain = _si("control", "", 0.9)
     """κ, motor control, dimensionless; the frequency ratio ζ of an ideal drive."""
     no_load_speed: _Plain | None = _si("no_load_speed", "rad/s", None, POSITIVE)
-    """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, which makes the tabulated
-    κ = 0.5…1.9 the tabulated range of ζ; the paper does not give Ω0."""
+    """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, for which the tabulated κ =
+    0.5…1.9 are the tabulated range of ζ; the paper does not give Ω0."""
 
     electrical_time: _Plain | None = _si("electrical_time", "s", None, POSITIVE)
     """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
@@ -555,7 +552,7 @@ class Parameters(Shown):
             self._warn_if_long(name)
 
     def _warn_if_long(self, name: str) -> None:
-        """Millimetres for metres are in range, and make a machine that never meets its stop."""
+        """Warn of lengths in millimetres: they are in range, but no stop is ever met."""
         length, radius = concrete(getattr(self, name)), concrete(self.crank_radius)
         if length is None or radius is None:
             return
@@ -570,24 +567,24 @@ class Parameters(Shown):
 
     @property
     def units(self) -> dict[str, str]:
-        """SI units of each parameter."""
+        """The SI unit of each parameter."""
         written = ((f.name, f.metadata["unit"]) for f in dataclasses.fields(self))
         return {name: unit.replace("**2", "²").replace("*", "·") for name, unit in written}
 
     @property
     def natural_frequency(self) -> _Plain:
-        """Natural frequency of the body on its spring, ω = √(k0/m_C), in rad/s."""
+        """The natural frequency of the body on its spring, ω = √(k0/m_C), in rad/s."""
         return (self.stiffness / self.body_mass) ** 0.5
 
     def scene(self, *, drive: str = "motor", crank: str = "cosine") -> Scene:
-        """The dimensionless scene.
+        """Return the dimensionless scene.
 
         **Arguments:** `drive` is `"motor"` or `"ideal"` (which turns at ζ = κ); `crank` is
         `"cosine"` (first approximation) or `"slider"` (exact kinematics).
         """
         one_of("drive", drive, ("motor", "ideal"))
         one_of("crank", crank, ("cosine", "slider"))
-        require_ranges(self)  # again: a number may have been put in place of another
+        require_ranges(self)  # again: a number may have been replaced
         omega = self.natural_frequency
         if drive == "ideal":
             turning: IdealDrive | Motor = IdealDrive(self.control)
@@ -606,7 +603,7 @@ class Parameters(Shown):
             )
         damping = self.damping / (2 * self.body_mass * omega)
         if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):
-            # Of numbers that are out of range some give a scene of numbers that are not.
+            # Some parameters out of range give a scene with parameters in range.
             damping = jnp.where(in_range(self), damping, jnp.nan)
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
@@ -617,23 +614,23 @@ class Parameters(Shown):
         )
 
     def metres(self, Y: Any) -> Any:
-        """A dimensionless position Y in m."""
+        """Return a dimensionless position Y in m."""
         return self.crank_radius * Y
 
     def metres_per_second(self, V: Any) -> Any:
-        """A dimensionless velocity V = dY/dτ in m/s."""
+        """Return a dimensionless velocity V = dY/dτ in m/s."""
         return self.crank_radius * self.natural_frequency * V
 
     def radians_per_second(self, W: Any) -> Any:
-        """A dimensionless crank speed W (or a frequency ratio ζ) in rad/s."""
+        """Return a dimensionless crank speed W (or a frequency ratio ζ) in rad/s."""
         return self.natural_frequency * W
 
     def seconds(self, tau: Any) -> Any:
-        """A dimensionless time τ in s."""
+        """Return a dimensionless time τ in s."""
         return tau / self.natural_frequency
 
 
 def _ratio(a: Any, b: Any) -> Any:
-    """a / b; of known numbers a known one, inside of `jit` too."""
+    """Return a / b as a known number if both are, inside of `jit` too."""
     over, under = concrete(a), concrete(b)
     return a / b if over is None or under is None else over / under

@@ -55,7 +55,7 @@ class State:
 
 
 def _state(components: Mapping[str, Any]) -> State:
-    """Return a state with any components, also placeholders of JAX."""
+    """Return a state whose components may also be placeholders of JAX."""
     new = object.__new__(State)
     new.__dict__.update(components)
     return new

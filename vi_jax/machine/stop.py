@@ -1,4 +1,4 @@
-"""Rigid stops; and compliant ones, whose force follows a contact law while the body penetrates."""
+"""Rigid stops, and compliant stops whose force follows a contact law during penetration."""
 
 import abc
 import dataclasses
@@ -37,13 +37,13 @@ from .own import by_default, is_own
 
 
 def _unless_tiny(V: Number) -> Any:
-    """A velocity, but 0 where its square is below the smallest number."""
+    """Return a velocity, or 0 if its square is below the smallest number."""
     least = 100 * float(jnp.finfo(jnp.result_type(V)).tiny) ** 0.5
     return jnp.where(jnp.abs(V) > least, V, 0.0)
 
 
 class Wall(Shown):
-    """Where a stop stands, rigid or compliant: at `gap` on its `side`."""
+    """The position of a stop, rigid or compliant: at `gap` on its `side`."""
 
     gap: eqx.AbstractVar[Float[Array, "..."]]
 
@@ -54,19 +54,19 @@ class Wall(Shown):
 
     @property
     def place(self) -> Float[Array, "..."]:
-        """Position of the stop, sign·gap (unit: that of the gap)."""
+        """The position of the stop, sign·gap (unit: that of the gap)."""
         return self.sign * self.gap
 
     def beyond(self, Y: Number) -> Any:
-        """How far a position lies beyond the stop; negative inside."""
+        """Return the depth of a position beyond the stop; negative inside."""
         return self.sign * Y - self.gap
 
     def approach(self, V: Number) -> Any:
-        """Speed towards the stop, sign·V; negative for a body that moves away."""
+        """Return the speed towards the stop, sign·V; negative for a body that moves away."""
         return self.sign * V
 
     def mirrors(self, other: "Wall") -> bool:
-        """Whether the other is the image of this one, as far as their numbers are known."""
+        """Return whether the other is the mirror image of this one, as far as is known."""
         if type(other) is not type(self) or other.sign == self.sign:
             return False
         image = dataclasses.replace(other, side=self.side)  # pyright: ignore
@@ -81,16 +81,16 @@ class RigidStop(Wall, AbstractEvent):
     """A rigid wall with Newton's restitution law: at contact and approaching, V ← -k V.
 
     A stop on the right keeps Y ≤ gap, one on the left keeps Y ≥ -gap. The gap may be zero or
-    negative (a body pressed on); the restitution is in [0, 1], both ends included, or a function of
-    the speed of approach with values there (a pytree, if it has parameters).
+    negative (a body pressed on). The restitution is in [0, 1], both ends included. It may be a
+    function of the speed of approach with such values (a pytree, if it has parameters).
 
-    It limits the coordinate that `on` names: the components of the state that are position and
-    velocity, `on=("x", "u")`; of a `Mechanical` one of its coordinates, `on="y"`, or a function of
-    them, `on=lambda q: q.left - q.right`; of a linear machine (`vi.machines.Structure`) the sum
-    `at`·x of its displacements. Without a name it is the machine's `position`.
+    It limits the coordinate `on`, the names of position and velocity in the state: `on=("x", "u")`.
+    For a `Mechanical` it is one of the coordinates, `on="y"`, or a function of them, `on=lambda q:
+    q.left - q.right`. For a linear machine (`vi.machines.Structure`) it is the sum `at`·x of
+    displacements. The default is the machine's `position`.
 
-    With `friction` μ a body rubs where it hits the stop, or rests on it, along another coordinate,
-    which `along` names in the same way (see `ContactFriction`).
+    With `friction` μ, Coulomb friction acts during impacts and rest on the stop, along another
+    coordinate, `along`, which is named in the same way (see `ContactFriction`).
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
@@ -102,12 +102,11 @@ class RigidStop(Wall, AbstractEvent):
     on: Any = eqx.field(static=True, default=None, kw_only=True)
     """The names of position and velocity, or the coordinate or function of a `Mechanical`."""
     mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
-    """The effective mass of an impact, for `Run.impact_energy`: 1 by default; a `Mechanical`
-    computes it."""
+    """The effective mass of an impact, for `Run.impact_energy`: 1, or that of a `Mechanical`."""
     friction: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("friction")
     )
-    """μ, Coulomb's coefficient of friction (dimensionless); none by default."""
+    """μ, Coulomb's coefficient of friction (dimensionless); without friction by default."""
     along: Any = eqx.field(static=True, default=None, kw_only=True)
     """The coordinate that the body slips along, given as in `on`."""
     tangential_restitution: Float[Array, "..."] | None = eqx.field(
@@ -117,8 +116,8 @@ class RigidStop(Wall, AbstractEvent):
     coordinate: int = eqx.field(static=True, default=0, kw_only=True)
     """Index into the machine's `coordinates`."""
     modes: Callable[..., Any] | None = eqx.field(static=True, default=None, kw_only=True)
-    """`modes(machine, s, state, *modes)`: the machine's own modes after an impact in this state,
-    one number, a tuple, or a dictionary of those that change; by default all stay."""
+    """The machine's own modes after an impact in this state, `modes(machine, s, state, *modes)`:
+    one number, a tuple, or a dictionary of those that change; by default unchanged."""
     at: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("at")
     )
@@ -128,7 +127,7 @@ class RigidStop(Wall, AbstractEvent):
         "tangential_restitution": SHARE,
     }  # fmt: skip
     word: ClassVar = "impact"
-    from_below: ClassVar = False  # behind an impact the body goes away from the stop
+    from_below: ClassVar = False  # after an impact the body moves away
 
     def __check_init__(self):
         require_ranges(self)
@@ -141,11 +140,11 @@ class RigidStop(Wall, AbstractEvent):
         count("coordinate", self.coordinate)
 
     def guard(self, machine, s, state, *modes):
-        """How far the coordinate is beyond the stop."""
+        """Return the depth of the coordinate beyond the stop."""
         return self.beyond(machine.coordinates[self.coordinate].position(state))
 
     def after(self, machine, s, state, *modes):
-        """The rebound, on the stop; switches are in the modes that they have behind an impact."""
+        """Return the state of the rebound, exactly on the stop, and the modes after an impact."""
         body = machine.coordinates[self.coordinate]
         new = body.placed(state, self.place, self.leaving(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
@@ -153,7 +152,7 @@ class RigidStop(Wall, AbstractEvent):
     def modes_after(
         self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes
     ) -> Modes:
-        """The machine's modes after an impact.
+        """Return the machine's modes after an impact.
 
         **Arguments:** `before` and `after`, the states; `modes`, those before.
         """
@@ -165,36 +164,36 @@ class RigidStop(Wall, AbstractEvent):
         return struck_modes(machine, s, after, modes, own)
 
     def jump(self, machine, s, state, *modes):
-        """The rebound where the body is."""
+        """Return the state after the rebound, without a correction of the position."""
         body = machine.coordinates[self.coordinate]
         return body.placed(state, body.position(state), self.leaving(body.velocity(state)))
 
     def speed(self, machine, state, rate):
-        """V⁻, the speed of approach."""
+        """Return V⁻, the speed of approach."""
         return self.approach(machine.coordinates[self.coordinate].velocity(state))
 
     @property
     def is_one_number(self) -> bool:
-        """Whether the law is Newton's with one number, so that its range is known beforehand."""
+        """True if the law is Newton's with one number, so that its range is known beforehand."""
         return type(self) is RigidStop and not callable(self.restitution)
 
     def coefficient(self, approach: object) -> Any:
-        """k at this speed of approach."""
+        """Return k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 
     @by_default
     def rebound(self, V: Number) -> Any:
-        """The velocity after an impact with this one (Eq. 17 of the paper)."""
+        """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
 
     def leaving(self, V: Number) -> Any:
-        """The velocity after an impact with this one: the `rebound`, but nothing for a speed whose
-        square is below the smallest number, so that a body may come to rest on the stop."""
+        """Return the velocity after an impact: the `rebound`, but zero for a speed whose square is
+        below the smallest number, so that a body may come to rest on the stop."""
         return self.rebound(_unless_tiny(V))
 
     def rebound_and_share(self, approach: Any) -> tuple[Any, Any]:
-        """The velocity (`leaving`) and the `share` of the speed after an impact at this speed of
-        approach. The law is evaluated once for both, since it may be long (a network)."""
+        """Return the velocity (`leaving`) and the `share` of the speed after an impact at this
+        speed of approach. The law, which may be a network, is evaluated once for both."""
         V = self.sign * approach
         if not is_own(type(self).rebound):
             k = self.coefficient(approach)
@@ -202,46 +201,43 @@ class RigidStop(Wall, AbstractEvent):
         return self.leaving(V), self.share(approach)
 
     def share(self, approach: Any) -> Any:
-        """The share of a speed of approach that is left after the impact: k, or by a `rebound` of
-        one's own."""
+        """Return the share of the speed that is left after an impact: k, or that by a `rebound`."""
         if not is_own(type(self).rebound):
             return self.coefficient(approach)
         left = -self.approach(self.rebound(self.sign * approach))
         return left / jnp.where(approach > 0, approach, 1.0)
 
     def loss(self, approach: Any, share: Any = None) -> Any:
-        """Energy lost in an impact, per unit of mass: ½(1 - k²) V⁻²; `share` is k where known."""
+        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `share` is k."""
         share = self.share(approach) if share is None else share
         return 0.5 * (1 - share**2) * approach**2
 
 
 class AbstractContactLaw(Shown):
-    """Force away from a `SoftStop` by the depth δ > 0 and its rate δ'.
+    """The force away from a `SoftStop` as a function of the depth δ > 0 and its rate δ'.
 
     A subclass defines `force`. It may use the stiffness K and the damping α of the stop, or
     parameters of the law.
     """
 
     exponent: float = eqx.field(static=True, default=1.0, converter=float)
-    """p, the power of the depth in the spring's force, at least 1; the step length depends on it.
-    Static."""
+    """p ≥ 1, the power of the depth in the spring's force, for the length of steps. Static."""
 
     def __check_init__(self):
         require("exponent", self.exponent, low=1.0)
 
     @property
     def is_analytic(self) -> bool:
-        """Whether the force has a power series at first touch."""
+        """True if the force has a power series at first touch."""
         return self.exponent == 1
 
     @abc.abstractmethod
     def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
-        """The force away from the stop on a body that touches, without prestress; it may pull (be
-        negative)."""
+        """Return the force away from the stop during contact, without prestress; it may pull."""
 
     def pulls(self, stiffness: Any, damping: Any, prestress: Any, depth: Any, rate: Any) -> Any:
-        """A function with the sign of the pull: positive where the stop would pull the body. It
-        ends a contact that may not pull, and should be smooth at first touch.
+        """Return a value with the sign of the pull, positive if the stop would pull the body. Its
+        zero ends a contact that may not pull. It should be smooth at first touch.
 
         **Arguments:** `stiffness` K and `damping` α; `prestress` F0, or `None`; `depth` δ and its
         `rate` δ' with respect to time.
@@ -250,13 +246,12 @@ class AbstractContactLaw(Shown):
         return -force if prestress is None else -(prestress + force)
 
     def damping_of(self, restitution: Any) -> Any:
-        """α that gives this restitution at every speed; `None` for a law whose restitution depends
-        on it."""
+        """Return α for this restitution at every speed, or `None` if it depends on speed."""
         return None
 
     def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
-        """The frequency with which a body oscillates on the stop, at the depth that it will
-        reach; `stiffness` is that per unit of its mass."""
+        """Return the frequency of oscillations on the stop, at the depth that the body will reach;
+        `stiffness` is per unit of its mass."""
         p, deepest = self.exponent, jnp.maximum(depth, 1e-12)
         if p > 1:
             reach = (0.5 * (p + 1) * rate**2 / stiffness + 1e-30) ** (1 / (p + 1))
@@ -267,48 +262,48 @@ class AbstractContactLaw(Shown):
 class PowerLaw(AbstractContactLaw):
     """K δᵖ + α √K δ^((p-1)/2) δ': p = 1 is a spring with a dashpot, p = 3/2 Hertz's contact.
 
-    Its coefficient of restitution does not depend on the speed,
-    α = √(2(p+1)) (-ln e)/√(π² + ln² e) (Feng, arXiv 2603.27764).
+    The coefficient of restitution does not depend on the speed: α = √(2(p+1)) (-ln e)/√(π² + ln² e)
+    (Feng, arXiv 2603.27764).
     """
 
     def force(self, stiffness, damping, depth, rate):
-        """K δ^p of the spring and α √K δ^((p-1)/2) δ' of the dashpot; on a body of another mass
-        than 1 the stop gives α √m for α."""
+        """Return the sum of K δ^p of the spring and α √K δ^((p-1)/2) δ' of the dashpot. The stop
+        passes α √m for α if the mass m is not 1."""
         p = self.exponent
         resist = damping * jnp.sqrt(stiffness) * power(depth, 0.5 * (p - 1)) * rate
         return stiffness * power(depth, p) + resist
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """The pull over δ^((p-1)/2), which is smooth at first touch."""
+        """Return the pull over δ^((p-1)/2), which is smooth at first touch."""
         root = power(depth, 0.5 * (self.exponent + 1))
         pull = -stiffness * root - damping * jnp.sqrt(stiffness) * rate
         flat = power(depth, 0.5 * (self.exponent - 1))
         return pull if prestress is None else pull * flat - prestress
 
     def damping_of(self, restitution):
-        """α from e in (0, 1]."""
+        """Return α for e in (0, 1]."""
         require("restitution", restitution, low=0.0, high=1.0, open_low=True)
         drop = -jnp.log(jnp.asarray(restitution, float))
         return sqrt(2 * (self.exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
 
 
 class HuntCrossley(AbstractContactLaw):
-    """K δᵖ (1 + α δ'), whose restitution falls with the speed."""
+    """K δᵖ (1 + α δ'), with a restitution that decreases with speed."""
 
     def force(self, stiffness, damping, depth, rate):
-        """The spring's force with a damping in proportion to it."""
+        """Return the spring's force with damping in proportion to it."""
         spring = stiffness * power(depth, self.exponent)
         return spring + damping * spring * rate
 
     def pulls(self, stiffness, damping, prestress, depth, rate):
-        """The pull over the spring's force, without prestress: that vanishes at first touch."""
+        """Return the pull over the spring's force, which is 0 at first touch without prestress."""
         if prestress is None:
             return -(1 + damping * rate)
         return super().pulls(stiffness, damping, prestress, depth, rate)
 
 
 def power(x: Any, n: float) -> Any:
-    """xⁿ inside; for n = 0 and 1 continued smoothly to where a step may look beyond the surface."""
+    """Return xⁿ for x > 0; for n = 0 and 1 continued smoothly to where a step may evaluate it."""
     if n == 0:
         return jnp.ones_like(x)
     if n == 1:
@@ -317,31 +312,30 @@ def power(x: Any, n: float) -> Any:
     return jnp.where(inside, jnp.where(inside, x, 1.0) ** n, 0.0)
 
 
-# Modes: the body touches; it has been let go of, but has not yet come out; it is apart.
+# Modes: the body touches; it is released, but not yet out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 
-# Laws that may be asked for by their names.
+# Laws with names.
 _LAWS: dict[str, type[AbstractContactLaw]] = {"power": PowerLaw, "hunt-crossley": HuntCrossley}
 
-# A body is near enough for the contact's time scale to matter (unit: that of the coordinate): a
-# choice, since a step that ends on first touch may end a little short of it.
+# Within this distance (unit: that of the coordinate) the contact's time scale matters: a choice,
+# since a step that ends on first touch may end a little short of it.
 _NEAR = 1e-6
 
 
 class SoftStop(Wall, AbstractSwitch):
     """A compliant stop: pushes the body back while it penetrates by δ > 0.
 
-    The force on a body of mass m is F0 plus that of its law, by default `PowerLaw`: K δᵖ + α √(K m)
-    δ^((p-1)/2) δ', p = 1 being a spring with a dashpot, p = 3/2 Hertz's contact. Its coefficient of
-    restitution does not depend on the speed, so that `restitution` may be given instead of
-    `damping`. That of `HuntCrossley`, K δᵖ (1 + α δ'), falls with speed.
+    The force on a body of mass m is the prestress F0 plus that of its law. The default law is
+    `PowerLaw`, K δᵖ + α √(K m) δ^((p-1)/2) δ'. A spring with a dashpot has p = 1, Hertz's contact p
+    = 3/2. Its coefficient of restitution does not depend on the speed, so that `restitution` may be
+    given instead of `damping`. That of `HuntCrossley`, K δᵖ (1 + α δ'), decreases with speed.
 
     With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
-    order δ^((p-1)/2); steps sized by their error (`Adaptive`) follow it, fixed ones lose their
-    order there. A step's error does
-    not show the derivative of such an end: through an adhesive stop with 1 < p < 3 derivatives,
-    and with them multipliers and `find_orbit`, are right to 1e-2 only. Take `adhesive=False` there
-    (1e-6 and better), or the Hunt–Crossley law.
+    order δ^((p-1)/2). Adaptive steps (`Adaptive`) follow it, fixed ones lose their order there. The
+    error of a step does not show the derivative of such an end. Through an adhesive stop with 1 < p
+    < 3 derivatives, and with them multipliers and `find_orbit`, are accurate to 1e-2 only. Use
+    `adhesive=False` there (1e-6 and better), or the Hunt–Crossley law.
 
     **Arguments:**
 
@@ -349,19 +343,19 @@ class SoftStop(Wall, AbstractSwitch):
     - `stiffness` K, a force by depthᵖ, N/m for a spring in SI units; positive (for a `Scene`: in
       units of the body's own spring).
     - `restitution` e in (0, 1], or `damping` α, not negative (no unit for a power law, s/m for
-      `HuntCrossley`); neither: no damping.
+      `HuntCrossley`); no damping by default.
     - `dashpot` c of a power law, not negative: a force by speed, N s/m for a spring in SI units.
       The term c δ^((p-1)/2) δ' is added to the force.
     - `law`: `"power"` or `"hunt-crossley"`, and `exponent` p, at least 1 (1 by default); or any
-      `AbstractContactLaw`, which has its own.
-    - `prestress` F0: the force at first touch, not negative; none by default.
+      `AbstractContactLaw`, which has its own exponent.
+    - `prestress` F0: the force at first touch, not negative; 0 by default.
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` releases the body
-      when the force falls to zero. Static.
+      when the force decreases to zero. Static.
     - `side`: `"right"` or `"left"`.
     - `on`: the coordinate that it limits, as of a `RigidStop`.
-    - `mass` on which the force acts: 1 by default; a `Mechanical` knows it.
+    - `mass`: the mass on which the force acts, 1 by default; a `Mechanical` computes it.
 
-    **Raises:** `ValueError` naming the argument that is out of range.
+    **Raises:** `ValueError` with the name of an argument that is out of range.
     """
 
     gap: Float[Array, "..."]
@@ -426,40 +420,39 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def analytic(self) -> bool:  # pyright: ignore
-        """Whether the force has a power series at first touch: where it is straight in the depth.
-        Others have a kink or a root there."""
+        """True if the force has a power series at first touch: a linear one, without kink or
+        root."""
         return self.law.is_analytic
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
-        """Only at a prestressed contact, whose force jumps as it is touched: else the force on a
-        body that goes in is that on one that comes out."""
+        """True for a prestressed contact, whose force jumps at first touch. Otherwise the force is
+        the same on a body that goes in or comes out."""
         return self.prestress is not None
 
     def depth(self, machine: Machine, state: State) -> tuple[Any, Any]:
-        """δ and δ' (by time); δ is negative apart from the stop."""
+        """Return δ and δ' (by time); δ is negative apart from the stop."""
         body = machine.coordinates[self.coordinate]
         return self.beyond(body.position(state)), self.approach(body.velocity(state))
 
     def force(self, depth: Number, rate: Number, mass: Any = 1.0) -> Any:
-        """Force away from the stop on a body of this mass that touches."""
+        """Return the force away from the stop on a body of this mass in contact."""
         force = self.law.force(self.stiffness, self._damping(mass), depth, rate)
         return force if self.prestress is None else self.prestress + force
 
     def contribution(self, machine, s, state, mode):
-        """The acceleration that the stop adds to the coordinate."""
+        """Return the acceleration that the stop adds to the coordinate."""
         mass = self._mass(machine, s, state)
         push = -self.sign * self.force(*self.depth(machine, state), mass)
         return jnp.where(mode > 0, push if _is_one(mass) else push / mass, 0.0)
 
     def push_in(self, machine, s, state, mode):
-        """The acceleration of the coordinate while the body touches, and its push."""
+        """Return the acceleration of the coordinate during contact, and its push."""
         body = machine.coordinates[self.coordinate]
         return self.contribution(machine, s, state, mode), push_of(body, state)
 
     def begin(self, machine, s, state):
-        """The mode of a motion that begins: touching, unless the body is apart or has been
-        released."""
+        """Return the initial mode: touching, unless the body is apart or has been released."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         holds = TOUCHING
@@ -468,7 +461,7 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(inside, holds, APART)
 
     def guard(self, machine, s, state, mode):
-        """The guard of touching, leaving, or being released."""
+        """Return the guard of touching, leaving, or being released."""
         depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
@@ -477,18 +470,18 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
 
     def after(self, machine, s, state, mode):
-        """Touching, released or apart, after the guard that rose to zero."""
+        """Return the mode (touching, released or apart) after its guard rose to zero."""
         if self.adhesive:
             return state, -mode
         depth, _ = self.depth(machine, state)
         pulls = self._pulls(machine, s, state)
-        inside = depth > 0  # without damping the force falls to zero as the body comes out
+        inside = depth > 0  # without damping the force vanishes as the body comes out
         released = jnp.where(inside & (pulls >= -depth), RELEASED, APART)
         again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
         return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
 
     def longest_step(self, machine: Machine, s: Scalar, state: State) -> Any:
-        """A fifth of the period in which a body oscillates on the stop; infinite apart from it."""
+        """Return a fifth of the period of oscillations on the stop; infinite apart from it."""
         depth, rate = self.depth(machine, state)
         mass = self._mass(machine, s, state)
         stiffness = self.stiffness if _is_one(mass) else self.stiffness / mass
@@ -499,7 +492,6 @@ class SoftStop(Wall, AbstractSwitch):
         return machine.coordinates[self.coordinate].mass_at(s, state)
 
     def _damping(self, mass: Any) -> Any:
-        """The damping that the law gets for a body of this mass."""
         if not isinstance(self.law, PowerLaw):
             return self.damping
         damping = self.damping if _is_one(mass) else self.damping * jnp.sqrt(mass)
@@ -513,12 +505,11 @@ class SoftStop(Wall, AbstractSwitch):
 
 
 def _is_one(mass: Any) -> bool:
-    """Whether a mass is known to be 1 while a program is traced: it costs nothing then."""
+    """Return whether a mass is known to be 1 while tracing: then it costs nothing."""
     return isinstance(mass, float | int) and mass == 1
 
 
 def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractContactLaw:
-    """A law by its name and exponent, or as it is."""
     if isinstance(law, str):
         one_of("law", law, tuple(_LAWS))
         return _LAWS[law](1.0 if exponent is None else exponent)
@@ -534,7 +525,7 @@ def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractConta
 def _damping_of(
     law: AbstractContactLaw, restitution: Number, damping: Number | None, given: str
 ) -> Any:
-    """α from a restitution that was `given` in its place."""
+    """Return α for a restitution; `given` is the text of the arguments for an error."""
     found = law.damping_of(restitution) if damping is None else None
     if found is None:
         raise ValueError(
