@@ -130,8 +130,7 @@ class ShaftMachine(AbstractMachine):
         return state.W > 0 if self.is_paced(state) else None
 
     def check_start(self, start: State) -> None:
-        """Raise `ValueError` if a start is beyond its section, or does not turn in the phase
-        clock."""
+        """Raise `ValueError` for a start beyond the section, or not turning in the phase clock."""
         if self.is_paced(start):
             speed = concrete(self.section_speed(start))
             if speed is not None and not (speed > 0).all():
@@ -387,8 +386,7 @@ class Scene(ShaftMachine):
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
     def _is_within_reach(self) -> bool:
-        """Return whether by the library's equations only a slider within |U| ≤ 1 pulls at the
-        body."""
+        """Return whether the library's equations hold: only a slider within |U| ≤ 1 pulls."""
         return (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
@@ -511,9 +509,9 @@ class Parameters(Shown):
 
     Each number may be a quantity of `pint`, in any unit of its kind.
 
-    The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J, ε =
-    m_C a²/J. Those of the motor are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`, τe =
-    ωL/R. The crank has λ = a/l. A motor with constants K_t and K_e at the voltage u has κT0 = K_t
+    The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
+    ε = m_C a²/J. Those of the motor are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`,
+    τe = ωL/R. The crank has λ = a/l. A motor with constants K_t, K_e at voltage u has κT0 = K_t
     u/R, κΩ0 = u/K_e.
     """
 

@@ -420,8 +420,7 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def analytic(self) -> bool:  # pyright: ignore
-        """True if the force has a power series at first touch: a linear one, without kink or
-        root."""
+        """True if the force has a power series at first touch: a linear one, without a kink."""
         return self.law.is_analytic
 
     @property

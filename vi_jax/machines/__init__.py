@@ -1,4 +1,4 @@
-"""Ready machines of other kinds than the paper's, each in a file that shows how to write one."""
+"""Ready machines besides the paper's, each in a file that shows how to write one."""
 
 from ..machine import StructureState as StructureState
 from .beam import Beam as Beam

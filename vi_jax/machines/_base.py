@@ -1,4 +1,4 @@
-"""What the ready machines share: their fields, pairs of stops, and kinds of drive."""
+"""Parts that the ready machines share: fields, pairs of stops, and kinds of drive."""
 
 from collections.abc import Mapping
 from math import pi
@@ -12,8 +12,7 @@ from ..machine import AbstractMachine, RigidStop, stops_of
 
 
 def number_field(name: str, default: float | None, allowed: Range = REAL, unit: str = "") -> Any:
-    """A field of a machine that holds a real number in a range, given by keyword; where the default
-    is `None`, it may be left out."""
+    """Return a keyword field for a real number in a range, optional if the default is `None`."""
     converter = real(name) if default is not None else optional_real(name)
     about = {"range": allowed, "unit": unit}
     return eqx.field(kw_only=True, default=default, converter=converter, metadata=about)
@@ -22,17 +21,17 @@ def number_field(name: str, default: float | None, allowed: Range = REAL, unit: 
 def stops_at(
     gap: Scalar, restitution: Scalar, *, two_sided: bool = True, **others: Any
 ) -> tuple[RigidStop, ...]:
-    """Equal stops at this distance from zero: on the right, and if two-sided then on the left."""
+    """Return equal stops at this distance from zero: on the right, and if two-sided on the left."""
     sides = ("right", "left") if two_sided else ("right",)
     return tuple(RigidStop(gap, restitution, side, **others) for side in sides)
 
 
 class ReadyMachine(AbstractMachine):
-    """A machine whose numbers are in their ranges; what is not in `quantity_units` and has no unit
-    in its field is without."""
+    """A machine whose numbers are in their ranges. Numbers without a unit in their field and in
+    `quantity_units` are dimensionless."""
 
     quantity_units: ClassVar[Mapping[str, str]] = {}
-    """The units of components of the state and of time, rates, energy and power."""
+    """The units of the state's components and of time, rates, energy and power."""
 
     def __check_init__(self):
         require_ranges(self)
@@ -48,18 +47,18 @@ class PhaseMachine(ReadyMachine):
 
     @property
     def cycle(self) -> float:
-        """A cycle is 2π of the drive's phase."""
+        """The cycle, 2π of the drive's phase."""
         return 2 * pi
 
 
 class ForcedMachine(PhaseMachine):
-    """A machine shaken at an angular frequency ω, its number `frequency`, with the phase ωt as the
+    """A machine driven at an angular frequency ω, its field `frequency`, with the phase ωt as the
     independent variable."""
 
     frequency: eqx.AbstractVar[Scalar]
 
     def pace(self, s: Scalar, state: State) -> Scalar:
-        """dt/ds = 1/ω, the time that a unit of phase takes."""
+        """Return dt/ds = 1/ω, the duration of a unit of phase."""
         return 1 / self.frequency
 
 

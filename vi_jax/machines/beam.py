@@ -29,7 +29,7 @@ from ._base import number_field, stops_at
 
 @cache
 def _roots(modes: int) -> np.ndarray:
-    """The first roots β of cos β cosh β = -1, by Newton's method on cos β + 1/cosh β."""
+    """Return the first roots β of cos β cosh β = -1, by Newton's method on cos β + 1/cosh β."""
     x = (np.arange(modes) + 0.5) * pi
     with np.errstate(over="ignore"):
         for _ in range(8):
@@ -39,7 +39,7 @@ def _roots(modes: int) -> np.ndarray:
 
 @cache
 def _tilt(modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """σ = (cosh β + cos β)/(sinh β + sin β) of each mode, and (1 - σ)e^β, without cancellation."""
+    """Return σ = (cosh β + cos β)/(sinh β + sin β) and (1 - σ)e^β of each mode, not cancelling."""
     x = _roots(modes)
     small = np.exp(-x)
     below = 0.5 * (1 - small * small) + small * np.sin(x)
@@ -54,22 +54,22 @@ class Beam(LinearMachine):
 
         EI ∂⁴w/∂x⁴ + ρA ∂²w/∂s² = load,   w = Σ φᵢ(x/L) qᵢ(s),   ωᵢ = βᵢ² √(EI/(ρA L⁴))
 
-    with cos β cosh β = -1 and φ = cosh βξ - cos βξ - σ (sinh βξ - sin βξ), of which the square has
-    the mean 1 (R. D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979). Its state is a
-    `StructureState` of the modes' coordinates q; `deflection` gives w.
+    with cos β cosh β = -1 and φ = cosh βξ - cos βξ - σ (sinh βξ - sin βξ). The mean of φ² is 1 (R.
+    D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979). The state is a
+    `StructureState` of the modes' coordinates q; `deflection` returns w.
 
     The clamp moves as a cos ωs, and w is relative to it, or a force F cos ωs acts on the tip. An
     impact acts on all modes at once (F. C. Moon and S. W. Shaw, International Journal of Non-Linear
-    Mechanics 18, 1983, had one): more modes make the effective mass of an impact smaller, and the
-    steps shorter while they ring. A cycle is 2π/ω.
+    Mechanics 18, 1983, had one). More modes make the effective mass of an impact smaller, and the
+    steps shorter while they oscillate. A cycle is 2π/ω.
 
     **Arguments:**
 
-    - `modes`, how many, at least 1; static.
-    - `gap` of the stop, any number, or `None` for none; `restitution` in [0, 1]; `place` of the
-      stop along the beam, in (0, 1] of its length; `two_sided` for one on each side, static.
+    - `modes`: the number of modes, at least 1; static.
+    - `gap` of the stop, any number, or `None` for no stop; `restitution` in [0, 1]; `place` of the
+      stop along the beam, in (0, 1] of its length; `two_sided` for a stop on each side, static.
     - `damping_ratio`, not negative, one for all modes or (modes,).
-    - `amplitude` of the shaking, a or F, any number; `shaken`: `"base"` or `"tip"`, static;
+    - `amplitude` of the excitation, a or F, any number; `shaken`: `"base"` or `"tip"`, static;
       `frequency` ω, positive.
     - `length` L, `bending_stiffness` EI and `mass_per_length` ρA, positive, by default 1.
     """
@@ -102,28 +102,28 @@ class Beam(LinearMachine):
 
     @property
     def natural_frequencies(self) -> Float[Array, " modes"]:
-        """ωᵢ, the angular frequencies of the modes, lowest first."""
+        """The angular frequencies ωᵢ of the modes, lowest first."""
         stiff = self.bending_stiffness / (self.mass_per_length * self.length**4)
         return jnp.asarray(_roots(self.modes) ** 2) * jnp.sqrt(stiff)
 
     @property
     def mass(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """ρA L, of each mode."""
+        """The mass ρA L of each mode."""
         return jnp.full((self.modes,), self.mass_per_length * self.length)
 
     @property
     def stiffness(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """ρA L ω² of each mode."""
+        """The stiffness ρA L ω² of each mode."""
         return self.mass * self.natural_frequencies**2
 
     @property
     def damping(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """2ξω ρA L of each mode."""
+        """The damping 2ξω ρA L of each mode."""
         return 2 * self.damping_ratio * self.natural_frequencies * self.mass
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:  # pyright: ignore
-        """The stop at `place`, or one on each side of it; none without a gap."""
+        """The stop at `place`, or one on each side; empty without a gap."""
         if self.gap is None:
             return ()
         first, *other = stops_at(self.gap, self.restitution, two_sided=self.two_sided)
@@ -131,8 +131,7 @@ class Beam(LinearMachine):
 
     @property
     def forces(self) -> tuple[None, Float[Array, " modes"], None]:
-        """The force on each mode: the beam's inertia as its clamp moves, or the force on its
-        tip."""
+        """The force on each mode: inertia due to the clamp's motion, or the force on the tip."""
         if self.shaken == "tip":
             return None, self.amplitude * self.shape(1.0), None
         mean = jnp.asarray(2 * _tilt(self.modes)[0] / _roots(self.modes))
@@ -140,16 +139,16 @@ class Beam(LinearMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Axis labels of position and velocity."""
+        """The axis labels of position and velocity."""
         return "w at the stop" if self.contacts else "q of mode 1", "its rate"
 
     def shape(self, place: Any) -> Float[Array, "*places modes"]:
-        """φ of each mode at places along the beam, in [0, 1] of its length."""
+        """Return φ of each mode at places along the beam, in [0, 1] of its length."""
         x = jnp.asarray(place)[..., None]
         beta, (sigma, lean) = _roots(self.modes), _tilt(self.modes)
         away = jnp.exp(beta * (x - 1)) * lean + (1 + sigma) * jnp.exp(-beta * x)
         return 0.5 * away - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
 
     def deflection(self, state: StructureState, place: Number = 1.0) -> Float[Array, "..."]:
-        """w at places along the beam, in [0, 1] of its length: by default of its tip."""
+        """Return w at places along the beam, in [0, 1] of its length: by default at its tip."""
         return self.shape(place) @ state.displacement

@@ -12,7 +12,7 @@ from ._base import PhaseMachine, number_field
 
 
 class BallState(Shown):
-    """A ball as seen from the table."""
+    """The position and velocity of a ball relative to the table."""
 
     units: ClassVar = {"height": "g/ω²", "speed": "g/ω"}
 
@@ -26,9 +26,8 @@ class BouncingBall(PhaseMachine):
     """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
 
     The independent variable is ωt, a cycle 2π. The motion with one bounce in n cycles begins at Γ =
-    nπ (1 - e)/(1 + e), and doubles its period at Γ² = [nπ (1 - e)/(1 + e)]² + [2 (1 + e²)/(1 +
-    e)²]² (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear Dynamics 10,
-    1996).
+    nπ (1 - e)/(1 + e). Its period doubles at Γ² = [nπ (1 - e)/(1 + e)]² + [2 (1 + e²)/(1 + e)²]²
+    (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear Dynamics 10, 1996).
 
     **Arguments:** `acceleration` Γ, the table's largest acceleration (unit: g), not negative;
     `restitution` e in [0, 1].
@@ -47,15 +46,15 @@ class BouncingBall(PhaseMachine):
         return (RigidStop(0.0, self.restitution, "left", on=("height", "speed")),)
 
     def field(self, s: Scalar, state: BallState) -> BallState:
-        """d(state)/d(ωt): free fall less the table's acceleration."""
+        """Return d(state)/d(ωt): free fall minus the table's acceleration."""
         return BallState(state.speed, -1 - self.acceleration * jnp.cos(s))
 
     def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> BallState:
-        """A ball above the table at ωt = 0, where the table is lowest."""
+        """Return a ball above the table at ωt = 0, when the table is lowest."""
         return BallState(number("height", height), number("speed", speed))
 
     def sketch(self, pen: Any, state: BallState, phase: float) -> None:
-        """A ball above its table."""
+        """Draw a ball above its table."""
         radius, table = 0.3 * pen.size, -float(self.acceleration) * cos(phase)
         wide = 2.4 * pen.size
         pen.body(0.0, table - 0.15 * pen.size, width=wide, height=0.3 * pen.size, color=pen.green)

@@ -1,4 +1,4 @@
-"""A capsule that drives itself along the ground: dry friction, sticking, impacts and drift."""
+"""A capsule that moves along the ground by internal impacts: dry friction, sticking, drift."""
 
 import dataclasses
 from math import pi
@@ -13,7 +13,7 @@ from ._base import ForcedMachine, number_field
 
 
 class CapsuleState(Shown):
-    """The mass inside as seen from the capsule, and the capsule as seen from the ground."""
+    """The mass inside relative to the capsule, and the capsule relative to the ground."""
 
     units: ClassVar = {
         **dict.fromkeys(("place", "travel", "progress"), "F/k"),
@@ -21,15 +21,15 @@ class CapsuleState(Shown):
     }
 
     place: Scalar
-    """Place of the mass, from where its spring is relaxed (unit: F/k)."""
+    """Position of the mass, from where its spring is relaxed (unit: F/k)."""
     speed: Scalar
     """Speed of the mass relative to the capsule (unit: F/√(k m))."""
     capsule_speed: Scalar
     """Speed of the capsule on the ground (unit: F/√(k m))."""
     travel: Scalar
-    """How far the capsule has moved since the cycle began (unit: F/k)."""
+    """Distance that the capsule has moved since the cycle began (unit: F/k)."""
     progress: Scalar
-    """How far the capsule moved in the cycle before (unit: F/k)."""
+    """Distance that the capsule moved in the previous cycle (unit: F/k)."""
 
 
 class Capsule(ForcedMachine, Mechanical):
@@ -41,14 +41,14 @@ class Capsule(ForcedMachine, Mechanical):
 
         x1'' = α cos ωt - p - 2 ξ p',   γ x2'' = p + 2 ξ p' - friction,   p = x1 - x2 ≤ δ
 
-    for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e and
-    the momentum of both is kept. The independent variable is ωt, a cycle 2π. The component
+    for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e, and
+    the momentum of both is conserved. The independent variable is ωt, a cycle 2π. The component
     `progress` of the state is the distance that the capsule moved in the last cycle.
 
     **Arguments:** `amplitude` α of the force on the mass, any number; `frequency` ω, positive;
     `damping_ratio` ξ, not negative; `mass_ratio` γ = M/m, positive; `gap` δ, any number;
-    `restitution` e in [0, 1]; `friction` of the sliding capsule, not negative, and `static_ratio`,
-    that of static to sliding friction, at least 1.
+    `restitution` e in [0, 1]; `friction` of the sliding capsule, not negative; `static_ratio`, the
+    ratio of static to sliding friction, at least 1.
     """
 
     amplitude: Any = number_field("amplitude", 1.6, REAL, "F")
@@ -72,11 +72,11 @@ class Capsule(ForcedMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        """The mass matrix of the mass, as seen from the capsule, and of both together (unit: m)."""
+        """The mass matrix for the mass relative to the capsule, and for the capsule (unit: m)."""
         return [[1.0, 1.0], [1.0, 1 + self.mass_ratio]]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """The drive, and the spring and the dashpot between the mass and the capsule."""
+        """Return the drive, and the spring and the dashpot between the mass and the capsule."""
         drive = self.amplitude * jnp.cos(t)
         return {"place": drive - q.place - 2 * self.damping_ratio * v.place, "travel": drive}
 
@@ -89,19 +89,19 @@ class Capsule(ForcedMachine, Mechanical):
         )
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """A fifth of the shorter of the drive's cycle and the period of the mass on its spring."""
+        """Return a fifth of the drive's cycle, or of the period of mass and capsule if shorter."""
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
 
     def renewed(self, state: CapsuleState) -> CapsuleState:
-        """The travel of a cycle is its progress."""
+        """Return the state with the travel of the cycle as its progress."""
         at = state.travel
         return dataclasses.replace(state, travel=jnp.zeros_like(at), progress=at)
 
     def start(
         self, *, place: Number = 0.0, speed: Number = 0.0, capsule_speed: Number = 0.0
     ) -> Any:
-        """At rest, with the spring relaxed, by default."""
+        """Return a state; by default at rest with the spring relaxed."""
         given = number("place", place), number("speed", speed)
         capsule = number("capsule_speed", capsule_speed)
         return CapsuleState(*given, capsule, jnp.zeros_like(capsule), jnp.zeros_like(capsule))

@@ -1,4 +1,4 @@
-"""A Duffing oscillator between two stops; with no cubic term the classic impact oscillator."""
+"""A Duffing oscillator between two stops; without a cubic term the classic impact oscillator."""
 
 from math import cos
 from typing import Any, ClassVar
@@ -13,13 +13,13 @@ from ._base import ForcedMachine, number_field, stops_at, supported
 
 
 class Duffing(ForcedMachine):
-    """x'' + δ x' + α x + β x³ = A cos ωt, between stops at ±gap or with one on the right alone.
+    """x'' + δ x' + α x + β x³ = A cos ωt, between stops at ±gap or with a stop on the right.
 
-    The independent variable is the phase ωt, a cycle 2π. A motion of small amplitude that stays off
-    the stops is that of a linear oscillator if β = 0: it grazes where A² = gap² ((α - ω²)² + δ²ω²).
+    The independent variable is the phase ωt, a cycle 2π. With β = 0, a motion that stays off the
+    stops is that of a linear oscillator. It grazes where A² = gap² ((α - ω²)² + δ²ω²).
 
     **Arguments:** `amplitude` A, `frequency` ω (positive), `damping` δ (not negative), `stiffness`
-    α and `cubic` β (of any sign), `gap` (positive), `restitution` in [0, 1], `two_sided` whether
+    α and `cubic` β (of any sign), `gap` (positive), `restitution` in [0, 1]; `two_sided`, whether
     there is a stop on the left as well; static.
     """
 
@@ -36,26 +36,26 @@ class Duffing(ForcedMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """One on the right, and one on the left of a two-sided machine."""
+        """The stop on the right, and one on the left of a two-sided machine."""
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 
     def field(self, s: Scalar, state: OscillatorState) -> OscillatorState:
-        """d(state)/d(ωt) between impacts; the state's V is dx/dt."""
+        """Return d(state)/d(ωt) between impacts; the state's V is dx/dt."""
         x, v = state.Y, state.V
         force = self.amplitude * jnp.cos(s) - self.damping * v
         force = force - x * (self.stiffness + self.cubic * x * x)
         return OscillatorState(v / self.frequency, force / self.frequency)
 
     def start(self, *, Y: Number = 0.0, V: Number = 0.0) -> OscillatorState:
-        """At rest in the middle by default."""
+        """Return a state; by default at rest in the middle."""
         return OscillatorState(number("Y", Y), number("V", V))
 
     def mirrored(self, state: OscillatorState) -> OscillatorState | None:
-        """x → -x half a cycle later, if there are two stops."""
+        """Return -x half a cycle later, if there are two stops."""
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
 
     def sketch(self, pen: Any, state: OscillatorState, phase: float) -> None:
-        """A body on its spring, between stops, with the force on it."""
+        """Draw a body on its spring, between stops, with the force on it."""
         place, size = float(state.Y), pen.size
         post = supported(self, pen, place)
         pull = 0.9 * size * cos(phase)

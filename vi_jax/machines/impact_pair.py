@@ -1,4 +1,4 @@
-"""A ball in a shaken box: impact pair, impact damper, vibro-impact harvester."""
+"""A ball in a vibrating box: impact pair, impact damper, vibro-impact harvester."""
 
 from collections.abc import Mapping
 from math import sin
@@ -13,23 +13,23 @@ from ._base import PhaseMachine, number_field, stops_at
 
 
 class PairState(Shown):
-    """The ball in its box."""
+    """The state of the ball in its box."""
 
     units: ClassVar = {"place": "a", "speed": "a ω"}
 
     place: Scalar
-    """Place of the ball, from the middle of the box (unit: a)."""
+    """Position of the ball, from the middle of the box (unit: a)."""
     speed: Scalar
     """Speed of the ball relative to the box (unit: a ω)."""
 
 
 class FreePairState(PairState):
-    """The ball in its box, and the box."""
+    """The states of the ball in its box, and of the box."""
 
     units: ClassVar = {**PairState.units, "box": "a", "box_speed": "a ω"}
 
     box: Scalar
-    """Place of the box (unit: a)."""
+    """Position of the box (unit: a)."""
     box_speed: Scalar
     """Speed of the box (unit: a ω)."""
 
@@ -37,25 +37,25 @@ class FreePairState(PairState):
 class ImpactPair(PhaseMachine, Mechanical):
     """A ball between the walls of a box.
 
-    The box moves as a sin ωt; or, if `mass_ratio` is given, it is itself a body on a spring and a
-    damper, driven by a force: X'' + 2 ξ Ω X' + Ω² X = F sin s between impacts, at which the
-    relative speed is reversed and scaled by e and the momentum of both is kept. The independent
-    variable is s = ωt, a cycle 2π.
+    The box moves as a sin ωt. If `mass_ratio` is given, it is a body on a spring and a damper,
+    driven by a force: X'' + 2 ξ Ω X' + Ω² X = F sin s between impacts. An impact reverses the
+    relative speed and scales it by e, and conserves the momentum of both. The independent variable
+    is s = ωt, a cycle 2π.
 
     With the prescribed box and σ = (1 - e)/(1 + e), the symmetric motion with one impact at each
     wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed of approach
-    2w/(1 + e); its fold is at λ = √(1 + π²/(4σ²)), and it loses its symmetry at
+    2w/(1 + e). Its fold is at λ = √(1 + π²/(4σ²)), and it loses its symmetry at
     λ = (π/2 - 2/π)/√(4/π² + σ²) (Heiman, Bajaj and Sherman, Journal of Sound and Vibration 124,
     1988).
 
     **Arguments:**
 
-    - `half_gap` λ: half the box's length less the ball's (unit: a), positive.
+    - `half_gap` λ: half of the box's length minus the ball's (unit: a), positive.
     - `restitution` e in [0, 1].
-    - `mass_ratio`: the ball's mass over the box's, positive; without it the motion of the box is
-      given.
+    - `mass_ratio`: the ball's mass over the box's, positive; by default the box's motion is
+      prescribed.
     - `damping_ratio` ξ, `frequency` Ω (of the box on its spring, unit: ω; 0 leaves out the spring)
-      and `force` F (unit: M a ω²), of a box that is free.
+      and `force` F (unit: M a ω²), of a free box.
     """
 
     half_gap: Any = number_field("half_gap", 1.6, POSITIVE, "a")
@@ -69,7 +69,7 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def q(self) -> tuple[str, ...]:  # pyright: ignore
-        """The ball as seen from the box; and the box, if it is free."""
+        """The coordinates: the ball relative to the box, and the box if it is free."""
         return ("place",) if self.mass_ratio is None else ("place", "box")
 
     @property
@@ -79,7 +79,7 @@ class ImpactPair(PhaseMachine, Mechanical):
         return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
 
     def _applied(self, t: Scalar, q: Any, v: Any, *modes: Scalar) -> dict[str, Any]:
-        """The forces on the ball, as seen from a box whose motion is given, and on a free box."""
+        """Return the forces on the ball relative to a prescribed box, or on ball and box."""
         if self.mass_ratio is None:
             return {"place": jnp.sin(t)}
         pull = -self.frequency * (self.frequency * q.box + 2 * self.damping_ratio * v.box)
@@ -92,7 +92,7 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
-        """Masses are in that of the ball, or of a box that is free."""
+        """The units, with the mass of the ball as unit of mass, or that of a free box."""
         mass = "m" if self.mass_ratio is None else "M"
         rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
         return {**FreePairState.units, **rates}
@@ -105,18 +105,18 @@ class ImpactPair(PhaseMachine, Mechanical):
         box: Number = 0.0,
         box_speed: Number = 0.0,
     ) -> Any:
-        """The ball in the middle of the box by default; a box that is free at rest."""
+        """Return a state, by default with the ball in the middle and a free box at rest."""
         ball = number("place", place), number("speed", speed)
         if self.mass_ratio is None:
             return PairState(*ball)
         return FreePairState(*ball, number("box", box), number("box_speed", box_speed))
 
     def mirrored(self, state: State) -> Any:
-        """Left and right exchanged, half a cycle later."""
+        """Return the state with left and right exchanged, half a cycle later."""
         return type(state)(*(-x for x in vars(state).values()))
 
     def sketch(self, pen: Any, state: Any, phase: float) -> None:
-        """A box with a ball in it."""
+        """Draw a box with a ball in it."""
         free = self.mass_ratio is not None
         box = float(state.box) if free else sin(phase)
         radius, wall, half = 0.4 * pen.size, 0.25 * pen.size, float(self.half_gap)

@@ -1,8 +1,8 @@
-"""Machines and other objects by their names, as a file, a command or a page gives them.
+"""Machines and other objects by name, from a file, a command or a page.
 
-Three values are special: `{ from, to, count }` is a row of evenly spaced numbers, a table with the
-key `class` is an object made from its other keys, and dotted keys are names, as in
-`stops.0.gap = [1.0, 2.0]`. All others are passed on as they are.
+Three kinds of values are special. `{ from, to, count }` is a row of evenly spaced numbers. A table
+with the key `class` is an object made from its other keys. Dotted keys are names, such as
+`stops.0.gap = [1.0, 2.0]`. All others are unchanged.
 """
 
 import difflib
@@ -21,11 +21,11 @@ from ..machine import AbstractMachine
 
 
 class InputError(ValueError):
-    """What is wrong with a file, a name or its arguments, in one sentence."""
+    """An error in a file, a name or its arguments, described in one sentence."""
 
 
 def check_keys(given: Iterable[str], known: Iterable[str], place: str) -> None:
-    """**Raises:** `InputError` for a key that does not exist, with the nearest ones."""
+    """Raise `InputError` with similar names for a key that does not exist."""
     known = list(known)
     for key in given:
         if key not in known:
@@ -35,7 +35,7 @@ def check_keys(given: Iterable[str], known: Iterable[str], place: str) -> None:
 
 
 def machine_of(name: object, keywords: Mapping[str, Any]) -> AbstractMachine:
-    """Return the machine that a class or a function makes. **Raises:** `InputError`."""
+    """Return the machine from a class or a function. **Raises:** `InputError`."""
     machine = made(name, keywords, "[arguments]")
     if not isinstance(machine, AbstractMachine):
         raise InputError(f"{name} must make a machine, but made {machine!r}")
@@ -43,11 +43,11 @@ def machine_of(name: object, keywords: Mapping[str, Any]) -> AbstractMachine:
 
 
 def made(name: object, keywords: Mapping[str, Any], place: str) -> Any:
-    """Return what a class or a function makes of keywords. **Raises:** `InputError`.
+    """Return the result of calling a class or a function with keywords. **Raises:** `InputError`.
 
-    **Arguments:** its name, `package.module:name` or `path/to/file.py:name`; a method of a class,
-    as in `vi_jax:Parameters.scene`, gets its own keywords, and the class all others; the keywords
-    as the file has them; their place in the file.
+    **Arguments:** `name`, `package.module:name` or `path/to/file.py:name`. A method of a class, as
+    in `vi_jax:Parameters.scene`, receives its own keywords, and the class all others. `keywords`
+    are as in the file, and `place` is their place in it.
     """
     module, _, path = str(name).rpartition(":")
     if not module or not path:
@@ -88,14 +88,14 @@ def _imported(module: str) -> Any:
 
 
 def _fitting(parameter: inspect.Parameter, value: Any) -> Any:
-    """A whole number as a float where the class declares one: an integer would be compile-time."""
+    """Return an integer as a float if the class declares one: it would be compile-time."""
     words = f"{parameter.annotation} {type(parameter.default).__name__}"
     wants_float = re.search(r"[Ff]loat|Array", words) and not re.search(r"\bint\b", words)
     return float(value) if wants_float and type(value) is int else value
 
 
 def _line(error: BaseException) -> str:
-    """The last line of the user's that an error came through."""
+    """Return the last line of user code in the traceback of an error, as text."""
     others = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
     lines = traceback.extract_tb(error.__traceback__)
     own = [x for x in lines if not any(other in x.filename for other in others)]
@@ -103,7 +103,7 @@ def _line(error: BaseException) -> str:
 
 
 def value_of(value: Any, place: str) -> Any:
-    """Return a value of a file as the library takes it (see above). **Raises:** `InputError`."""
+    """Return a value of a file as the library needs it (see above). **Raises:** `InputError`."""
     if isinstance(value, list):
         return tuple(value_of(x, place) for x in value)
     if not isinstance(value, dict):
@@ -120,7 +120,7 @@ def value_of(value: Any, place: str) -> Any:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Items by their dotted names, in quotes or not."""
+    """Yield items by their dotted names, in quotes or not."""
     for key, value in table.items():
         if isinstance(value, dict) and not value.keys() & {"class", "from"}:
             yield from _flat(value, f"{prefix}{key}.")

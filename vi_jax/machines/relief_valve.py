@@ -1,4 +1,4 @@
-"""A pressure relief valve that chatters on its seat, by itself."""
+"""A pressure relief valve that chatters on its seat without a drive."""
 
 from math import pi
 from typing import Any, ClassVar
@@ -12,14 +12,14 @@ from ._base import ReadyMachine, number_field
 
 
 class ValveState(Shown):
-    """The valve's body and the vessel under it; without units, as the numbers of `ReliefValve`."""
+    """The valve's body and the vessel under it; dimensionless, as the numbers of `ReliefValve`."""
 
     ranges: ClassVar = {"pressure": POSITIVE}
 
     lift: Scalar
-    """Distance of the body from its seat (without unit)."""
+    """Distance of the body from its seat (dimensionless)."""
     speed: Scalar
-    """Speed of the body, positive where the valve opens."""
+    """Speed of the body, positive when the valve opens."""
     pressure: Scalar
     """Pressure in the vessel above the ambient one; positive."""
 
@@ -30,10 +30,10 @@ class ReliefValve(ReadyMachine):
 
         lift'' = pressure - κ lift' - (lift + δ),    pressure' = β (q - lift √pressure)
 
-    and impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). It has no drive: a
-    cycle ends at the greatest lift (the speed falls through zero), after a varying time. Above q =
-    8.491 (with the other defaults) the open valve stands still, and there is no next cycle: observe
-    it at equal times by `observed_every`.
+    with impacts on the seat at lift = 0 (Hős and Champneys, Physica D 241, 2012). It has no drive:
+    a cycle ends at the greatest lift (the speed falls through zero), after a varying time. Above
+    q = 8.491 (with the other defaults) the open valve stands still, without a next cycle. Observe
+    it at equal times then, by `observed_every`.
 
     **Arguments:** `flow_rate` q, positive; `damping` κ, `precompression` δ of the spring, both not
     negative; `compressibility` β, positive; `restitution` r on the seat, in [0, 1].
@@ -54,21 +54,21 @@ class ReliefValve(ReadyMachine):
         return (RigidStop(0.0, self.restitution, "left", on=("lift", "speed")),)
 
     def field(self, s: Scalar, state: ValveState) -> ValveState:
-        """d(state)/dt between impacts on the seat."""
+        """Return d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         leaves = state.lift * jnp.sqrt(state.pressure)
         return ValveState(state.speed, force, self.compressibility * (self.flow_rate - leaves))
 
     def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
-        """The shorter time constant: that of the motion, or of the pressure under an open valve."""
+        """Return the shorter time constant, of the motion or of the pressure."""
         drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
         return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
 
     def start(
         self, *, lift: Number = 1.0, speed: Number = 0.0, pressure: Number = 12.0
     ) -> ValveState:
-        """An open valve by default, its lift about to fall."""
+        """Return a state; by default an open valve whose lift begins to decrease."""
         return ValveState(
             number("lift", lift), number("speed", speed), number("pressure", pressure)
         )

@@ -1,4 +1,4 @@
-"""A structure of many degrees of freedom with rigid stops, given by its matrices or its modes."""
+"""A structure of many degrees of freedom with rigid stops, defined by its matrices or its modes."""
 
 import dataclasses
 from typing import Any
@@ -23,13 +23,13 @@ from .._checks import (
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field
 
-# A matrix differs from its transpose by no more than this share of its largest number: rounding of
-# one that was assembled. A choice.
+# The largest asymmetry of a matrix, relative to its largest entry, that counts as rounding: a
+# choice.
 _ALIKE = 1e-12
 
 
 def _numbered(contacts: object) -> tuple[RigidStop, ...]:
-    """Contacts with the numbers of their coordinates; those of one `at` share the first one's."""
+    """Return contacts with the indices of their coordinates; equal `at` share the first index."""
     rows, found = [], []
     for stop in tuple_of("contacts", contacts, RigidStop):
         if stop.at is not None:
@@ -54,24 +54,24 @@ class Structure(LinearMachine):
         M x'' + C x' + K x = f₀ + A (f₁ cos ωs + f₂ sin ωs)
 
     Its state is a `StructureState` of displacements x and velocities x', n numbers each. Each stop
-    limits a sum c·x, which is its `at`: the third mass meets `vi.RigidStop(0.5, 0.8, at=[0, 0, 1])`
-    at 0.5; with `at=[1, -1, 0]` the first two approach each other. An impact with the restitution k
-    takes x' to x' - (1 + k) (c·x') M⁻¹c/(cᵀM⁻¹c), by an impulse along c (B. Brogliato, Nonsmooth
-    Mechanics, 2016). A resting coordinate stays on its stop, while the rest of the structure moves,
-    until the stop would have to pull.
+    limits a sum c·x, where c is its `at`. With `vi.RigidStop(0.5, 0.8, at=[0, 0, 1])` the third
+    mass has a stop at 0.5; with `at=[1, -1, 0]` the first two approach each other. An impact with
+    the restitution k takes x' to x' - (1 + k) (c·x') M⁻¹c/(cᵀM⁻¹c), by an impulse along c (B.
+    Brogliato, Nonsmooth Mechanics, 2016). A resting coordinate stays on its stop, while the rest of
+    the structure moves, until the stop would have to pull.
 
-    Time is the independent variable, and a cycle is 2π/ω, also where nothing is shaken.
+    Time is the independent variable, and a cycle is 2π/ω, also without a force.
 
-    It is followed in its natural modes, by default by `ExactFlight`: without any error of steps for
-    every damping, as a rigid body and in resonance too. Derivatives with respect to each of its
-    numbers exist at coincident frequencies.
+    The natural modes are used, by default with `ExactFlight`, which has no step error for any
+    damping, also for rigid bodies and in resonance. Derivatives with respect to all numbers exist
+    at coincident frequencies.
 
     **Arguments:**
 
     - `mass` M, symmetric and positive definite; `damping` C (0 by default) and `stiffness` K,
       symmetric: (n, n), or (n,) for a diagonal matrix.
-    - `contacts`, `vi.RigidStop`s with `at`; those with the same `at` are the two sides of a gap.
-    - `force` f₁, `sine_force` f₂ and `static_force` f₀: (n,), or `None` for none.
+    - `contacts`, `vi.RigidStop`s with `at`; two with the same `at` are the two sides of a gap.
+    - `force` f₁, `sine_force` f₂ and `static_force` f₀: (n,), or `None`.
     - `amplitude` A, any number; `frequency` ω, positive.
 
     **Raises:** `ValueError` for other numbers and shapes.
@@ -114,17 +114,15 @@ class Structure(LinearMachine):
         static_force: Any = None,
         **others: Any,
     ) -> "Structure":
-        """A structure given by n modes: measured ones, or some of a larger model's.
+        """Return a structure from n modes, measured or of a larger model.
 
-        Its state holds the modes' own coordinates q: the points of `shapes` are displaced by
-        `shapes @ q`.
+        Its state has modal coordinates q; the points of `shapes` are displaced by `shapes @ q`.
 
         **Arguments:**
 
-        - `frequencies`, angular ones (n,), not negative; `damping_ratios` (n,), or one for all.
-        - `shapes` (points, n), of modes of mass 1: by how much each mode displaces each point.
-          Rows `at` of `contacts` and the forces then have a number for each point; without shapes
-          one for each mode.
+        - `frequencies`, angular (n,), not negative; `damping_ratios` (n,), or one for all.
+        - `shapes` (points, n) of modes of mass 1: the displacement of each point by each mode. Rows
+          `at` and forces have a number for each point, or without shapes for each mode.
         - The others are those of a `Structure`.
 
         **Raises:** `ValueError` for other numbers and shapes.
@@ -160,7 +158,7 @@ class Structure(LinearMachine):
 
     @property
     def forces(self) -> tuple[Any, Any, Any]:
-        """f₀, A f₁ and A f₂."""
+        """The vectors f₀, A f₁ and A f₂."""
         cosine, sine = (
             None if f is None else self.amplitude * f for f in (self.force, self.sine_force)
         )
@@ -168,7 +166,7 @@ class Structure(LinearMachine):
 
 
 def _onto(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
-    """What acts at points, as it acts on modes."""
+    """Return a force or a row of points in terms of the modes."""
     if f is None:
         return None
     f = number(name, f)
@@ -181,8 +179,8 @@ def _onto(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
 
 
 def _check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
-    """The number of degrees of freedom. **Raises:** `ValueError` for matrices of other shapes, that
-    are not symmetric or hold what is no number, and for a mass that is not positive definite."""
+    """Return the number of degrees of freedom. **Raises:** `ValueError` for matrices of other
+    shapes, that are not symmetric or not finite, and for a mass that is not positive definite."""
     shape = mass.shape
     if len(shape) not in (1, 2) or shape[0] != shape[-1] or not shape[0]:
         raise ValueError(
@@ -202,7 +200,7 @@ def _check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
 
 
 def _check_numbers(name: str, value: object) -> None:
-    """**Raises:** `ValueError` for a matrix that is known and not finite, or not symmetric."""
+    """Raise `ValueError` for a known matrix that is not finite or not symmetric."""
     known = concrete(value)
     if known is None:
         return
@@ -222,7 +220,7 @@ def _check_numbers(name: str, value: object) -> None:
 
 
 def _check_positive(mass: object) -> None:
-    """**Raises:** `ValueError` for masses that are known and not positive definite."""
+    """Raise `ValueError` for known masses that are not positive definite."""
     known = concrete(mass)
     if known is None:
         return
@@ -235,7 +233,7 @@ def _check_positive(mass: object) -> None:
 
 
 def _check_vector(name: str, value: Any, n: int) -> None:
-    """**Raises:** `ValueError` for a vector of another length, or that is not finite."""
+    """Raise `ValueError` for a vector of another length, or that is not finite."""
     if value is None:
         return
     if value.shape != (n,):
@@ -247,7 +245,7 @@ def _check_vector(name: str, value: Any, n: int) -> None:
 
 
 def _check_contacts(contacts: tuple[RigidStop, ...], n: int) -> None:
-    """**Raises:** `ValueError` for a contact without a row of n numbers, or of zeros alone."""
+    """Raise `ValueError` for a contact without a row of n numbers, or with zeros only."""
     rows = 0
     for i, stop in enumerate(contacts):
         if stop.at is None:

@@ -16,7 +16,7 @@ from ._base import PhaseMachine, number_field, stops_at, supported
 
 
 class RotorState(Shown):
-    """Body and shaft, in the phase clock."""
+    """The state of body and shaft in the phase clock."""
 
     units: ClassVar = {"Y": "m r/M", "V": "m r ω/M", "P": "J ω", "phase": "rad"}
 
@@ -25,12 +25,12 @@ class RotorState(Shown):
     V: Scalar
     """dY/dτ (unit: m r ω/M)."""
     P: Scalar
-    """Momentum of the shaft, W - ε V sin φ, which impacts keep (unit: J ω); on the section it is
-    the speed W itself."""
+    """Momentum of the shaft, W - ε V sin φ, which impacts conserve (unit: J ω); W on the
+    section."""
 
 
 class TimedRotorState(RotorState):
-    """Body and shaft, in the time clock."""
+    """The state of body and shaft in the time clock."""
 
     phase: Scalar
     """Angle of the rotor since the last section (radians)."""
@@ -38,7 +38,7 @@ class TimedRotorState(RotorState):
 
 class UnbalancedRotor(ShaftMachine, PhaseMachine):
     """A body of mass M on a spring k and a damper c, on which a motor of limited power turns a
-    rotor with an unbalance m at the radius r; if `gap` is given, between stops.
+    rotor with an unbalance m at the radius r; between stops, if `gap` is given.
 
     With the body's displacement Y in units of m r/M, time τ = ω t, ω² = k/M, and the rotor's speed
     W = dφ/dτ:
@@ -46,22 +46,22 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         Y'' + 2ξ Y' + Y = W² cos φ + W' sin φ
         W' = τ0 (κ - W/w0) + ε Y'' sin φ
 
-    Passing the resonance takes power, so that the speed of a weak motor stays behind its control
+    Passing the resonance takes power. The speed of a weak motor therefore stays behind its control
     and then jumps (Sommerfeld 1902). At a slowly varying speed ζ the load, averaged over a turn, is
     ε ξ ζ⁵/D with D = (1 - ζ²)² + 4ξ²ζ², and to first order in ε
 
         τ0 (κ - ζ/w0) = ε ξ ζ⁵/D
 
     (V. O. Kononenko, Vibrating Systems with a Limited Power Supply, 1969; I. I. Blekhman,
-    Vibrational Mechanics, 2000). Gravity is left out, as for a shaft that stands upright or turns
-    fast.
+    Vibrational Mechanics, 2000). Gravity is left out, as for an upright or a fast shaft.
 
-    An impact changes the velocity of the body and the speed of the shaft: the former is reversed
-    and scaled, and the momentum of the shaft P = W - ε Y' sin φ, a component of the state, is
-    conserved. The energy ½Y'² + ½Y² - W Y' sin φ + W²/(2ε) then falls by ½(1 - k²)(1 - ε sin²φ)V⁻².
+    An impact changes the velocity of the body and the speed of the shaft. The velocity is reversed
+    and scaled. The momentum of the shaft P = W - ε Y' sin φ, a component of the state, is
+    conserved. The energy ½Y'² + ½Y² - W Y' sin φ + W²/(2ε) then decreases by ½(1 - k²)(1 - ε
+    sin²φ)V⁻².
 
-    The independent variable is φ, a cycle 2π, and the rotor must turn forward; `simulate(...,
-    clock="time")` has time instead, and starts from rest.
+    The independent variable is φ, a cycle 2π, and the rotor must turn forward. With
+    `simulate(..., clock="time")` it is time, and a start from rest is possible.
 
     **Arguments:**
 
@@ -70,7 +70,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
     - `no_load_speed` w0 at κ = 1 (unit: ω), positive.
     - `coupling` ε = (m r)²/(M J), with J the inertia of the shaft and the unbalance, in [0, 1).
     - `damping_ratio` ξ = c/(2 M ω), not negative.
-    - `gap` of the stops (unit: m r/M), positive; `None` for none.
+    - `gap` of the stops (unit: m r/M), positive; `None` for no stops.
     - `restitution` in [0, 1].
     - `two_sided`: whether there is a stop on the left as well; static.
     - `clock_name`: `"phase"` or `"time"`; static.
@@ -95,33 +95,33 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """None without `gap`; else one on the right, and one on the left if two-sided."""
+        """The stop on the right, and one on the left if two-sided; empty without `gap`."""
         if self.gap is None:
             return ()
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 
     def speed(self, phase: Number, state: State) -> Scalar:
-        """W = dφ/dτ of the rotor (unit: ω) at this angle."""
+        """Return W = dφ/dτ of the rotor (unit: ω) at this angle."""
         return state.P + self.coupling * state.V * jnp.sin(phase)
 
     def load(self, speed: Number) -> Float[Array, "..."]:
-        """ε ξ ζ⁵/D, the averaged load of the vibration on a rotor of this speed (unit: J ω²)."""
+        """Return ε ξ ζ⁵/D, the averaged load of the vibration at this rotor speed (unit: J ω²)."""
         z = jnp.asarray(speed)
         detuned = (1 - z * z) ** 2 + (2 * self.damping_ratio * z) ** 2
         return self.coupling * self.damping_ratio * z**5 / detuned
 
     def averaged_control(self, speed: Number) -> Float[Array, "..."]:
-        """κ at which a motor runs at this mean speed, to first order in ε and without stops."""
+        """Return κ of a motor at this mean speed, to first order in ε and without stops."""
         return jnp.asarray(speed) / self.no_load_speed + self.load(speed) / self.strength
 
     def field(self, s: Scalar, state: State) -> Any:
-        """d(state)/dφ, or d(state)/dτ of a state for the time clock, between impacts."""
+        """Return d(state)/dφ, or d(state)/dτ for a state of the time clock, between impacts."""
         phase = self._angle(s, state)
         sine, cosine = jnp.sin(phase), jnp.cos(phase)
         W = state.P + self.coupling * state.V * sine
         motor = self.strength * (self.control - W / self.no_load_speed)
         force = W * W * cosine - state.Y - 2 * self.damping_ratio * state.V
-        # Both equations solved for Y''; the shaft's own is that of its momentum.
+        # Both equations solved for Y''; the equation of the shaft is that of its momentum.
         push = (force + sine * motor) / (1 - self.coupling * sine * sine)
         twist = motor - self.coupling * state.V * W * cosine
         if self.is_timed(state):
@@ -130,17 +130,17 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return RotorState(pace * state.V, pace * push, pace * twist)
 
     def effective_mass(self, s: Scalar, state: State) -> Scalar:
-        """1 - ε sin²φ, what an impact acts on, since it jerks the shaft too (unit: M)."""
+        """Return 1 - ε sin²φ, the mass in an impact, which also accelerates the shaft (unit: M)."""
         sine = jnp.sin(self._angle(s, state))
         return 1 - self.coupling * sine * sine
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The body's, with its effective mass."""
+        """The coordinate of the body, with its effective mass."""
         return (super().coordinates[0]._replace(mass=self.effective_mass),)
 
     def start(self, *, Y: Number = 0.0, V: Number = 0.0, W: Number | None = None) -> Any:
-        """A state on the section φ = 0; `W` (unit: ω) defaults to the no-load speed κ w0, and
+        """Return a state on the section φ = 0. `W` (unit: ω) defaults to the no-load speed κ w0;
         `W=0` is a start from rest, for the time clock."""
         speed = self.control * self.no_load_speed if W is None else W
         Y, V, P = number("Y", Y), number("V", V), number("W", speed)
@@ -149,21 +149,21 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return self.adopt(RotorState(Y, V, P))
 
     def mirrored(self, state: State) -> Any:
-        """Y → -Y half a turn later, unless there is a stop on one side only."""
+        """Return -Y half a turn later, unless there is a stop on one side only."""
         if self.gap is not None and not self.two_sided:
             return None
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     def section_speed(self, state: State) -> Any:
-        """The momentum of the shaft is its speed where φ = 0."""
+        """Return the momentum of the shaft, which is its speed at φ = 0."""
         return state.P
 
     def pace(self, s: Scalar, state: State) -> Scalar | None:
-        """dτ/dφ = 1/W where the angle is the independent variable."""
+        """Return dτ/dφ = 1/W if the angle is the independent variable."""
         return _pace(self.speed(s, state)) if self.is_paced(state) else None
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """A fifth of the shorter of the rotor's turn and the body's natural period."""
+        """Return a fifth of the rotor's turn, or of the body's period if that is shorter."""
         speed = self._speed(s, state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         return turn * speed if self.clock_name == "phase" else turn
@@ -178,15 +178,15 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return state.phase if self.is_timed(state) else s
 
     def _speed(self, s: Scalar, state: State) -> Scalar:
-        """Speed of the rotor without its sign (unit: ω)."""
+        """Return the absolute speed of the rotor (unit: ω)."""
         return jnp.abs(self.speed(self._angle(s, state), state))
 
     def alive(self, state: State) -> jax.Array | None:
-        """In the phase clock a rotor that does not turn forward has a state that is no number."""
+        """Return False in the phase clock if the rotor does not turn forward: its state is NaN."""
         return jnp.isfinite(state.P) if self.is_paced(state) else None
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """A body on its spring, with the unbalanced rotor in it."""
+        """Draw a body on its spring, with the unbalanced rotor in it."""
         place, size = float(state.Y), pen.size
         radius = 0.34 * size
         post = supported(self, pen, place)
@@ -200,5 +200,5 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
 
 
 def _pace(W: Scalar) -> Scalar:
-    """dτ/dφ; no number where the rotor does not turn forward."""
+    """Return dτ/dφ; NaN if the rotor does not turn forward."""
     return jnp.where(W > 0, 1 / W, jnp.nan)

@@ -25,7 +25,7 @@ WOOD, SLEEVE, BIRD, BEAK = "#c9a36b", "#6f6f6f", "#4c5b66", "#e0b83f"
 
 
 class WoodpeckerState(Shown):
-    """Sleeve and bird; angles counterclockwise, with the bird on the right of the pole."""
+    """The state of sleeve and bird; angles counterclockwise, the bird on the right of the pole."""
 
     units: ClassVar = {
         **dict.fromkeys(("height", "drop"), "m"), "speed": "m/s",
@@ -34,7 +34,7 @@ class WoodpeckerState(Shown):
     }  # fmt: skip
 
     height: Scalar
-    """Height of the sleeve's middle above where the cycle began (m)."""
+    """Height of the sleeve's middle above its height when the cycle began (m)."""
     sleeve_angle: Scalar
     """φM, the angle between the sleeve and the pole (rad)."""
     bird_angle: Scalar
@@ -46,42 +46,43 @@ class WoodpeckerState(Shown):
     bird_rate: Scalar
     """dφS/dt of the bird (rad/s)."""
     drop: Scalar
-    """How far the sleeve came down in the cycle before (m)."""
+    """Distance that the sleeve moved down in the previous cycle (m)."""
 
 
 class Woodpecker(ReadyMachine, Mechanical):
     """A sleeve with some play on a pole, and a bird on a spring at it that pecks the pole.
 
-    The sleeve tilts until its edge jams on the pole by friction; the bird swings on, lifts the edge
-    off, the sleeve slides down and jams the other way, the beak hits the pole, and back it swings.
-    Its three coordinates are the height y, the sleeve's φM and the bird's φS, angles small:
+    The sleeve tilts until its edge jams on the pole by friction. The bird swings on and lifts the
+    edge off. The sleeve slides down and jams the other way; the beak hits the pole, and the bird
+    swings back. The coordinates are the height y, the sleeve's φM and the bird's φS, with small
+    angles:
 
         T = ½ m_M y'² + ½ J_M φM'² + ½ J_S φS'² + ½ m_S (y' + l_M φM' + l_G φS')²
         U = ½ c (φM - φS)² + m_M g y + m_S g (y + l_M φM + l_G φS)
 
-    Three contacts, with Newton's restitution and Coulomb's friction μ in impacts and between them:
-    the lower and the upper edge of the sleeve, r_M - r_O ± h_M φM ≥ 0, which slip with y' + r_M
-    φM'; and the beak, l_M + l_G - l_S - r_O - h_S φS ≥ 0, which slips with y' + l_M φM' + (l_G -
-    l_S) φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und Stößen, 1995; F. Pfeiffer
-    and Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996; numbers as in the example of
-    the Siconos software). A slipping contact sticks after an impact if the cone of friction lets
-    it.
+    Three contacts have Newton's restitution, and Coulomb friction μ in impacts and between them.
+    The lower and the upper edge of the sleeve have r_M - r_O ± h_M φM ≥ 0 and slip with y' + r_M
+    φM'. The beak has l_M + l_G - l_S - r_O - h_S φS ≥ 0 and slips with y' + l_M φM' + (l_G - l_S)
+    φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und Stößen, 1995; F. Pfeiffer and
+    Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Numbers are as in the example
+    of the Siconos software. A slipping contact sticks after an impact if the cone of friction
+    allows it.
 
-    Only its weight drives it: a cycle ends where φS falls through `section_angle`, after a varying
-    time; the component `drop` of the state is the descent in the last one. Time is the independent
-    variable. Numbers are in SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the
-    sleeve and `BEAK`, and the switches the friction on each.
+    Only its weight drives it. A cycle ends when φS falls through `section_angle`, after a varying
+    time. The component `drop` of the state is the descent in the last cycle. Time is the
+    independent variable, and units are SI units. The stops are, in this order, `LOWER` and `UPPER`
+    edge of the sleeve and `BEAK`; the switches are the friction on each.
 
     **Arguments:**
 
     - `friction` μ, not negative; `sleeve_restitution`, `beak_restitution` in [0, 1].
     - `sleeve_mass` m_M, `bird_mass` m_S (kg), `sleeve_inertia` J_M, `bird_inertia` J_S (kg m²),
       `stiffness` c of the spring (N m/rad), `gravity` g (m/s²), all positive.
-    - `sleeve_arm` l_M, from the pole's axis to the spring, `bird_arm` l_G, from there to the bird's
-      centre of mass, `beak_arm` l_S, from there back to the tip of its beak, which is `beak_height`
+    - `sleeve_arm` l_M, from the pole's axis to the spring; `bird_arm` l_G, from there to the bird's
+      centre of mass; `beak_arm` l_S, from there back to the tip of its beak, which is `beak_height`
       h_S above; `sleeve_height` h_M, half of the sleeve's; `sleeve_radius` r_M inside, greater than
       `pole_radius` r_O (all in m, positive).
-    - `section_angle` (rad), any number that the bird swings through.
+    - `section_angle` (rad), any angle that the bird swings through.
     """
 
     friction: Any = number_field("friction", 0.3, NOT_NEGATIVE)
@@ -126,18 +127,17 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def play(self) -> Scalar:
-        """r_M - r_O, between the sleeve upright and the pole (m)."""
+        """The distance r_M - r_O of the upright sleeve from the pole (m)."""
         return self.sleeve_radius - self.pole_radius
 
     @property
     def reach(self) -> Scalar:
-        """l_M + l_G - l_S - r_O, from the pole to the beak of a bird upright (m)."""
+        """The distance l_M + l_G - l_S - r_O of an upright bird's beak from the pole (m)."""
         return self.sleeve_arm + self.bird_arm - self.beak_arm - self.pole_radius
 
     @property
     def contacts(self) -> tuple[RigidStop | ContactFriction, ...]:
-        """The pole for the lower and the upper edge of the sleeve, and for the beak, and friction
-        on each."""
+        """The pole at the lower and the upper edge of the sleeve and at the beak, with friction."""
         lower, upper = (
             RigidStop(self.play, self.sleeve_restitution, side, coordinate=1)
             for side in ("left", "right")
@@ -148,8 +148,8 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """How far the beak and the sleeve's upper edge have come towards the pole, and along it how
-        high an edge of the sleeve and the beak are: all in metres, so that all forces are in N."""
+        """The displacements of the beak and of the sleeve's upper edge towards the pole, and the
+        heights of an edge of the sleeve and of the beak, all in metres, so that forces are in N."""
         beak = self.bird_arm - self.beak_arm
         gaps = (
             lambda q: self.beak_height * q.bird_angle,
@@ -161,7 +161,7 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        """The mass matrix: the bird hangs on both arms."""
+        """The mass matrix; the bird hangs on both arms."""
         sleeve, bird = self.sleeve_arm, self.bird_arm
         own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
         hanging = [
@@ -170,7 +170,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         return [[x + (i == j) * own[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """The weights, and the moment of the spring. The contacts add the forces of the pole."""
+        """Return the weights, and the moment of the spring, without the forces of the contacts."""
         moment = self.stiffness * (q.sleeve_angle - q.bird_angle)
         weight = self.bird_mass * self.gravity
         return {
@@ -180,21 +180,20 @@ class Woodpecker(ReadyMachine, Mechanical):
         }
 
     def _usual(self) -> Scalar:
-        """The period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
+        """Return the period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
         J = J_S + m_S l_G²."""
         inertia = self.bird_inertia + self.bird_mass * self.bird_arm**2
         return 2 * pi * jnp.sqrt(inertia / self.stiffness)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """A fifth of the period of the sleeve and the bird in free fall, which swing against each
-        other."""
+        """Return a fifth of the period of relative oscillations of sleeve and bird in free fall."""
         _, sleeve, bird = solved(self.mass, (0.0, -1.0, 1.0))
         return 0.4 * pi / jnp.sqrt(self.stiffness * (bird - sleeve))
 
     cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
 
     def renewed(self, state: WoodpeckerState) -> WoodpeckerState:
-        """The way down in a cycle is its drop; observed at equal times, the height goes on."""
+        """Return the state with the descent in the cycle as `drop`, unless at equal times."""
         if counter_of(self) is None:
             return state
         at = jnp.zeros_like(state.height)
@@ -205,11 +204,11 @@ class Woodpecker(ReadyMachine, Mechanical):
         bird_angle: Number | None = None, speed: Number = -0.34, sleeve_rate: Number = 0.0,
         bird_rate: Number = -7.5,
     ) -> WoodpeckerState:  # fmt: skip
-        """A state that is near to the cycle of the default numbers: on the section, the sleeve on
-        its lower edge and sliding down, the bird swinging away.
+        """Return a state near the cycle of the default numbers: on the section, the sleeve on its
+        lower edge and sliding down, the bird swinging away.
 
-        **Arguments:** a component each, in SI units; `None` is the sleeve on its lower edge, and
-        the bird at the section.
+        **Arguments:** one for each component, in SI units; the default angles are those of the
+        sleeve on its lower edge, and of the section.
         """
         jammed = -self.play / self.sleeve_height
         given = {
@@ -221,7 +220,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         return WoodpeckerState(**numbers, drop=jnp.zeros_like(numbers["height"]))
 
     def sketch(self, pen: Any, state: WoodpeckerState, phase: float) -> None:
-        """Pole, sleeve, spring and bird, as large as they are."""
+        """Draw pole, sleeve, spring and bird to scale."""
         inside, half = float(self.sleeve_radius), float(self.sleeve_height)
         pole, arm = float(self.pole_radius), float(self.bird_arm)
         beak = float(self.bird_arm - self.beak_arm), float(self.beak_height)
@@ -232,7 +231,7 @@ class Woodpecker(ReadyMachine, Mechanical):
             shape = about + _rotated(points, angle)
             pen.ax.fill(*shape.T, facecolor=color, edgecolor="0.15", lw=1.2, joinstyle="round")
 
-        # The pole is as long as the motion, with rings a centimetre apart that show the way down.
+        # The pole is as long as the motion. Rings a centimetre apart show the descent.
         low, high = -pen.reach - beak[1] - arm, beak[1] + arm + half
         filled(0.0, [(-pole, low), (pole, low), (pole, high), (-pole, high)], 0.0, WOOD)
         for ring in np.arange(np.ceil(low / 0.01), high / 0.01) * 0.01:
