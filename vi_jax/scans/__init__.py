@@ -1,4 +1,4 @@
-"""Many motions at once: grids, sweeps, basins, Lyapunov exponents, regimes."""
+"""Batches of motions: grids, sweeps, basins, Lyapunov exponents, regimes."""
 
 from ._all_orbits import AllOrbits as AllOrbits
 from ._all_orbits import Searched as Searched

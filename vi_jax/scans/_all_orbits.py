@@ -1,4 +1,4 @@
-"""`all_orbits`: the periodic motions that searches from a region of starts find."""
+"""`all_orbits`: the periodic motions found by searches from a region of starts."""
 
 import dataclasses
 import functools
@@ -29,55 +29,55 @@ from .program import start_with
 
 @dataclasses.dataclass(frozen=True)
 class Searched:
-    """What was searched for motions of one period, and what this says of motions not found."""
+    """Statistics of the search for motions of one period, for estimates of motions not found."""
 
     cycles: int
-    """The period asked for, in drive cycles; motions of its divisors solve its equations too."""
+    """The period in drive cycles; motions whose periods divide it solve its equations too."""
     starts: int
-    """Random starts from which a search began."""
+    """Number of random starts."""
     simulated: int
-    """Those that could be simulated: not beyond a stop, for one."""
+    """Number of starts that could be simulated, for example not beyond a stop."""
     converged: int
-    """Searches that found a motion."""
+    """Number of searches that found a motion."""
     motions: int
-    """Different motions among them."""
+    """Number of different motions among them."""
     once: int
-    """Motions that one search alone found."""
+    """Number of motions that only one search found."""
     still: int = 0
-    """Searches that ended at an equilibrium, which is no motion."""
+    """Number of searches that ended at an equilibrium, which is not a motion."""
 
     @property
     def unseen(self) -> float:
-        """Good and Turing's estimate of the probability that the next search which converges finds
-        a motion that none of these has: `once / converged`, NaN if none converged. It counts
-        searches, not motions: many motions with small sets of starts may hide in it."""
+        """Good and Turing's estimate of the probability that the next converging search finds a new
+        motion: `once / converged`, NaN if none converged. It counts searches, not motions: many
+        motions with small sets of starts may be missing."""
         return self.once / self.converged if self.converged else np.nan
 
     @property
     def detectable(self) -> float:
-        """The share of the searches that converge which a motion must have to be found by one of so
-        many in 95 of 100 cases; NaN if none converged."""
+        """The share of the converging searches above which a motion is found by this number of
+        searches in 95 of 100 cases; NaN if none converged."""
         return 1 - 0.05 ** (1 / self.converged) if self.converged else np.nan
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class AllOrbits(InWords):
-    """Periodic motions found from a region of starts, stable and unstable, and statistics of the
+    """Periodic motions from a region of starts, stable and unstable, and statistics of the
     search."""
 
     orbits: Orbits
     """The motions, by period and then by least position; each with its multipliers."""
     found: np.ndarray
-    """Searches that found each; (motions, periods), in the order of `searched`."""
+    """Number of searches that found each; (motions, periods), in the order of `searched`."""
     searched: tuple[Searched, ...]
-    """One for each period asked for."""
+    """The statistics of each period."""
     region: dict[str, tuple[float, float]]
-    """Ranges of the parts of the start."""
+    """Ranges of the components of the start."""
     machine: AbstractMachine
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether each motion is stable."""
+        """True for each stable motion."""
         return np.array([bool(orbit.stable) for orbit in self.orbits], bool)
 
     @property
@@ -86,13 +86,12 @@ class AllOrbits(InWords):
         return np.array([int(orbit.cycles) for orbit in self.orbits], int)
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """The motions as an `xarray.Dataset`: of each its period, extremes, impacts, stability,
-        multipliers and section states (NaN beyond its period), and how many searches `found` it;
-        of each period what was searched.
+        """Return the motions as an `xarray.Dataset`: for each its period, extremes, impacts,
+        stability, multipliers, section states (NaN beyond its period), and the number of searches
+        that `found` it; for each period the statistics of its search.
 
-        **Arguments:** `along`, to keep only what has one dimension: `"motion"`, `"search"` (the
-        periods asked for), `"cycle"` or `"multiplier"`, which then makes a table without
-        repetitions.
+        **Arguments:** `along`, to keep only variables with one dimension: `"motion"`, `"search"`
+        (the periods), `"cycle"` or `"multiplier"`, as a table without repetitions.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -160,36 +159,36 @@ def all_orbits(
     root_finder: AbstractRootFinder | None = None,
     method: MethodLike = None,
 ) -> AllOrbits:
-    """Find the periodic motions of up to so many cycles, stable and unstable.
+    """Find the periodic motions up to a number of cycles, stable and unstable.
 
     For each period of 1 to `cycles` drive cycles `find_orbit` searches from random starts, all in
     one compiled call. The results are sorted into different motions with their least periods. A
-    random search may miss orbits: the result has the number of searches, how many converged, and
-    the probability that the next one finds a new orbit (Good–Turing estimate). Host-side: not to be
-    traced; one compiled program for each period.
+    random search may miss orbits. The result has the number of searches, of those that converged,
+    and the probability that the next one finds a new orbit (Good–Turing estimate). Host-side: not
+    to be traced; one compiled program for each period.
 
     **Arguments:**
 
     - `machine`: the machine.
     - `cycles`: the longest period.
-    - `region`: ranges of parts of the start, such as `{"start.Y": (-4, 2), "start.V": (-4, 4)}`,
-      on the machine's section.
-    - `starts`: random starts for each period, uniform in the region (with `seed`).
+    - `region`: ranges of components of the start, such as
+      `{"start.Y": (-4, 2), "start.V": (-4, 4)}`, on the machine's section.
+    - `starts`: the number of random starts for each period, uniform in the region (with `seed`).
     - `tolerance`: as for `distinct_orbits`.
-    - `start`: a state on the section with the parts that are not in the region; by default
+    - `start`: a state on the section with the components that are not in the region; by default
       `machine.start()`.
     - `root_finder`, `method`: as for `find_orbit`.
 
     **Returns:** `AllOrbits`.
 
-    **Raises:** `ValueError` or `TypeError` for arguments that cannot be used; on Ctrl-C
-    `Interrupted`, whose `partial` holds the periods that were searched, if there are any.
+    **Raises:** `ValueError` or `TypeError` for unusable arguments; on Ctrl-C `Interrupted`, whose
+    `partial` has the finished periods, if there are any.
     """
     machine, cycles = machine_of(machine), count("cycles", cycles, least=1)
     starts, seed = count("starts", starts, least=1), count("seed", seed)
     tolerance = given_number("tolerance", tolerance, low=0.0)
     begin = machine.start() if start is None else start
-    # A draw for each period: longer ones do not change what shorter ones are searched from.
+    # Each period has its own random starts, so that those of shorter periods stay the same.
     rows = [starts_in(region, machine, begin, 1, starts, (seed, n)) for n in range(1, cycles + 1)]
     ranges = {name: (float(low), float(high)) for name, (low, high) in region.items()}
 
@@ -209,7 +208,7 @@ def _sorted_out(
     machine: AbstractMachine, batches: list[Orbit], tolerance: float,
     region: dict[str, tuple[float, float]],
 ) -> AllOrbits:  # fmt: skip
-    """The different motions in what searches for 1, 2, … cycles found."""
+    """Return the different motions in the results of searches for 1, 2, … cycles."""
     orbits, found = distinct_among(batches, tolerance)
     searched = tuple(
         Searched(

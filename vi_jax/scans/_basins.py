@@ -1,4 +1,4 @@
-"""`basins`: which start goes to which motion; `integrity_profile`: how basins erode."""
+"""`basins`: the motion that each start settles on; `integrity_profile`: the erosion of basins."""
 
 import difflib
 import inspect
@@ -66,7 +66,7 @@ class Attractor(NamedTuple):
     starts: int
     """Number of starts that ended on it."""
     fraction: float
-    """Part of all starts."""
+    """Share of all starts."""
     error: float
     """Standard error of `fraction` for random starts, √(p(1 - p)/N); on a grid it is an upper
     estimate."""
@@ -77,21 +77,20 @@ class Integrity(NamedTuple):
     (2003). Distances are in the given `scales`."""
 
     label: int
-    """Which motion: `attractors[label]`."""
+    """The index of the motion in `attractors`."""
     local: float
     """Local integrity measure: radius of the largest ball of starts around the motion that all
     settle on it, the least over its sections; NaN if none of them lies in the region."""
     sections: np.ndarray
-    """The same of each section state; shape (period,), NaN outside of the region."""
+    """The radius for each section state; shape (period,), NaN outside of the region."""
     factor: float
     """Integrity factor: radius of the largest ball of such starts anywhere in the region."""
     centre: dict[str, float]
     """Its centre, by the names of the region."""
     local_at_edge: bool
-    """Whether the edge of the region limits the ball of `local`, so that a larger region might give
-    a larger ball."""
+    """True if the edge of the region limits the ball of `local`: it may be larger."""
     factor_at_edge: bool
-    """Whether the edge of the region limits the ball of `factor`."""
+    """True if the edge of the region limits the ball of `factor`."""
     resolution: float
     """The uncertainty of the radii: half a diagonal of the grid's cells."""
 
@@ -100,33 +99,32 @@ class Basins(NamedTuple):
     """Basins of attraction: the motion that each start settles on, and these motions."""
 
     data: "xr.Dataset"
-    """`label` over the region (or over `sample`): an index into `attractors`, or below 0 for starts
-    that settle on no periodic motion (`label.attrs` has the reasons); `period`, `impacts`,
-    `result`, and a section state on which the lane ended."""
+    """`label` over the region (or over `sample`): an index into `attractors`, or negative for
+    starts that settle on no periodic motion (`label.attrs` has the reasons); `period`, `impacts`,
+    `result`, and a section state at the end of the lane."""
     attractors: list[Attractor]
     """The periodic motions, the largest basin first: label i is `attractors[i]`."""
     irregular: dict[str, float]
-    """Fractions of the starts that ended on no periodic motion: chaotic, unsettled, failed,
-    transient (transiently chaotic, see `Regime`)."""
+    """Shares of the starts that settle on no periodic motion: chaotic, unsettled, failed, transient
+    (transiently chaotic, see `Regime`)."""
     machine: AbstractMachine
-    """The machine whose basins these are; it words the periods."""
+    """The machine with these basins, for names of periods."""
 
     def period_of(self, cycles: int) -> str:
-        """A duration of so many cycles, in the words of the machine."""
+        """Return the duration of a number of cycles, in the words of the machine."""
         return cycles_in_words(self.machine, cycles)
 
     def integrity(self, *, scales: Mapping[str, float] | None = None) -> list[Integrity]:
-        """How far the starts of each motion reach: the largest ball of them around the motion, and
-        anywhere.
+        """Return the largest ball of starts of each motion, around the motion and anywhere.
 
-        A ball ends at a cell whose start settles elsewhere, or nowhere, and at the edge of the
-        region. A stop does not limit a ball, since no start lies beyond it, and the range of an
-        angle of `wrap_angles` has no edge if it is a whole turn. Balls lie within the
-        region's components: if other components of a motion differ from those of the starts,
-        sections count by their place in the region.
+        A ball ends at a cell whose start settles elsewhere, or on no motion, and at the edge of the
+        region. A stop does not limit a ball, since no start lies beyond it. The range of an angle
+        of `wrap_angles` has no edge if it is a whole turn. Balls lie within the region's
+        components: if other components of a motion differ from those of the starts, its sections
+        are projected into the region.
 
-        **Arguments:** `scales`, what counts as distance 1 along parts of the start, such as
-        `{"start.V": 2.0}`; 1 where left out.
+        **Arguments:** `scales`, the unit of distance along components of the start, such as
+        `{"start.V": 2.0}`; 1 by default.
 
         **Returns:** an `Integrity` for each of `attractors`.
 
@@ -158,8 +156,8 @@ class Basins(NamedTuple):
         return found
 
     def entropy(self, *, box: int = 5) -> geometry.BasinEntropy:
-        """Basin entropy and boundary basin entropy: how uncertain the outcome is in a small box of
-        starts. Chaotic, unsettled and failed count as outcomes; starts beyond a stop are left out.
+        """Return basin entropy and boundary basin entropy: the uncertainty of the outcome in a box
+        of starts. Chaotic, unsettled and failed are outcomes; starts beyond a stop are left out.
 
         **Arguments:** `box`, starts along each side of a box.
 
@@ -170,8 +168,8 @@ class Basins(NamedTuple):
         return geometry.entropy_of(label, box=box, there=there)
 
     def uncertainty(self, *, confidence: float = 0.95) -> geometry.Uncertainty:
-        """Uncertainty exponent of the basins' boundaries: how slowly the part of uncertain starts
-        decreases with the error of the starts. It is 1 for smooth boundaries.
+        """Return the uncertainty exponent of the basins' boundaries: the power of the error of the
+        starts with which the share of uncertain starts decreases. It is 1 for smooth boundaries.
 
         It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its interval is
         the uncertainty due to the grid: about ±0.05 at 512 starts along each of two axes.
@@ -190,7 +188,7 @@ class Basins(NamedTuple):
         return geometry.uncertainty_of(label, confidence=float(confidence), there=there)
 
     def _grid(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
-        """Labels on the grid of the starts, which of these can be at all, the names of its axes."""
+        """Return labels on the grid, which starts are not beyond a stop, and the axes' names."""
         label = self.data["label"]
         names = [str(name) for name in label.dims]
         if names == ["sample"] or min(label.shape) < 2:
@@ -201,12 +199,12 @@ class Basins(NamedTuple):
         return np.asarray(label), np.asarray(self.data["result"]) != _BEYOND, names
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """These basins as an `xarray.Dataset`: `data`, and of each motion `motion_period`,
+        """Return the basins as an `xarray.Dataset`: `data`, and for each motion `motion_period`,
         `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
-        (`motion_Y`, NaN beyond its period). A `label` from 0 on is a place along `motion`.
+        (`motion_Y`, NaN beyond its period). A nonnegative `label` is an index along `motion`.
 
-        **Arguments:** `along`, to keep only what lies along one dimension: `"motion"`, `"cycle"`
-        (their section states), or the last axis of the starts for `data`.
+        **Arguments:** `along`, to keep only variables with one dimension: `"motion"`, `"cycle"`
+        (section states), or the last axis of the starts for `data`.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -240,12 +238,12 @@ class Basins(NamedTuple):
 
 
 def in_one_array(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows of several lengths, with NaN behind the shorter ones."""
+    """Return rows of several lengths as one array, shorter ones filled with NaN."""
     return np.array([*itertools.zip_longest(*rows, fillvalue=np.nan)], float).T
 
 
 def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> np.ndarray:
-    """What counts as distance 1 along these axes. **Raises:** as `Basins.integrity`."""
+    """Return the units of distance along these axes. **Raises:** as `Basins.integrity`."""
     given = {} if scales is None else dict(scales)
     for name, scale in given.items():
         if name not in names:
@@ -254,12 +252,12 @@ def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> n
     return np.array([float(given.get(name, 1.0)) for name in names])
 
 
-# Options of `scan` that verbs which scan starts set themselves.
+# Options of `scan` that the functions of this file set themselves.
 _SET = {"measure", "paired", "cycles", "derivatives", "axes"}
 
 
 class _Mark(Sections):
-    """Of the last section states that of greatest position, the same for all lanes on a motion."""
+    """The one of the last section states with the greatest position, equal on each motion."""
 
     def described(self, start):
         return {name: {"unit_of": name} for name in components(start)}
@@ -286,23 +284,24 @@ def basins(
     progress: bool = True,
     **options: Any,
 ) -> Basins:
-    """Find the motions that starts in a region settle on, and which start goes to which.
+    """Find the motions that starts in a region settle on, and the motion of each start.
 
-    No motion must be known in advance: the final motion of each start is compared with those found
-    so far, including phase shifts, and a new motion is added if none is near. Starts beyond a stop
-    count as failed.
+    No motion must be known in advance. The final motion of each start is compared with those found
+    so far, including phase shifts, and a new motion is added if needed. Starts beyond a stop count
+    as failed.
 
     **Arguments:**
 
     - `machine`: the machine.
-    - `region`: ranges of parts of the start, such as `{"start.Y": (-4, 2), "start.V": (-4, 4)}`.
+    - `region`: ranges of components of the start, such as
+      `{"start.Y": (-4, 2), "start.V": (-4, 4)}`.
     - `resolution`: starts along each of them, on a grid that fills the range (cell centres).
-    - `samples`: instead of the grid so many random starts, uniform in the region (with `seed`),
-      for fractions with a standard error.
-    - `settle`: drive cycles before the motion is judged.
+    - `samples`: the number of random starts instead of the grid, uniform in the region (with
+      `seed`), for fractions with a standard error.
+    - `settle`: drive cycles before the motion is classified.
     - `longest`, `tolerance`: as in `Regime`.
-    - `apart`: section states farther apart than this belong to different motions; relative to
-      the size of each number, as in `Regime`.
+    - `apart`: section states farther apart than this belong to different motions; relative to the
+      size of each number, as in `Regime`.
     - `method`, `start`, `progress`, and further options: as for `scan` (`store` to interrupt and
       resume).
 
@@ -335,7 +334,7 @@ def _sorted_out(
     longest: int,
     method: AbstractMethod,
 ) -> Basins:
-    """The basins in what `_scanned` found; the parts of the region are replaced in `begin`."""
+    """Return the basins in the result of `_scanned`; `begin` has all other components."""
     label, motions = _labelled(data, machine, begin, apart, longest, method)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
@@ -361,8 +360,8 @@ def _sorted_out(
 
 
 def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> list[str]:
-    """Edges of the region beyond which no start can be, such as `"start.Y high"`, for a stop is
-    there: in the middle of each edge a start inside of it is looked at, and one beyond."""
+    """Return edges of the region at a stop, such as `"start.Y high"`: in the middle of each edge, a
+    start just inside is possible, and one just beyond is not."""
     rows = {str(name): np.asarray(data[name]) for name in data["period"].dims}
     found = []
     for name, row in rows.items():
@@ -390,8 +389,8 @@ def _may_start(machine: AbstractMachine, begin: object, values: Mapping[str, flo
 def _check_options(
     verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
 ) -> None:
-    """**Raises:** `TypeError` for an option that is none of `scan`'s, or one that a verb which
-    scans starts does not take; `refused` are those that this verb alone does not take."""
+    """Raise `TypeError` for an option that `scan` does not have, that no function here takes, or
+    that is `refused` by this one."""
     who = verb.__name__
     own, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
@@ -410,7 +409,7 @@ def _scanned(
     tolerance: float | None,
     **options: Any,
 ) -> "xr.Dataset":
-    """What a scan finds of starts, for `_sorted_out`; those that fail are no news."""
+    """Return the data of a scan of starts, for `_sorted_out`, without a warning of failed lanes."""
     measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
@@ -425,7 +424,7 @@ def starts_in(
     samples: int | None,
     seed: int | tuple[int, ...],
 ) -> dict[str, np.ndarray]:
-    """The starts in a region, as axes of a scan: those of a grid, or random ones in pairs.
+    """Return the starts in a region as axes of a scan: those of a grid, or random ones in pairs.
     **Raises:** `ValueError` or `TypeError` that names the argument."""
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
@@ -461,8 +460,8 @@ def _labelled(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
     method: AbstractMethod,
 ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
-    """A label for each lane, and the section states (period, components) of each motion, that of
-    the most lanes first; arguments as for `_sorted_out`."""
+    """Return a label for each lane, and the section states (period, components) of each motion,
+    most lanes first; arguments as for `_sorted_out`."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
@@ -472,7 +471,7 @@ def _labelled(
     places = [START + name for name in names]
     starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in places]
     unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
-    # Lanes on one motion fall into few cells; what is found for one of them holds for all.
+    # Lanes on one motion lie in few cells. A result for one of them holds for all.
     cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -481,7 +480,7 @@ def _labelled(
     angles = angles_in(machine, begin)
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
-        # The motions of this period, (motions, period, components), and their numbers.
+        # The motions of this period, (motions, period, components), and their indices.
         rows, numbers = known.get(p, (np.empty((0, p, len(names))), []))
         away = distance(nearest_images(angles, rows, state), state, unit).min(axis=1)
         close = np.flatnonzero(away <= apart)
@@ -490,7 +489,7 @@ def _labelled(
             continue
         of_cell[i] = len(motions)
         here = with_leaves(begin, dict(zip(names, state, strict=True)))
-        # Always as many cycles, so that another period is not another program.
+        # The same number of cycles for all periods, for one compiled program.
         run = simulate(machine, here, longest, method=method)
         motions.append(np.asarray(in_rows(run.sections))[1 : p + 1])
         known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, of_cell[i]]
@@ -500,11 +499,11 @@ def _labelled(
     return label, [motions[i] for i in order]
 
 
-# From one value to the next a section of one motion moves by less than this part of the region.
-# A choice.
+# From one value to the next, sections of a motion move less than this share of the region. A
+# choice.
 _MOVES = 0.25
 
-# What is said of each motion at each value, and where there is none.
+# The variables of each motion at each value, with their values if it does not exist.
 _NUMBERS = {
     "share": 0.0, "error": 0.0, "local": np.nan, "factor": np.nan,
     "local_at_edge": False, "factor_at_edge": False,
@@ -512,58 +511,56 @@ _NUMBERS = {
 
 
 class IntegrityProfile(NamedTuple):
-    """Basins over one number of a machine: the share and the integrity of each motion, also called
-    an erosion profile. Thompson's Dover cliff is where they fall off.
+    """Basins over one parameter of a machine: the share and the integrity of each motion, also
+    called an erosion profile. The steep decrease is Thompson's Dover cliff.
 
-    Motions at two neighbouring values count as the same if they have the same period and number of
+    Motions at neighbouring values count as the same if they have the same period and number of
     impacts, and their sections differ by less than a quarter of the region.
     """
 
     parameter: str
     values: np.ndarray
-    """The values, rising; shape (values,)."""
+    """The values in rising order; shape (values,)."""
     period: np.ndarray
-    """Period of each motion in drive cycles; shape (motions,), the one of most starts first."""
+    """The period of each motion in drive cycles; shape (motions,), most starts first."""
     impacts: np.ndarray
-    """Impacts in a period; shape (motions,)."""
+    """The number of impacts in a period; shape (motions,)."""
     label: np.ndarray
-    """Number of the motion among the `attractors` at each value, -1 where no start settles on it;
-    shape (motions, values), as of all below."""
+    """The index of the motion in `attractors` at each value, -1 if no start settles on it; shape
+    (motions, values), as for all below."""
     share: np.ndarray
-    """Part of the starts that settle on it, 0 where none does."""
+    """The share of starts that settle on it."""
     error: np.ndarray
-    """Standard error of `share`, as in `Attractor`."""
+    """The standard error of `share`, as in `Attractor`."""
     local: np.ndarray
-    """Local integrity measure, as in `Integrity`; NaN where no start settles on the motion, or its
+    """The local integrity measure, as in `Integrity`; NaN if no start settles on the motion, or its
     sections lie outside of the region."""
     factor: np.ndarray
-    """Integrity factor; NaN where no start settles on the motion."""
+    """The integrity factor; NaN if no start settles on the motion."""
     local_at_edge: np.ndarray
-    """Whether the edge of the region limits the ball, so that a larger region might give a larger
-    one."""
+    """True if the edge of the region limits the ball of `local`: it may be larger."""
     factor_at_edge: np.ndarray
-    """Whether the edge of the region limits the ball of `factor`."""
+    """True if the edge of the region limits the ball of `factor`."""
     resolution: float
-    """The uncertainty of the radii; NaN if there is no motion."""
+    """The uncertainty of the radii; NaN without motions."""
     basins: list[Basins]
     """The basins at each value."""
 
     @property
     def irregular(self) -> dict[str, np.ndarray]:
-        """Parts of the starts that end on no periodic motion, by the names of `REGIMES`; each of
-        shape (values,)."""
+        """The shares of starts on no periodic motion, by names of `REGIMES`; shape (values,)."""
         return {name: np.array([x.irregular[name] for x in self.basins])
                 for name in self.basins[0].irregular}  # fmt: skip
 
     def name_of(self, motion: int) -> str:
-        """A motion in words: its period and its impacts."""
+        """Return a motion in words: its period and its impacts."""
         period = self.basins[0].period_of(int(self.period[motion]))
         return f"{period}, {so_many(round(float(self.impacts[motion])), 'impact')}"
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """This profile as an `xarray.Dataset` over `motion` and the parameter.
+        """Return the profile as an `xarray.Dataset` over `motion` and the parameter.
 
-        **Arguments:** `along`, to keep only what lies along one of these.
+        **Arguments:** `along`, to keep only variables over one of these.
 
         **Raises:** `ValueError` if there is no such dimension.
         """
@@ -625,15 +622,15 @@ def integrity_profile(
     """Compute basins, their shares and their integrity over one parameter (an erosion profile), as
     one scan by one compiled program.
 
-    **Arguments:** `machine` and `parameter`, the name of the number that is changed, such as
-    `"drive.frequency_ratio"`; its `values`, which are taken in rising order; `scales`, as for
-    `Basins.integrity`; all others and further options as for `basins`, with the same starts at each
-    value (`start`: by default the machine's own there).
+    **Arguments:** `machine`; `parameter`, the name of the number that varies, such as
+    `"drive.frequency_ratio"`; its `values`, which are sorted; `scales`, as for `Basins.integrity`;
+    all others and further options as for `basins`, with the same starts at each value (`start`: by
+    default the machine's own at each value).
 
     **Returns:** an `IntegrityProfile`.
 
-    **Raises:** as `basins`; `ValueError` for values that are no rising row of numbers, or scales of
-    what is not in the region.
+    **Raises:** as `basins`; `ValueError` for values that are not a row of numbers, or scales of
+    names outside of the region.
     """
     machine = machine_of(machine)
     check_leaf(machine, parameter)
@@ -671,7 +668,7 @@ def _profile(
     found: list[Basins],
     integrity: list[list[Integrity]],
 ) -> IntegrityProfile:
-    """The basins at each value sorted by motion."""
+    """Return the basins at each value sorted by motion."""
     label = _matched(found, axes)
     shape = label.shape
     numbers = {name: np.full(shape, absent) for name, absent in _NUMBERS.items()}
@@ -691,8 +688,8 @@ def _profile(
 
 
 def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which attractor at each value is which motion, -1 for none: (motions, values). Of the motions
-    of a kind those nearest to each other are one, the nearest pair first."""
+    """Return the label of each motion at each value, -1 without the motion: (motions, values).
+    Attractors of a kind are matched with the last of each motion, the nearest pair first."""
     names = [name.removeprefix(START) for name in axes]
     angles = np.array([is_angle(found[0].machine, name) for name in names])
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
@@ -721,7 +718,7 @@ def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
 def _distance(
     a: Attractor, b: Attractor, names: list[str], angles: np.ndarray, widths: np.ndarray
 ) -> float:
-    """How far sections are apart, as a part of the widths, by the best shift in phase."""
+    """Return the distance of sections, relative to the widths, at the best shift in phase."""
     x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
     shifted = (np.roll(y, shift, axis=0) for shift in range(len(y)))
     return float(min((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted))

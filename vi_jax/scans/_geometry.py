@@ -1,4 +1,4 @@
-"""The geometry of basins, from labels on a grid: entropies, uncertainty exponent, largest balls."""
+"""Geometry of basins from labels on a grid: entropies, uncertainty exponent, largest balls."""
 
 import itertools
 from typing import NamedTuple
@@ -7,8 +7,8 @@ import numpy as np
 
 from ..machine import without_turns
 
-# Tiles along each axis, of which one after the other is left out for the confidence interval, in
-# more dimensions and in one; and the distances looked at, at most this part of the grid. Choices.
+# Tiles along each axis, one of which is left out at a time for the confidence interval, in several
+# dimensions and in one; the number of distances, and the longest as a share of the grid. Choices.
 _TILES, _TILES_OF_A_ROW = 8, 64
 _DISTANCES, _FARTHEST = 8, 1 / 16
 
@@ -32,24 +32,23 @@ class BasinEntropy(NamedTuple):
 
 class Uncertainty(NamedTuple):
     """Final-state sensitivity, after Grebogi, McDonald, Ott and Yorke, Physics Letters A 99, 415
-    (1983): the part of the starts whose outcome an error ε may change grows as a power of ε.
+    (1983). The share of starts whose outcome may change by an error ε grows as a power of ε.
 
-    The error is one of a single part of the start at a time. Across a smooth boundary the exponent
-    is 1; across a fractal one it is the dimension of the starts less that of the boundary. A
-    boundary may be smooth in one direction and fractal in another: the smallest exponent decides as
-    ε → 0.
+    The error is in a single component of the start. The exponent is 1 across a smooth boundary.
+    Across a fractal one it is the dimension of the starts minus that of the boundary. A boundary
+    may be smooth in one direction and fractal in another: the smallest exponent decides as ε → 0.
     """
 
     exponents: np.ndarray
-    """Exponent for errors along each axis of the grid, shape (axes,); NaN where fewer than three
+    """The exponent for errors along each axis of the grid, shape (axes,); NaN if fewer than three
     distances meet a boundary."""
     intervals: np.ndarray
-    """Confidence interval of each; shape (axes, 2)."""
+    """The confidence interval of each exponent; shape (axes, 2)."""
     distances: np.ndarray
     """The errors ε, in cells of the grid; shape (distances,)."""
     fractions: np.ndarray
-    """Part of the starts for which the one at this distance, up or down the axis, has another
-    outcome; shape (axes, distances)."""
+    """The share of starts with another outcome at this distance, up or down the axis; (axes,
+    distances)."""
 
     @property
     def exponent(self) -> float:
@@ -69,18 +68,18 @@ class Uncertainty(NamedTuple):
 
 
 class Ball(NamedTuple):
-    """A ball of starts that all have one outcome."""
+    """A ball of starts with the same outcome."""
 
     radius: float
     centre: np.ndarray
     at_edge: bool
-    """Whether the edge of the region is what it meets first, so that it might be larger."""
+    """True if the edge of the region limits it, so that it might be larger."""
 
 
 def entropy_of(label: np.ndarray, *, box: int, there: np.ndarray | None = None) -> BasinEntropy:
-    """Basin entropy of labels on a grid of any dimension, by boxes of `box` cells along each side,
-    which do not overlap; cells left over at the ends of the axes are left out. `there` is which
-    cells hold a start at all (all by default)."""
+    """Return the basin entropy of labels on a grid of any dimension, by separate boxes of `box`
+    cells along each side; remaining cells at the ends of the axes are left out. `there` is True for
+    cells with a start (all by default)."""
     there = np.ones(label.shape, bool) if there is None else there
     cells, held = _boxes(label, box), _boxes(there, box)
     many = held.sum(axis=1)
@@ -101,7 +100,6 @@ def entropy_of(label: np.ndarray, *, box: int, there: np.ndarray | None = None) 
 
 
 def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
-    """The cells box by box, (boxes, cells of a box)."""
     counts = [size // box for size in cells.shape]
     whole = cells[tuple(slice(n * box) for n in counts)]
     split = whole.reshape([part for n in counts for part in (n, box)])
@@ -112,15 +110,14 @@ def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
 def uncertainty_of(
     label: np.ndarray, *, confidence: float = 0.95, there: np.ndarray | None = None
 ) -> Uncertainty:
-    """Uncertainty exponents of the boundaries between labels on a grid of any dimension; `there` is
-    which cells hold a start at all (all by default): one without is no other outcome.
+    """Return the uncertainty exponents of the boundaries between labels on a grid of any dimension;
+    `there` is True for cells with a start (all by default); other cells have no outcome.
 
-    The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, three at least.
-    The same starts are looked at for all of them: those that have neighbours at the largest one. An
-    exponent is the slope of ln(fraction) over ln(distance) by least squares. Its interval has two
-    parts, added in quadrature: what the slope varies by as one tile of the grid after the other is
-    left out (jackknife), which is the chance of where the region lies, and the scatter about the
-    straight line.
+    The distances are eight, in cells, from 1 to a sixteenth of the shortest axis or 3. The starts
+    are those with neighbours at the largest distance. An exponent is the slope of ln(fraction) over
+    ln(distance) by least squares. Its interval has two parts, added in quadrature. One is the
+    variation of the slope if one tile of the grid at a time is left out (jackknife), due to the
+    position of the region. The other is the scatter about the straight line.
     """
     there = np.ones(label.shape, bool) if there is None else there
     farthest = max(int(min(label.shape) * _FARTHEST), 3)
@@ -141,8 +138,8 @@ def uncertainty_of(
 def _power(
     distances: np.ndarray, uncertain: np.ndarray, starts: np.ndarray, confidence: float
 ) -> tuple[float, float]:
-    """The exponent by which uncertain starts (distances, tiles) grow with the distance, and half of
-    its interval."""
+    """Return the exponent of the growth of uncertain starts (distances, tiles) with distance, and
+    half of its interval."""
     from scipy.special import stdtrit  # slow to load
 
     total = uncertain.sum(axis=1)
@@ -158,7 +155,7 @@ def _power(
 
 
 def _labels_differ(label: np.ndarray, there: np.ndarray, axis: int, distance: int) -> np.ndarray:
-    """Which cells have another outcome so many cells away along an axis, up or down."""
+    """Return which cells have another outcome at this distance along an axis, up or down."""
     found = np.zeros(label.shape, bool)
     low = (slice(None),) * axis + (slice(None, -distance),)
     high = (slice(None),) * axis + (slice(distance, None),)
@@ -169,7 +166,7 @@ def _labels_differ(label: np.ndarray, there: np.ndarray, axis: int, distance: in
 
 
 def _by_tile(found: np.ndarray, there: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """How many starts away from the margin are found, and are there, in each tile of the grid."""
+    """Return the numbers of `found` cells and of starts in each tile, without the margin."""
     inner = tuple(slice(margin, size - margin) for size in found.shape)
     found, there = found[inner] & there[inner], there[inner]
     tiles = _TILES_OF_A_ROW if found.ndim == 1 else _TILES
@@ -182,7 +179,7 @@ def _by_tile(found: np.ndarray, there: np.ndarray, margin: int) -> tuple[np.ndar
 
 
 def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
-    """Slope of a straight line by least squares, and its standard error from the scatter."""
+    """Return the slope of a straight line by least squares, and its standard error."""
     x, y = across - across.mean(), up - up.mean()
     slope = float(x @ y / (x @ x))
     rest = y - slope * x
@@ -190,12 +187,12 @@ def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
 
 
 def _jackknife(across: np.ndarray, uncertain: np.ndarray, starts: np.ndarray) -> float:
-    """Standard error of the slope, from its values with each tile left out."""
+    """Return the standard error of the slope, from its values with each tile left out."""
     slopes = []
     for tile in np.flatnonzero(starts):
         rest = uncertain.sum(axis=1) - uncertain[:, tile]
         if not (rest > 0).all():
-            return np.inf  # one tile holds all that is uncertain: nothing is known of the spread
+            return np.inf  # one tile has all uncertain starts: the spread is unknown
         slopes.append(_slope(across, np.log(rest / (starts.sum() - starts[tile])))[0])
     several = len(slopes)
     return float(np.sqrt((several - 1) * np.var(slopes))) if several > 1 else np.inf
@@ -205,13 +202,13 @@ class Cells(NamedTuple):
     """The cells of a grid, in which distances are measured."""
 
     centres: list[np.ndarray]
-    """Their centres along each axis, equally spaced."""
+    """The centres along each axis, equally spaced."""
     scales: np.ndarray
-    """What counts as distance 1 along each axis."""
+    """The unit of distance along each axis."""
     ends: np.ndarray
-    """Whether the low and the high edge of each axis end a ball; shape (axes, 2)."""
+    """True for the low and the high edge of each axis if it ends a ball; shape (axes, 2)."""
     angles: np.ndarray = np.array(False)
-    """Which axes are angles, of which whole turns do not count."""
+    """True for axes that are angles, modulo whole turns."""
 
     @property
     def widths(self) -> np.ndarray:
@@ -219,30 +216,30 @@ class Cells(NamedTuple):
 
     @property
     def edges(self) -> np.ndarray:
-        """Low and high edge of each axis; shape (axes, 2)."""
+        """The low and high edge of each axis; shape (axes, 2)."""
         half = 0.5 * self.widths
         return np.array([(x[0] - h, x[-1] + h) for x, h in zip(self.centres, half, strict=True)])
 
     @property
     def round(self) -> np.ndarray:
-        """Which axes are angles of a whole turn, whose edges are one place."""
+        """True for axes that are angles of a whole turn, whose edges coincide."""
         return self.angles & np.isclose(np.ptp(self.edges, axis=1), 2 * np.pi)
 
     def inside(self, point: np.ndarray) -> np.ndarray:
-        """A point with its angles in the turn that begins at the low edge."""
+        """Return a point with its angles in the turn that begins at the low edge."""
         low = self.edges[:, 0]
         return np.where(self.angles, low + (point - low) % (2 * np.pi), point)
 
     def to_edge(self, point: np.ndarray) -> float:
-        """How far a point is from the edges that end a ball."""
+        """Return the distance of a point from the edges that end a ball."""
         distance = np.abs(self.edges - point[:, None]) / self.scales[:, None]
         return float(np.min(distance[self.ends], initial=np.inf))
 
 
 def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
-    """The largest ball around a point that meets neither foreign cells, of another outcome, nor an
-    edge. Cells are boxes around their starts, of which the whole counts as foreign. The radius is
-    NaN for a point outside of the region."""
+    """Return the largest ball around a point without foreign cells, of another outcome, or edges. A
+    cell is a box around its start, and all of it counts as foreign. The radius is NaN for a point
+    outside of the region."""
     low, high = cells.edges.T
     if not ((point >= low) & (point <= high)).all():
         return Ball(np.nan, point, False)
@@ -258,16 +255,16 @@ def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
 
 
 def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
-    """The largest ball around a start (or a corner or face of its cell) of one outcome that meets
-    neither foreign cells nor an edge, by an exact Euclidean distance transform. At least one cell
-    is `own`; cells that are neither hold no start, and do not end a ball."""
+    """Return the largest ball around a start of one outcome, or a corner or face of its cell,
+    without foreign cells or edges, by an exact Euclidean distance transform. At least one cell is
+    `own`. Cells that are neither contain no start, and do not end a ball."""
     from scipy.ndimage import distance_transform_edt  # slow to load
 
-    # Half a turn more on both sides of an angle, from where the cells go on.
+    # Angles are extended periodically by half a turn on both sides.
     more = np.where(cells.round, np.array(own.shape) // 2 + 1, 0)
     own = np.pad(own, [(n, n) for n in more])
     foreign = np.pad(foreign, [(n, n) for n in more], mode="wrap")
-    # On a lattice of half the spacing the point of a box nearest to any node is itself a node.
+    # On a lattice of half the spacing, the point of a box nearest to any node is itself a node.
     shape = tuple(2 * size + 1 for size in own.shape)
     free, near = np.ones(shape, bool), np.zeros(shape, bool)
     for offset in itertools.product((0, 1, 2), repeat=own.ndim):

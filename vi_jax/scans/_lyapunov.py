@@ -59,38 +59,37 @@ class Lyapunov(Summarized):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates in time, as the machine counts it (`unit`;
-    for a `Scene` ω)."""
+    """The spectrum, greatest first: mean growth rates in time (`unit`; for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
-    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. Of an
-    autonomous machine per usual `cycle`, at which it is observed."""
+    """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. An
+    autonomous machine is observed at intervals of its usual `cycle`, which count as cycles."""
     spread: Float[Array, "..."]
     """Difference of the greatest exponent between the two halves of the run."""
     state: State
     """Section state at the end."""
     result: RESULTS
-    """Whether the run was simulated to its end; if not, the numbers are NaN."""
+    """The end of the run: `successful`, or a reason for which the numbers are NaN."""
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
-    """The machine's own averages over the time of the cycles observed, by name."""
+    """The machine's own averages over the time of the observed cycles, by name."""
     units: Stated = eqx.field(static=True, default=())
-    """In which units they are, as the machine states it."""
+    """The units that the machine states."""
     unit: str = eqx.field(static=True, default="")
-    """Of the exponents, as the machine states it; "" if it does not."""
+    """The unit of the exponents; "" if the machine states none."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
-        """Whether the run was simulated to its end."""
+        """True if the run was simulated to its end."""
         return self.result == RESULTS.successful
 
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """These exponents, or a batch of them, as an `xarray.Dataset`. The state at the end becomes
-        a variable for each component (`state_Y`), and `result` is the reason's name. Not to be
+        """Return the exponents, or a batch of them, as an `xarray.Dataset`. The final state has a
+        variable for each component (`state_Y`), and `result` is the reason's name. Not to be
         traced.
 
-        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only what is given
-        along one dimension: `"exponent"`, or a batch axis.
+        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only variables
+        with one dimension: `"exponent"`, or a batch axis.
         """
         batch = batch_names(dims, self.exponents.ndim - 1)
         each = *batch, "exponent"
@@ -105,7 +104,7 @@ class Lyapunov(Summarized):
         return tidy(with_units(data, dict(self.units), own) if own else data, along)
 
     def summary(self) -> str:
-        """The exponents; of a batch the range of the greatest."""
+        """Return the exponents as text; for a batch the range of the greatest."""
         if self.exponents.ndim > 1:
             lanes, good = self.spread.shape, int(jnp.sum(self.successful))
             greatest = number_in_words(self.exponents[..., 0].ravel(), self.unit)
@@ -121,12 +120,12 @@ class Lyapunov(Summarized):
         return "\n".join([first, *lines])
 
 
-# Cycles of one call where more than twice as many are asked for: some tenths of a second. A choice,
-# even, as the windows of `_window` are.
+# Cycles of one call if there are more than twice as many: some tenths of a second. A choice, and an
+# even number, as the windows of `_window` are.
 _AT_ONCE = 512
 
-# What is left of a direction is rounding below so many roundings of its length: a choice, some
-# times what the projections leave.
+# A direction that is this number of roundings of its previous length counts as zero: a choice, some
+# times the error of the projections.
 _ROUNDING = 16
 
 
@@ -146,30 +145,28 @@ def lyapunov(
 
     Tangent vectors are carried through the flow and its impacts (the saltation matrix) and made
     orthogonal after each drive cycle (Benettin's method). Rates are averaged with weights that
-    vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017), which on periodic and
-    quasi-periodic motions converges faster than any power of the number of cycles, once these are
-    some tens of the motion's periods. The exponent 0 along the motion itself is not among them,
-    unless the machine is autonomous: it is observed at intervals of its usual `cycle` then. A
-    motion that rests on a stop forgets its past at once: its exponent is -∞, or very negative if
-    rounding remains at the release. Works under `jit` and `vmap`.
+    vanish smoothly at both ends (Das, Saiki, Sander and Yorke 2017). On periodic and quasi-periodic
+    motions this converges faster than any power of the number of cycles, after some tens of the
+    motion's periods. The exponent 0 along the motion is not included, unless the machine is
+    autonomous: then it is observed at intervals of its usual `cycle`. A motion that rests on a stop
+    forgets its past at once: its exponent is -∞, or very negative if rounding remains at the
+    release. Works under `jit` and `vmap`.
 
     **Arguments:**
 
     - `machine`, `start`: as for `simulate`; runs in the phase clock.
-    - `cycles`: drive cycles observed, at least 8; static.
-    - `settle`: drive cycles before that.
+    - `cycles`: the number of observed drive cycles, at least 8; static.
+    - `settle`: the number of drive cycles before that.
     - `number`: the number of exponents, greatest first; all by default. Each costs about as much as
       the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
-    - `progress`: show a bar where more than 1024 cycles are observed, in a terminal or a notebook;
-      not within `jit` or `vmap`.
+    - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
 
     **Returns:** a `Lyapunov`.
 
     **Raises:** as `simulate`; `ValueError` for a machine with both a section and a `renewed`; on
-    Ctrl-C, where more than 1024 cycles are observed, `Interrupted`, whose `partial` are the
-    exponents by the cycles so far.
+    Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
     if is_autonomous(machine, bare(start)):
@@ -179,7 +176,7 @@ def lyapunov(
                 f"{type(machine).__name__} has: at equal intervals it would be renewed there. The "
                 "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
             )
-        # On its section the exponent 0 along the motion could not be seen.
+        # States on a section do not show the exponent 0 along the motion.
         machine = machine.observed_every(machine.cycle)
     method = chosen(machine, method)
     carried = cycle_map(machine, method=method)
@@ -215,7 +212,7 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
-    """The exponents of one motion that begins on the section."""
+    """Return the exponents of one motion that begins on the section."""
     carry = _begun(the_map, start, settle, number)
     window = _window(cycles) if number == 1 else 1
     carry, seen = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)
@@ -224,23 +221,23 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
 
 @compiled
 def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
-    """The numbers of the state where observing begins, with the machine's own modes (`None` if it
-    has none), the first tangent vectors, and whether the motion came there."""
+    """Return the state as a row where the observation begins, with the machine's own modes (or
+    `None`), the first tangent vectors, and the result of the run to there."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"
     )
     x = raveled(before.last)[0]
     modes = modes_of(before.last)
-    # In no special position: directions of single components would stay what they are where one
-    # component does not move the others, and miss the greatest exponent.
+    # In general position: directions of single components would never change if a component does
+    # not act on the others, and could miss the greatest exponent.
     frame = np.linalg.qr(np.random.default_rng(0).normal(size=(x.size, x.size)))[0][:, :number]
     return (x, modes), jnp.asarray(frame, x.dtype), before.result
 
 
 @compiled
 def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
-    """What is observed in `_AT_ONCE` cycles, of which all but the first `windows` are left out."""
+    """Return the observations in the first `windows` windows, and zeros up to `_AT_ONCE` cycles."""
     observe = _observer(the_map, start, window)
     absent = jtu.tree_map(jnp.zeros_like, jax.eval_shape(observe, carry, None)[1])
 
@@ -253,14 +250,14 @@ def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
 
 
 def _observer(the_map: CycleMap, start, window: int) -> Any:
-    """A function that carries on what `_begun` gives, with rates, durations and integrals."""
+    """Return a function that continues from `_begun`, with rates, durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(bare(start))[1]
-    # Directions are of numbers relative to their sizes: in units that differ by much, rounding of
-    # the large ones would hide the small ones.
+    # Directions are relative to the sizes of components. With units of very different sizes,
+    # rounding of large components would hide small ones.
     unit = row_sizes(machine, start)
 
-    # Where all cycles last alike, turning points need not be met for the sake of durations.
+    # With cycles of equal duration, turning points are not needed.
     plain = has_fixed_cycle(machine, bare(start)) and not has_averages(machine)
     record = "sections" if plain else "motion"
 
@@ -285,7 +282,7 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         )(frame)
         frame, sizes = _orthogonal(grown[-1])
         alone = frame.shape[1] == 1
-        none = sizes == 0  # whose logarithm has no derivative, not even times zero
+        none = sizes == 0  # their logarithm has no derivative, not even times zero
         logarithms = jnp.where(none, -jnp.inf, jnp.log(jnp.where(none, 1.0, sizes)))
         rates = _growth(grown[..., 0])[:, None] if alone else logarithms[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
@@ -295,7 +292,7 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
 
 
 def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
-    """The exponents by what `_observer`'s function gives: `carry`, and `seen` in a row."""
+    """Return the exponents from `carry` and `seen` in a row, results of `_observer`'s function."""
     ((x, modes), _, result), (rates, duration, integrals) = carry, seen
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
@@ -318,32 +315,32 @@ _ended = compiled(_summed)
 
 
 def _window(cycles: int) -> int:
-    """Cycles after which a direction is made a unit again. In one it may change by as much as a
-    number can; in more of them it would vanish or become infinite where a cycle is long."""
+    """Return the number of cycles after which a direction is normalized. In one its length may
+    change by the range of floats; in several long ones it would underflow or overflow."""
     return 2 if cycles % 2 == 0 else 1
 
 
 def _length(vector: Float[Array, " states"]) -> Scalar:
-    """Its norm, of numbers whose squares are too small or too large for one too."""
+    """Return the norm of a vector, also if squares of its components underflow or overflow."""
     largest = jnp.max(jnp.abs(vector))
     unit = jnp.where((largest > 0) & (largest < jnp.inf), largest, 1.0)
-    # Of nothing the norm has no derivative, not even times zero.
+    # The norm of zero has no derivative, not even times zero.
     norm = jnp.linalg.norm(jnp.where(largest == 0, 1.0, vector / unit))
     return jnp.where(largest == 0, 0.0, unit * norm)
 
 
 def _growth(ways: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
-    """The logarithm of what each cycle makes of the length of a direction that begins as a unit."""
+    """Return the logarithm of the growth of a direction in each cycle; it begins with length 1."""
     sizes = jax.vmap(_length)(ways)
     before = jnp.concatenate([jnp.ones_like(sizes[:1]), sizes[:-1]])
-    # Nothing is left of what is forgotten at once, nor after that.
+    # A direction that vanished stays zero.
     return jnp.where(before > 0, jnp.log(sizes / jnp.where(before > 0, before, 1.0)), -jnp.inf)
 
 
 def _orthogonal(
     frame: Float[Array, "states number"],
 ) -> tuple[Float[Array, "states number"], Float[Array, " number"]]:
-    """The frame made orthonormal (Gram and Schmidt, twice), and the lengths that it had left."""
+    """Return the frame made orthonormal (Gram and Schmidt, twice), and its lengths before that."""
     columns, sizes = [], []
     for column in frame.T:
         before = _length(column)
@@ -351,8 +348,7 @@ def _orthogonal(
             for other in columns:
                 column = column - jnp.dot(other, column) * other
         size = _length(column)
-        # Nothing but rounding is left of a direction that is forgotten at once, as where the body
-        # rests.
+        # Only rounding is left of a direction that is forgotten at once, as in a rest.
         lost = size <= _ROUNDING * jnp.finfo(size.dtype).eps * before
         columns.append(jnp.where(lost, 0.0, column / jnp.where(lost, 1.0, size)))
         sizes.append(jnp.where(lost, 0.0, size))
@@ -360,12 +356,12 @@ def _orthogonal(
 
 
 def _weighted(rates, duration):
-    """Mean rates in time, and those of the greatest exponent in both halves."""
+    """Return mean rates in time, and those of the greatest exponent in both halves."""
 
     def mean(rates, duration):
         place = (jnp.arange(duration.size, dtype=duration.dtype) + 0.5) / duration.size
         weight = jnp.exp(-1 / (place * (1 - place)))
-        # At both ends weights fall below the smallest number, and 0 · ∞ is no number.
+        # At both ends weights underflow, and 0 · ∞ is NaN.
         lost = jnp.any(rates == -jnp.inf, axis=0)
         return jnp.where(lost, -jnp.inf, weight @ jnp.where(lost, 0.0, rates)) / (weight @ duration)
 

@@ -1,4 +1,4 @@
-"""`scan`: axes over parameters and starts give a labelled data set."""
+"""`scan`: a labelled data set of motions over axes of parameters and starts."""
 
 import contextlib
 import dataclasses
@@ -31,26 +31,25 @@ from ..machine import AbstractMachine
 from .program import Blocks, ScanProgram, check_corners, make_program
 from .store import MemoryStore, Where, ZarrStore, opened
 
-# Lanes of a block on a CPU and on an accelerator: choices. A block is what an interrupt loses.
+# Lanes of a block on a CPU and on an accelerator: choices. An interrupt loses one block.
 _MOST, _ON_ACCELERATOR = 4096, 65536
 
-# A block has so many lanes on each device, or so many doubled again and again: few sizes, for few
-# programs. A choice.
+# A block has this number of lanes times a power of two on each device: few sizes, few programs.
 _LEAST = 256
 
-# Blocks that a cluster has at a time: a choice, more than it has cores.
+# Blocks that a cluster has at a time: a choice, more than its cores.
 _ON_CLUSTER = 4096
 
-# Seconds without a new block after which a cluster is asked for its workers. A choice.
+# Seconds without a new block before a cluster's workers are checked. A choice.
 _PATIENCE = 10.0
 
-# Dask's blocks are given to it again after so many times the longest wait for one so far (that for
-# the first one is not known, and taken to be as many times the patience). A choice.
+# Dask receives its blocks again after this many times the longest wait for a block so far. Before
+# the first block, the longest wait counts as `_LONG` times `_PATIENCE`. A choice.
 _LONG = 6
 
 
 class ScanInterrupted(Interrupted):
-    """Raised when a scan is interrupted; `data` holds the finished part."""
+    """An interrupted scan; `data` has the finished part."""
 
     def __init__(self, data: "xr.Dataset", store: str | Path | None):
         kept = "what was computed is in `.data`"
@@ -61,7 +60,7 @@ class ScanInterrupted(Interrupted):
 
 
 class Workplace(NamedTuple):
-    """Where blocks are computed: by threads on local devices, or by a cluster."""
+    """The place where blocks are computed: threads on local devices, or a cluster."""
 
     workers: int
     devices: int
@@ -69,9 +68,8 @@ class Workplace(NamedTuple):
 
 
 def workplace(workers: int | None, devices: int | None, cluster: object) -> Workplace:
-    """As many threads and devices as are asked for, or as there are. **Raises:** `TypeError` or
-    `ValueError` for what are no such numbers, more devices than there are, or a cluster that is
-    none."""
+    """Return the given numbers of threads and devices, or those available. **Raises:** `TypeError`
+    or `ValueError` for other values, too many devices, or another object than a cluster."""
     if not (
         cluster is None or isinstance(cluster, futures.Executor) or hasattr(cluster, "get_executor")
     ):
@@ -92,12 +90,12 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
 def computed(
     program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False
 ) -> "xr.Dataset":
-    """What a program finds on a grid (`blocks`), checked before any work; `store` is a path to keep
-    it at, `None` for the memory. **Raises:** as `scan`."""
+    """Return the data of a program on a grid (`blocks`), checked before any work; `store` is the
+    path of a store, `None` for memory. **Raises:** as `scan`."""
     program = check_corners(program, blocks)
     with contextlib.closing(opened(program, blocks, store)) as kept:
         todo = kept.open_blocks()
-        _ = xr.Dataset  # loaded now: after an interrupt nobody waits for that
+        _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
         with at_work(
             "scan", lambda: ScanInterrupted(kept.data(), store),
@@ -128,22 +126,22 @@ def in_blocks(
     lanes: int | None = None,
     numbers: np.ndarray | None = None,
 ) -> Blocks:
-    """The grid in blocks of `lanes`: as in the store if there is one, or as suits the workplace. By
-    the `numbers` of lanes, by default their places, noise tells them apart. **Raises:**
-    `ValueError` if a block would not fit into the memory."""
+    """Return the grid in blocks of `lanes`: by default those of the store if there is one, or
+    suitable for the workplace. The lanes' `numbers`, by default their indices, determine their
+    noise. **Raises:** `ValueError` if a block would not fit into memory."""
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
     at_fault = "cycles" if lanes is None else "lanes"
     if lanes is None:
         lanes = _block_size(total, place)
-    else:  # a multiple of what it must be, but no larger than the grid
+    else:  # a multiple of the step, but no larger than the grid needs
         step = _LEAST * place.devices
         lanes = math.ceil(min(count("lanes", lanes, least=1), total) / step) * step
     points = program.cycles * max(1, program.options.samples) + 1
     fits_records(at_fault, lanes * points, 12)
     if program.lane_noise is not None and numbers is None:
-        if total > 2**32:  # by so many numbers lanes are told apart
+        if total > 2**32:  # lanes have 32-bit numbers
             raise ValueError(
                 f"Argument `axes` must have at most {2**32:,} lanes where there is noise, but has "
                 f"{total:,}."
@@ -153,7 +151,7 @@ def in_blocks(
 
 
 def _lanes_in(path: Path) -> int | None:
-    """The block size of a store that is there already."""
+    """Return the block size of an existing store, or `None`."""
     try:
         attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
         return int(attributes["scan"]["lanes"])
@@ -162,7 +160,7 @@ def _lanes_in(path: Path) -> int | None:
 
 
 def _block_size(total: int, place: Workplace) -> int:
-    """Lanes in a block: few sizes, for each is a program; small enough to occupy every core."""
+    """Return the lanes in a block: few sizes, since each is a program, for blocks on every core."""
     if jax.default_backend() != "cpu":
         most, share = _ON_ACCELERATOR * place.devices, total
     else:
@@ -174,7 +172,7 @@ def _block_size(total: int, place: Workplace) -> int:
 
 
 class ClusterLost(Exception):
-    """A cluster, or an executor, does not answer."""
+    """A cluster, or an executor, does not respond."""
 
 
 def run_blocks(
@@ -188,13 +186,12 @@ def run_blocks(
 
     Local threads have one core and one block each; on an accelerator, or over several devices,
     there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
-    cluster seems to have forgotten are given to it once more (a worker that is killed can leave
-    Dask waiting for ever: https://github.com/dask/distributed/issues/3196).
+    cluster seems to have lost are submitted once more (a killed worker can leave Dask waiting for
+    ever: https://github.com/dask/distributed/issues/3196).
 
-    **Raises:** `ClusterLost`; what a block raises.
+    **Raises:** `ClusterLost`; errors of a block.
     """
-    # With NumPy's arrays it can be sent with every task: data that are shared would die with their
-    # worker.
+    # As NumPy arrays it is sent with every task: shared data would be lost with their worker.
     parcel = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
     with contextlib.ExitStack() as stack:
         if place.cluster is not None:
@@ -205,7 +202,7 @@ def run_blocks(
             if place.devices > 1 or jax.default_backend() != "cpu":
                 at_once = 1
             elif todo and at_once > 1:
-                # Compiled here, once and not in several threads at a time.
+                # Compiled here once, not in several threads.
                 compute(program, blocks.values(todo[0]), blocks.lanes, dry=True)
             pool = stack.enter_context(futures.ThreadPoolExecutor(at_once))
             devices, one_core = place.devices, True
@@ -223,7 +220,7 @@ def run_blocks(
 
         def finish(future: futures.Future) -> None:
             where = running.get(future)
-            if where is None:  # given away twice, and done by the other one
+            if where is None:  # submitted twice, and done by the other
                 return
             try:
                 write(where, future.result())
@@ -270,7 +267,7 @@ def _executor_of(cluster: Any) -> futures.Executor:
 
 
 def _has_workers(cluster: Any) -> bool:
-    """Whether a cluster has workers, with a warning where it has none."""
+    """Return whether a cluster has workers; warn if it has none."""
     if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
         warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
         return False
@@ -286,13 +283,13 @@ def _task(
     one_core: bool,
 ) -> dict[str, np.ndarray]:
     threads = lanes.threads(1) if one_core else contextlib.nullcontext()
-    with jax.enable_x64(x64), threads:  # a thread has its own
+    with jax.enable_x64(x64), threads:  # each thread has its own setting
         program = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parcel)
         return compute(program, values, lanes_of_block, devices)
 
 
 def _how_to_go_on(kept: MemoryStore) -> str:
-    """What is left of a scan whose cluster is lost."""
+    """Return a message about the finished part of a scan after the loss of its cluster."""
     how = "Nothing was stored. Pass a `store`, from which the same call can continue."
     if isinstance(kept, ZarrStore):
         number = len(kept.blocks)
@@ -328,9 +325,9 @@ def compute(
     *,
     dry: bool = False,
 ) -> dict[str, np.ndarray]:
-    """The numbers of a block of lanes, by name, as the program finds them. A block is filled up to
-    `lanes`, so that all blocks are one program. With several devices the lanes are dealt to them in
-    turn, since neighbours take alike long. `dry` only compiles: none of the lanes is run."""
+    """Return the numbers of a block of lanes, by name. A block is padded to `lanes`, so that all
+    blocks are one program. Lanes are dealt to several devices in turn, since neighbours take
+    similar times. With `dry`, the program is only compiled: no lane is run."""
     size = next(iter(values.values())).size
     deal = np.arange(lanes).reshape(-1, devices).T.ravel()
     place = np.minimum(deal, size - 1)
@@ -341,7 +338,7 @@ def compute(
 
 
 class LanesFailed(UserWarning):
-    """Said of a scan of which some lanes failed."""
+    """The warning that some lanes of a scan failed."""
 
 
 @warning_once
@@ -371,7 +368,7 @@ def scan(
 ) -> "xr.Dataset":
     """Simulate every combination of the axes' values and keep measures of each motion.
 
-    Other values on the axes, in the machine or in `settle` compile nothing again.
+    Other values on the axes, in the machine or in `settle` do not compile again.
 
     **Arguments:**
 
@@ -379,30 +376,30 @@ def scan(
       once, since another function compiles again).
     - `axes`: names of numbers of the machine (`"drive.frequency_ratio"`, `"stops.0.restitution"`)
       or of the start (`"start.Y"`), each with a row of values.
-    - `measure`: what is kept: names out of `"extremes"`, `"regime"`, `"frequency_ratio"`,
-      `"power"`, `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`, or of the machine's own
-      `averages`, which replace ours of the same name; `AbstractMeasure`s; functions of a lane's
-      machine and `Run` that return named numbers.
-    - `start`: the first state; by default the machine's own start at rest.
-    - `settle`, `cycles`: drive cycles before observing, and observed (static; by default 32 or
-      what the measures need); `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`.
+    - `measure`: the results: names among `"extremes"`, `"regime"`, `"frequency_ratio"`, `"power"`,
+      `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`, or of the machine's own `averages`,
+      which replace ours of the same name; `AbstractMeasure`s; functions of a lane's machine and
+      `Run` that return named numbers.
+    - `start`: the initial state; by default the machine's own start.
+    - `settle`, `cycles`: the numbers of drive cycles before observation, and observed (static; by
+      default 32 or as many as the measures need).
+    - `method`, `clock`, `max_impacts`, `max_steps`: as for `simulate`.
     - `derivatives`: names, as on the axes, with respect to which every real variable is
       differentiated: `d_y_min` and so on, with an axis `by`.
-    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's. Lane n of the
-      grid (the last axis is filled first) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is
-      an axis of amplitudes, `"noise.path"` of paths. Measures that look for a period are refused.
-    - `paired`: a lane for each place in the rows (of one length), along `sample`, and no grid.
-    - `verify`: the number of lanes, drawn at random, that are run again by a tighter method.
-      `data.attrs` then holds the number of different lanes (`verified_changed_period`, for
-      integers) or the error that 95 of 100 stay below (`verified_error_y_min`; infinite if one
-      failed).
-    - `store`: folder of a Zarr store, written block by block. The same call resumes it and computes
-      again what was lost; a changed one (or your functions' code) is refused with the difference.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one JAX key. Lane n of the grid
+      (the last axis varies fastest) has the key `jax.random.fold_in(key, n)`. `"noise.V"` is an
+      axis of amplitudes, `"noise.path"` of paths. Measures that need a period are refused.
+    - `paired`: a lane for each index in the rows (of one length), along `sample`, and no grid.
+    - `verify`: the number of random lanes that are run again by a more accurate method.
+      `data.attrs` then has the number of different lanes (`verified_changed_period`, for integers)
+      or the 95 % quantile of the error (`verified_error_y_min`; infinite if one failed).
+    - `store`: the folder of a Zarr store, written block by block. The same call resumes it and
+      computes lost blocks again. A changed call (or code of yours) is refused, with the difference.
     - `lanes`: lanes in a block (a multiple of 256); memory grows with it and with `cycles`.
-    - `workers`, `devices`: blocks at work at once on a CPU (by default one a core), and local
+    - `workers`, `devices`: blocks computed at once on a CPU (by default one per core), and local
       devices over which a block is spread (all by default).
-    - `cluster`: a `dask.distributed.Client`, or an `Executor` of `concurrent.futures`, to compute
-      the blocks there.
+    - `cluster`: a `dask.distributed.Client`, or an `Executor` of `concurrent.futures`, which
+      computes the blocks.
     - `progress`: show a bar, in a terminal or a notebook.
 
     **Returns:** an `xarray.Dataset` over the axes, with units; `result` is the reason why each lane
@@ -449,7 +446,7 @@ def _verified(
     data: "xr.Dataset", blocks: Blocks, lanes: int, program: ScanProgram, place: Workplace,
     store: str | Path | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Attributes: how some of the lanes, drawn by chance, come out by a better program."""
+    """Return attributes: differences of some random lanes between `data` and a better program."""
     total = data["result"].size
     lanes = min(lanes, total)
     drawn = np.sort(np.random.default_rng(0).choice(total, lanes, replace=False))
@@ -457,7 +454,7 @@ def _verified(
     if blocks.paired:
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
-    numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own paths
+    numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own noise
     again = in_blocks(program, axes, place, paired=True, numbers=numbers)
     kept = functools.partial(ScanInterrupted, data, store)
     with at_work("verification", kept, progress=False):

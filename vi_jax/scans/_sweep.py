@@ -1,4 +1,4 @@
-"""`sweep`: a parameter changed little by little, the motion carried from value to value."""
+"""`sweep`: a slow change of one parameter, with the motion carried from value to value."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -55,11 +55,11 @@ from ..machine import (
 from .measures import CODES, REGIMES, Regime, Usual, flags
 from .program import lane_noise_of
 
-# A jump is so many times the change at the values beside it, and this part of the largest
+# A jump is this many times the change at the neighbouring values, and this share of the largest
 # position, or of ζ: choices.
 _JUMP, _NOTED = 3.0, 0.01
 
-# What is a number at each value of every sweep.
+# The variables with one number at each value of every sweep.
 COLUMNS = (
     "y_min", "y_max", "period", "impacts", "frequency_ratio", "impact_speed", "impact_energy",
 )  # fmt: skip
@@ -70,51 +70,51 @@ class Sweep(Summarized):
     `AbstractMachine.units`). Under `vmap` batch axes come first."""
 
     parameter: str = eqx.field(static=True)
-    """Name of the number that was changed."""
+    """Name of the parameter."""
     values: Float[Array, "..."]
     """Its values."""
     y_min: Float[Array, "..."]
-    """Smallest position (of the first coordinate) over the cycles observed."""
+    """Smallest position (of the first coordinate) over the observed cycles."""
     y_max: Float[Array, "..."]
-    """Largest position over the cycles observed."""
+    """Largest position over the observed cycles."""
     period: Int[Array, "..."]
     """Period in drive cycles, or `REGIMES.unsettled` if none was found, or `REGIMES.failed`."""
     impacts: Float[Array, "..."]
-    """Impacts in a period; in a cycle, on average, where there is no period."""
+    """Impacts in a period; without a period, the mean per cycle."""
     frequency_ratio: Float[Array, "..."] | None
     """ζ: mean speed of the drive; `None` for machines that are not driven."""
     impact_speed: Float[Array, "..."]
-    """Greatest V⁻ over the cycles observed."""
+    """Greatest V⁻ over the observed cycles."""
     impact_energy: Float[Array, "..."]
-    """Energy lost in impacts, mean of the cycles observed (see `Run.impact_energy`)."""
+    """Energy lost in impacts per observed cycle, the mean (see `Run.impact_energy`)."""
     sections: State
-    """Section states of the cycles observed; leaves (values, cycles)."""
+    """Section states of the observed cycles; leaves (values, cycles)."""
     result: RESULTS
-    """Whether each value was simulated to its end."""
+    """The end of the run at each value: `successful` or a reason."""
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
-    """The machine's own averages over the time of the cycles observed, by name (see
+    """The machine's own averages over the time of the observed cycles, by name (see
     `AbstractMachine.averages`)."""
     labels: tuple[str, str] = eqx.field(static=True, kw_only=True)
-    """What pictures write beside position and velocity, in the machine's words."""
+    """The machine's labels of position and velocity in pictures."""
     periods: tuple[str, ...] = eqx.field(static=True, kw_only=True)
-    """Names of the periods of 1, 2, ... cycles, in the machine's words."""
+    """The machine's names of the periods of 1, 2, ... cycles."""
     units: Stated = eqx.field(static=True, kw_only=True)
-    """In which units its quantities are, as the machine states it."""
+    """The units that the machine states."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
-        """Whether each value was simulated to its end."""
+        """True at the values that were simulated to the end."""
         return self.result == RESULTS.successful
 
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """This sweep, or a batch of them, as an `xarray.Dataset` over its values, a coordinate with
-        the parameter's name. Section states are a variable for each component (`section_Y`), and
-        `result` is the reason's name. Not to be traced.
+        """Return the sweep, or a batch of them, as an `xarray.Dataset` over its values, a
+        coordinate with the parameter's name. Section states are a variable for each component
+        (`section_Y`), and `result` is the reason's name. Not to be traced.
 
-        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only what is given
-        along one dimension: `"value"`, or `"cycle"` (the sections).
+        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only variables
+        with one dimension: `"value"`, or `"cycle"` (the sections).
         """
         each = (*batch_names(dims, self.values.ndim - 1), "value")
         variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
@@ -126,11 +126,11 @@ class Sweep(Summarized):
         return tidy(with_units(data, dict(self.units), own), along)
 
     def drawn(self) -> Any:
-        """The smallest position at each value."""
+        """Return the smallest position at each value."""
         return self.y_min if self.values.ndim == 1 else None
 
     def summary(self) -> str:
-        """The motions in the order of the values, and where one gives way to another."""
+        """Return the motions in the order of the values as text, with the changes between them."""
         if self.values.ndim != 1:
             good = int(jnp.sum(self.successful))
             return (
@@ -163,7 +163,7 @@ class Sweep(Summarized):
         ]
 
     def _jumps(self) -> list[list[str]]:
-        """What changes at each value by far more than at those beside it; not without a period."""
+        """Return the changes at each value that are far larger than at neighbours, if periodic."""
         name, units = name_in(self.labels[0]), dict(self.units)
         numbers = {
             f"min {name}": (self.y_min, unit_of(units, "position")),
@@ -188,7 +188,7 @@ class Sweep(Summarized):
         return found
 
 
-# Values of one call: few, so that an interrupt loses little, but more than a call costs.
+# Values of one call: few, so that an interrupt loses little, but enough to outweigh a call's cost.
 _AT_ONCE = 16
 
 
@@ -217,23 +217,21 @@ def sweep(
 
     **Arguments:**
 
-    - `machine`, `parameter`: the machine and the name of the number that is changed, such as
+    - `machine`, `parameter`: the machine and the name of the number that varies, such as
       `"drive.frequency_ratio"`.
     - `values`: its values in the order of the sweep.
     - `start`: state at the first value; by default at rest (a motor at its no-load speed).
-    - `settle`, `cycles`: drive cycles at each value before observing, and observed; static.
+    - `settle`, `cycles`: drive cycles at each value before observation, and observed; static.
     - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
-    - `tolerance`: how closely sections must repeat for a period, as in `Regime`.
-    - `max_steps`: steps at each value beyond which it counts as failed.
-    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one key of JAX's; value number n
-      has the key `jax.random.fold_in(key, n)`. Under noise there are no periods: use extremes and
-      sections.
+    - `tolerance`: the largest difference of sections that repeat, as in `Regime`.
+    - `max_steps`: the largest number of steps at each value; with more, it counts as failed.
+    - `noise`, `key`: a `WhiteNoise`, by default none, and with it one JAX key; value number n has
+      the key `jax.random.fold_in(key, n)`. There are no periods with noise: use sections.
     - `progress`: show a bar, in a terminal or a notebook; not within `jit` or `vmap`.
 
-    **Returns:** a `Sweep`. A value that fails is NaN, and the next one continues from the value
-    before it.
+    **Returns:** a `Sweep`. A value that fails is NaN; the next one continues from the value before.
 
-    **Raises:** `ValueError` or `TypeError` for an unknown name or values that are no numbers; on
+    **Raises:** `ValueError` or `TypeError` for an unknown name or values that are not numbers; on
     Ctrl-C `Interrupted`, whose `partial` is the sweep so far.
     """
     machine = machine_of(machine)
@@ -265,11 +263,11 @@ def sweep(
     if lane_noise is not None:
         check_noise(machine, bare(start), noise)
     options = (settle, cycles, method, rests, regime, max_steps, lane_noise, bare(start))
-    # With noise beside it the number of the value, by which each has its own path.
+    # With noise, the index of the value is carried along: each has its own path.
     begin = start if lane_noise is None else (start, jnp.uint32(0))
     if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
         return _sweep(machine, parameter, values, begin, *options)[1]
-    # All by one program: the last part is filled up by what ends at once.
+    # One program for all parts: the last part is filled up with NaN, which ends at once.
     size, missing = values.size, -values.size % _AT_ONCE
     rows = np.append(np.asarray(values), np.full(missing, np.nan)).reshape(-1, _AT_ONCE)
     pieces = ((min(_AT_ONCE, size - _AT_ONCE * i), jnp.asarray(row)) for i, row in enumerate(rows))
@@ -278,7 +276,7 @@ def sweep(
         return _sweep(machine, parameter, row, start, *options)
 
     def joined(_, parts: list[Sweep]) -> Sweep:
-        # By NumPy: hundreds of arrays would be a program.
+        # In NumPy: for hundreds of arrays JAX would compile a program.
         return jtu.tree_map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
 
     return in_parts(
@@ -287,7 +285,7 @@ def sweep(
 
 
 def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
-    """Values as an array, and on the host if known. **Raises:** `ValueError` if of other kinds."""
+    """Return values as an array, also in NumPy if known. **Raises:** `ValueError` for others."""
     values = number("values", values).astype(jnp.result_type(float))
     numbers = concrete(values)
     finite = numbers is None or bool(np.isfinite(numbers).all())
@@ -301,7 +299,7 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 
 
 def taken_along(machine: AbstractMachine, state: State) -> State:
-    """The state, the body taken along by a stop that has come nearer."""
+    """Return the state with the body moved to a stop that is beyond it, at rest."""
     here = bare(state)
     for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
@@ -317,8 +315,8 @@ def _sweep(
     machine, parameter, values, start, settle, cycles, method, rests, regime, max_steps,
     lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
-    """The state after the last value, and what was found at each; `start`, with noise with
-    the number of the first value; `first`, the state at the first value of all."""
+    """Return the state after the last value, and the results at each; `start`, with noise with the
+    index of the first value; `first`, the state at the first value of all."""
 
     def one(state, value):
         here, noise = with_leaf(machine, parameter, value), {}

@@ -1,5 +1,5 @@
-"""Measures: what a scan keeps of each motion. Its period in drive cycles is one; of motions that do
-not repeat there are means with errors, densities and times of escape."""
+"""Measures: the results of a scan for each motion. One is the period in drive cycles. For motions
+without a period there are means with errors, densities and escape times."""
 
 import abc
 import dataclasses
@@ -30,18 +30,18 @@ from ..machine import (
 )
 from ._lyapunov import lyapunov
 
-# How far sections a period apart may differ; so many times that, if a longer period fits within it;
-# and so many times what the longer one differs by. Choices.
+# The largest difference of sections a period apart; its factor for longer periods, if some period
+# fits; and the largest ratio of differences of two periods that fit. Choices.
 _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
-# The least that sections are held to: so many times what they wander by, and so many roundings.
-# Choices.
+# The least tolerance of sections: multiples of their error under the method, and of rounding:
+# choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
 class REGIMES(IntEnum):
-    """Negative values of `period` for motions without one, and of the `label` of basins for starts
-    that settle on no motion."""
+    """Negative values of `period` for motions without a period, and of the `label` of basins for
+    starts that settle on no motion."""
 
     chaotic = -1, "chaotic"
     unsettled = -2, "unsettled"
@@ -61,7 +61,7 @@ CODES = {regime.name: int(regime) for regime in sorted(REGIMES)}
 
 
 def flags(codes: Mapping[str, int]) -> dict[str, Any]:
-    """Attributes of a variable that say what its special numbers mean."""
+    """Return attributes of a variable with the meanings of its special numbers."""
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
@@ -75,18 +75,18 @@ def least_period(
     sizes: Any = 1.0,
     angles: np.ndarray | None = None,
 ) -> Int[Array, ""]:
-    """The fewest drive cycles after which a motion repeats, its impacts too, or
+    """Return the fewest drive cycles after which a motion repeats, its impacts too, or
     `REGIMES.unsettled`.
 
     A motion that still spirals in may repeat better after several turns of the spiral than after
-    its period. So it counts as settled if some period fits within the tolerance, and of the periods
-    that fit within a hundred times the tolerance the least is taken; but none that fits ten
-    thousand times worse than another, for no spiral does so. A period fits only if as many impacts
-    come in each cycle: beside a grazing these tell apart what sections hardly do.
+    its period. So it counts as settled if some period fits within the tolerance. The least period
+    that fits within a hundred times the tolerance is returned. But a period is left out if another
+    fits ten thousand times better; in a spiral none does. A period fits only if the impacts of each
+    cycle agree: near a grazing, sections hardly differ.
 
-    **Arguments:** `sections`, more than `longest` of them; the `impacts` of the cycle that ends at
-    each; `tolerance`, relative to `sizes` (`row_sizes`) + |state|, by default 1e-6 or, if that is
-    more, ten times what they `wander` by under their method; which of their numbers are `angles`.
+    **Arguments:** `sections`, more than `longest`; `impacts` of the cycle before each; `tolerance`,
+    relative to `sizes` (`row_sizes`) + |state|, by default the larger of 1e-6 and ten times
+    `wander`, the error of sections under their method; `angles`, True for angles.
     """
     states = in_rows(sections).T
     if tolerance is None:
@@ -124,16 +124,16 @@ class AbstractMeasure(eqx.Module):
     """A measure: a function of the observed cycles of each lane, computed before the next lanes."""
 
     attributes: ClassVar[About] = {}
-    """Attributes of the variables by name, such as `units` and `long_name`; `dims` names the axes
-    of one that is an array, and `unit_of` a quantity in whose unit a variable is, which the machine
-    states (see `AbstractMachine.units`)."""
+    """Attributes of the variables by name, such as `units` and `long_name`. `dims` are the names of
+    an array's axes, and `unit_of` a quantity with the same unit, which the machine states (see
+    `AbstractMachine.units`)."""
 
     record: ClassVar[str] = "motion"
-    """The record that it needs, as in `simulate`: `"motion"`, or only `"sections"` and the numbers
-    of impacts and steps."""
+    """The required record, as in `simulate`: `"motion"`, or `"sections"` with counts of impacts and
+    steps."""
 
     def described(self, start: State) -> About:
-        """Attributes of the variables, for states like `start`."""
+        """Return attributes of the variables, for states like `start`."""
         return self.attributes
 
     @property
@@ -143,28 +143,28 @@ class AbstractMeasure(eqx.Module):
 
     @property
     def instants(self) -> int:
-        """The samples in a cycle that it needs (`Run.samples`); 0 for none."""
+        """The number of samples in a cycle that it needs (`Run.samples`)."""
         return 0
 
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
-        """This measure for motions computed by a method; by default itself."""
+        """Return this measure for motions computed by a method; by default itself."""
         return self
 
     def begun(self, start: State) -> "AbstractMeasure":
-        """This measure for a motion that begins in `start`; by default itself."""
+        """Return this measure for a motion that begins in `start`; by default itself."""
         return self
 
     @abc.abstractmethod
     def __call__(self, machine: AbstractMachine, run: Run) -> Numbers:
-        """Named numbers (or short arrays) of one lane."""
+        """Return named numbers (or short arrays) of one lane."""
 
     @property
     def passes(self) -> int:
-        """How often a lane may need `refine` at most."""
+        """The largest number of calls of `refine` for a lane."""
         return 1
 
     def needs_refinement(self, found: Numbers, pass_number: Any = 0) -> Flag | None:
-        """Whether a lane needs `refine`, at pass number `pass_number`; `None` if none ever does."""
+        """Return whether a lane needs `refine` at pass `pass_number`; `None` for no lane ever."""
         return None
 
     @by_default
@@ -177,13 +177,13 @@ class AbstractMeasure(eqx.Module):
         pass_number: Any = 0,
         rests: bool | None = None,
     ) -> Numbers:
-        """Costlier numbers, only for lanes that need them, from the state after the cycles
-        observed; they replace those found. `rests` is as for `simulate`."""
+        """Return further numbers, only for lanes that need them, from the state after the observed
+        cycles; they replace those found. `rests` is as for `simulate`."""
         return {}
 
 
 class _Kind(NamedTuple):
-    """What a measure is that scans know by its name."""
+    """The definition of a measure with a name."""
 
     record: str
     attributes: About
@@ -235,8 +235,8 @@ _KINDS = {
 
 
 class Usual(AbstractMeasure):
-    """Numbers that a run has of its cycles: extremes, mean speed of the drive, mean power of the
-    impacts, impacts in a cycle, steps tried and rejected."""
+    """Numbers of a run's cycles: extremes, mean speed of the drive, mean power of the impacts,
+    impacts per cycle, steps tried and rejected."""
 
     name: str = eqx.field(static=True)
 
@@ -252,8 +252,8 @@ class Usual(AbstractMeasure):
 
 
 class Average(AbstractMeasure):
-    """One of the machine's own averages, over the time of the cycles observed (see
-    `AbstractMachine.averages`). Every verb that takes names of measures takes its name alone."""
+    """One of the machine's own averages, over the time of the observed cycles (see
+    `AbstractMachine.averages`). A name of an average may be given instead of this measure."""
 
     name: str = eqx.field(static=True)
 
@@ -271,7 +271,7 @@ class Average(AbstractMeasure):
 
 
 class Sections(AbstractMeasure):
-    """The section states of the last `number` cycles, one variable for each part of the state."""
+    """The section states of the last `number` cycles, a variable for each component."""
 
     number: int = eqx.field(static=True, default=16)
     record = "sections"
@@ -306,7 +306,7 @@ class Exponent(AbstractMeasure):
         count("observed", self.observed, least=8)
 
     def __call__(self, machine, run):
-        """NaN: the exponent is found by `refine`."""
+        """Return NaN: the exponent is computed by `refine`."""
         return {"exponent": jnp.full((), jnp.nan, _dtype(run))}
 
     def needs_refinement(self, found, pass_number=0):
@@ -322,19 +322,18 @@ class Exponent(AbstractMeasure):
 class Regime(AbstractMeasure):
     """`period` in drive cycles and `impacts` in a period; motions without a period by kind.
 
-    A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`
-    (relative to the size of each number of the state, which is 1 for the paper's scenes; by default
-    1e-6, or ten tolerances of a method that sizes its steps by one) with as many impacts in each
-    cycle; see `least_period` for one that still spirals in. Other motions are observed for another
-    `observed` cycles. Unless its greatest Lyapunov exponent exceeds `threshold` there (in the
-    machine's own unit of rates), a motion is unsettled or quasi-periodic. If it does, the motion is
-    continued for `lasting` cycles and observed once more: it is chaotic if its exponent exceeds
-    `threshold` again, else transiently chaotic: it has settled meanwhile, or is about to. `REGIMES`
-    has the numbers that stand for these in `period`.
+    A motion has the least period p ≤ `longest` after which its sections repeat within `tolerance`,
+    with as many impacts in each cycle. The tolerance is relative to the size of each component,
+    which is 1 for the paper's scenes; by default it is 1e-6, or ten tolerances of a method with
+    adaptive steps. See `least_period` for a motion that still spirals in. Other motions are
+    observed for another `observed` cycles. Unless its greatest Lyapunov exponent exceeds
+    `threshold` there (in the machine's unit of rates), a motion is unsettled or quasi-periodic. If
+    it does, the motion is continued for `lasting` cycles and observed once more. It is chaotic if
+    its exponent exceeds `threshold` again. Otherwise it is transiently chaotic: it has settled
+    meanwhile, or is about to. `REGIMES` has the numbers for these kinds in `period`.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
-    later. A longer `lasting` makes this rarer and chaotic lanes more expensive; 0 leaves the second
-    pass out.
+    later. A longer `lasting` makes this rarer and chaotic lanes more expensive; 0 omits it.
     """
 
     longest: int = eqx.field(static=True, default=64)
@@ -343,9 +342,9 @@ class Regime(AbstractMeasure):
     threshold: Any = eqx.field(default=2e-3)
     lasting: int = eqx.field(static=True, default=4000)
     wander: Any = eqx.field(default=0.0, kw_only=True)
-    """What sections wander by under the method; a scan puts its own method's here."""
+    """The error of sections under the method; set by a scan."""
     start: Any = eqx.field(default=(), kw_only=True)
-    """Where the motion begins, by which its size is judged; a scan puts each lane's here."""
+    """The initial state of each lane, from which its size follows; set by a scan."""
     record = "sections"
     attributes: ClassVar[About] = {
         "period": {"units": "cycles", "long_name": "least period", **flags(CODES)},
@@ -364,7 +363,7 @@ class Regime(AbstractMeasure):
         count("lasting", self.lasting)
 
     def under(self, method):
-        """This measure, for sections that differ by as much as they do under this method."""
+        """Return this measure with the error of sections under this method."""
         return dataclasses.replace(self, wander=method.wander)
 
     def begun(self, start):
@@ -372,16 +371,16 @@ class Regime(AbstractMeasure):
 
     @property
     def cycles(self):
-        """Twice the longest period, so that each is seen to repeat."""
+        """Twice the longest period, so that each repeats."""
         return 2 * self.longest
 
     @property
     def passes(self):
-        """One at what does not repeat, and one at what is chaotic."""
+        """A pass for motions that do not repeat, and one for chaotic ones."""
         return 2 if self.lasting else 1
 
     def __call__(self, machine, run):
-        """Period and impacts of one lane; whether it is chaotic is left to `refine`."""
+        """Return period and impacts of one lane, without a check of chaos."""
         sections = jtu.tree_map(lambda x: x[1:], run.sections)
         first = jtu.tree_map(lambda x: x[0], run.sections)
         begin = self.start if jtu.tree_leaves(self.start) else first
@@ -399,31 +398,31 @@ class Regime(AbstractMeasure):
         }
 
     def needs_refinement(self, found, pass_number=0):
-        """True if it does not repeat; at the second pass, if it is chaotic."""
+        """Return whether it does not repeat; at the second pass, whether it is chaotic."""
         return found["period"] == jnp.where(
             jnp.asarray(pass_number) == 0, REGIMES.unsettled, REGIMES.chaotic
         )
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Chaotic or not; at the second pass, still or not."""
+        """Return whether it is chaotic, or at the second pass still chaotic."""
         settle = pass_number * (self.observed + self.lasting)
         out = lyapunov(
             machine, state, self.observed, settle=settle, number=1, method=method, rests=rests
         )
         chaotic = out.exponents[0] > self.threshold
-        # What cannot be continued is left as it was.
+        # A lane that cannot be continued is unchanged.
         went_on, before = out.successful & (pass_number > 0), found["period"]
         otherwise = jnp.where(went_on, REGIMES.transient, before)
         return {"period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(before.dtype)}
 
 
-# What a run tells of each cycle, and not at an instant.
+# Results of a run for each cycle, not for an instant.
 _COLUMNS = (
     "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "duration",
     "frequency_ratio",
 )  # fmt: skip
 
-# Of those, what the loop has at hand as a cycle ends.
+# Columns that the loop has when a cycle ends.
 _OF_CYCLE = _COLUMNS[:5]
 
 Of = str | Callable[..., Any]
@@ -437,7 +436,7 @@ class _Observed(AbstractMeasure):
 
     @property
     def record(self):  # pyright: ignore
-        """Only what is not known on sections, or of each cycle, needs the motion between them."""
+        """The required record: sections are enough for states and impacts."""
         of_states = self.samples or isinstance(self.of, tuple)
         return "sections" if of_states or self.of == "impacts" else "motion"
 
@@ -446,8 +445,8 @@ class _Observed(AbstractMeasure):
         return self.samples
 
     def row(self, machine: AbstractMachine, run: Run, name: Of) -> tuple[Array, Array]:
-        """The quantity at all instants, and at those behind the first, or in all cycles.
-        **Raises:** `ValueError` for a name that has none."""
+        """Return the quantity at all instants, and at those after the first; or in all cycles,
+        twice. **Raises:** `ValueError` for an unknown name."""
         if not isinstance(name, str):
             found = jnp.asarray(name(machine, run))
             if found.ndim != 1:
@@ -483,22 +482,22 @@ def _called(of: Of) -> str:
 
 
 class Statistics(_Observed):
-    """Mean and spread of a quantity over the cycles observed, each with its standard error.
+    """Mean and spread of a quantity over the observed cycles, each with its standard error.
 
     For `"V"` they are `V_mean`, `V_error`, `V_spread` (the standard deviation) and
-    `V_spread_error`. Neighbouring cycles are not independent, so the errors are those of means over
-    `batches` parts of the row (batch means): right if a part is long compared with the memory of
-    the motion, else too small. The scatter of the means of lanes with other paths is an error
-    without this condition.
+    `V_spread_error`. Neighbouring cycles are not independent. The errors are therefore those of
+    means over `batches` parts of the row (batch means). They are right if a part is long compared
+    with the memory of the motion, else too small. The scatter of the means of lanes with other
+    paths is an error without this condition.
 
     **Arguments:**
 
-    - `of`: a part of the state (`"V"`) or a quantity of the machine, on sections; of each cycle
-      `"impacts"`, `"y_min"`, `"y_max"`, `"impact_speed"`, `"impact_energy"`, `"rests"`,
+    - `of`: a component of the state (`"V"`) or a quantity of the machine, on sections; for each
+      cycle `"impacts"`, `"y_min"`, `"y_max"`, `"impact_speed"`, `"impact_energy"`, `"rests"`,
       `"duration"`, or one of the machine's averages; or a function of a lane's machine and `Run`
-      that returns one row, whose name it takes.
+      that returns one row; its name is used.
     - `batches`: parts of the row, at least 2; static.
-    - `samples`: instants in a cycle at which the state is looked at instead of sections; static.
+    - `samples`: instants in a cycle at which the state is evaluated, instead of sections; static.
 
     **Raises:** `TypeError` or `ValueError` for arguments of other kinds.
     """
@@ -535,7 +534,7 @@ class Statistics(_Observed):
         mean = jnp.mean(row)
         square = (row - mean) ** 2
         spread = jnp.sqrt(jnp.mean(square))
-        # That of the variance, and from it that of its root, in proportion.
+        # The error of the variance gives that of its root, by 1/(2 spread).
         halved = 2 * jnp.where(spread > 0, spread, 1.0)
         numbers = {
             "mean": mean,
@@ -546,25 +545,25 @@ class Statistics(_Observed):
         return {f"{_called(self.of)}_{k}": x for k, x in numbers.items()}
 
     def _error(self, row: Float[Array, " instants"]) -> Float[Array, ""]:
-        """The standard error of the mean of a row, by the last of it that makes equal parts."""
+        """Return the standard error of a row's mean, from its end that has equal parts."""
         long = row.size // self.batches
         parts = row[row.size - long * self.batches :].reshape(self.batches, long)
         return jnp.std(jnp.mean(parts, axis=1), ddof=1) / self.batches**0.5
 
 
 class Density(_Observed):
-    """Probability density of one or two parts of the state: `density`, by bins, and `outside`, the
-    share of the instants that lie in none of them.
+    """Probability density of one or two components of the state: `density` by bins, and `outside`,
+    the share of instants outside of all bins.
 
-    The density times the size of a bin is the share of the instants in it, of all instants, those
-    outside included. The bins' edges are in the attributes of `density`, by the name of the part.
-    The scatter of lanes with their own paths gives its error.
+    The density times the size of a bin is the share of the instants in it, relative to all
+    instants. The bins' edges are attributes of `density`, by the component's name. The scatter of
+    lanes with their own paths gives its error.
 
     **Arguments:**
 
-    - `of`: the edges of the bins, rising, by the name of what they are of, as in
-      `{"Y": jnp.linspace(-2, 2, 41)}`; with two names the density is that of both together.
-    - `samples`: instants in a cycle, evenly spaced; 0 for the sections alone; static.
+    - `of`: the edges of the bins in rising order by the name of the component, as in
+      `{"Y": jnp.linspace(-2, 2, 41)}`; with two names it is the joint density.
+    - `samples`: the number of evenly spaced instants in a cycle; 0 for sections only; static.
 
     **Raises:** `TypeError` or `ValueError` for edges that do not rise, and for more than two names.
     """
@@ -606,7 +605,7 @@ class Density(_Observed):
         place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
         for row, edges, size in zip(rows, self.edges, sizes, strict=True):
             mine = jnp.searchsorted(edges, row, side="right") - 1
-            # The last bin has its upper edge, on which a body may rest.
+            # The last bin includes its upper edge, on which a body may rest.
             mine = jnp.where(row == edges[-1], size - 1, mine)
             inside = inside & (mine >= 0) & (mine < size)
             place = place * size + jnp.clip(mine, 0, size - 1)
@@ -618,9 +617,9 @@ class Density(_Observed):
 
 class Escape(_Observed):
     """The first time at which a quantity leaves an interval: `escape_cycle`, counted in cycles from
-    where observation begins, and `escaped`, whether it does (1) or not (0).
+    the beginning of the observation, and `escaped`, 1 or 0.
 
-    For a lane without escape, `escape_cycle` is the observed time: its time of escape is censored,
+    For a lane without escape, `escape_cycle` is the observed time: its escape time is censored,
     known to be longer. Means of `escape_cycle` alone are too small; see `escape_rate`. A lane that
     lies outside at the beginning has 0. A passage is detected at the observed instants only. If the
     motion may return between them, use the extremes `"y_min"` and `"y_max"` of each cycle, which
@@ -628,9 +627,9 @@ class Escape(_Observed):
 
     **Arguments:**
 
-    - `of`: as for `Statistics`; what is known cycle by cycle counts as at the cycle's end.
+    - `of`: as for `Statistics`; a result for a cycle counts at the cycle's end.
     - `low`, `high`: ends of the interval; by default infinite.
-    - `samples`: instants in a cycle at which the state is looked at instead of sections; static.
+    - `samples`: instants in a cycle at which the state is evaluated, instead of sections; static.
 
     **Raises:** `TypeError` or `ValueError` for arguments of other kinds, or an interval that is
     empty or without ends.
@@ -661,8 +660,8 @@ class Escape(_Observed):
         }
 
     def leaves(self, machine: AbstractMachine, state: State, record: Any, first: Any) -> Any:
-        """Whether a lane has left, seen from the loop at a record point, where recording begins at
-        the `first`, so that it need not go on; `None` where only the whole record tells."""
+        """Return whether a lane has left at a record point (the `first` begins the recording), so
+        that the loop may end; `None` if this needs the whole record."""
         parts, name = components(state), self.of
         if not isinstance(name, str) or has_quantities(machine):
             return None
@@ -678,7 +677,7 @@ class Escape(_Observed):
 
     def __call__(self, machine, run):
         row, behind = self.row(machine, run, self.of)
-        # What is known of cycles begins with the first cycle's end.
+        # Results for cycles begin at the end of the first cycle.
         row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])
         outside = self._outside(row)
         escaped = jnp.any(outside)
@@ -696,18 +695,17 @@ def escape_rate(
 ) -> "xr.Dataset":
     """Estimate the rate at which lanes escape, per cycle, with its confidence interval.
 
-    Lanes that do not escape count with the time for which they were observed: the rate is the
-    number of escapes over the time of all lanes until then (maximum likelihood for escapes at a
-    constant rate), and its interval that of a Poisson number (Garwood 1936), from below to 0 where
-    none escapes. The estimate takes into account that an escape observed at instants, `step` apart,
-    happened between two of them. Host-side: not to be traced.
+    The rate is the number of escapes over the observed time of all lanes, also of those without
+    escape (maximum likelihood for escapes at a constant rate). Its interval is that of a Poisson
+    number (Garwood 1936), with a lower end of 0 without escapes. It is taken into account that an
+    escape observed at instants, `step` apart, happened between two. Host-side: not to be traced.
 
     **Arguments:**
 
-    - `data`: what `scan` found with the measure `Escape`.
-    - `over`: the dimensions whose lanes are taken together; by default all of them.
+    - `data`: the result of `scan` with the measure `Escape`.
+    - `over`: the dimensions over which lanes are combined; by default all.
     - `after`: cycles that are left out, with the lanes that escape in them, since the rate is
-      constant only once the start is forgotten. Compare the results of two values.
+      constant only after transients. Compare the results of two values.
     - `confidence` of the interval.
 
     **Returns:** an `xarray.Dataset` over the other dimensions: `rate`, `rate_low` and `rate_high`
@@ -730,14 +728,14 @@ def escape_rate(
     for name in names:
         one_of("over", name, tuple(dims))
     step = float(time.attrs.get("step", 1.0))
-    watched = time > after  # not so for lanes that failed, which are NaN
+    watched = time > after  # false for failed lanes, which are NaN
     escaped = watched & (data["escaped"] == 1)
     escapes = escaped.sum(names)
     looks = ((time - after) / step).where(watched, 0.0).sum(names)
     tail = 0.5 * (1.0 - confidence)
 
     def rate(number: Any) -> Any:
-        """Of so many escapes: at each look a part of the lanes that are left."""
+        """Return the rate for a number of escapes, which share the lanes left at each instant."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return -np.log1p(-np.minimum(number / looks, 1.0)) / step
 
@@ -761,7 +759,7 @@ def escape_rate(
 
 
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
-    "extremes": functools.partial(Usual, "extremes"),  # first what most users ask for
+    "extremes": functools.partial(Usual, "extremes"),  # the most common first
     "regime": Regime,
     "sections": Sections,
     "exponent": Exponent,

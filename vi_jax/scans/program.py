@@ -1,5 +1,5 @@
-"""What a scan computes: lanes on a grid, in blocks; their noise, of which each has its own path by
-its number; and the program of them, a pytree that is compiled once and can be sent away."""
+"""The program of a scan: lanes on a grid, in blocks; their noise, with a path for each lane's
+number; and a pytree that is compiled once and can be sent to other processes."""
 
 import dataclasses
 import difflib
@@ -54,25 +54,24 @@ from ..machine import (
 )
 from .measures import MEASURES, AbstractMeasure, Average, Escape, Numbers
 
-# The number of a lane among its values, where it has one: no name of an axis.
+# The key of a lane's number among its values; it names no axis.
 LANE = "lane number"
 
-# What the name of an axis begins with, of a number of the start and of one of the noise; one of the
-# machine has no prefix.
+# Prefixes of the names of axes: of the machine's numbers, of the start's, and of the noise's.
 MACHINE, START, NOISE = "", "start.", "noise."
 
 
 def part_of(name: str) -> str | None:
-    """What an axis or a derivative is of: `MACHINE`, `START` or `NOISE`; `None` for `LANE`."""
+    """Return the prefix of an axis or derivative (`MACHINE`, `START`, `NOISE`), or `None`."""
     if name == LANE:
         return None
     return next((prefix for prefix in (START, NOISE) if name.startswith(prefix)), MACHINE)
 
 
 class Blocks:
-    """A grid cut into rectangles of at most so many lanes, contiguous in the grid's order. If its
-    axes are `paired`, their values are taken together, one lane for each place in the rows. With
-    `numbers`, one for each lane in the grid's order, they are among the lanes' values."""
+    """A grid cut into rectangles with at most `lanes` lanes, contiguous in the grid's order. With
+    `paired` axes, one lane has the values at one index of all rows. `numbers`, one for each lane in
+    the grid's order, are added to the lanes' values."""
 
     def __init__(
         self,
@@ -95,18 +94,18 @@ class Blocks:
 
     @property
     def total(self) -> int:
-        """Number of lanes in the whole grid."""
+        """The number of lanes in the whole grid."""
         return math.prod(self.shape)
 
     def dims_of(self, name: str) -> tuple[str]:
-        """The dimension along which an axis' values lie."""
+        """Return the dimension of an axis' values."""
         return ("sample",) if self.paired else (name,)
 
     def __len__(self) -> int:
         return math.prod(map(len, self._edges()))
 
     def __iter__(self) -> Iterator[tuple[slice, ...]]:
-        """Where each block lies in the grid."""
+        """Iterate over the blocks as slices of the grid."""
         pairs = zip(self._edges(), self.block, self.shape, strict=True)
         rows = ([slice(i, min(i + n, size)) for i in edges] for edges, n, size in pairs)
         return itertools.product(*rows)
@@ -115,7 +114,7 @@ class Blocks:
         return [range(0, size, n) for size, n in zip(self.shape, self.block, strict=True)]
 
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
-        """The axes' values of the block's lanes, and their numbers as `LANE`."""
+        """Return the axes' values of the block's lanes, and their numbers as `LANE`."""
         beside = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}
         if self.paired:
             return {name: x[where] for name, x in self.axes.items()} | beside
@@ -129,10 +128,10 @@ class LaneNoise(eqx.Module):
 
     noise: WhiteNoise
     key: UInt32[Array, "2"]
-    """The words of its key, of which each lane's is made."""
+    """The words of the key from which each lane's key is derived."""
 
     def described(self) -> dict[str, Any]:
-        """What makes two noises the same, as JSON can hold it."""
+        """Return a description for comparison with other noise, in types of JSON."""
         sizes = {name: np.asarray(x).tolist() for name, x in self.noise.amplitudes.items()}
         words = [f"{int(word):08x}" for word in np.asarray(self.key)]
         return {"amplitudes": sizes, "impulses": self.noise.impulses, "key": " ".join(words)}
@@ -141,8 +140,8 @@ class LaneNoise(eqx.Module):
 def lane_noise_of(
     noise: object, key: object, axes: Iterable[str] = (), derivatives: Iterable[str] = ()
 ) -> LaneNoise | None:
-    """The noise of a scan, `None` for none; `axes` and `derivatives` are names. **Raises:**
-    `TypeError` or `ValueError` for what does not fit together."""
+    """Return the noise of a scan, or `None`; `axes` and `derivatives` are names. **Raises:**
+    `TypeError` or `ValueError` for arguments that do not fit together."""
     given = {"axes": axes, "derivatives": derivatives}
     names = [
         (which, name) for which, row in given.items() for name in row if part_of(name) == NOISE
@@ -165,22 +164,22 @@ def lane_noise_of(
 
 
 class ScanProgram(eqx.Module):
-    """What is computed of every lane of a scan."""
+    """The computation for every lane of a scan."""
 
     machine: AbstractMachine | None
     build: Callable[..., Any] | None = eqx.field(static=True)
-    """Makes the machine of the axes' values, in place of `machine`."""
+    """A function that makes the machine from the axes' values, instead of `machine`."""
     start: State
-    """The first state, or `None` for the machine's own."""
+    """The initial state, or `None` for the machine's own."""
     derivatives: tuple[str, ...] = eqx.field(static=True)
-    """Names of the numbers by which the variables are differentiated."""
+    """Names of the numbers with respect to which variables are differentiated."""
     measures: tuple[AbstractMeasure, ...]
     cycles: int = eqx.field(static=True)
-    """Cycles observed."""
+    """The number of observed cycles."""
     options: RunOptions
-    """How each lane is run, checked; its method is one, no name."""
+    """The checked options of each run, with a method as an object."""
     lane_noise: LaneNoise | None = None
-    """Noise, where there is some."""
+    """The noise, if any."""
 
     @property
     def method(self) -> AbstractMethod:
@@ -190,9 +189,9 @@ class ScanProgram(eqx.Module):
     def lane(
         self, values: Mapping[str, Any], nudge: Array | None = None
     ) -> tuple[AbstractMachine, State]:
-        """Machine and start of the lane with these values on the axes, in the scan's clock; `nudge`
-        is added to the numbers that derivatives are asked for. **Raises:** `TypeError` if the
-        function that makes the machine makes something else."""
+        """Return machine and start of the lane with these values on the axes, in the scan's clock;
+        `nudge` is added to the numbers of `derivatives`. **Raises:** `TypeError` if the function in
+        argument `machine` returns another object."""
         of_machine = {name: x for name, x in values.items() if part_of(name) == MACHINE}
         if self.build is not None:
             machine = self.build(**of_machine)
@@ -213,13 +212,13 @@ class ScanProgram(eqx.Module):
         return machine, self._nudged(start, START, nudge)
 
     def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
-        """Machine and start of the lane at this place of all axes."""
+        """Return machine and start of the lane at this index of all axes."""
         return self.lane({name: jnp.asarray(x[place]) for name, x in blocks.axes.items()})
 
     def noise_of(
         self, values: Mapping[str, Any], nudge: Array | None = None
     ) -> tuple[WhiteNoise, Array]:
-        """Noise and key of a lane, whose number is among its values; `nudge` as in `lane`."""
+        """Return noise and key of a lane, whose number is among its values; `nudge`: see `lane`."""
         assert self.lane_noise is not None
         noise, number = self.lane_noise.noise, jnp.asarray(values[LANE], jnp.uint32)
         sizes = {name: values.get(NOISE + name, x) for name, x in noise.amplitudes.items()}
@@ -227,7 +226,7 @@ class ScanProgram(eqx.Module):
         return dataclasses.replace(noise, amplitudes=sizes), lane_key(self.lane_noise.key, number)
 
     def _nudged(self, tree: Any, prefix: str, nudge: Array | None) -> Any:
-        """`tree` with the numbers moved that derivatives are asked for."""
+        """Return `tree` with `nudge` added to the numbers of `derivatives`."""
         if nudge is None:
             return tree
         for name, change in zip(self.derivatives, nudge, strict=True):
@@ -239,7 +238,7 @@ class ScanProgram(eqx.Module):
     def __call__(
         self, values: dict[str, Shaped[Array, " lanes"]], wanted: Array
     ) -> dict[str, Array]:
-        """The numbers of all lanes, by name; `result` among them."""
+        """Return the numbers of all lanes, by name, with `result` among them."""
         found, state = self._first(values, wanted, None)
         out = dict(found)
         for measure in self.measures:
@@ -266,7 +265,7 @@ class ScanProgram(eqx.Module):
         def lane_of(values):
             return self.lane(values, nudge)
 
-        options = dataclasses.replace(self.options, clock=None)  # `lane` has seen to it
+        options = dataclasses.replace(self.options, clock=None)  # `lane` has set the clock
         noise_of = None
         if self.lane_noise is not None:
             noise_of = functools.partial(self.noise_of, nudge=nudge)
@@ -281,7 +280,7 @@ class ScanProgram(eqx.Module):
                 found |= new
             for name, x in found.items():
                 if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
-                    # Added, not chosen: the derivative of a failed lane stays NaN as well.
+                    # Added, not selected, so that the derivative of a failed lane is NaN as well.
                     found[name] = x + jnp.where(run.successful, 0.0, jnp.nan)
             if run.outcome is not None:
                 found["outcome"] = run.outcome.astype(jnp.int8)
@@ -292,15 +291,15 @@ class ScanProgram(eqx.Module):
     def _again(
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
-        """`out` with what a measure finds at another pass, at the lanes that need it only; of all
-        lanes `wanted` is whether it is computed, `state` that after the cycles observed."""
+        """Return `out` with the results of another pass of a measure, for lanes that need it:
+        `wanted` are the lanes that are computed, `state` the states after the observed cycles."""
         needed = jax.vmap(lambda found: measure.needs_refinement(found, *pass_number))(out)
         if needed is None:
             return out
 
         def one(values, state, out, needed):
             machine, _ = self.lane(values)
-            # Another lane ends at once, its start being no number.
+            # Other lanes end at once, since their start is NaN.
             state = jtu.tree_map(lambda x: jnp.where(needed, x, jnp.nan), state)
             refined = measure.refine(
                 machine, state, self.method, out, *pass_number, rests=self.options.rests
@@ -323,13 +322,13 @@ def make_program(
     noise: Any = None,
     key: Any = None,
 ) -> ScanProgram:
-    """The program of a scan, its arguments checked as far as they can be without the axes' values;
-    `names` are those of the axes. **Raises:** `TypeError` or `ValueError`, as `scan`."""
+    """Return the program of a scan, with its arguments checked as far as possible without the axes'
+    values; `names` are those of the axes. **Raises:** `TypeError` or `ValueError`, as `scan`."""
     build, own = None, [name for name in names if part_of(name) == MACHINE]
     template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
     if template is not None:
         method, _, averages = _known(template, options.method, start)
-        rests = True  # its numbers on the axes may let a body rest: `check_corners` tells
+        rests = True  # preliminary: `check_corners` decides
     elif callable(machine):
         build = machine
         method, rests, averages = _known_of_made(build, own, options.method, start)
@@ -356,7 +355,7 @@ def make_program(
             check_leaf_name(template, first, name, "axes", lane_noise)
     measures = tuple(measure.under(method) for measure in measures)
     motion = any(measure.record == "motion" for measure in measures)
-    # A lane that has escaped ends before its time, where nothing else is asked.
+    # An escaped lane ends early if there is no other measure.
     alone = measures[0] if len(measures) == 1 and not derivatives else None
     stop = jtu.Partial(Escape.leaves, alone) if isinstance(alone, Escape) else None
     options = dataclasses.replace(
@@ -376,8 +375,7 @@ def make_program(
     )
 
 
-# What is known of all machines of a scan: how they are carried, whether a body can come to rest in
-# them, and the names of their averages.
+# Properties of all machines of a scan: method, whether a body may come to rest, names of averages.
 _Known = tuple[AbstractMethod, bool, tuple[str, ...]]
 
 
@@ -392,8 +390,8 @@ def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known
 def _known_of_made(
     build: Callable[..., Any], names: list[str], method: MethodLike, start: State
 ) -> _Known:
-    """The same of the machines that a function makes, whatever its values. **Raises:** `ValueError`
-    if the function does not take these names."""
+    """Return `_Known` for the machines from a function, for any values. **Raises:** `ValueError` if
+    the function does not take these names."""
     try:
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
@@ -402,12 +400,12 @@ def _known_of_made(
             f"{error}."
         ) from None
     except ValueError:
-        pass  # its arguments are not known
+        pass  # its arguments are unknown
     found: list[_Known] = []
 
     def made(values):
         machine = build(**values)
-        is_one = isinstance(machine, AbstractMachine)  # else it is refused once there are lanes
+        is_one = isinstance(machine, AbstractMachine)  # else `lane` raises an error
         unknown = chosen(None, method), True, ()
         found.append(_known(machine, method, start) if is_one else unknown)
 
@@ -416,7 +414,7 @@ def _known_of_made(
 
 
 def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[str]) -> None:
-    """**Raises:** `ValueError` if a name is none for a variable, or another's."""
+    """Raise `ValueError` for a name that a variable cannot have, or that is in use."""
     who = getattr(measure, "function", measure)
     who = getattr(who, "__name__", type(who).__name__)
     for name in new:
@@ -427,7 +425,7 @@ def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[s
 
 
 def _as_arrays(tree: Any) -> Any:
-    """Numbers as arrays, so that others are not another program."""
+    """Return numbers as arrays, so that other numbers use the same program."""
     return jtu.tree_map(
         lambda x: strongly_typed(jnp.asarray(x) if isinstance(x, np.ndarray | float) else x), tree
     )
@@ -436,7 +434,7 @@ def _as_arrays(tree: Any) -> Any:
 def check_leaf_name(
     machine: AbstractMachine, start: State, name: str, argument: str, lane_noise: LaneNoise | None
 ) -> None:
-    """**Raises:** `ValueError` if machine, start and noise have no number of this name."""
+    """Raise `ValueError` if machine, start and noise have no number with this name."""
     if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
     of_start, names = part_of(name) == START, [START + n for n in components(bare(start))]
@@ -447,12 +445,12 @@ def check_leaf_name(
 
 
 def start_with(start: State, values: Mapping[str, Any]) -> State:
-    """Replace numbers of a start, given by the names of their axes."""
+    """Return a start with other numbers, by the names of their axes."""
     return with_leaves(start, {name.removeprefix(START): x for name, x in values.items()})
 
 
 def _corners(blocks: Blocks) -> np.ndarray:
-    """The lanes in which the axes have their least and greatest values, one in a row."""
+    """Return the lanes at which the axes have their least and greatest values, as rows."""
     rows = list(blocks.axes.values())
     if blocks.paired:
         ends = {int(place) for x in rows for place in (x.argmin(), x.argmax())}
@@ -462,12 +460,12 @@ def _corners(blocks: Blocks) -> np.ndarray:
 
 
 def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
-    """The program, once machine, start and method are checked at the corners of the grid.
+    """Return the program after checks of machine, start and method at the corners of the grid.
     **Raises:** `ValueError` or `TypeError` for what cannot be run.
 
-    What the gaps are at the corners says whether a body can come to rest anywhere on the grid; if
-    none can, the program leaves that out. (Where a function makes the machines, the program knows
-    it already.) Axes that are paired have no corners: machines are checked at all their lanes.
+    The gaps at the corners decide whether a body may come to rest anywhere on the grid; if not, the
+    program omits rests. (If a function makes the machines, this is known already.) Paired axes have
+    no corners: machines are checked at all their lanes.
     """
     rests = False
     if blocks.paired and program.machine is not None:
@@ -492,7 +490,7 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
 
 
 class Custom(AbstractMeasure):
-    """A user's own function of one lane's machine and run."""
+    """A user's own function of a lane's machine and run."""
 
     function: Callable[..., Any] = eqx.field(static=True)
 
@@ -516,9 +514,9 @@ class Custom(AbstractMeasure):
 
 
 def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
-    """Measures by name, as objects, or functions of a machine and a run; one or several. A name may
-    be that of one of the machine's own `averages`, which comes first. **Raises:** `ValueError` for
-    an unknown name, `TypeError` for anything else."""
+    """Return measures by name, as objects, or functions of a machine and a run; one or several.
+    Names of the machine's own `averages` come first. **Raises:** `ValueError` for an unknown name,
+    `TypeError` for anything else."""
     if isinstance(measure, str) or callable(measure) or not isinstance(measure, Iterable):
         measure = (measure,)
     found = tuple(_measure(one, averages) for one in measure)
@@ -545,8 +543,8 @@ def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
 
 
 def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
-    """The cycles to observe: those asked for, or as many as these measures need. **Raises:**
-    `ValueError` if they are too few for one of them."""
+    """Return the number of cycles to observe: the given one, or what these measures need.
+    **Raises:** `ValueError` if it is too small for one of them."""
     needed = max(m.cycles for m in measures)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:
@@ -558,7 +556,7 @@ def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
 
 
 def samples_for(measures: Iterable[AbstractMeasure]) -> int:
-    """Samples in a cycle. **Raises:** `ValueError` for measures that ask for different ones."""
+    """Return the samples in a cycle. **Raises:** `ValueError` if measures need different ones."""
     asked = {m.instants for m in measures if m.instants}
     if len(asked) > 1:
         raise ValueError(

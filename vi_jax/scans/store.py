@@ -1,5 +1,5 @@
-"""Where a scan's numbers go: arrays in memory, or a Zarr store that survives interruption; and what
-a scan is, in words and numbers, by which a store knows its own scan."""
+"""Storage of a scan's results, as arrays in memory or as a Zarr store that survives interruption;
+and the description of a scan, by which a store recognizes it."""
 
 import functools
 import hashlib
@@ -35,21 +35,21 @@ try:
 except ImportError:  # not on Windows
     fcntl = None
 
-# What stands in whole numbers of lanes that were not computed, `result` among them.
+# The value of integers, `result` among them, in lanes that were not computed.
 NOT_COMPUTED = -1
 
-# The attribute that says which release began a store.
+# The attribute with the release that began a store.
 _RELEASE = "vi_jax"
 
-# What begins the digest of code that cannot be compared.
+# The beginning of the digest of code that cannot be compared.
 UNVERIFIABLE = "it has no source: "
 
 Where = tuple[slice, ...]
-"""A block: where it lies on each axis of the grid."""
+"""A block: its slice on each axis of the grid."""
 
 
 class Variable(NamedTuple):
-    """One array of a scan: axes beyond the grid's, their sizes, type and attributes."""
+    """An array of a scan: axes beyond the grid's, their sizes, type and attributes."""
 
     dims: tuple[str, ...]
     sizes: tuple[int, ...]
@@ -58,7 +58,7 @@ class Variable(NamedTuple):
 
     @property
     def empty(self) -> Any:
-        """What stands where nothing was computed."""
+        """The value in lanes that were not computed."""
         return np.nan if np.issubdtype(self.dtype, np.floating) else NOT_COMPUTED
 
 
@@ -67,7 +67,7 @@ class MemoryStore:
 
     def __init__(self, program: ScanProgram, blocks: Blocks, variables: Mapping[str, Variable]):
         self.program, self.blocks, self.variables = program, blocks, variables
-        # As a file gives it back.
+        # In the form read from a file.
         self.about = json.loads(json.dumps(_description_of(program, blocks)))
         self.arrays: Mapping[str, Any] = self._opened()
 
@@ -87,13 +87,13 @@ class MemoryStore:
             array[where] = numbers[name].reshape(lanes + array.shape[len(where) :])
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is open."""
 
     def data(self) -> "xr.Dataset":
-        """Return what was computed, with units and with what the scan is."""
+        """Return the results, with units and a description of the scan."""
         data, (machine, _) = self._labelled(), self.program.at(self.blocks, 0)
         for name in self.blocks.axes:
-            # Machines that a function makes have no numbers of these names, nor has noise units.
+            # Machines from a function have no numbers with these names, and noise has no units.
             known = name.startswith(START) or self.program.build is None
             if known and part_of(name) != NOISE:
                 data[name].attrs |= attributes(unit_of(units_of(machine), name))
@@ -114,7 +114,7 @@ class MemoryStore:
 
 
 class ZarrStore(MemoryStore):
-    """A Zarr group on disk, one chunk for each block, with Zarr's check sum of each (CRC-32C).
+    """A Zarr group on disk with a chunk for each block, with Zarr's checksum of each (CRC-32C).
 
     Chunks of NaN are written too, so that a missing chunk of a computed block is a lost one. No
     other process, and no other scan of this one, may write to the store until it is closed.
@@ -167,13 +167,13 @@ class ZarrStore(MemoryStore):
         return arrays
 
     def close(self) -> None:
-        """Let others write."""
+        """Release the lock, so that others may write."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
     def open_blocks(self) -> list[Where]:
-        """Return the blocks still to be computed. Warns of damaged ones, which are among them."""
+        """Return the blocks still to be computed. Warn of damaged ones, which are among them."""
         found = [where for where in self.blocks if not self._is_done(where)]
         if self.lost:
             more = f" and {len(self.lost) - 5:,} more" if len(self.lost) > 5 else ""
@@ -201,13 +201,13 @@ class ZarrStore(MemoryStore):
         return "/".join([name, "c", *map(str, corner)])
 
     def _labelled(self) -> "xr.Dataset":
-        """The data of the store, which are read when they are used."""
+        """Return the data of the store, which are read at their first use."""
         data = xr.open_zarr(str(self.path), chunks=None, mask_and_scale=False)
         return data[[*data["result"].dims, *sorted(map(str, data.data_vars))]]
 
 
 def _read(array: Any, where: Any) -> np.ndarray | None:
-    """The numbers there, or `None`: a file may be cut short or hold anything."""
+    """Return the numbers there, or `None`: a file may be truncated or corrupt."""
     try:
         return np.asarray(array[where])
     except Exception:
@@ -215,7 +215,7 @@ def _read(array: Any, where: Any) -> np.ndarray | None:
 
 
 def _locked(folder: Path) -> int | None:
-    """A descriptor that holds a lock until it is closed; `None` where there are no locks."""
+    """Return a descriptor that holds a lock until it is closed; `None` without locks."""
     if fcntl is None:
         return None
     lock = os.open(folder, os.O_RDONLY)
@@ -236,7 +236,7 @@ def _locked(folder: Path) -> int | None:
 def _make(
     path: Path, description: Mapping[str, Any], blocks: Blocks, variables: Mapping[str, Variable]
 ) -> None:
-    """An empty store, made beside its place and then renamed: it is there whole or not at all."""
+    """Create an empty store under another name and rename it: it exists as a whole or not."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -261,7 +261,7 @@ def _make(
                 compressors=compressors,
             )
         with warnings.catch_warnings():
-            # With it one file describes all arrays, and others open the store without a warning.
+            # One file then describes all arrays, and others open the store without a warning.
             warnings.filterwarnings("ignore", "Consolidated metadata")
             zarr.consolidate_metadata(str(made), zarr_format=3)
         try:
@@ -272,8 +272,8 @@ def _make(
 
 
 def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None) -> MemoryStore:
-    """Where the numbers of a scan go: into a store, or into the memory where there is no path.
-    **Raises:** `ValueError` for what does not fit into the memory, or a path that is no store's."""
+    """Return the storage of a scan: a Zarr store, or memory without a path. **Raises:**
+    `ValueError` for data that do not fit into memory, or a path that is not a store's."""
     variables = _variables_of(program, blocks)
     per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
     in_memory = blocks.total * per_lane if path is None else blocks.total + 500 * len(blocks)
@@ -285,7 +285,7 @@ def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None) -> Mem
 
 
 def _check_writable(path: str | Path) -> None:
-    """**Raises:** `ValueError` if no store can be written there; makes the folders above it."""
+    """Raise `ValueError` if no store can be written there; create the folders above it."""
     problem = "it is empty" if path == "" else unwritable(Path(path).parent)
     if problem is None and "\0" in str(path):
         problem = "it holds a null character"
@@ -326,14 +326,14 @@ def _refuse_another_scan(
 
 
 def _description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
-    """What makes two scans the same, in words and numbers that JSON can hold."""
+    """Return a description for comparison with other scans, in types of JSON."""
 
     def described(tree: object) -> str:
         return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
     machine: dict[str, Any] = {}
     parts = {"": program.machine}
-    if program.machine is None:  # a function is known by what it makes
+    if program.machine is None:  # a function is described by the machines that it makes
         machine = {"made by": _lasting(getattr(program.build, "__qualname__", repr(program.build)))}
         parts = {"first ": program.at(blocks, 0)[0], "last ": program.at(blocks, -1)[0]}
     for which, part in parts.items():
@@ -371,12 +371,12 @@ def _description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
 
 
 def _lasting(text: str) -> str:
-    """Without addresses in memory, which are others in each process."""
+    """Return a text without addresses in memory, which differ in each process."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
 def _codes(program: ScanProgram) -> dict[str, str]:
-    """What tells the user's own functions and classes from others of the same name."""
+    """Return digests of the user's own functions and classes."""
     parts: dict[str, Any] = {"machine": program.machine if program.build is None else program.build}
     parts |= {"start": program.start, "method": program.method}
     if program.lane_noise is not None and program.lane_noise.noise.functions:
@@ -386,23 +386,23 @@ def _codes(program: ScanProgram) -> dict[str, str]:
     return {name: identity(part) for name, part in parts.items()}
 
 
-# Code that does not change while a study goes on, and is known by its name.
+# Packages whose code does not change during a study; it is identified by name.
 _LIBRARIES = {
     "vi_jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optax", "optimistix",
     "lineax", "jaxtyping", "beartype", "xarray", "matplotlib", *sys.stdlib_module_names,
 }  # fmt: skip
 
-# What a class holds besides what its author wrote.
+# Members of a class that its author did not write.
 _MADE = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
 
 
 def identity(thing: object) -> str:
-    """Return a digest of a function, or of an object: the source of its code, and its content.
+    """Return a digest of a function or an object, from its source code and its content.
 
     A function refers to its defaults, to the variables that it closes over and to the globals that
-    it names; functions and classes among them are part of the digest, unless they are a library's.
-    Of an object count its class and its attributes. If something has neither source nor content,
-    the answer begins with `UNVERIFIABLE` and names it.
+    it names. Functions and classes among them are part of the digest, unless they are a library's.
+    An object contributes its class and its attributes. If something has neither source nor content,
+    the result begins with `UNVERIFIABLE` and names it.
     """
     digest = hashlib.sha256()
     try:
@@ -414,7 +414,8 @@ def identity(thing: object) -> str:
 
 
 def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """The words that `thing` is made of. `seen` holds what was begun: things refer in rings."""
+    """Yield the words that describe `thing`. Visited objects are in `seen`, as references may be
+    cyclic."""
     if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
         yield repr(thing)
     elif isinstance(thing, np.ndarray | np.generic | jax.Array):
@@ -432,7 +433,7 @@ def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
 
 
 def _parts(thing: Any) -> list[Any]:
-    """Its parts. **Raises:** `OSError` or `TypeError` if it has neither source nor content."""
+    """Return the parts of an object. **Raises:** `OSError` or `TypeError` for one without any."""
     if isinstance(thing, set | frozenset):
         return sorted(map(identity, thing))
     if isinstance(thing, list | tuple):
@@ -455,7 +456,7 @@ def _parts(thing: Any) -> list[Any]:
         used = inspect.getclosurevars(thing)
         if not own:
             return [*name, used.nonlocals]
-        if inspect.getfile(thing) == "<string>":  # Python 3.13 has that of `python -c` for all
+        if inspect.getfile(thing) == "<string>":  # Python 3.13 names the source of `python -c` so
             raise OSError("it was made by `exec`")
         source = inspect.getsource(thing)
         return [source, thing.__defaults__, thing.__kwdefaults__, used.nonlocals, used.globals]
@@ -463,7 +464,7 @@ def _parts(thing: Any) -> list[Any]:
 
 
 def _members(kind: type) -> Iterator[Any]:
-    """What the author of a class wrote in it: methods and plain values, with their names."""
+    """Yield the methods and plain values that the author of a class wrote, with their names."""
     for name, value in sorted(vars(kind).items()):
         code = getattr(inspect.unwrap(value) if callable(value) else value, "__code__", None)
         is_made = isinstance(value, _MADE) or (code and code.co_filename == "<string>")
@@ -477,7 +478,7 @@ def _numbers(tree: Any) -> dict[str, Any]:
 
 
 def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
-    """The variables that a program computes, by name, found without computing them."""
+    """Return the variables of a program by name, without computing them."""
     values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
     if blocks.numbers is not None:
         values[LANE] = jnp.zeros(4, jnp.uint32)
