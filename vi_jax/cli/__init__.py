@@ -1,3 +1,3 @@
-"""The command line: what a TOML file asks for, as one command for each verb."""
+"""The command line: one command for each function, with arguments in a TOML file."""
 
 from .command import main as main

@@ -1,4 +1,4 @@
-"""The command line: `vi-jax VERB FILE.toml` for what a file asks, and `vi-jax explore`.
+"""The command line: `vi-jax VERB FILE.toml` with arguments in a file, and `vi-jax explore`.
 
 Each verb calls the function of its name, prints, writes and draws.
 """
@@ -48,42 +48,42 @@ _ENDINGS = {"output": (".csv", ".nc"), "picture": (".png", ".pdf", ".svg")}
 _LEFT_OUT = {"machine", "orbit", "options", "progress", "cluster", "throw", "key"}
 _NOT_NEEDED = {*_LEFT_OUT, "start", "guess"}
 
-# Cycles, or samples, of one part of a run: a fraction of a second, or seconds of a slow machine.
+# Cycles, or samples, of one part of a run: a fraction of a second, or seconds for a slow machine.
 _CYCLES, _SAMPLES = 1024, 16384
 
 _MACHINE = "a class or a function that makes the machine (module:name or path/to/file.py:name)"
 
 
 class Found(NamedTuple):
-    """What a verb found, and how that is written as a table and drawn."""
+    """The result of a verb, with functions for its table and its picture."""
 
     lines: list[str]
     table: Callable[[], Any] | None = None
     draw: Callable[[Figure], object] | None = None
     good: bool = True
-    """Whether anything succeeded."""
+    """True if anything succeeded."""
     interrupted: bool = False
-    """Whether Ctrl-C ended it early."""
+    """True if Ctrl-C ended it early."""
     result: Any = None
 
 
 class Verb(NamedTuple):
-    """A function of the library, and what is done with its arguments."""
+    """A function of the library, and the handling of its arguments."""
 
     about: str
     function: Callable[..., Any]
     work: Callable[..., Found]
     own: tuple[str, ...] = ()
-    """Keys of its table that are no arguments of the function."""
+    """Keys of its table that are not arguments of the function."""
 
     def keys(self) -> list[str]:
-        """The keys of its table."""
+        """Return the keys of its table."""
         names = [*inspect.signature(self.function).parameters]
         names += [*inspect.signature(scan).parameters] if "options" in names else []
         return [x for x in dict.fromkeys([*names, *self.own, *_ENDINGS]) if x not in _LEFT_OUT]
 
     def check(self, table: Mapping[str, Any], place: str) -> None:
-        """**Raises:** `InputError` for a key that does not exist, or that is missing."""
+        """Raise `InputError` for an unknown or a missing key."""
         check_keys(table, self.keys(), place)
         for name, parameter in inspect.signature(self.function).parameters.items():
             needed = parameter.default is parameter.empty and name not in _NOT_NEEDED
@@ -92,13 +92,13 @@ class Verb(NamedTuple):
 
 
 def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
-    """Do what a file asks of a verb. **Raises:** `InputError`."""
+    """Return the result of a verb with the arguments of a file. **Raises:** `InputError`."""
     before, thing = [], machine
     what, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
     if not isinstance(table, dict):
         raise InputError(f"missing table {place}, which holds the arguments")
     what.check(table, place)
-    if verb == "continue":  # its parameter is looked at before the orbit is sought
+    if verb == "continue":  # checked before the search for the orbit
         with errors_in(place):
             check_leaf(machine, table.get("parameter", ""))
         found = do("orbit", machine, {"orbit": {}, **tables})
@@ -122,7 +122,7 @@ def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
 
 
 def _check_path(path: Any, endings: tuple[str, ...], place: str) -> None:
-    """**Raises:** `InputError` if a file cannot be written; makes the folder above it."""
+    """Raise `InputError` if a file cannot be written; create the folder above it."""
     if not isinstance(path, str) or Path(path).suffix not in endings:
         raise InputError(f"{place} must end in {', '.join(endings)}, but is {path!r}")
     reason = unwritable(Path(path).parent) or ("it is a folder" if Path(path).is_dir() else None)
@@ -143,7 +143,7 @@ def _write_files(found: Found, output: str | None = None, picture: str | None = 
         figure = Figure(figsize=(7.5, 4.2), layout="constrained")
         try:
             found.draw(figure)
-        except ValueError as error:  # what was computed is not lost by it
+        except ValueError as error:  # the other results are kept
             return [*lines, f"  picture: not drawn: {error}"]
         figure.savefig(picture, dpi=110)
         lines.append(f"  picture: {picture}")
@@ -151,8 +151,8 @@ def _write_files(found: Found, output: str | None = None, picture: str | None = 
 
 
 def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, bool]:
-    """What a function returns, or what it had computed on Ctrl-C, which is ignored from then on;
-    whether that ended it."""
+    """Return the result of a function, partial on Ctrl-C, and whether that ended it. Further ones
+    have no effect."""
     try:
         return function(*args, **options), False
     except Interrupted as error:
@@ -162,7 +162,7 @@ def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any
 
 def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
-    if along == "sample":  # the picture shows where between samples an impact is
+    if along == "sample":  # for impacts between samples in the picture
         options.setdefault("impact_log", 8)
     run, cut = run_in_parts(machine, machine.start() if start is None else start, **options)
 
@@ -177,7 +177,7 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
         figure.set_size_inches(11, 3.6)
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
         seen, shown = run, machine
-        if run.samples is None:  # the same cycles again; one without a drive at equal intervals
+        if run.samples is None:  # the same cycles again; autonomous ones at equal intervals
             first = jtu.tree_map(lambda x: x[0], run.sections)
             if is_autonomous(machine, first):
                 shown = machine.observed_every(machine.cycle)
@@ -191,8 +191,8 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
 def run_in_parts(
     machine: AbstractMachine, start: Any, cycles: int, *, samples: int = 0, **options: Any
 ) -> tuple[Run, bool]:
-    """A run of one motion, as `simulate`, but Ctrl-C ends it with the cycles that were recorded;
-    whether that ended it."""
+    """Return a run of one motion, as `simulate`, and whether Ctrl-C ended it. The run then has the
+    cycles recorded so far."""
     length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
     planned(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
     if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
@@ -207,13 +207,13 @@ def run_in_parts(
     except KeyboardInterrupt:
         if not runs:
             raise
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # nor while they are put together
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # also while parts are joined
         return _joined(runs), True
     return _joined(runs), False
 
 
 def _joined(runs: list[Run]) -> Run:
-    """Parts of one run in a row; the first state of a part is the last of the part before it."""
+    """Return parts of one run as one; a part begins with the last state of that before it."""
     time, length = 0.0, runs[0].impacts.size
     for i, run in enumerate(runs):
         if run.samples is not None:
@@ -246,7 +246,7 @@ def _sweep(
             options["start"] = jtu.tree_map(lambda x: x[last, -1], there.sections)
         try:
             found[ways[1]], cut = _kept(sweep, machine, **options | {"values": values[::-1]})
-        except KeyboardInterrupt:  # before there was anything to keep
+        except KeyboardInterrupt:  # without any result to keep
             cut = True
 
     def table() -> Any:
@@ -334,7 +334,7 @@ VERBS: Mapping[str, Verb] = {
 
 @contextmanager
 def errors_in(place: str) -> Iterator[None]:
-    """Turn errors of the library about its arguments into a `InputError` that names the table."""
+    """Turn errors of the library about its arguments into an `InputError` that names the table."""
     try:
         yield
     except (ValueError, TypeError) as error:
@@ -345,9 +345,8 @@ def errors_in(place: str) -> Iterator[None]:
 
 
 def start_of(machine: AbstractMachine, table: Any) -> Any:
-    """Return the state that `[start]` describes, by the arguments of the machine's `start`, by what
-    replaces parts of the default one, or whole for a machine without. **Raises:** `InputError`.
-    """
+    """Return the state that `[start]` describes: arguments of the machine's `start`, components
+    that replace those of the default, or all without `start`. **Raises:** `InputError`."""
     if not isinstance(table, dict):
         return table
     if type(machine).start is AbstractMachine.start:

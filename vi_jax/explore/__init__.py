@@ -1,1 +1,1 @@
-"""A page with sliders on which motions are seen at once: `vi-jax explore`."""
+"""A page with sliders and immediate pictures of motions: `vi-jax explore`."""

@@ -1,5 +1,5 @@
-"""The page, a marimo app: sliders of a machine's numbers, its motion, a diagram, and the machine
-moving. The other files compute and draw."""
+"""The page, a marimo app: sliders of a machine's numbers, its motion, a diagram, and an animation.
+The other files compute and draw."""
 
 import marimo  # pyright: ignore[reportMissingImports]
 
@@ -31,14 +31,14 @@ def _(MAPS, SERVED, SHOWN, mo, ready):
     which = mo.ui.radio(MAPS, value=MAPS[0])
     upwards = mo.ui.dropdown(list(SHOWN), value=next(iter(SHOWN)), label="upwards")
     moving = mo.ui.run_button(label="let it move")
-    picked, pick = mo.state(("", {}))  # of a machine, the values that a click has chosen
+    picked, pick = mo.state(("", {}))  # for a machine, the values chosen by a click
     mo.hstack([menu, tab], justify="start", gap=2)
     return first, kinds, menu, moving, pick, picked, subjects, tab, upwards, which
 
 
 @app.cell
 def _(MotionPicture, first, kinds, menu, mo, subjects):
-    # Compiled when it is first chosen; the first one is already.
+    # Compiled at its first choice; the first machine is compiled already.
     if menu.value not in subjects:
         chosen = first[1]
         if menu.value != first[0]:

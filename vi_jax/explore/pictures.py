@@ -1,4 +1,4 @@
-"""The page's pictures. That of a motion is SVG, written in milliseconds and sharp at any size."""
+"""The pictures of the page. A motion's is SVG, written in milliseconds."""
 
 import html
 import tempfile
@@ -15,7 +15,7 @@ from ..plot import BLUE, GREEN, RED, animate
 from .subject import SHOWN, WINDOW, Diagram, Motion, seen_evenly
 
 MAPS = ("section map", "impact map", "drive's speed")
-"""What the third picture of a motion shows."""
+"""The choices of the third picture of a motion."""
 
 _STYLE = f"""
 text {{ font: 13px "DejaVu Sans", sans-serif }} rect {{ fill: none }} .frame {{ stroke: black }}
@@ -25,15 +25,15 @@ path {{ fill: none; stroke-linecap: round; stroke-linejoin: round }} .behind {{ 
 .multiplier {{ stroke: {BLUE}; stroke-width: 8 }}
 """
 
-# Limits are kept while what is drawn is so far within them and fills so much of them. The least
-# extent of what is drawn, as a share of its size, of sections as one of their motion's. Choices.
+# Limits are kept while the data have this margin to them and fill this share of them. The least
+# extent of data, as a share of their size, and of sections, as a share of their motion's. Choices.
 _EDGE, _FILLED, _LEAST, _WIDE = 0.02, 0.5, 0.001, 0.1
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class _Panel:
-    """One of the pictures in a picture: its frame, its limits, and what is drawn within them."""
+    """One of the panels in a picture: its frame, its limits, and its drawings."""
 
     def __init__(self, left: int, top: int, width: int, height: int):
         self.corner, self.size = (left, top), (width, height)
@@ -41,7 +41,7 @@ class _Panel:
         self._drawn: list[str] = []
 
     def fit(self, axis: int, values: np.ndarray, *, least: float = 0.0) -> None:
-        """Set limits around what is finite, a little wider; keep them where they still suit."""
+        """Set limits around finite values, a little wider; keep them if they still suit."""
         values = values[np.abs(values) < 1e300]
         if not values.size:
             return
@@ -52,7 +52,7 @@ class _Panel:
             self.limits[axis] = middle - 0.6 * width, middle + 0.6 * width
 
     def draw(self, style: str, x: np.ndarray, y: np.ndarray, *, dots: bool = False) -> None:
-        """Draw a line, with a gap at what is not finite, or dots."""
+        """Draw a line, with gaps at values that are not finite, or dots."""
         points = np.stack([self._pixels(0, x), self._pixels(1, y)], axis=-1)
         good = np.isfinite(points[:, 0] + points[:, 1])
         begins = good & ~np.append(False, good[:-1])
@@ -68,7 +68,7 @@ class _Panel:
         return self.size[axis] * (1 - share if axis else share)
 
     def framed(self, labels: Sequence[str], note: str = "") -> str:
-        """Return what was drawn, in its frame, and begin anew."""
+        """Return the drawings in their frame, and begin anew."""
         (left, top), (width, height), middle = self.corner, self.size, 'text-anchor="middle"'
         drawn, self._drawn = "".join(self._drawn), []
         (across, x_label), (upwards, y_label) = (self._ticks(k, labels[k]) for k in (0, 1))
@@ -85,7 +85,7 @@ class _Panel:
         )
 
     def _ticks(self, axis: int, label: str) -> tuple[list[tuple[float, str]], str]:
-        """Places and words of the ticks, and the label with the power of ten taken out of them."""
+        """Return positions and texts of the ticks, and the label with their common power of ten."""
         low, high = self.limits[axis]
         most = min(8, self.size[axis] // (48, 32)[axis])
         places = np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(low, high))
@@ -98,19 +98,19 @@ class _Panel:
 
 
 class MotionPicture:
-    """Four pictures of a motion in one: its time history, phase portrait, map, and multipliers."""
+    """Four panels of a motion: its time history, phase portrait, map, and multipliers."""
 
     def __init__(self, labels: tuple[str, str]):
-        """**Arguments:** what the machine calls its position and its velocity."""
+        """**Arguments:** `labels`, the machine's labels of position and velocity."""
         self._labels = labels
         self._course = _Panel(66, 28, 930, 200)
         lower = (_Panel(left, 312, 248, 200) for left in (66, 407, 748))
         self._portrait, self._map, self._circle = lower
         self._course.limits[0] = (0.0, WINDOW)
-        self._circle.limits = [(-1.488, 1.488), (-1.2, 1.2)]  # a circle is round
+        self._circle.limits = [(-1.488, 1.488), (-1.2, 1.2)]  # for a round circle
 
     def draw(self, motion: Motion, which: str = MAPS[0]) -> bytes:
-        """Return the picture of a motion, as SVG; the map is `which` out of `MAPS`."""
+        """Return the picture of a motion as SVG; the map is `which` out of `MAPS`."""
         panels = (*self._motion(motion), self._mapped(motion, which), self._multipliers(motion))
         return (
             '<svg xmlns="http://www.w3.org/2000/svg" width="1008" height="560" '
@@ -163,7 +163,7 @@ class MotionPicture:
 
 
 def draw_diagram(found: Diagram, chosen: float, shown: str) -> Axes:
-    """A bifurcation diagram, with the chosen value marked; `shown`, out of `SHOWN`."""
+    """Return a bifurcation diagram, with the chosen value marked; `shown` is out of `SHOWN`."""
     figure = Figure(figsize=(11.2, 3.6), dpi=90)
     ax, rows = figure.add_axes((0.065, 0.14, 0.92, 0.84)), getattr(found, SHOWN[shown])
     ax.plot(found.values, rows, "o", color="0.15", ms=1.3, mew=0)
@@ -173,7 +173,7 @@ def draw_diagram(found: Diagram, chosen: float, shown: str) -> Axes:
 
 
 def gif_of(motion: Motion) -> bytes:
-    """The machine moving through the cycles that are drawn, as a GIF that takes seconds to make."""
+    """Return an animation of the drawn cycles as a GIF, which takes seconds."""
     evenly = seen_evenly(motion.machine, motion.window.last)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "motion.gif"

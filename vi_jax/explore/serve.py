@@ -1,4 +1,4 @@
-"""The page, served on this machine by marimo."""
+"""The server of the page on this machine, by marimo."""
 
 import contextlib
 import importlib.util
@@ -17,15 +17,15 @@ from urllib.parse import urlsplit
 from .subject import Subject as Subject
 
 NEEDED = "marimo>=0.25"
-"""What the page needs beside the library."""
+"""The additional package that the page needs."""
 
 SERVED: list[tuple[str, Subject]] = []
-"""Last the name and the sliders of the machine that the page shows first, which runs on threads of
-this process, and gets nothing but its address."""
+"""The last entry is the name and the sliders of the page's first machine. The page runs on threads
+of this process and receives only its address."""
 
 
 def missing() -> str | None:
-    """What to do if the page cannot be served because marimo is not installed, else `None`."""
+    """Return advice if marimo, which serves the page, is not installed, else `None`."""
     if importlib.util.find_spec("marimo") is not None:
         return None
     return f"the page needs marimo, which is not installed: pip install '{NEEDED}'"
@@ -37,12 +37,12 @@ def serve(
 ) -> None:  # fmt: skip
     """Serve the page until Ctrl-C, which ends the process.
 
-    Its address, which is reported, holds a token without which nothing is answered.
+    The reported address contains a token, which every request needs.
 
-    **Arguments:** address and port to listen at (port 0: any that is free); the machine to show
-    first and its name; whether to open a browser; `tell`, called with lines about the progress.
+    **Arguments:** `host` and `port`, the address (port 0: any free one); `machine`, the first
+    machine and its name; `browser`, whether to open one; `tell`, called with lines of progress.
 
-    **Raises:** `OSError` if it cannot listen there.
+    **Raises:** `OSError` if the address is not available.
     """
     import marimo  # pyright: ignore[reportMissingImports]
     import uvicorn  # pyright: ignore[reportMissingImports]
@@ -50,7 +50,7 @@ def serve(
     page = str(Path(__file__).with_name("page.py"))
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family) as listening:
-        # asyncio sets it only for sockets that it opened; without it an answer waits up to 40 ms.
+        # asyncio sets it only for its own sockets; without it a response waits up to 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         machine[1].compile(tell)
         SERVED.append(machine)
@@ -58,28 +58,28 @@ def serve(
         address = f"http://{f'[{host}]' if ':' in host else host}:{port}?access_token={token}"
         made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
         app: Any = made.with_app(path="", root=page).build()
-        # The cookie with the token is named by the port: a browser keeps one cookie of each name
-        # for all ports of a host, so that two of these servers would overwrite each other's.
+        # The port is part of the cookie's name. A browser keeps one cookie of each name for all
+        # ports of a host, so that two servers would overwrite each other's.
         for mounted in app.routes:
             mounted.app.state.port = port
         options: Any = {"log_level": "warning", "timeout_graceful_shutdown": 1}
         server = uvicorn.Server(uvicorn.Config(guarded(app, host), **options))
         tell(f"serving {address} until Ctrl-C")
-        if browser:  # it waits until it is answered
+        if browser:  # it waits for the response
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
-    # marimo leaves threads that wait for its pages, for which Python would wait in turn.
+    # Threads of marimo still wait for pages, and Python would wait for them.
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(0)
 
 
 def guarded(app: Any, host: str) -> Any:
-    """An ASGI app that refuses requests from the pages of others, which a browser may send too: by
-    another name of this machine (DNS rebinding), or with another origin.
+    """Return an ASGI app that refuses requests from other pages, by another name of this machine
+    (DNS rebinding) or with another origin.
 
-    **Arguments:** the app; the address that it listens at.
+    **Arguments:** `app`; `host`, the address on which it listens.
     """
     from starlette import datastructures, responses, websockets  # pyright: ignore
     from starlette.middleware import trustedhost  # pyright: ignore

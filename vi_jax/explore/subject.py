@@ -1,6 +1,6 @@
-"""A machine on the page: sliders made of its numbers, its motions and its diagrams.
+"""A machine on the page: sliders of its numbers, its motions and its diagrams.
 
-Every number of the machine and of the start is traced, so that no other value is another program.
+Every number of the machine and of the start is traced, so that all values use one program.
 """
 
 import inspect
@@ -40,22 +40,22 @@ from ..plot import MotionPath, axis_name, motion_path
 from ..scans import REGIMES, Regime, lyapunov, taken_along
 
 START, SETTLE = "start.", "cycles before"
-"""How the sliders of the start are named, and that of the cycles before what is drawn."""
+"""The prefix of the start's sliders, and the name of that of the cycles before the drawn ones."""
 
 ACROSS, CYCLES = 241, 16
-"""Values across a diagram, and cycles of each that are drawn."""
+"""Values across a diagram, and drawn cycles of each."""
 
 SHOWN = {
     "least position in a cycle": "low", "position on the section": "position",
     "velocity on the section": "velocity", "fastest impact in a cycle": "speed",
 }  # fmt: skip
-"""What a diagram can show upwards, with the array of a `Diagram`."""
+"""The choices of a diagram's ordinate, with the arrays of a `Diagram`."""
 
-# Steps of a slider; sliders at most that are made by themselves; seconds within which a redrawing
-# computes, which with marimo's work is below 0.2; cycles before what is drawn at most. Choices.
+# Steps of a slider; the most automatic sliders; seconds of computation for a redrawing, which with
+# marimo's work takes less than 0.2; the most cycles before the drawn ones. Choices.
 _STEPS, _MOST, _PATIENCE, _LONGEST = 400, 40, 0.1, 1000
 
-# Cycles before that are tried, to learn how long one takes; the fewest; and rounding of a slider.
+# Cycles for a measurement of the time of one; the fewest cycles; and rounding of a slider.
 _TRIED, _FEWEST, _ROUNDING = 40, 20, 1e-9
 
 WINDOW = 8
@@ -64,16 +64,16 @@ WINDOW = 8
 OBSERVED = 256
 """Drive cycles observed for the maps, the regime and the multipliers."""
 
-# As for scans but shorter, for a slider: choices.
+# As for scans, but shorter: choices.
 _REGIME = Regime(longest=32, observed=128, lasting=0)
 
-# Samples of a cycle; impacts of one that are drawn, and that enter the impact map.
+# Samples of a cycle; its impacts that are drawn, and those in the impact map.
 _SAMPLES, _DRAWN, _MAPPED = 48, 8, 4
 
-# Multipliers so near to 1 in size, or to the real axis, count as on it.
+# Multipliers this near to 1 in size, or to the real axis, count as on it.
 _NEUTRAL = 1e-7
 
-# Steps beyond which a motion is given up, so that no slider waits for long.
+# The most steps of a motion, so that no slider waits for long.
 _MOST_STEPS = 400_000
 
 
@@ -84,25 +84,25 @@ class Motion(NamedTuple):
     path: MotionPath
     """The motion over `WINDOW` cycles, with its impacts."""
     impact_phase: np.ndarray
-    """Crank angle of each impact observed (radians)."""
+    """Crank angle of each observed impact (radians)."""
     impact_speed: np.ndarray
-    """Speed V⁻ before each impact observed (unit: a ω)."""
+    """Speed V⁻ before each observed impact (unit: a ω)."""
     frequency_ratio: np.ndarray
-    """ζ of each cycle observed."""
+    """ζ of each observed cycle."""
     extremes: tuple[float, float]
-    """Smallest and greatest Y over the cycles observed."""
+    """Smallest and greatest Y over the observed cycles."""
     period: int
     """Period in drive cycles, or one of `REGIMES`."""
     impacts: float
-    """Impacts in a period; in a cycle, on average, where there is no period."""
+    """Impacts in a period; without a period, the mean per cycle."""
     multipliers: np.ndarray
-    """Floquet multipliers, the greatest first; none where there is no period."""
+    """Floquet multipliers, the greatest first; empty without a period."""
     exponent: float
-    """Greatest Lyapunov exponent where there is no period, else NaN."""
+    """Greatest Lyapunov exponent without a period, else NaN."""
     fault: str
-    """Why it could not be simulated; empty if it could."""
+    """The reason of a failure; empty after success."""
     places: tuple[np.ndarray, np.ndarray]
-    """Position and velocity on the sections of the cycles observed."""
+    """Position and velocity on the sections of the observed cycles."""
     quantities: dict[str, float]
     """The machine's own quantities on the last section, and its averages over the cycles."""
     window: Run
@@ -110,7 +110,7 @@ class Motion(NamedTuple):
 
     @property
     def regime(self) -> str:
-        """The regime in words: its period and impacts, or what has no period."""
+        """The regime in words: its period and impacts, or the kind of a motion without a period."""
         if self.period > 0:
             impacts = so_many(round(self.impacts), "impact")
             return f"period {cycles_in_words(self.machine, self.period)} with {impacts}"
@@ -124,7 +124,7 @@ class Motion(NamedTuple):
 
     @property
     def stability(self) -> str:
-        """The multipliers in words, or the exponent."""
+        """The multipliers, or the exponent, in words."""
         if self.period <= 0:
             if self.fault or not np.isfinite(self.exponent):
                 return ""
@@ -140,7 +140,7 @@ class Motion(NamedTuple):
 
 
 def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
-    """The motion after `settle` cycles; a start beyond a stop is moved onto it."""
+    """Return the motion after `settle` cycles; a start beyond a stop is moved onto it."""
     run, window, found, multipliers, places = _seen(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
     exponent = np.nan
@@ -173,7 +173,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
 
 @compiled
 def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
-    """The run observed, its first cycles sampled, its regime, multipliers and section points."""
+    """Return the observed run, its first cycles sampled, regime, multipliers, section points."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
     start = taken_along(scene, adopt(scene, start))
@@ -189,14 +189,14 @@ def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, 
 
 
 def seen_evenly(machine: AbstractMachine, state: State) -> AbstractMachine:
-    """The machine; one without a drive observed at equal intervals, where samples can be taken."""
+    """Return the machine; an autonomous one is observed at equal intervals, for samples."""
     if not is_autonomous(machine, state):
         return machine
     return machine.observed_every(jnp.asarray(machine.cycle))
 
 
 def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> jax.Array:
-    """Derivative of the map over the last `period` cycles, cycle by cycle."""
+    """Return the derivative of the map over the last `period` cycles, cycle by cycle."""
     the_map = cycle_map(scene, method=method)
     cycles = jnp.maximum(period, 0).astype(jnp.int32)
 
@@ -209,7 +209,7 @@ def _monodromy(scene: AbstractMachine, run: Run, period: Any, method: Any) -> ja
 
 
 def _exponent_of(scene: AbstractMachine, state: State) -> float:
-    """The greatest exponent; NaN for a machine that has none (a drift renewed on its section)."""
+    """Return the greatest exponent; NaN for a machine with a section and `renewed`."""
     try:
         return float(lyapunov(scene, state, _REGIME.observed, settle=0, number=1).exponents[0])
     except ValueError:
@@ -217,7 +217,7 @@ def _exponent_of(scene: AbstractMachine, state: State) -> float:
 
 
 class Control(NamedTuple):
-    """One slider: its label, its range, its step and its value when the page opens."""
+    """A slider: its label, range, step and first value."""
 
     label: str
     low: float
@@ -227,7 +227,7 @@ class Control(NamedTuple):
 
 
 class Diagram(NamedTuple):
-    """What motions from one start settle on, over one number; arrays of shape (values, cycles)."""
+    """Attractors from one start over one parameter; arrays of shape (values, cycles)."""
 
     label: str
     values: np.ndarray
@@ -240,11 +240,11 @@ class Diagram(NamedTuple):
 class Subject:
     """A machine whose numbers are sliders.
 
-    **Arguments:** the machine; ranges of some of its numbers and of its start (`"start.Y"`), which
-    go before those of its own `slider_ranges`, if it has such, and before those made here: from
-    zero to twice the value, within what the machine allows.
+    **Arguments:** `machine`; `ranges` of some of its numbers and of its start (`"start.Y"`). They
+    override the machine's own `slider_ranges`, if any, and the default: from zero to twice the
+    value, within the allowed range.
 
-    **Raises:** `ValueError` for a range of what it does not have, or that is none.
+    **Raises:** `ValueError` for a range of an unknown number, or a wrong range.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class Subject:
                                  f"but is of {name!r}.")  # fmt: skip
         first = sorted(numbers, key=lambda name: name not in given)[:_MOST]
         self.names = tuple(name for name in numbers if name in first)
-        """The machine's numbers that have sliders."""
+        """The names of the machine's numbers with sliders."""
         self.controls: dict[str, Control] = {}
         for name, value in {**{x: numbers[x] for x in self.names}, **begin}.items():
             low, high = _range_of(machine, name, value)
@@ -273,13 +273,13 @@ class Subject:
             self.controls[name] = Control(_label(machine, name, numbers), low, high, step, value)
         self.controls[SETTLE] = Control(SETTLE, 0.0, _LONGEST, 1.0, 0.0)
         self.before = 0
-        """Cycles before what a diagram shows; as many as fit, once one was made."""
+        """The cycles before the drawn ones of a diagram: as many as the time allows."""
         self._kept: tuple[Any, Any] = None, None
 
     def at(self, values: Mapping[str, Any]) -> tuple[AbstractMachine, Any]:
-        """Machine and start at these values of the sliders.
+        """Return machine and start at these values of the sliders.
 
-        **Raises:** `ValueError` for values that no slider has, or that the machine refuses.
+        **Raises:** `ValueError` for values outside of a slider, or that the machine does not allow.
         """
         for name, (label, low, high, _, _) in self.controls.items():
             x = values.get(name)
@@ -294,11 +294,12 @@ class Subject:
         return machine, with_leaves(self.start, begin)
 
     def seen(self, values: Mapping[str, Any]) -> Motion:
-        """The motion at these values of the sliders."""
+        """Return the motion at these values of the sliders."""
         return look(*self.at(values), int(values[SETTLE]))
 
     def compile(self, tell: Callable[[str], None]) -> None:
-        """Compile what the sliders need, and fit the cycles before to how long they take here."""
+        """Compile the programs of the sliders, and fit the number of cycles before the drawn ones
+        to their speed on this computer."""
         tell(f"compiling the {type(self.machine).__name__}")
         start = self.at(self.beginning())[1]
         _exponent_of(self.machine, look(self.machine, start, 0).window.last)
@@ -306,12 +307,12 @@ class Subject:
         self.controls[SETTLE] = Control(SETTLE, 0.0, float(fits), 1.0, float(min(300, fits)))
 
     def beginning(self) -> dict[str, float]:
-        """The first value of each slider, by name."""
+        """Return the first value of each slider, by name."""
         return {name: control.value for name, control in self.controls.items()}
 
     def diagram(self, values: Mapping[str, Any], parameter: str) -> Diagram:
-        """What motions from the start settle on over one of the machine's numbers; kept while the
-        others do not change. The first one is compiled."""
+        """Return the attractors from the start over one of the machine's numbers, kept while the
+        others do not change. The first call compiles."""
         key = [(name, x) for name, x in values.items() if name not in (parameter, SETTLE)]
         if self._kept[0] != (parameter, key):
             machine, start = self.at(values)
@@ -329,7 +330,7 @@ class Subject:
         return self._kept[1]
 
     def words(self, motion: Motion) -> dict[str, str]:
-        """What stands above the picture of a motion, by name."""
+        """Return the texts above the picture of a motion, by name."""
         units, (low, high) = self.machine.units, motion.extremes
         found = {"position": f"{low:.5g} … {high:.5g}"}
         found |= {name: f"{x:.5g}" for name, x in motion.quantities.items()}
@@ -344,8 +345,7 @@ _MOTOR = {"drive.control": (0.3, 2.5), "start.W": (0.1, 2.5), **_SCENE}
 
 
 def ready() -> dict[str, Callable[[], Subject]]:
-    """What the page's menu offers: the paper's scene, and the ready machines that can be made
-    without numbers."""
+    """Return the machines of the menu: the paper's scene, and ready machines with all defaults."""
     ideal, motor = Scene.ideal(frequency_ratio=0.9, damping_ratio=0.01), Parameters().scene()
     found: dict[str, Callable[[], Subject]] = {
         "Scene, ideal drive": lambda: Subject(ideal, _IDEAL),
@@ -361,7 +361,7 @@ def ready() -> dict[str, Callable[[], Subject]]:
 
 
 def _label(machine: AbstractMachine, name: str, numbers: Mapping[str, Any]) -> str:
-    """The field's symbol for a number, or its name where another number has the same symbol."""
+    """Return the field's symbol of a number, or its name if another number has the same symbol."""
     if name.startswith(START):
         return f"start {axis_name(name.removeprefix(START), machine.units)}"
     label = axis_name(name, machine.units)
@@ -370,7 +370,7 @@ def _label(machine: AbstractMachine, name: str, numbers: Mapping[str, Any]) -> s
 
 
 def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
-    """From zero to twice the value (-1 to 1 of zero), within what the machine allows."""
+    """Return the range from zero to twice the value (-1 to 1 for zero), as far as allowed."""
     low, high = sorted((0.0, 2 * value)) if value else (-1.0, 1.0)
     if name.startswith(START):
         reach = max(2 * abs(value), 2.0)
@@ -392,8 +392,8 @@ def _range_of(machine: object, name: str, value: float) -> tuple[float, float]:
 
 
 def _grid(low: float, high: float, value: float) -> tuple[float, float]:
-    """The first place of a slider and its step, which is 1, 2 or 5 times a power of ten if the
-    value is a multiple of that; the value is among its places, or the page would move it."""
+    """Return the first value of a slider and its step: 1, 2 or 5 times a power of ten, if the value
+    is a multiple of that. The value is on the grid: otherwise the page would move it."""
     rough = (high - low) / _STEPS
     power = 10.0 ** np.floor(np.log10(rough))
     step = float(power * max(digit for digit in (1, 2, 5) if digit * power <= 1.001 * rough))
@@ -406,8 +406,8 @@ def _grid(low: float, high: float, value: float) -> tuple[float, float]:
 
 
 def _fitting(do: Callable[[int], Any]) -> int:
-    """How many cycles before are done in the time that a redrawing may take."""
-    # Seconds of the processor, since other programs delay it.
+    """Return the number of cycles that can be computed in the time for a redrawing."""
+    # Processor time, which other programs do not delay.
     twice: Any = {"timer": time.process_time, "number": 1, "repeat": 2}
     seconds = lambda cycles: min(timeit.repeat(lambda: do(cycles), **twice))
     do(0)  # compiles

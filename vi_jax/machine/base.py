@@ -399,9 +399,9 @@ class AbstractMachine(Shown):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """The units by name: of `position`, `velocity`, `time`, `rate` (of exponents), `energy`,
-        `power`, and of each parameter and component of the state. "1" is dimensionless, and "" is
-        the name of all others. By default they are those of `labels` and fields' metadata."""
+        """The units of `position`, `velocity`, `time`, `rate` (of exponents), `energy`, `power`,
+        and each parameter and component of the state, by name. "1" is dimensionless, and "" is the
+        name of all others. The defaults are in `labels` and fields' metadata."""
         found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
         own = {**dict(found), **fields_with(type(self), "unit")}
         return {x: unit for x, unit in own.items() if unit}

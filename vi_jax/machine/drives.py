@@ -300,8 +300,9 @@ class Motor(AbstractDrive):
     def torque(
         self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
-        """Return the motor's torque (per J ω²), and the rates of the components after W. By crank
-        angle, `pace` is 1/W, and the function `paced` divides both by W."""
+        """Return the motor's torque (per J ω²), and the rates of the components after W. If the
+        crank angle is the independent variable, `pace` is 1/W, and the function `paced` divides by
+        W."""
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):

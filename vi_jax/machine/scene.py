@@ -510,7 +510,7 @@ class Parameters(Shown):
     Each number may be a quantity of `pint`, in any unit of its kind.
 
     The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
-    ε = m_C a²/J. Those of the motor are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`,
+    ε = m_C a²/J. For the motor they are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`,
     τe = ωL/R. The crank has λ = a/l. A motor with constants K_t, K_e at voltage u has κT0 = K_t
     u/R, κΩ0 = u/K_e.
     """

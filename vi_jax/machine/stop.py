@@ -327,9 +327,10 @@ class SoftStop(Wall, AbstractSwitch):
     """A compliant stop: pushes the body back while it penetrates by δ > 0.
 
     The force on a body of mass m is the prestress F0 plus that of its law. The default law is
-    `PowerLaw`, K δᵖ + α √(K m) δ^((p-1)/2) δ'. A spring with a dashpot has p = 1, Hertz's contact p
-    = 3/2. Its coefficient of restitution does not depend on the speed, so that `restitution` may be
-    given instead of `damping`. That of `HuntCrossley`, K δᵖ (1 + α δ'), decreases with speed.
+    `PowerLaw`, K δᵖ + α √(K m) δ^((p-1)/2) δ'. A spring with a dashpot has p = 1, Hertz's contact
+    p = 3/2. Its coefficient of restitution does not depend on the speed, so that `restitution` may
+    be given instead of `damping`. The restitution by `HuntCrossley`, K δᵖ (1 + α δ'), decreases
+    with speed.
 
     With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
     order δ^((p-1)/2). Adaptive steps (`Adaptive`) follow it, fixed ones lose their order there. The

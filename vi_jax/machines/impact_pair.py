@@ -42,9 +42,9 @@ class ImpactPair(PhaseMachine, Mechanical):
     relative speed and scales it by e, and conserves the momentum of both. The independent variable
     is s = ωt, a cycle 2π.
 
-    With the prescribed box and σ = (1 - e)/(1 + e), the symmetric motion with one impact at each
-    wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed of approach
-    2w/(1 + e). Its fold is at λ = √(1 + π²/(4σ²)), and it loses its symmetry at
+    Let the motion of the box be prescribed and σ = (1 - e)/(1 + e). The symmetric motion with one
+    impact at each wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed
+    of approach 2w/(1 + e). Its fold is at λ = √(1 + π²/(4σ²)), and it loses its symmetry at
     λ = (π/2 - 2/π)/√(4/π² + σ²) (Heiman, Bajaj and Sherman, Journal of Sound and Vibration 124,
     1988).
 

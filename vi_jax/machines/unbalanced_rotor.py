@@ -37,8 +37,8 @@ class TimedRotorState(RotorState):
 
 
 class UnbalancedRotor(ShaftMachine, PhaseMachine):
-    """A body of mass M on a spring k and a damper c, on which a motor of limited power turns a
-    rotor with an unbalance m at the radius r; between stops, if `gap` is given.
+    """A body of mass M on a spring k and a damper c, with a motor of limited power that turns a
+    rotor with an unbalance m at the radius r. If `gap` is given, the body moves between stops.
 
     With the body's displacement Y in units of m r/M, time τ = ω t, ω² = k/M, and the rotor's speed
     W = dφ/dτ:

@@ -148,8 +148,8 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The displacements of the beak and of the sleeve's upper edge towards the pole, and the
-        heights of an edge of the sleeve and of the beak, all in metres, so that forces are in N."""
+        """The displacements of beak and upper edge of the sleeve towards the pole, and the heights
+        of a sleeve's edge and of the beak. All are in metres, so that forces are in N."""
         beak = self.bird_arm - self.beak_arm
         gaps = (
             lambda q: self.beak_height * q.bird_angle,

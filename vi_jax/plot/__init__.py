@@ -1,4 +1,4 @@
-"""Pictures of motions: every function takes an `ax`, or makes one, and returns it; animations."""
+"""Pictures and animations of motions. Every function draws into `ax`, or a new figure."""
 
 from ._animate import MotionAnimation as MotionAnimation
 from ._animate import animate as animate

@@ -1,4 +1,4 @@
-"""Animations: a machine that moves above its time history."""
+"""Animations: a machine in motion above its time history."""
 
 from math import ceil
 from pathlib import Path
@@ -20,18 +20,18 @@ from .colors import BLUE, RED
 from .motion import counts_by_angle, drawn_path, motion_path, plot_history, turns
 from .schematic import pen_for, sketch
 
-# Samples of a cycle that an orbit is drawn with; seconds that a cycle takes, and most in all.
+# Samples of a cycle of an orbit; seconds per cycle, and at most in all.
 _SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
-# Frames by which the room that a drawing takes is measured.
+# Frames from which the limits of the drawing are computed.
 _MEASURED = 12
-# Inches: of a figure, and what the time history takes of its height.
+# Inches: the width of a figure, and the height of the time history.
 _WIDE, _BELOW = 7.2, 2.1
-# Pictures within an HTML file may take so much: MB.
+# The largest size of the pictures in an HTML file, MB.
 _MOST = 50.0
 
 
 class _Frames(NamedTuple):
-    """What is drawn, one row for each frame: cycles, states, and positions by coordinate."""
+    """The data of all frames as rows: cycles, states, and positions by coordinate."""
 
     cycles: np.ndarray
     states: Any
@@ -50,25 +50,24 @@ def animate(
 ) -> "MotionAnimation":
     """Animate a motion: the machine moves above its time history.
 
-    Shown in a notebook as it is; `animation.save("motion.gif")` writes a file.
+    A notebook shows the result; `animation.save("motion.gif")` writes a file.
 
     **Arguments:**
 
-    - `motion`: a `Run` simulated with `samples=...` (and `impact_log=...`, so that impacts are met
-      where they are), or an `Orbit`, of which one period is drawn.
-    - `machine`: the machine; needed for a run, and left out for an orbit, which has its own. How it
-      is drawn: see `plot_sketch`.
+    - `motion`: a `Run` simulated with `samples=...` (and `impact_log=...`, for exact corners at
+      impacts), or an `Orbit`, of which one period is drawn.
+    - `machine`: the machine; needed for a run, and left out for an orbit, which contains it. For
+      the drawing, see `plot_sketch`.
     - `window`: the first and the last cycle to draw.
-    - `seconds`: how long it lasts; by default 2.5 s per cycle, up to 12 s.
+    - `seconds`: the duration; by default 2.5 s per cycle, up to 12 s.
     - `fps`: frames per second.
     - `history`: whether to draw the time history below.
-    - `figure`: an empty figure to draw into, one of pyplot's to see it in a window; by default a
-      new one.
+    - `figure`: an empty figure to draw into, one of pyplot's for a window; by default a new one.
 
-    **Returns:** a `MotionAnimation`, which is one of matplotlib's.
+    **Returns:** a `MotionAnimation`, a subclass of matplotlib's `FuncAnimation`.
 
-    **Raises:** `TypeError` if `motion` is no motion; `ValueError` for a motion without samples, a
-    batch, a failed motion, or numbers out of range.
+    **Raises:** `TypeError` if `motion` is not a motion; `ValueError` for a motion without samples,
+    a batch, a failed motion, or numbers out of range.
     """
     instance_of("motion", motion, (Run, Orbit), "a `Run` or an `Orbit`")
     fps = count("fps", fps, least=1, most=100)
@@ -102,7 +101,7 @@ def animate(
 def _frames(
     run: Run, machine: AbstractMachine, path: Any, good: np.ndarray, number: int
 ) -> _Frames:
-    """Frames evenly spaced in time, interpolated between the points that are `good`."""
+    """Return frames evenly spaced in time, interpolated between the points that are `good`."""
     samples = run.samples
     assert samples is not None
     cycles, time = (np.asarray(x, float) for x in (samples.cycles, samples.time))
@@ -117,7 +116,7 @@ def _frames(
         return np.stack(rows, axis=-1).reshape(-1, *x.shape[1:])
 
     states = jax.tree_util.tree_map(between, samples.state)
-    # The corners of the paths at their impacts, which no samples have.
+    # The corners of the paths at impacts, which samples do not contain.
     for k in sorted({0, *(stop.coordinate for stop in stops_of(machine))}):
         one = motion_path(run, machine=machine, coordinate=k)
         known = np.isfinite(one.Y)
@@ -128,9 +127,9 @@ def _frames(
 
 
 class MotionAnimation(animation.FuncAnimation):
-    """An animation of a motion; made by `animate`.
+    """An animation of a motion, from `animate`.
 
-    Shown in a notebook as it is, saved by `save`; `draw(i)` gives one frame.
+    A notebook shows it, `save` writes it to a file, and `draw(i)` returns one frame.
     """
 
     def __init__(
@@ -157,14 +156,14 @@ class MotionAnimation(animation.FuncAnimation):
         super().__init__(
             figure, self._draw, frames=len(frames.cycles), interval=1000 / fps, repeat=True
         )
-        # matplotlib warns of an animation that is never shown; here that is no mistake.
+        # No warning of matplotlib of an animation that is never shown.
         self._draw_was_started = True
 
     def __len__(self) -> int:
         return len(self._frames.cycles)
 
     def draw(self, index: int) -> Figure:
-        """The figure at one frame, a still picture."""
+        """Return the figure at one frame, a still picture."""
         self._draw(range(len(self))[index])
         return self._figure
 
@@ -188,7 +187,7 @@ class MotionAnimation(animation.FuncAnimation):
         sketch(machine, pen_for(machine, self._above, frames.positions), state, phase)
 
     def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The room that all frames take, so that none of them moves the others."""
+        """Return the limits of all frames, so that the picture does not move."""
         places = self._frames.positions
         number = places.shape[1]
         chosen = {int(f(row)) for row in places for f in (np.argmin, np.argmax)}
@@ -206,8 +205,8 @@ class MotionAnimation(animation.FuncAnimation):
     def save(self, filename: str | Path, writer: Any = None, **options: Any) -> None:  # pyright: ignore
         """Write a file by one of matplotlib's writers.
 
-        **Arguments:** the file; the `writer`, by default Pillow for a `.gif`, an HTML page for an
-        `.html`, and ffmpeg for anything else, where it is installed; options of matplotlib's
+        **Arguments:** `filename`; `writer`, by default Pillow for a `.gif`, an HTML page for an
+        `.html`, and ffmpeg, if installed, for anything else; options of matplotlib's
         `Animation.save`.
         """
         kinds = {".gif": animation.PillowWriter, ".html": animation.HTMLWriter}
@@ -219,7 +218,7 @@ class MotionAnimation(animation.FuncAnimation):
 
 
 class _History:
-    """The time history with what has passed drawn over it."""
+    """The time history, with the past part drawn over it."""
 
     def __init__(self, ax: Axes, run: Run, machine: AbstractMachine, frames: _Frames):
         unit = "angle" if counts_by_angle(machine) else "cycles"
@@ -238,7 +237,7 @@ class _History:
         ax.spines[["top", "right"]].set_visible(False)
 
     def move(self, index: int) -> None:
-        """Draw the course up to the frame of this index."""
+        """Draw the motion up to the frame with this index."""
         place, Y = self._factor * self._frames.cycles[index], self._dots[index]
         passed = self._place <= place
         self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])

@@ -1,9 +1,9 @@
-"""The looks of all pictures: colours that are distinct with any colour vision, marks, widths.
+"""Styles of all pictures: colours that are distinct with any colour vision, marks, widths.
 
-A colour stands for a period, and for the same period everywhere; what has no period is grey. They
-are of the sets of Okabe and Ito and of Paul Tol, put in such an order that each differs from those
-before it, in lightness too, as seen with normal and with each kind of dichromatic vision (a test
-measures by how much). Bifurcations differ by mark and dash, so that they need no colour.
+A colour stands for the same period in all pictures; motions without a period are grey. The colours
+are from the sets of Okabe and Ito and of Paul Tol. Their order is such that each differs from those
+before it, also in lightness, with normal and with each kind of dichromatic vision (a test measures
+the differences). Bifurcations differ by mark and dash, so that they need no colour.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,18 +17,18 @@ from matplotlib.lines import Line2D
 
 from ..scans import REGIMES
 
-# By period in drive cycles: 2π, 4π, ...; a period beyond the list has the last one.
+# The colours of periods 2π, 4π, ... (drive cycles); longer periods have the last one.
 PERIODS = (
     "#0072b2", "#e69f00", "#882255", "#66ccee", "#332288", "#ddcc77", "#d55e00", "#5e3c99",
     "#cc79a7",
 )  # fmt: skip
-# The 4π motions that hit more than once: darker, as they are another family.
+# The 4π motions with several impacts: darker, as they are another family.
 MORE_IMPACTS = "#a3480b"
 
-# Outcomes with which events end a motion, by number; no period has these.
+# Outcomes with which events end a motion, by number; periods have other colours.
 OUTCOMES = ("#009e73", "#aaaa00", "#ee8866", "#99ddff")
 
-# The less regular, the darker; what failed is white.
+# Less regular motions are darker; failed lanes are white.
 IRREGULAR = {
     REGIMES.unsettled: "#b9b9b9",
     REGIMES.transient: "#7f7f7f",
@@ -96,14 +96,14 @@ def color_of(cycles: int, impacts: float | int | None = None) -> str:
 
 
 def distinct_colors(motions: Iterable[tuple[int, float]]) -> list[str]:
-    """Colours of motions by their periods and impacts, further ones of a kind in other shades."""
+    """Return colours of motions by periods and impacts, in other shades for more of a kind."""
     kinds: dict[str, Iterator[str]] = {}
     colors = (color_of(int(cycles), float(impacts)) for cycles, impacts in motions)
     return [next(kinds.setdefault(color, _shades(color))) for color in colors]
 
 
 def _shades(color: str) -> Iterator[str]:
-    """The colour, and then others of its hue for further motions of the same kind."""
+    """Yield the colour, and then other shades of it for further motions of the same kind."""
     yield color
     while True:
         for part in (0.7, 0.35):
@@ -123,18 +123,18 @@ def mark_of(kind: str, **style: Any) -> Line2D:
 
 
 def mark_style(kind: str) -> dict[str, Any]:
-    """Options of `Axes.plot` for a special point."""
+    """Return options of `Axes.plot` for a special point."""
     marker, fill = MARKS[kind]
     size = {"*": 9.0, "X": 7.0, "P": 7.0}.get(marker, 7.0 if "$" in marker else 5.0)
     return {"marker": marker, "mfc": fill, "mec": "k", "mew": 0.8, "ms": size, "ls": "none"}
 
 
 def once(ax: Axes, label: str) -> str | None:
-    """The label, unless something in the axes has it."""
+    """Return the label, or `None` if the axes have it already."""
     return None if label in ax.get_legend_handles_labels()[1] else label
 
 
 def thick(points: float) -> float:
-    """A line's width, thinner or thicker as lines are set to be."""
+    """Return the width of a line, scaled with matplotlib's setting of line widths."""
     name: Any = "lines.linewidth"
     return points * matplotlib.rcParams[name] / matplotlib.rcParamsDefault[name]

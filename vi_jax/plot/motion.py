@@ -41,11 +41,11 @@ from .colors import BLUE, STOP, once, thick
 
 
 def new_axes(ax: Axes | None) -> Axes:
-    """`ax`, or the axes of a new figure, of the size that was set for figures if one was."""
+    """Return `ax`, or the axes of a new figure, with the size that the user has set, if any."""
     if ax is not None:
         instance_of("ax", ax, Axes, "one `Axes` of matplotlib")
         return ax
-    import matplotlib.pyplot as plt  # only here, so that drawing into given axes has no state
+    import matplotlib.pyplot as plt  # only here: given axes need no global state
 
     own = rcParams["figure.figsize"] != rcParamsDefault["figure.figsize"]
     size = None if own else (7, 3.5)
@@ -56,11 +56,11 @@ class MotionPath(NamedTuple):
     """Points of a motion in their order, as NumPy arrays of one length."""
 
     cycles: np.ndarray
-    """Place on the drive's clock, in cycles since the start (crank angle over 2π)."""
+    """Clock of the drive, in cycles since the start (crank angle over 2π)."""
     Y: np.ndarray
-    """Position: what the stops limit (unit: the machine's; a for a `Scene`)."""
+    """Position, which stops limit (unit: the machine's; a for a `Scene`)."""
     V: np.ndarray
-    """Velocity: what an impact reverses (unit: the machine's; a ω for a `Scene`)."""
+    """Velocity, which an impact reverses (unit: the machine's; a ω for a `Scene`)."""
 
 
 def motion_path(
@@ -72,10 +72,10 @@ def motion_path(
 ) -> MotionPath:
     """Return the path of one sampled motion.
 
-    **Arguments:** a `Run` simulated with `samples=...` (or its `Samples`); with the `machine`, the
-    impacts logged (`impact_log=...`) enter as two points each, before and after the impact, so
-    that a corner at the stop is drawn where it is; `window`, the first and the last cycle to keep;
-    `coordinate`, the number or the name of the coordinate whose path it is, with its own impacts.
+    **Arguments:** `motion`, a `Run` simulated with `samples=...` (or its `Samples`); `machine`,
+    with which each logged impact (`impact_log=...`) adds two points, before and after it, for exact
+    corners at stops; `window`, the first and the last cycle to keep; `coordinate`, by number or by
+    name, with its own impacts.
 
     **Raises:** `ValueError` if the run has no samples or is a batch, if its states lack `Y` and `V`
     without a machine that replaces them, or for an unknown coordinate.
@@ -116,8 +116,8 @@ def motion_path(
 def drawn_path(
     motion: Run | Samples, *, machine: AbstractMachine | None, **about: Any
 ) -> MotionPath:
-    """The path that a picture draws: that of an angle lies within a turn, and its line is broken
-    where it passes half a turn. Arguments and errors are those of `motion_path`."""
+    """Return the path for a picture: an angle is reduced to a turn, and its line is broken where it
+    passes half a turn. Arguments and errors are those of `motion_path`."""
     path = motion_path(motion, machine=machine, **about)
     if machine is None or not turns(motion, machine, about["coordinate"]):
         return path
@@ -129,7 +129,7 @@ def drawn_path(
 
 
 def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
-    """Whether a coordinate is one of the machine's angles, of `wrap_angles` or `turn_of`."""
+    """Return whether a coordinate is an angle of `wrap_angles` or `turn_of`."""
     samples = motion.samples if isinstance(motion, Run) else motion
     assert samples is not None
     Y = _course(machine, coordinate_of(machine, coordinate), samples.state)[0]
@@ -141,8 +141,8 @@ def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str
 
 
 def _course(machine: AbstractMachine | None, k: int | str, states: Any) -> tuple[Any, Any]:
-    """Position and velocity of states by coordinate number k, or the component of that name;
-    without a machine their components `Y` and `V`."""
+    """Return position and velocity of states by coordinate number k, or the component with that
+    name; without a machine `Y` and `V`."""
     if isinstance(k, str):
         rate = f"v.{k}"  # of a `Mechanical`
         return jax.vmap(
@@ -158,7 +158,7 @@ def _by_number(machine: AbstractMachine, k: int, states: Any) -> tuple[Any, Any]
 
 
 def coordinate_of(machine: AbstractMachine | None, coordinate: int | str) -> int | str:
-    """The number of a coordinate, also by its name; the name of one that no contact limits.
+    """Return the number of a coordinate, also by its name, or the name if no contact limits it.
     **Raises:** `ValueError` for a number that the machine does not have."""
     if isinstance(coordinate, str):
         number = None if machine is None else number_on(machine, coordinate)
@@ -180,7 +180,7 @@ def _with_impacts(
     if not stop.size:
         return path
     length = np.full(run.impacts.shape, float(logged_turn(machine)))
-    if is_autonomous(machine, run.last):  # whose cycles are of several lengths
+    if is_autonomous(machine, run.last):  # cycles of different lengths
         length = np.asarray(run.duration)
     at = cycle + np.asarray(log.phase)[logged] / length[cycle]
     speed = np.asarray(log.speed)[logged]
@@ -197,7 +197,7 @@ def _with_impacts(
 
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
-    """Whether a machine states its periods in crank angle, as the paper's does (and none given)."""
+    """Return whether periods are in crank angle, as for the paper's machine or `None`."""
     return machine is None or cycles_in_words(machine, 1) == "2π"
 
 
@@ -220,11 +220,11 @@ def plot_history(
 
     - `motion`: a `Run` simulated with `samples=...`, or its `Samples`.
     - `machine`: the machine, for its stops and for impacts logged in the run.
-    - `ax`: axes to draw into; a new figure if left out.
+    - `ax`: axes to draw into; by default a new figure.
     - `window`: the first and the last cycle to draw.
-    - `shift`: cycles by which to move the motion along the axis.
+    - `shift`: the number of cycles by which to move the motion along the axis.
     - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
-      `machine`, which is the angle for the paper's machine and where no machine is given.
+      `machine`, which is the angle for the paper's machine or without a machine.
     - `stops`: whether to draw the stops.
     - `coordinate`: the coordinate to draw, by number or by name, with its own stops and impacts.
     - `style`: options of `Axes.plot`.
@@ -251,7 +251,7 @@ def plot_history(
 def _draw_stops(
     machine: AbstractMachine, coordinate: int | str, ax: Axes, line: Callable[..., Any]
 ) -> None:
-    """Draw rigid stops as thick lines, and soft ones, which the body goes into, as dashed ones."""
+    """Draw rigid stops as thick lines, and soft ones as dashed lines."""
     for stop in all_stops(machine, coordinate):
         look = {"lw": thick(1.8), "label": once(ax, "stop")}
         if isinstance(stop, SoftStop):
@@ -260,7 +260,7 @@ def _draw_stops(
 
 
 def all_stops(machine: AbstractMachine, coordinate: int | str | None = None) -> list[Any]:
-    """The rigid and then the soft stops of a machine; of one coordinate, if it is given."""
+    """Return the rigid and then the soft stops of a machine, or of one coordinate."""
     soft = (switch for switch in switches_of(machine) if isinstance(switch, SoftStop))
     both = (*stops_of(machine), *soft)
     return [stop for stop in both if coordinate is None or stop.coordinate == coordinate]
@@ -269,13 +269,13 @@ def all_stops(machine: AbstractMachine, coordinate: int | str | None = None) -> 
 def _labels(
     motion: Run | Samples, machine: AbstractMachine | None, coordinate: int | str
 ) -> tuple[str, str]:
-    """The names of position and velocity, with units; samples do not know their machine."""
+    """Return the names of position and velocity, with units; samples have no machine."""
     if machine is None:
         return motion.labels if isinstance(motion, Run) else ("Y", "V")
     names, labels = PLAIN, machine.labels
     if isinstance(coordinate, str):
         names = labels = (coordinate, f"v.{coordinate}")
-    elif coordinate:  # the machine's words are those of the first
+    elif coordinate:  # the machine's labels are for the first
         plain = tuple(f"{name} of coordinate {coordinate}" for name in PLAIN)
         labels = names_on(machine, coordinate) or plain
     position, velocity = (
@@ -286,7 +286,7 @@ def _labels(
 
 
 def angle_axis(ax: Axes, *, every: int = 1) -> None:
-    """Label an axis that counts the crank angle in units of π, at multiples of `every`."""
+    """Label an axis with the crank angle in units of π, at multiples of `every`."""
     ax.set_xlabel("crank angle φ")
     ax.xaxis.set_major_locator(MultipleLocator(every))
     ax.xaxis.set_major_formatter(FuncFormatter(_multiple_of_pi))
@@ -309,8 +309,8 @@ def plot_phase_portrait(
 ) -> Axes:
     """Draw velocity over position, with the stops as lines (dashed if soft) and sections as dots.
 
-    **Arguments:** as for `plot_history`; `sections` marks the state after each whole cycle. An
-    impact is the vertical line along the stop from V to -k V (if the run has an impact log).
+    **Arguments:** as for `plot_history`; `sections`, whether to mark the state after each whole
+    cycle. With an impact log, an impact is the vertical line along the stop from V to -k V.
     """
     path = drawn_path(motion, machine=machine, window=window, coordinate=coordinate)
     ax = new_axes(ax)

@@ -1,5 +1,5 @@
-"""Pictures of periodic motions, in the field's conventions: branches of them, sweeps, boundaries,
-multipliers, a saddle's manifolds, and what a grazing leads to."""
+"""Pictures of periodic motions: branches, sweeps, boundaries, multipliers, a saddle's manifolds,
+and attractors near a grazing."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -33,20 +33,20 @@ from ..scans import REGIMES, Sweep
 from .colors import BLUE, DASHES, IRREGULAR, MARKS, RED, color_of, mark_style, once, thick
 from .motion import new_axes
 
-# Names of lines in a legend, and where dots lie: above lines and below the marks.
+# Names of lines in a legend, and the order of dots: above lines and below marks.
 _STABLE, _UNSTABLE = "stable", "unstable"
 _DOTS = 3
 
-# Of a segment along which an angle passes half a turn, where it begins again: no line is drawn.
+# Segments along which an angle passes half a turn are not drawn.
 _NONE = 2
 
-# Sections drawn at each value of the parameter, the last ones: more would only lie on each other.
+# Sections drawn at each value of the parameter, the last ones: more would coincide.
 _DRAWN = 64
 
-# Marks on the axis, which its scale would let run into each other.
+# Ticks of the axis: with its scale, more would overlap.
 _TICKS = 5
 
-# At most so many motions are named in the legend.
+# The largest number of motions named in the legend.
 _NAMED = 8
 
 
@@ -62,21 +62,21 @@ def plot_branch(
 ) -> Axes:
     """Draw a branch: stable parts solid, unstable ones dashed, special points marked.
 
-    Its colour is that of its period, as in all pictures; a motion of two cycles with several
-    impacts has another than one with a single impact.
+    The colour is that of its period, as in all pictures. A motion of two cycles with several
+    impacts has another colour than one with a single impact.
 
-    **Arguments:** the branch; `ax`, a new figure if left out; `y` and `x`, names of columns of the
-    branch (`Branch.column_names`): `"duration"`, `"section_Y"`, or an average of the machine's such
-    as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that is not fixed by a stop);
-    `special`, whether to mark the special points; `legend`, whether to draw one: the period and the
-    impacts that the colour stands for (or the branch's `label`), what solid and dashed lines are,
-    and the marks; options of `Axes.plot`.
+    **Arguments:** `branch`; `ax`, by default a new figure; `y` and `x`, names of columns of the
+    branch (`Branch.column_names`): `"duration"`, `"section_Y"`, or one of the machine's averages
+    such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that a stop does not
+    fix); `special`, whether to mark the special points; `legend`, whether to draw one with the
+    period and the impacts of the colour (or the branch's `label`), the meaning of solid and dashed
+    lines, and the marks; options of `Axes.plot`.
     """
     instance_of("branch", branch, Branch, "a `Branch`, from `continue_orbit`")
     y = _moving(branch) if y is None else y
     across, up = _array(branch, "x", x), _array(branch, "y", y)
     ax = new_axes(ax)
-    # Points where stability changes are points of the branch: there rounding decides.
+    # At changes of stability, which are points of the branch, rounding decides.
     inside = np.abs(branch.multipliers).max(axis=1) < 1 + 1e-6
     stable = inside[1:] & inside[:-1]
     angles = [z for name, z in ((x, across), (y, up)) if _is_angle(branch, name)]
@@ -114,14 +114,14 @@ def _is_angle(branch: Branch, name: str) -> bool:
 
 
 def _moving(found: Branch | Sweep) -> str:
-    """The extreme that varies: the other one may be a stop's place. The least if neither does."""
+    """Return the name of the extreme that varies; the other one may be fixed by a stop."""
     extremes = np.asarray(found.y_min), np.asarray(found.y_max)
     low, high = (np.ptp(x) > 1e-9 * np.abs(extremes).max() for x in extremes)
     return "y_max" if high and not low else "y_min"
 
 
 def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
-    """An array with a number for each point. **Raises:** `ValueError` that lists them."""
+    """Return an array with a number for each point. **Raises:** `ValueError` with their names."""
     if isinstance(found, Branch):
         return found.column(one_of(argument, name, found.column_names))
     arrays = {
@@ -133,7 +133,7 @@ def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
 
 
 def _legend(ax: Axes) -> None:
-    """Branches first, then their lines, then the marks."""
+    """Draw a legend: branches first, then their lines, then the marks."""
     named = list(zip(*ax.get_legend_handles_labels(), strict=True))
     named.sort(key=lambda x: 2 if x[1] in MARKS else x[1] in (_STABLE, _UNSTABLE))
     if named:
@@ -142,7 +142,7 @@ def _legend(ax: Axes) -> None:
 
 
 def _stretches(kinds: np.ndarray) -> list[tuple[int, int, int]]:
-    """First and last point (exclusive) and kind of each stretch of like segments."""
+    """Return the first and last point (exclusive) and the kind of each part with equal segments."""
     edges = [0, *(np.flatnonzero(np.diff(kinds.astype(int))) + 1), len(kinds)]
     return [(int(a), int(b) + 1, int(kinds[a])) for a, b in itertools.pairwise(edges)]
 
@@ -152,8 +152,8 @@ def plot_sweep(
 ) -> Axes:
     """Draw a sweep as dots, one for each value, above the branches in the same axes.
 
-    **Arguments:** one sweep; `ax`; names of its arrays with a number for each value, as for
-    `plot_branch`; options of `Axes.plot`.
+    **Arguments:** `sweep`; `ax`; `y` and `x`, names of its arrays with a number for each value, as
+    for `plot_branch`; options of `Axes.plot`.
     """
     instance_of("sweep", sweep, Sweep, "a `Sweep`, from `sweep`")
     y = _moving(sweep) if y is None else y
@@ -173,13 +173,13 @@ def plot_boundary(
 ) -> Axes:  # fmt: skip
     """Draw a boundary curve in its two parameters, with points of codimension two.
 
-    Its colour is that of the motion's period, its dash shows what happens there: solid a grazing,
-    dashed a period doubling, dash-dotted a fold, with two dots a Neimark–Sacker bifurcation, dotted
-    a loss of symmetry or a branch point.
+    The colour is that of the motion's period, the dash that of the bifurcation: solid for a
+    grazing, dashed for a period doubling, dash-dotted for a fold, with two dots for a
+    Neimark–Sacker bifurcation, dotted for a loss of symmetry or a branch point.
 
-    **Arguments:** the curve; `ax`; `special`, whether to mark the points of codimension two;
-    `legend`, whether to draw one: what the dash means (or the curve's `label`), and the marks;
-    options of `Axes.plot`.
+    **Arguments:** `curve`; `ax`; `special`, whether to mark the points of codimension two;
+    `legend`, whether to draw one with the meaning of the dash (or the curve's `label`) and the
+    marks; options of `Axes.plot`.
     """
     instance_of("curve", curve, Boundary, "a `Boundary`, from `boundary`")
     ax = new_axes(ax)
@@ -202,8 +202,7 @@ def plot_boundary(
 def extreme_name(
     name: str, labels: tuple[str, str], units: Mapping[str, str], averages: Any = ()
 ) -> str:
-    """The label of an axis of smallest or greatest positions, in the machine's words, or of an
-    average of the machine's own."""
+    """Return the machine's label of an axis of smallest or greatest positions, or of an average."""
     if name in averages:
         return in_brackets(f"mean {name}", unit_of(units, name))
     least = {"y_min": "min", "y_max": "max"}.get(name)
@@ -236,8 +235,8 @@ def plot_multipliers(
 ) -> Axes:
     """Draw Floquet multipliers in the complex plane with the unit circle: stable if all lie inside.
 
-    **Arguments:** an `Orbit` (or a batch of them, or a list); `ax`, axes to draw into, a new
-    figure if left out; options of `Axes.plot`.
+    **Arguments:** `orbits`, an `Orbit` (or a batch of them, or a list); `ax`, by default a new
+    figure; options of `Axes.plot`.
     """
     listed = [orbits] if isinstance(orbits, Orbit) else tuple_of("orbits", orbits, Orbit)
     for orbit in listed:
@@ -261,8 +260,8 @@ def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> A
 
     The saddle is a cross.
 
-    **Arguments:** what `manifold` found; `ax`, axes to draw into, as those of `plot_basins`, a new
-    figure if left out; options of `Axes.plot`.
+    **Arguments:** `found`, the result of `manifold`; `ax`, such as that of `plot_basins`, by
+    default a new figure; options of `Axes.plot`.
     """
     own = ax is None
     ax = new_axes(ax)
@@ -284,14 +283,14 @@ def plot_grazing(
 ) -> Axes:
     """Draw the attractor of a local map above the simulated motions of the machine.
 
-    The axis is the parameter, less its value at the grazing, scaled by the square root, so motions
-    that grow as the root lie between straight lines; upwards the first coordinate on the section,
-    less that of the motion without impact. The machine's attractor is in pale rings (if it was
-    simulated), the forecast's in dots of the colour of its period, chaos dark. If nothing near
-    attracts, grey dots are the far motion of the machine, `found.far`.
+    The axis is the parameter minus its value at the grazing, scaled by the square root, so motions
+    that grow as the root lie between straight lines. The ordinate is the first coordinate on the
+    section minus that of the motion without impact. The machine's attractor is in pale rings (if it
+    was simulated), the forecast's in dots with the colour of its period, chaos dark. If there is no
+    attractor near, grey dots are the far motion of the machine, `found.far`.
 
-    **Arguments:** the `Grazing`; `ax`, axes to draw into, a new figure if left out; `legend`,
-    whether to draw one; options of `Axes.plot` for the forecast's dots.
+    **Arguments:** `found`, a `Grazing`; `ax`, by default a new figure; `legend`, whether to draw
+    one; options of `Axes.plot` for the forecast's dots.
     """
     instance_of("found", found, Grazing, "a `Grazing`, from `grazing`")
     legend, ax = flag("legend", legend), new_axes(ax)
@@ -315,7 +314,7 @@ def plot_grazing(
     ax.plot(0.0, 0.0, **{**mark_style("grazing"), "label": "grazing", "zorder": 4})
     ax.set_xscale("function", functions=(_root, lambda x: x * np.abs(x)))
     farthest = found.forecast.offset[np.argmax(np.abs(found.forecast.offset))]
-    ax.plot([farthest, 0.0], [0.0, 0.0], ls="none")  # where nothing is drawn, the axis as it is
+    ax.plot([farthest, 0.0], [0.0, 0.0], ls="none")  # for the axis if nothing is drawn
     ticks = farthest * (np.arange(_TICKS) / (_TICKS - 1)) ** 2
     ax.set_xticks(ticks, ["0", *(f"{x:.2g}" for x in ticks[1:])])
     units = dict(found.units)
@@ -328,7 +327,7 @@ def plot_grazing(
 
 
 def _draw_machine(ax: Axes, found: Grazing, machine: Motions) -> None:
-    """What the machine settles on, near the grazing and, if most of it is there, far away."""
+    """Draw the motions of the machine near the grazing and, if most are there, far away."""
     near = machine.period >= 0
     if near.any() or found.far is None:
         across, up = _dots(machine.offset[near], machine.position[near])
@@ -347,6 +346,6 @@ def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _root(x: object) -> np.ndarray:
-    """The square root, continued as an odd function."""
+    """Return the square root, continued as an odd function."""
     x = np.asarray(x, float)
     return np.sign(x) * np.sqrt(np.abs(x))

@@ -1,4 +1,4 @@
-"""Pictures of grids: maps of regimes, basins of attraction, and how basins erode."""
+"""Pictures of grids: maps of regimes, basins of attraction, and their erosion."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,17 +22,17 @@ from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, distinct_colors, thi
 from .motion import new_axes
 from .orbit import axis_name
 
-# What was not computed lies below all regimes.
+# Lanes that were not computed lie below all regimes.
 _LEAST = min(REGIMES) - 1
 # In the order of a legend, after the periods.
 _OTHERS = {
     **{int(regime): (regime.meaning, color) for regime, color in IRREGULAR.items()},
     _LEAST: ("not computed", look.NOT_COMPUTED),
 }
-# In the place of the period of a motion that no event ended, if none is known.
+# The number for the period of a motion that no event ended, if its period is unknown.
 _GOES_ON = len(PERIODS) + 1
 
-# Motions named one by one in the legend; further ones share its last line.
+# Motions with their own line in the legend; further ones share its last line.
 _NAMED = 12
 
 
@@ -47,17 +47,17 @@ def plot_regimes(
 ) -> Axes:
     """Draw a map of the regimes of motion, or of outcomes, over two axes of a scan.
 
-    Each cell has the colour of its period, up to 8 drive cycles and beyond; chaotic, transiently
-    chaotic, unsettled and failed lanes have different greys. If the data hold `impacts`, motions
-    without any are paler, and motions of two cycles with one impact and with more have different
-    colours. A lane that an event ended has the colour of its outcome. The legend names the colours
-    that occur.
+    Each cell has the colour of its period, up to 8 drive cycles and beyond. Chaotic, transiently
+    chaotic, unsettled and failed lanes have different greys. If the data contain `impacts`, motions
+    without impacts are paler, and motions of two cycles with one impact and with more have
+    different colours. A lane that an event ended has its outcome's colour. The legend has all
+    colours.
 
-    **Arguments:** the data of a scan that measured `"regime"`, or of a machine whose events or
-    stops have outcomes (`ends="overturned"`); `machine`, whose words name the
-    periods (left out: 2π and so on for a `Scene`, cycles for any other machine); `ax`, axes to draw
-    into, a new figure if left out; `x` and `y`, the names of the axes to draw along, the first and
-    the second of the scan if left out; `legend`, whether to draw one, on the right of the axes.
+    **Arguments:** `data` of a scan with the measure `"regime"`, or of a machine whose events or
+    stops have outcomes (`ends="overturned"`); `machine`, for the names of periods (by default 2π
+    and so on for a `Scene`, cycles for any other machine); `ax`, by default a new figure; `x` and
+    `y`, the names of the axes, by default the first and the second of the scan; `legend`, whether
+    to draw one, on the right of the axes.
 
     **Raises:** `ValueError` if there is no period and no outcome in the data, or not over two axes.
     """
@@ -85,8 +85,8 @@ def plot_regimes(
 
 
 def _lanes(data: xr.Dataset) -> np.ndarray:
-    """Three numbers of each lane: its outcome, its period or regime, and its impacts where they are
-    told apart, 2 for more than one; -1 if there is none."""
+    """Return three numbers of each lane: its outcome; its period or regime; its impacts if they are
+    distinguished, 2 for more than one. -1 means absent."""
     if "period" in data:
         period = np.clip(np.asarray(data["period"]).astype(int), _LEAST + 1, len(PERIODS))
     else:
@@ -110,7 +110,7 @@ def _lanes(data: xr.Dataset) -> np.ndarray:
 def _entry(
     kind: Sequence[int], word: Callable[[int], str], outcomes: Sequence[str]
 ) -> tuple[tuple[int, ...], str, str]:
-    """Place in the legend, name and colour of lanes: by period and impacts, then outcomes."""
+    """Return place in the legend, name and colour of lanes: periods and impacts, then outcomes."""
     outcome, period, impacts = kind
     if outcome >= 0:
         return (1, outcome), outcomes[outcome], OUTCOMES[outcome % len(OUTCOMES)]
@@ -125,7 +125,7 @@ def _entry(
 
 
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
-    """What to call periods in these data, whose attributes hold the class of the machine."""
+    """Return the function that names periods in data from a machine of this class."""
     if data.attrs.get("machine_class", "Scene") != "Scene":
         return lambda cycles: so_many(cycles, "cycle")
     return lambda cycles: f"{2 * cycles}π"
@@ -134,13 +134,13 @@ def _word_of(data: xr.Dataset) -> Callable[[int], str]:
 def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
     """Draw basins of attraction over two components of the start, with the motions' section points.
 
-    A grid of starts is drawn as an image, random starts as dots. The legend gives each motion's
-    period, its impacts and its part of the starts. A basin has the colour of its motion's period,
+    A grid of starts is drawn as an image, random starts as dots. The legend has each motion's
+    period, its impacts and its share of the starts. A basin has the colour of its motion's period,
     as in all pictures; further motions of the same kind have other shades of it.
 
-    **Arguments:** what `basins` found; `ax`, axes to draw into, a new figure if left out.
+    **Arguments:** `found`, the result of `basins`; `ax`, by default a new figure.
 
-    **Raises:** `ValueError` if the region does not span two parts of the start.
+    **Raises:** `ValueError` if the region does not span two components of the start.
     """
     label = found.data["label"]
     names = [str(name) for name in found.data.coords if str(name).startswith("start.")]
@@ -180,13 +180,13 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
 
 
 def _start_name(machine: AbstractMachine, name: str) -> str:
-    """The label of an axis of starts: the machine's words, with units, for what is a position or a
-    velocity; else the name, with its unit if the machine states one."""
+    """Return the label of an axis of starts: the machine's label, with units, for a position or a
+    velocity; else the name, with the unit that the machine states."""
     name = name.removeprefix("start.")
     by_its_name = in_brackets(f"{name} at the start", unit_of(units_of(machine), name))
     try:
         start = machine.start()
-    except ValueError:  # a machine that has no start of its own
+    except ValueError:  # a machine without a start
         start = None
     names = [] if start is None else leaf_names(start)
     if name in names:  # not a number within an array
@@ -218,8 +218,8 @@ def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]
 
 
 def _image(ax: Axes, across: np.ndarray, up: np.ndarray, shades: Any, colors: list[str]) -> None:
-    """Draw cells around points, whose rows may be in any order: `shades` has the index into
-    `colors` of each, (up, across)."""
+    """Draw cells around points, whose rows may be in any order: `shades` are the indices into
+    `colors` as (up, across)."""
     columns, rows = np.argsort(across), np.argsort(up)
     ax.pcolormesh(
         _cell_edges(across[columns]),
@@ -252,7 +252,7 @@ _WORDS = {
     "local": "largest ball of starts around the motion",
     "factor": "largest ball of starts",
 }
-# Motions named one by one in its legend.
+# Motions with their own line in its legend.
 _NAMED_LINES = 8
 
 
@@ -262,13 +262,13 @@ def plot_integrity(
     """Draw an erosion profile: the share or the integrity of each motion over the parameter.
 
     A line has the colour of its motion's period, as in all pictures; further motions of the same
-    kind have other shades of it. At a fall of a line, the motion loses its basin although it may
-    still be stable. The band around a share is its standard error, that around a radius the
-    resolution of the grid. Open circles are radii limited by the edge of the region.
+    kind have other shades of it. As its line falls, a motion loses its basin although it may still
+    be stable. The band around a share is its standard error, that around a radius the resolution of
+    the grid. Open circles are radii limited by the edge of the region.
 
-    **Arguments:** what `integrity_profile` found; `y`, `"share"`, `"local"` (local integrity
-    measure) or `"factor"` (integrity factor); `ax`, axes to draw into, a new figure if left out;
-    `legend`, whether to draw one, which names the first eight motions.
+    **Arguments:** `profile`, the result of `integrity_profile`; `y`, `"share"`, `"local"` (local
+    integrity measure) or `"factor"` (integrity factor); `ax`, by default a new figure; `legend`,
+    whether to draw one, which names the first eight motions.
     """
     instance_of("profile", profile, IntegrityProfile, "from `integrity_profile`")
     y, legend = one_of("y", y, tuple(_WORDS)), flag("legend", legend)

@@ -1,4 +1,4 @@
-"""Schematics of machines: each part drawn where it is, in the field's conventions."""
+"""Schematics of machines: each part is drawn at its position, in the field's conventions."""
 
 from math import pi
 from typing import Any
@@ -19,11 +19,10 @@ Point = tuple[float, float]
 
 
 class Pen:
-    """Draws the parts of a machine; the method `sketch(pen, state, phase)` of a machine
-    gets one.
+    """Drawing of a machine's parts, for the method `sketch(pen, state, phase)` of a machine.
 
-    Lengths are those of the machine's coordinate. `x` runs to the right and `y` upwards; `size` is
-    a good size for a body.
+    Lengths are those of the machine's coordinate. `x` is horizontal to the right and `y` upward;
+    `size` is a suitable size of a body.
     """
 
     blue, red, green = BLUE, RED, GREEN
@@ -35,22 +34,22 @@ class Pen:
         self.size = size
         """A good size for a body."""
         self.labels = labels
-        """Whether names are written beside the parts."""
+        """True to write names next to the parts."""
 
     def label(self, x: float, y: float, text: str, **look: Any) -> None:
-        """A name at a place, if `labels` is true."""
+        """Write a name at a place, if `labels` is true."""
         if self.labels:
             look = {"ha": "center", "va": "center", "fontsize": 11, "color": INK, **look}
             self.ax.text(x, y, text, **look)
 
     def line(self, *points: Point, **look: Any) -> None:
-        """A line through these points."""
+        """Draw a line through these points."""
         look = {"color": INK, "lw": 1.6, "solid_capstyle": "round", **look}
         self.ax.plot(*np.asarray(points, float).T, **look)
 
     def body(self, x: float, y: float = 0.0, *, width: float | None = None,
              height: float | None = None, color: str = BLUE) -> None:  # fmt: skip
-        """A body with its middle at (x, y).
+        """Draw a body with its middle at (x, y).
 
         **Arguments:** `width`, the pen's size by default; `height`, as the width by default.
         """
@@ -59,7 +58,7 @@ class Pen:
         self._draw_shape(Rectangle, (x - width / 2, y - height / 2), width, height, color=color)
 
     def ball(self, x: float, y: float, radius: float, *, color: str = BLUE) -> None:
-        """A ball with its middle at (x, y)."""
+        """Draw a ball with its middle at (x, y)."""
         self._draw_shape(Circle, (x, y), radius, color=color)
 
     def _draw_shape(self, shape: Any, *place: Any, color: str) -> None:
@@ -67,23 +66,23 @@ class Pen:
             self.ax.add_patch(shape(*place, facecolor=fill, edgecolor=color, alpha=alpha, lw=1.6))
 
     def disc(self, x: float, y: float, radius: float) -> None:
-        """A rotor or a crank's disc with its shaft."""
+        """Draw a rotor or a crank's disc with its shaft."""
         self.ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=INK, lw=1.6))
         self.pin(x, y, filled=True)
 
     def pin(self, x: float, y: float, *, filled: bool = False) -> None:
-        """A joint between two parts, open or filled."""
+        """Draw a joint between two parts, open or filled."""
         self.ax.plot(x, y, "o", color=INK if filled else "white", mec=INK, ms=6, zorder=4)
 
     def wall(
         self, x: float, side: int = 1, *, low: float, high: float, slot: float = 0.0,
         color: str = GREEN,
     ) -> None:  # fmt: skip
-        """A wall, hatched behind its face.
+        """Draw a wall, hatched behind its face.
 
-        **Arguments:** `x`, the place of the face; `side`, on which the hatching is: right (1) or
-        left (-1); `low` and `high`, its ends; `slot`, half a height that is left free about y = 0,
-        through which a spring can pass.
+        **Arguments:** `x`, the position of the face; `side` of the hatching, right (1) or left
+        (-1); `low` and `high`, its ends; `slot`, half the height of an opening about y = 0, for a
+        spring.
         """
         depth = 0.22 * self.size
         for bottom, top in ((low, -slot), (slot, high)) if slot else ((low, high),):
@@ -92,7 +91,8 @@ class Pen:
                 self.ax.plot([x, x + side * depth], [y, y + 0.7 * depth], color=color, lw=0.9)
 
     def soft_stop(self, face: float, side: int, row: float = 0.0, slot: float = 0.0) -> float:
-        """A plate at `face` on a spring before a wall, whose place is returned; see `wall`."""
+        """Draw a plate at `face` on a spring and a wall (see `wall`); return the wall's
+        position."""
         size, back = self.size, face + side * 0.8 * self.size
         plate = (face, row + 0.3 * size), (face, row + 0.7 * size)
         self.line(*plate, color=GREEN, lw=2.6)
@@ -101,11 +101,11 @@ class Pen:
         return back
 
     def stop(self, stop: Any, *, rest: float = 0.0, row: float = 0.0, slot: float = 0.0) -> float:
-        """A stop that a body of the pen's size meets with its face, rigid or on a spring; return
-        the place of its wall.
+        """Draw a stop for the face of a body of the pen's size, rigid or on a spring; return the
+        position of its wall.
 
-        **Arguments:** `rest`, where the body's middle is at position 0; `row`, its height; `slot`,
-        as for `wall`, of a stop on the left, where springs are.
+        **Arguments:** `rest`, the position of the body's middle at coordinate 0; `row`, its height;
+        `slot`, as for `wall`, for a stop on the left, where springs are.
         """
         face, slot = rest + float(stop.place) + stop.sign * self.size / 2, slot * (stop.sign < 0)
         if isinstance(stop, SoftStop):
@@ -115,11 +115,11 @@ class Pen:
         return face
 
     def floor(self, left: float, right: float, y: float) -> None:
-        """The ground from left to right."""
+        """Draw the ground from left to right."""
         self.ax.plot([left, right], [y, y], color="0.7", lw=1.0, zorder=0)
 
     def spring(self, start: Point, end: Point, *, coils: int = 6) -> None:
-        """A spring between two points."""
+        """Draw a spring between two points."""
         length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
         lead = min(0.2 * self.size, 0.2 * length)  # straight at both ends
         turns = np.tile([0.2 * self.size, -0.2 * self.size], coils)
@@ -127,7 +127,7 @@ class Pen:
         self._along(start, end, along, [0, 0, *turns, 0, 0], lw=1.3)
 
     def damper(self, start: Point, end: Point) -> None:
-        """A dashpot between two points, its cylinder on the side of `start`."""
+        """Draw a dashpot between two points, its cylinder on the side of `start`."""
         half, length = 0.13 * self.size, float(np.hypot(end[0] - start[0], end[1] - start[1]))
         foot, piston, cup = 0.2 * length, 0.5 * length, 0.65 * length
         self._along(start, end, [0, foot], [0, 0], lw=1.3)
@@ -136,7 +136,7 @@ class Pen:
         self._along(start, end, [piston, length], [0, 0], lw=1.3)
 
     def _along(self, start: Point, end: Point, along: object, across: object, **look: Any) -> None:
-        """A line in coordinates along and across the way from one point to another."""
+        """Draw a line in coordinates along and across the line between two points."""
         way = np.subtract(end, start)
         length = np.hypot(*way)
         unit = way / length if length else np.array([1.0, 0.0])
@@ -145,7 +145,7 @@ class Pen:
         self.ax.plot(x, y, **{"color": INK, "solid_joinstyle": "round", **look})
 
     def arrow(self, start: Point, end: Point, *, color: str = INK, bend: float = 0.0) -> None:
-        """A force, or a sense of rotation if it is bent."""
+        """Draw a force, or a sense of rotation if it is bent."""
         self.ax.add_patch(
             FancyArrowPatch(
                 start, end, connectionstyle=f"arc3,rad={bend}", arrowstyle="-|>",
@@ -154,10 +154,10 @@ class Pen:
         )  # fmt: skip
 
     def length(self, left: float, right: float, y: float, text: str, *, down: float) -> None:
-        """A length between two places, with its name; only with labels.
+        """Draw a length between two places, with its name; only with labels.
 
-        **Arguments:** `left` and `right`, the places; `y`, the height; `down`, how far above that
-        the name is (below, if negative).
+        **Arguments:** `left` and `right`, the places; `y`, the height; `down`, the distance of the
+        name above that (below, if negative).
         """
         if not self.labels:
             return
@@ -166,13 +166,13 @@ class Pen:
         self.label((left + right) / 2, y + down, text, color="0.2")
 
     def mark(self, x: float, low: float, high: float) -> None:
-        """A dotted line from which a length is counted; only with labels."""
+        """Draw a dotted line at the end of a length; only with labels."""
         if self.labels:
             self.ax.plot([x, x], [low, high], color="0.5", lw=0.8, ls=":")
 
 
 def sketch(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> None:
-    """Draw a machine in a state: by its own `sketch(pen, state, phase)`, if it has one."""
+    """Draw a machine in a state, by its own `sketch(pen, state, phase)` if it has one."""
     own = getattr(machine, "sketch", None)
     if own is not None:
         own(pen, state, phase)
@@ -186,20 +186,19 @@ def plot_sketch(
     """Draw a schematic of a machine with the names of its parts.
 
     A machine of your own is drawn by its method `sketch(pen, state, phase)`, if it has one: `pen`
-    (a `vi_jax.plot.Pen`) draws bodies, springs and walls. Otherwise its bodies are drawn between
-    their stops.
+    (a `vi_jax.plot.Pen`) draws bodies, springs and walls. By default, bodies are drawn between
+    stops.
 
     **Arguments:**
 
     - `machine`: the machine.
     - `state`: the state to draw; by default its own start.
-    - `phase`: the reading of its clock, by default 0; where a shaft turns its angle, by default
-      0.3π.
-    - `ax`: axes to draw into; a new figure if left out.
+    - `phase`: the reading of its clock, by default 0; for a shaft the angle, by default 0.3π.
+    - `ax`: axes to draw into; by default a new figure.
     """
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     state = machine.start() if state is None else adopt(machine, state)
-    if phase is None:  # a crank or a rotor is shown turned out of line
+    if phase is None:  # a crank or a rotor, turned
         phase = 0.3 * pi if isinstance(machine, ShaftMachine) else 0.0
     ax = new_axes(ax)
     sketch(machine, pen_for(machine, ax, _positions(machine, state), labels=True), state, phase)
@@ -216,14 +215,14 @@ def _positions(machine: AbstractMachine, state: State) -> np.ndarray:
 def pen_for(
     machine: AbstractMachine, ax: Axes, positions: np.ndarray, *, labels: bool = False
 ) -> Pen:
-    """A pen whose reach holds these positions and the stops."""
+    """Return a pen with a reach for these positions and the stops."""
     stops = [abs(float(stop.place)) for stop in all_stops(machine)]
     reach = max(0.0, *map(float, np.abs(positions).ravel()), *stops) or 1.0
     return Pen(ax, reach=reach, size=0.35 * reach, labels=labels)
 
 
 def _bodies(machine: AbstractMachine, pen: Pen, state: State) -> None:
-    """Every coordinate as a body between its stops, one below the other."""
+    """Draw every coordinate as a body between its stops, one below the other."""
     size = pen.size
     for i, place in enumerate(_positions(machine, state)):
         row = -2.2 * size * i
