@@ -277,10 +277,8 @@ class Subject:
         self._kept: tuple[Any, Any] = None, None
 
     def at(self, values: Mapping[str, Any]) -> tuple[AbstractMachine, Any]:
-        """Return machine and start at these values of the sliders.
-
-        **Raises:** `ValueError` for values outside of a slider, or that the machine does not allow.
-        """
+        """Return machine and start at these values of the sliders. **Raises:** `ValueError` for
+        values outside of a slider, or that the machine does not allow."""
         for name, (label, low, high, _, _) in self.controls.items():
             x = values.get(name)
             if not (isinstance(x, int | float) and low - _ROUNDING <= x <= high + _ROUNDING):

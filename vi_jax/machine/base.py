@@ -306,10 +306,8 @@ class AbstractMachine(Shown):
             return _coordinates_in(self)
 
     def start(self) -> State:
-        """Return the default start.
-
-        **Raises:** `ValueError` for a machine without a default start.
-        """
+        """Return the default start. **Raises:** `ValueError` for a machine without a default
+        start."""
         raise ValueError(
             f"Argument `start` is missing, and {type(self).__name__} has no method `start`. Pass a "
             "state, or write `def start(self): return vi.State(...)` in the class."
@@ -369,11 +367,12 @@ class AbstractMachine(Shown):
 
     def mirrored(self, state: State) -> State | None:
         """Return the image of a state under the symmetry of this machine, or `None` without a
-        symmetry. The image of a motion is a motion half a cycle later."""
+        symmetry. Half a cycle later, the image of a motion is a motion, too."""
         return None
 
     def step_limit(self, s: Scalar, state: State) -> Scalar | float:
-        """Return the longest step, with at most one extremum: `cycle`/5, less near a soft stop."""
+        """Return the longest step in which the motion has at most one extremum: by default
+        `cycle`/5, less near a soft stop."""
         counter = counter_of(self)
         limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
         for stop in switches_of(self):
@@ -401,7 +400,7 @@ class AbstractMachine(Shown):
     def units(self) -> Mapping[str, str]:
         """The units of `position`, `velocity`, `time`, `rate` (of exponents), `energy`, `power`,
         and each parameter and component of the state, by name. "1" is dimensionless, and "" is the
-        name of all others. The defaults are in `labels` and fields' metadata."""
+        name of all others. The defaults are those in brackets in `labels` and fields' metadata."""
         found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
         own = {**dict(found), **fields_with(type(self), "unit")}
         return {x: unit for x, unit in own.items() if unit}
@@ -412,12 +411,10 @@ class AbstractMachine(Shown):
     _others = property(_other_events)
 
     def _section(self, state: State) -> Scalar | None:
-        """See `section_in`."""
         counter = counter_of(self)
         return counter.section(self, state) if isinstance(counter, Passing) else None
 
     def _clock(self, state: State) -> Scalar | None:
-        """See `clock_of`."""
         return None
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
@@ -445,7 +442,7 @@ def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
 
 
 def has_velocity(machine: AbstractMachine, state: State) -> bool:
-    """Return whether `velocity` is one. Without stops it may be another component."""
+    """Return whether `velocity` is a velocity. Without stops it may be another component."""
     own = is_own(type(machine).velocity) or names_coordinates(machine)
     return own or bool(stops_of(machine)) or hasattr(state, "V")
 

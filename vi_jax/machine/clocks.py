@@ -16,10 +16,8 @@ from .scene import Scene, ShaftMachine
 
 
 def in_clock(machine: Machine, clock: str) -> Machine:
-    """Return the same machine with another independent variable.
-
-    **Raises:** `ValueError` for a machine with one clock.
-    """
+    """Return the same machine with another independent variable. **Raises:** `ValueError` for a
+    machine with one clock."""
     if isinstance(machine, ShaftMachine):
         return machine.in_clock(clock)
     raise ValueError(
@@ -35,10 +33,8 @@ def in_cycle_clock(machine: Machine) -> Machine:
 
 
 def at_section(machine: Machine, phase: Number) -> Machine:
-    """Return the same machine with its section elsewhere in the cycle.
-
-    **Raises:** `ValueError` for a machine whose section cannot be moved.
-    """
+    """Return the same machine with its section elsewhere in the cycle. **Raises:** `ValueError` for
+    a machine whose section cannot be moved."""
     if isinstance(machine, Scene):
         return machine.at_section(phase)
     raise ValueError(
@@ -53,10 +49,8 @@ def phase_at(machine: Machine, since_section: Number) -> Any:
 
 
 def adopt(machine: Machine, start: State) -> State:
-    """Return a start in the form that a machine needs.
-
-    **Raises:** `TypeError` for another object.
-    """
+    """Return a start in the form that a machine needs. **Raises:** `TypeError` for another
+    object."""
     return machine.adopt(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
 
 

@@ -50,10 +50,8 @@ def forces(
     gains: Sequence[Sequence[Scalar]], acting: Sequence[Flag], wanted: Sequence[Scalar]
 ) -> list[Scalar]:
     """Return the amount of each push that changes the velocities of the `acting` contacts as
-    `wanted`; 0 for the others.
-
-    **Arguments:** `gains`, from `shares`; `acting` and `wanted`, with an entry for each contact.
-    """
+    `wanted`; 0 for the others. **Arguments:** `gains`, from `shares`; `acting` and `wanted`, with
+    an entry for each contact."""
     rows = []
     for j, row in enumerate(gains):
         both = zip(row, acting, strict=True)
@@ -99,7 +97,7 @@ class FrictionImpulse(NamedTuple):
 
     state: State
     pushed: Scalar
-    """The amount of the stop's push."""
+    """The amount of the stop's push; `dragged` is that of the push along the stop."""
     dragged: Scalar
 
 
@@ -108,7 +106,8 @@ def with_friction_impulse(
 ) -> FrictionImpulse:
     """Return the result of an impact on stop `number` with Coulomb friction. The body sticks if the
     required impulse is at most `level` times that of the stop: its velocity along the stop is
-    reversed and scaled by the tangential restitution. Otherwise it slips against that impulse.
+    reversed and scaled by the tangential restitution. Otherwise it slips against `level` times the
+    stop's impulse.
 
     **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
     impact and after one without friction, whose velocity normal to the stop is kept.
@@ -124,7 +123,7 @@ def with_friction_impulse(
     ratio = body.mass_at(s, before) / along.mass_at(s, before)
     level, away = friction.level * ratio, -float(stop.sign)
     slips = jnp.abs(sticking[1]) > level * jnp.maximum(away * sticking[0], 0.0)
-    # The direction of slip after the impact decides; the stop's push changes the slip, too.
+    # Friction acts against the slip after the impact, which the stop's push changes, too.
     forward = _slipping(gains, wanted, -away * level)
     backward = _slipping(gains, wanted, away * level)
     left = slip + gains[1][0] * forward[0] + forward[1]
@@ -165,10 +164,8 @@ class Held(NamedTuple):
 def held_by(
     machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
 ) -> Held:
-    """Return the constraints of bodies at rest on stops.
-
-    **Arguments:** `modes`, those of switches first; `contact`, as in `Around`, or empty.
-    """
+    """Return the constraints of bodies at rest on stops. **Arguments:** `modes`, those of switches
+    first; `contact`, as in `Around`; empty for no rest."""
     limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
     stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
@@ -237,11 +234,9 @@ def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
 def check_takes(
     function: Callable[..., Any], whose: str, first: str, arguments: tuple[Any, ...], modes: int
 ) -> None:
-    """Raise `TypeError` if a user's function does not accept these arguments.
-
-    **Arguments:** `whose`, the function in words; `first`, the arguments before the modes in words;
-    `modes`, how many arguments are modes.
-    """
+    """Raise `TypeError` if a user's function does not accept these arguments. **Arguments:**
+    `whose`, the function in words; `first`, the arguments before the modes in words; `modes`, how
+    many arguments are modes."""
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError as error:
@@ -252,10 +247,8 @@ def check_takes(
 
 
 def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
-    """Return the result of a function of a machine's event.
-
-    **Raises:** `TypeError` with the function's name `whose`, if it takes other arguments.
-    """
+    """Return the result of a function of a machine's event. **Raises:** `TypeError` with the
+    function's name `whose`, if it takes other arguments."""
     try:
         return function(*arguments)
     except TypeError:
@@ -278,10 +271,8 @@ def acting(machine: Machine, s: Scalar, state: State, modes: Scalars) -> State:
 
 def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int = 0) -> State:
     """Return the machine's field in these modes. On a surface along which the motion slides, it is
-    the weighted mean of the fields on both sides.
-
-    **Arguments:** `first`, the first switch that may be in mode 0.
-    """
+    the weighted mean of the fields on both sides. **Arguments:** `first`, the number of the first
+    switch that may be in mode 0."""
     switches = switches_of(machine)
     found = [i for i, x in enumerate(switches) if x.blends and i >= first]
     if not found:

@@ -36,11 +36,9 @@ class Coordinate(NamedTuple):
 
 
 def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
-    """Return the coordinate of these components of a state.
-
-    **Arguments:** `on`, the names of position and velocity, or of a velocity alone; `mass`, as
-    `Coordinate.mass`, 1 if it is `None`.
-    """
+    """Return the coordinate of these components of a state. **Arguments:** `on`, the names of
+    position and velocity, or of a velocity alone; `mass`, as `Coordinate.mass`, 1 if it is
+    `None`."""
     position, velocity = (on, on) if isinstance(on, str) else on
     get = functools.partial(component, position), functools.partial(component, velocity)
     placed = functools.partial(_placed, position, velocity)
@@ -121,9 +119,7 @@ def _angles(machine: Machine) -> frozenset[str]:
 
 def angles_in(machine: Machine, like: State) -> np.ndarray | None:
     """Return which components of a state are angles of `wrap_angles`, or `None` without angles.
-
-    **Arguments:** `like`, one state, without modes.
-    """
+    **Arguments:** `like`, one state, without modes."""
     if not _angles(machine):
         return None
     return np.array([is_angle(machine, name) for name in components(like)])
@@ -131,9 +127,7 @@ def angles_in(machine: Machine, like: State) -> np.ndarray | None:
 
 def nearest_images(angles: np.ndarray | None, here: Any, there: Any) -> Any:
     """Return the images of `here`, under whole turns of angles, that are nearest to `there`.
-
-    **Arguments:** `angles`, from `angles_in`; states as rows of numbers, the last axis.
-    """
+    **Arguments:** `angles`, from `angles_in`; states as rows of numbers, the last axis."""
     if angles is None:
         return here
     moved = there + without_turns(here - there)

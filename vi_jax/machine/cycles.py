@@ -147,7 +147,7 @@ def at_intervals(machine: Any, interval: Any) -> Any:
 
 
 def _as_kind(new_kind: type, kind: type, machine: Any, cycle: Any, **others: Any) -> Any:
-    """Return a machine as another class, with the fields of `kind` except a field `cycle`."""
+    """Return a machine as another class, with the fields of `kind`; `cycle` replaces that field."""
     values = {name: getattr(machine, name) for name in _fields(kind)} | others
     if "cycle" in values:
         values["cycle"] = cycle

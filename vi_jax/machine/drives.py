@@ -163,17 +163,15 @@ class AbstractDrive(Shown):
     @abc.abstractmethod
     def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
         """Return d(state)/ds by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
-
         **Arguments:** `scene`, for its `crank`, `phase_at` and `pull`; `s`; `state`; `pushes`, the
-        accelerations of the body by compliant stops.
-        """
+        accelerations of the body by compliant stops."""
 
     def rate(self) -> Float[Array, "..."] | None:
         """Return the fastest decay rate with respect to τ, or `None` if nothing decays."""
         return None
 
     def usual(self, name: str, known: dict[str, Any]) -> Any:
-        """Return a component that a start leaves out; `known` are the components before it."""
+        """Return the default of a component in a start; `known` are the components before it."""
         raise ValueError(
             f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
             "no `usual` for it."
@@ -194,10 +192,8 @@ class AbstractDrive(Shown):
 
     def begin(self, **given: Any) -> dict[str, Any]:
         """Return the drive's components of a start, by name. A component that is not given, or
-        `None`, has its `usual` value.
-
-        **Raises:** `ValueError` if a number is not finite, or not a component of its state.
-        """
+        `None`, has its `usual` value. **Raises:** `ValueError` if a number is not finite, or not a
+        component of its state."""
         names = [part.name for part in dataclasses.fields(self.state)][2:]
         for name, value in given.items():
             if value is not None and name not in names:
@@ -300,9 +296,8 @@ class Motor(AbstractDrive):
     def torque(
         self, state: State, pace: Number | None, paced: Callable[[Any], Any]
     ) -> tuple[Number, tuple[Number, ...]]:
-        """Return the motor's torque (per J ω²), and the rates of the components after W. If the
-        crank angle is the independent variable, `pace` is 1/W, and the function `paced` divides by
-        W."""
+        """Return the motor's torque (per J ω²), and the rates of the components after W. By crank
+        angle, both are divided by W: by the function `paced`, or with `pace` = 1/W."""
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):

@@ -1,4 +1,4 @@
-"""Events: a guard, and what happens where it rises through zero."""
+"""Events: a guard, and a jump where it rises through zero."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple
@@ -20,7 +20,7 @@ class Around(NamedTuple):
     own: int
     """The index of the event's mode among them."""
     contact: Scalars
-    """For each coordinate, 1 + i while it rests on stop number i, else 0; may be empty."""
+    """For each coordinate, 1 + i while it rests on stop number i, else 0; empty without rests."""
 
     def instead(self, mode: object) -> Modes:
         """Return all modes, with another one in place of the event's."""
@@ -94,7 +94,7 @@ class AbstractEvent(Shown):
         return jnp.nan
 
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """Return the initial mode, for an event with a mode, of a motion that begins in `state`."""
+        """Return the initial mode of a motion that begins in `state`, if the event has a mode."""
         raise NotImplementedError(f"A {type(self).__name__} holds no mode.")
 
     def struck(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Scalar:
@@ -122,8 +122,8 @@ class AbstractSwitch(AbstractEvent):
     word: ClassVar = "switch"
 
     acts: bool = eqx.field(static=True, kw_only=True, default=False, repr=False)
-    """True if it adds its own force to the machine's field, which then does not receive its mode,
-    as everything in `contacts` does; static."""
+    """True if it adds its own force to the machine's field, as all contacts do. The field then does
+    not receive its mode. Static."""
 
     holds_mode: ClassVar[bool] = True
     from_below: ClassVar[bool] = False  # after the event the guard is that of another mode

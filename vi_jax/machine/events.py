@@ -186,10 +186,8 @@ def _values(modes: Any) -> tuple[Any, ...]:
 
 def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
     """Return the machine's own modes after an event, for which a user's function `whose` returned
-    `found`: all, or a dictionary of those that change.
-
-    **Raises:** `TypeError` for a name that the machine does not declare.
-    """
+    `found`: all, or a dictionary of those that change. **Raises:** `TypeError` for a name that the
+    machine does not declare."""
     names = tuple(declared_modes(machine))
     if not isinstance(found, Mapping) or not names:
         return _values(found)
@@ -255,10 +253,8 @@ def replaced(state: State, new: State) -> State:
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:
     """Return the state with the initial modes of a motion that begins in it; unchanged if it has
-    modes, or the machine has none.
-
-    **Arguments:** `axes`, the number of leading axes of the state.
-    """
+    modes, or the machine has none. **Arguments:** `axes`, the number of leading axes of the
+    state."""
     if isinstance(state, HybridState) or not has_own_modes(machine):
         return state
 

@@ -56,9 +56,7 @@ class Friction(AbstractSwitch):
         self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
     ) -> tuple[Any, Any, Any]:
         """Return the force that holds a body, the largest possible one, and the effective mass.
-
-        **Arguments:** `contact`, as in `Around`; `found`, from `held_flow`.
-        """
+        **Arguments:** `contact`, as in `Around`; `found`, from `held_flow`."""
 
     def touches(self, machine: Machine, contact: Scalars) -> Flag:
         """Return whether the body touches the surface; `contact` is as in `Around`."""
@@ -114,9 +112,7 @@ class Friction(AbstractSwitch):
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
     ) -> tuple[Any, Any]:
         """Return the force that friction balances on a body that sticks, and the largest one.
-
-        **Arguments:** `around`, the other modes and the resting contacts; `mode`, its own.
-        """
+        **Arguments:** `around`, the other modes and the resting contacts; `mode`, its own."""
         once: Any = _held
         _, found = once(machine, s, state, around.instead(mode), around.contact)
         force, most, _ = self.held(machine, s, state, around.contact, found[around.own])
@@ -126,10 +122,7 @@ class Friction(AbstractSwitch):
         self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
     ) -> Scalar:
         """Return the mode of a body without slip: sticking if the force is not too large, else the
-        direction of the force.
-
-        **Arguments:** `sticks`, whether the body may stick at all.
-        """
+        direction of the force. **Arguments:** `sticks`, whether the body may stick at all."""
         if not self.is_known(around):
             return jnp.zeros_like(s)
         pull, most = self._balance(machine, s, state, around, jnp.zeros_like(s))
@@ -141,7 +134,8 @@ class Friction(AbstractSwitch):
 def _held(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
-    """Jit-compile `held_flow`: a step calls it many times, and JAX traces it once."""
+    """Return `held_flow`, jitted: JAX traces and differentiates it once for many calls in a
+    step."""
     return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)
 
 

@@ -134,10 +134,8 @@ class ModalMachine(AbstractMachine):
 
 
 def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
-    """Return the coordinate c·x of a state.
-
-    **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`, 1/(cᵀM⁻¹c).
-    """
+    """Return the coordinate c·x of a state. **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`,
+    1/(cᵀM⁻¹c)."""
 
     def placed(state: State, Y: Scalar, V: Scalar) -> Any:
         x, v = state.displacement, state.velocity
@@ -422,7 +420,6 @@ class LinearMachine(AbstractMachine):
         return StructureState(v, self._accelerated(pull))
 
     def _accelerated(self, force: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the accelerations M⁻¹ f by a force on the displacements."""
         known = None if self._known is None else self._known.inverse
         return solved(self.mass, force) if known is None else known @ force
 

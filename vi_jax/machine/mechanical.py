@@ -277,7 +277,6 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
-    """Return the derivative of a function of the coordinates with respect to one of them."""
     here = getattr(q, name)
 
     def of_one(x: Any) -> Any:
@@ -350,9 +349,7 @@ def _is_zero(x: Any, zero: float = 0.0) -> bool:
 
 def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> Matrix:
     """Return masses as a matrix, from one per coordinate, by name or in order, or from rows.
-
-    **Raises:** `ValueError` for a wrong number of them, or a matrix for arrays.
-    """
+    **Raises:** `ValueError` for a wrong number of them, or a matrix for arrays."""
     n = len(shapes)
     if isinstance(given, Mapping):
         given = [given[x] for x in shapes]
@@ -383,8 +380,8 @@ def _is_mass(x: Any, shape: tuple[int, ...]) -> bool:
 
 
 def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
-    """Return M⁻¹ right for a symmetric positive definite matrix, by elimination without pivoting
-    and known zeros. Pivots are inverted: those of constant masses do not change in a step."""
+    """Return M⁻¹ right for a symmetric positive definite matrix, by elimination without pivoting,
+    omitting zeros. Pivots are inverted: those of constant masses do not change in a step."""
     n, rows, inverses = len(right), [[*row, x] for row, x in zip(M, right, strict=True)], []
     for i in range(n):
         inverses.append(1 / rows[i][i])

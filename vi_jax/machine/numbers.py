@@ -179,8 +179,8 @@ def unit_of(units: Mapping[str, str], name: str) -> str:
 
 
 def units_of(machine: Machine) -> dict[str, str]:
-    """Return the units of a machine. The default of position and velocity are the units of the
-    components that are their labels."""
+    """Return the units of a machine. By default, position and velocity have those of the components
+    that are their labels."""
     units = dict(machine.units)
     for quantity, name in zip(PLAIN, machine.labels, strict=True):
         if name in units:

@@ -102,11 +102,9 @@ class ShaftMachine(AbstractMachine):
         return state_of_numbers("start", start)
 
     def in_cycle_state(self, name: str, state: State) -> State:
-        """Return a section state without the shaft's angle, if it is of the time clock.
-
-        **Raises:** `ValueError` with the argument's name if the angle is known and not 0,
-        `TypeError` for another object than a state of this machine.
-        """
+        """Return a section state without the shaft's angle, if it is of the time clock. **Raises:**
+        `ValueError` with the argument's name if the angle is known and not 0, `TypeError` for
+        another object than a state of this machine."""
         if not self.is_timed(state):
             _require_state(name, state, self.state_type)
             return state
@@ -130,7 +128,7 @@ class ShaftMachine(AbstractMachine):
         return state.W > 0 if self.is_paced(state) else None
 
     def check_start(self, start: State) -> None:
-        """Raise `ValueError` for a start beyond the section, or not turning in the phase clock."""
+        """Raise `ValueError` for a start beyond the section, or with W ≤ 0 in the phase clock."""
         if self.is_paced(start):
             speed = concrete(self.section_speed(start))
             if speed is not None and not (speed > 0).all():
@@ -332,7 +330,6 @@ class Scene(ShaftMachine):
         return pull
 
     def _pushes(self, s, state, modes):
-        """Yield the contribution of each compliant stop to d²Y/dτ²."""
         for stop, mode in zip(self.soft_stops, modes, strict=True):
             yield stop.contribution(self, s, state, mode)
 
@@ -353,7 +350,8 @@ class Scene(ShaftMachine):
         return jnp.broadcast_to(speed, duration.shape)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """Return a fifth of the crank's turn or the body's period, less near a soft stop."""
+        """Return a fifth of the shorter of crank's turn and body's period, less near a soft
+        stop."""
         speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         for stop in self.soft_stops:
@@ -386,7 +384,7 @@ class Scene(ShaftMachine):
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 
     def _is_within_reach(self) -> bool:
-        """Return whether the library's equations hold: only a slider within |U| ≤ 1 pulls."""
+        """Return whether only a slider within |U| ≤ 1 pulls, by the library's equations."""
         return (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
@@ -575,11 +573,9 @@ class Parameters(Shown):
         return (self.stiffness / self.body_mass) ** 0.5
 
     def scene(self, *, drive: str = "motor", crank: str = "cosine") -> Scene:
-        """Return the dimensionless scene.
-
-        **Arguments:** `drive` is `"motor"` or `"ideal"` (which turns at ζ = κ); `crank` is
-        `"cosine"` (first approximation) or `"slider"` (exact kinematics).
-        """
+        """Return the dimensionless scene. **Arguments:** `drive` is `"motor"` or `"ideal"` (which
+        turns at ζ = κ); `crank` is `"cosine"` (first approximation) or `"slider"` (exact
+        kinematics)."""
         one_of("drive", drive, ("motor", "ideal"))
         one_of("crank", crank, ("cosine", "slider"))
         require_ranges(self)  # again: a number may have been replaced

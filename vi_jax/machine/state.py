@@ -23,10 +23,8 @@ class State:
         self.__dict__.update(components)
 
     def replace(self, **components: Any) -> "State":
-        """Return the state with other values of these components.
-
-        **Raises:** `TypeError` for a name that the state does not have.
-        """
+        """Return the state with other values of these components. **Raises:** `TypeError` for a
+        name that the state does not have."""
         unknown = [name for name in components if name not in vars(self)]
         if unknown:
             raise TypeError(
@@ -96,9 +94,7 @@ def like(state: Any, found: Any, whose: str) -> Any:
 
 def changed(state: Any, found: Any, whose: str) -> Any:
     """Return the state after a jump, for which a user's function returned the changed components.
-
-    **Arguments and raises:** as `like`.
-    """
+    **Arguments and raises:** as `like`."""
     if isinstance(found, Mapping):
         return with_components(state, found, whose, all_of_them=False)
     return like(state, found, whose)

@@ -152,10 +152,8 @@ class RigidStop(Wall, AbstractEvent):
     def modes_after(
         self, machine: Machine, s: Scalar, before: State, after: State, modes: Modes
     ) -> Modes:
-        """Return the machine's modes after an impact.
-
-        **Arguments:** `before` and `after`, the states; `modes`, those before.
-        """
+        """Return the machine's modes after an impact. **Arguments:** `before` and `after`, the
+        states; `modes`, those before."""
         own = None
         if self.modes is not None:
             found = self.modes(machine, s, before, *shown_modes(machine, modes))
@@ -208,7 +206,8 @@ class RigidStop(Wall, AbstractEvent):
         return left / jnp.where(approach > 0, approach, 1.0)
 
     def loss(self, approach: Any, share: Any = None) -> Any:
-        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `share` is k."""
+        """Return the energy lost in an impact, ½(1 - k²) V⁻² per unit of mass; `share` is k if
+        known."""
         share = self.share(approach) if share is None else share
         return 0.5 * (1 - share**2) * approach**2
 
@@ -329,8 +328,7 @@ class SoftStop(Wall, AbstractSwitch):
     The force on a body of mass m is the prestress F0 plus that of its law. The default law is
     `PowerLaw`, K δᵖ + α √(K m) δ^((p-1)/2) δ'. A spring with a dashpot has p = 1, Hertz's contact
     p = 3/2. Its coefficient of restitution does not depend on the speed, so that `restitution` may
-    be given instead of `damping`. The restitution by `HuntCrossley`, K δᵖ (1 + α δ'), decreases
-    with speed.
+    be given instead of `damping`. With `HuntCrossley`, K δᵖ (1 + α δ'), it decreases with speed.
 
     With p > 1 the power law's force has a steep start and, where it may pull, a steep end, of the
     order δ^((p-1)/2). Adaptive steps (`Adaptive`) follow it, fixed ones lose their order there. The
@@ -421,7 +419,7 @@ class SoftStop(Wall, AbstractSwitch):
 
     @property
     def analytic(self) -> bool:  # pyright: ignore
-        """True if the force has a power series at first touch: a linear one, without a kink."""
+        """True if the force has a power series at first touch: a linear one, without kink."""
         return self.law.is_analytic
 
     @property

@@ -76,7 +76,7 @@ class Capsule(ForcedMachine, Mechanical):
         return [[1.0, 1.0], [1.0, 1 + self.mass_ratio]]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """Return the drive, and the spring and the dashpot between the mass and the capsule."""
+        """Return the forces of the drive, and of spring and dashpot between mass and capsule."""
         drive = self.amplitude * jnp.cos(t)
         return {"place": drive - q.place - 2 * self.damping_ratio * v.place, "travel": drive}
 

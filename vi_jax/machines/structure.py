@@ -63,8 +63,8 @@ class Structure(LinearMachine):
     Time is the independent variable, and a cycle is 2π/ω, also without a force.
 
     The natural modes are used, by default with `ExactFlight`, which has no step error for any
-    damping, also for rigid bodies and in resonance. Derivatives with respect to all numbers exist
-    at coincident frequencies.
+    damping, also for rigid bodies and in resonance. Derivatives with respect to all numbers exist,
+    also at coincident frequencies.
 
     **Arguments:**
 

@@ -169,7 +169,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         return turn * speed if self.clock_name == "phase" else turn
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
-        """The shortest time constant: of a strongly damped body, or of a strong motor."""
+        """Return the shortest time constant, of a strongly damped body or a strong motor."""
         rate = jnp.maximum(2 * self.damping_ratio, self.strength / self.no_load_speed)
         pace = self._speed(s, state) if self.clock_name == "phase" else 1.0
         return pace * (1 - self.coupling) / jnp.maximum(rate, 1e-6)

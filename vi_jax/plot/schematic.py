@@ -49,10 +49,8 @@ class Pen:
 
     def body(self, x: float, y: float = 0.0, *, width: float | None = None,
              height: float | None = None, color: str = BLUE) -> None:  # fmt: skip
-        """Draw a body with its middle at (x, y).
-
-        **Arguments:** `width`, the pen's size by default; `height`, as the width by default.
-        """
+        """Draw a body with its middle at (x, y). **Arguments:** `width`, the pen's size by default;
+        `height`, as the width by default."""
         width = self.size if width is None else width
         height = width if height is None else height
         self._draw_shape(Rectangle, (x - width / 2, y - height / 2), width, height, color=color)
