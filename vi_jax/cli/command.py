@@ -151,8 +151,8 @@ def _write_files(found: Found, output: str | None = None, picture: str | None = 
 
 
 def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, bool]:
-    """Return the result of a function, partial on Ctrl-C, and whether that ended it. Further ones
-    have no effect."""
+    """Return the result of a function, partial after Ctrl-C, and whether that ended it. From then
+    on Ctrl-C is ignored."""
     try:
         return function(*args, **options), False
     except Interrupted as error:

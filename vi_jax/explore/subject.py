@@ -84,13 +84,13 @@ class Motion(NamedTuple):
     path: MotionPath
     """The motion over `WINDOW` cycles, with its impacts."""
     impact_phase: np.ndarray
-    """Crank angle of each observed impact (radians)."""
+    """Phase of each observed impact, as in an impact log (radians for a `Scene`)."""
     impact_speed: np.ndarray
-    """Speed V⁻ before each observed impact (unit: a ω)."""
+    """Speed V⁻ before each observed impact (unit: the machine's)."""
     frequency_ratio: np.ndarray
     """ζ of each observed cycle."""
     extremes: tuple[float, float]
-    """Smallest and greatest Y over the observed cycles."""
+    """Smallest and greatest position over the observed cycles."""
     period: int
     """Period in drive cycles, or one of `REGIMES`."""
     impacts: float
@@ -241,8 +241,8 @@ class Subject:
     """A machine whose numbers are sliders.
 
     **Arguments:** `machine`; `ranges` of some of its numbers and of its start (`"start.Y"`). They
-    override the machine's own `slider_ranges`, if any, and the default: from zero to twice the
-    value, within the allowed range.
+    override the machine's own `slider_ranges`, if any. The default is from zero to twice the value,
+    within the allowed range.
 
     **Raises:** `ValueError` for a range of an unknown number, or a wrong range.
     """

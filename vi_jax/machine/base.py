@@ -306,8 +306,7 @@ class AbstractMachine(Shown):
             return _coordinates_in(self)
 
     def start(self) -> State:
-        """Return the default start. **Raises:** `ValueError` for a machine without a default
-        start."""
+        """Return the default start. **Raises:** `ValueError` if the machine defines none."""
         raise ValueError(
             f"Argument `start` is missing, and {type(self).__name__} has no method `start`. Pass a "
             "state, or write `def start(self): return vi.State(...)` in the class."

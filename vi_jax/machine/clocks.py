@@ -49,8 +49,7 @@ def phase_at(machine: Machine, since_section: Number) -> Any:
 
 
 def adopt(machine: Machine, start: State) -> State:
-    """Return a start in the form that a machine needs. **Raises:** `TypeError` for another
-    object."""
+    """Return a start in the form that a machine needs. **Raises:** `TypeError` for others."""
     return machine.adopt(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
 
 

@@ -37,8 +37,7 @@ class Coordinate(NamedTuple):
 
 def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
     """Return the coordinate of these components of a state. **Arguments:** `on`, the names of
-    position and velocity, or of a velocity alone; `mass`, as `Coordinate.mass`, 1 if it is
-    `None`."""
+    position and velocity, or of a velocity; `mass`, as `Coordinate.mass`, 1 if it is `None`."""
     position, velocity = (on, on) if isinstance(on, str) else on
     get = functools.partial(component, position), functools.partial(component, velocity)
     placed = functools.partial(_placed, position, velocity)

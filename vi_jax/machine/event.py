@@ -122,8 +122,8 @@ class AbstractSwitch(AbstractEvent):
     word: ClassVar = "switch"
 
     acts: bool = eqx.field(static=True, kw_only=True, default=False, repr=False)
-    """True if it adds its own force to the machine's field, as all contacts do. The field then does
-    not receive its mode. Static."""
+    """True if it adds its own force to the machine's field, as all switches in `contacts` do. The
+    field then does not receive its mode. Static."""
 
     holds_mode: ClassVar[bool] = True
     from_below: ClassVar[bool] = False  # after the event the guard is that of another mode

@@ -253,8 +253,7 @@ def replaced(state: State, new: State) -> State:
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:
     """Return the state with the initial modes of a motion that begins in it; unchanged if it has
-    modes, or the machine has none. **Arguments:** `axes`, the number of leading axes of the
-    state."""
+    modes, or the machine has none. **Arguments:** `axes`, the number of batch axes."""
     if isinstance(state, HybridState) or not has_own_modes(machine):
         return state
 

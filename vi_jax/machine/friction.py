@@ -134,8 +134,7 @@ class Friction(AbstractSwitch):
 def _held(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
-    """Return `held_flow`, jitted: JAX traces and differentiates it once for many calls in a
-    step."""
+    """Return `held_flow`, jitted: a step calls it often, and JAX differentiates it once."""
     return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)
 
 

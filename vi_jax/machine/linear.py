@@ -64,7 +64,7 @@ class ModalMachine(AbstractMachine):
     slowness: Numbers
     """1/√|κ|; 1 for a rigid-body motion."""
     swing: Numbers
-    """√(κ - c²/4), the frequency of a damped mode; 1 without oscillation. It has no derivative."""
+    """√(κ - c²/4), the frequency of a damped mode, or 1 without oscillation; no derivatives."""
     swing_time: Numbers
     """1/`swing`."""
     oscillates: Scalar
@@ -134,8 +134,7 @@ class ModalMachine(AbstractMachine):
 
 
 def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
-    """Return the coordinate c·x of a state. **Arguments:** `row`, c; `push`, M⁻¹c/(cᵀM⁻¹c); `mass`,
-    1/(cᵀM⁻¹c)."""
+    """Return the coordinate c·x; `row` is c, `push` M⁻¹c/(cᵀM⁻¹c), and `mass` 1/(cᵀM⁻¹c)."""
 
     def placed(state: State, Y: Scalar, V: Scalar) -> Any:
         x, v = state.displacement, state.velocity

@@ -350,8 +350,8 @@ class Scene(ShaftMachine):
         return jnp.broadcast_to(speed, duration.shape)
 
     def step_limit(self, s: Scalar, state: State) -> Scalar:
-        """Return a fifth of the shorter of crank's turn and body's period, less near a soft
-        stop."""
+        """Return a fifth of the shorter of the drive's turn and the body's natural period, less
+        near a soft stop."""
         speed = self.drive.speed(state)
         turn = 0.4 * pi / jnp.maximum(1.0, speed)
         for stop in self.soft_stops:
@@ -509,8 +509,8 @@ class Parameters(Shown):
 
     The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
     ε = m_C a²/J. For the motor they are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`,
-    τe = ωL/R. The crank has λ = a/l. A motor with constants K_t, K_e at voltage u has κT0 = K_t
-    u/R, κΩ0 = u/K_e.
+    τe = ωL/R. The crank has λ = a/l. With motor constants K_t, K_e and a voltage u, κT0 = K_t u/R,
+    κΩ0 = u/K_e.
     """
 
     body_mass: _Plain = _si("body_mass", "kg", 0.35, POSITIVE)
@@ -573,9 +573,8 @@ class Parameters(Shown):
         return (self.stiffness / self.body_mass) ** 0.5
 
     def scene(self, *, drive: str = "motor", crank: str = "cosine") -> Scene:
-        """Return the dimensionless scene. **Arguments:** `drive` is `"motor"` or `"ideal"` (which
-        turns at ζ = κ); `crank` is `"cosine"` (first approximation) or `"slider"` (exact
-        kinematics)."""
+        """Return the dimensionless scene. **Arguments:** `drive`, `"motor"` or `"ideal"` (with
+        ζ = κ); `crank` is `"cosine"` (first approximation) or `"slider"` (exact kinematics)."""
         one_of("drive", drive, ("motor", "ideal"))
         one_of("crank", crank, ("cosine", "slider"))
         require_ranges(self)  # again: a number may have been replaced

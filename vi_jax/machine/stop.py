@@ -94,7 +94,7 @@ class RigidStop(Wall, AbstractEvent):
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))
-    """d, distance of the stop from the unstretched position (unit: a)."""
+    """d, distance of the stop from the coordinate's zero (its unit; a for a `Scene`)."""
     restitution: Any = eqx.field(converter=real_or_law("restitution"))
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
@@ -206,8 +206,7 @@ class RigidStop(Wall, AbstractEvent):
         return left / jnp.where(approach > 0, approach, 1.0)
 
     def loss(self, approach: Any, share: Any = None) -> Any:
-        """Return the energy lost in an impact, ½(1 - k²) V⁻² per unit of mass; `share` is k if
-        known."""
+        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `share` is k."""
         share = self.share(approach) if share is None else share
         return 0.5 * (1 - share**2) * approach**2
 

@@ -39,8 +39,8 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     The box moves as a sin ωt. If `mass_ratio` is given, it is a body on a spring and a damper,
     driven by a force: X'' + 2 ξ Ω X' + Ω² X = F sin s between impacts. An impact reverses the
-    relative speed and scales it by e, and conserves the momentum of both. The independent variable
-    is s = ωt, a cycle 2π.
+    relative speed, scales it by e, and conserves momentum. The independent variable is s = ωt, a
+    cycle 2π.
 
     Let the motion of the box be prescribed and σ = (1 - e)/(1 + e). The symmetric motion with one
     impact at each wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed
@@ -52,8 +52,7 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     - `half_gap` λ: half of the box's length minus the ball's (unit: a), positive.
     - `restitution` e in [0, 1].
-    - `mass_ratio`: the ball's mass over the box's, positive; by default the box's motion is
-      prescribed.
+    - `mass_ratio`: the ball's mass over the box's, positive; without it the box's motion is given.
     - `damping_ratio` ξ, `frequency` Ω (of the box on its spring, unit: ω; 0 leaves out the spring)
       and `force` F (unit: M a ω²), of a free box.
     """

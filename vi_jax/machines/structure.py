@@ -23,8 +23,7 @@ from .._checks import (
 from ..machine import LinearMachine, RigidStop
 from ._base import number_field
 
-# The largest asymmetry of a matrix, relative to its largest entry, that counts as rounding: a
-# choice.
+# The largest asymmetry of a matrix, relative to its largest entry, that is rounding: a choice.
 _ALIKE = 1e-12
 
 

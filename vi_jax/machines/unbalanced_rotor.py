@@ -25,8 +25,7 @@ class RotorState(Shown):
     V: Scalar
     """dY/dτ (unit: m r ω/M)."""
     P: Scalar
-    """Momentum of the shaft, W - ε V sin φ, which impacts conserve (unit: J ω); W on the
-    section."""
+    """Momentum of the shaft, W - ε V sin φ, kept by impacts (unit: J ω); W on the section."""
 
 
 class TimedRotorState(RotorState):

@@ -54,8 +54,7 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     The sleeve tilts until its edge jams on the pole by friction. The bird swings on and lifts the
     edge off. The sleeve slides down and jams the other way; the beak hits the pole, and the bird
-    swings back. The coordinates are the height y, the sleeve's φM and the bird's φS, with small
-    angles:
+    swings back. The coordinates are height y and small angles φM of the sleeve and φS of the bird:
 
         T = ½ m_M y'² + ½ J_M φM'² + ½ J_S φS'² + ½ m_S (y' + l_M φM' + l_G φS')²
         U = ½ c (φM - φS)² + m_M g y + m_S g (y + l_M φM + l_G φS)
@@ -65,8 +64,7 @@ class Woodpecker(ReadyMachine, Mechanical):
     φM'. The beak has l_M + l_G - l_S - r_O - h_S φS ≥ 0 and slips with y' + l_M φM' + (l_G - l_S)
     φS' (Ch. Glocker, Dynamik von Starrkörpersystemen mit Reibung und Stößen, 1995; F. Pfeiffer and
     Ch. Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Numbers are as in the example
-    of the Siconos software. A slipping contact sticks after an impact if the cone of friction
-    allows it.
+    of the Siconos software. A slipping contact may stick after an impact by the cone of friction.
 
     Only its weight drives it. A cycle ends when φS falls through `section_angle`, after a varying
     time. The component `drop` of the state is the descent in the last cycle. Time is the
@@ -180,8 +178,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         }
 
     def _usual(self) -> Scalar:
-        """Return the period of the bird on its spring, while the sleeve is jammed: 2π √(J/c) with
-        J = J_S + m_S l_G²."""
+        """Return 2π √((J_S + m_S l_G²)/c), the bird's period on its spring with a jammed sleeve."""
         inertia = self.bird_inertia + self.bird_mass * self.bird_arm**2
         return 2 * pi * jnp.sqrt(inertia / self.stiffness)
 
@@ -193,7 +190,7 @@ class Woodpecker(ReadyMachine, Mechanical):
     cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
 
     def renewed(self, state: WoodpeckerState) -> WoodpeckerState:
-        """Return the state with the descent in the cycle as `drop`, unless at equal times."""
+        """Return the state with the descent as `drop`; unchanged if observed at equal intervals."""
         if counter_of(self) is None:
             return state
         at = jnp.zeros_like(state.height)

@@ -206,8 +206,7 @@ class MotionAnimation(animation.FuncAnimation):
         """Write a file by one of matplotlib's writers.
 
         **Arguments:** `filename`; `writer`, by default Pillow for a `.gif`, an HTML page for an
-        `.html`, and ffmpeg, if installed, for anything else; options of matplotlib's
-        `Animation.save`.
+        `.html`, and ffmpeg, if installed, for others; options of `Animation.save`.
         """
         kinds = {".gif": animation.PillowWriter, ".html": animation.HTMLWriter}
         kind = kinds.get(Path(filename).suffix)

@@ -50,8 +50,8 @@ def plot_regimes(
     Each cell has the colour of its period, up to 8 drive cycles and beyond. Chaotic, transiently
     chaotic, unsettled and failed lanes have different greys. If the data contain `impacts`, motions
     without impacts are paler, and motions of two cycles with one impact and with more have
-    different colours. A lane that an event ended has its outcome's colour. The legend has all
-    colours.
+    different colours. A lane that an event ended has the colour of its outcome. The legend has the
+    colours that occur.
 
     **Arguments:** `data` of a scan with the measure `"regime"`, or of a machine whose events or
     stops have outcomes (`ends="overturned"`); `machine`, for the names of periods (by default 2π

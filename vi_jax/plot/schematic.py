@@ -79,8 +79,7 @@ class Pen:
         """Draw a wall, hatched behind its face.
 
         **Arguments:** `x`, the position of the face; `side` of the hatching, right (1) or left
-        (-1); `low` and `high`, its ends; `slot`, half the height of an opening about y = 0, for a
-        spring.
+        (-1); `low` and `high`, its ends; `slot`, half the height of an opening about y = 0.
         """
         depth = 0.22 * self.size
         for bottom, top in ((low, -slot), (slot, high)) if slot else ((low, high),):
@@ -89,8 +88,7 @@ class Pen:
                 self.ax.plot([x, x + side * depth], [y, y + 0.7 * depth], color=color, lw=0.9)
 
     def soft_stop(self, face: float, side: int, row: float = 0.0, slot: float = 0.0) -> float:
-        """Draw a plate at `face` on a spring and a wall (see `wall`); return the wall's
-        position."""
+        """Draw a plate at `face` on a spring, and a wall (see `wall`); return the wall's place."""
         size, back = self.size, face + side * 0.8 * self.size
         plate = (face, row + 0.3 * size), (face, row + 0.7 * size)
         self.line(*plate, color=GREEN, lw=2.6)
@@ -184,8 +182,7 @@ def plot_sketch(
     """Draw a schematic of a machine with the names of its parts.
 
     A machine of your own is drawn by its method `sketch(pen, state, phase)`, if it has one: `pen`
-    (a `vi_jax.plot.Pen`) draws bodies, springs and walls. By default, bodies are drawn between
-    stops.
+    (a `vi_jax.plot.Pen`) draws bodies, springs and walls. Otherwise bodies between stops are drawn.
 
     **Arguments:**
 

@@ -62,8 +62,7 @@ class Searched:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class AllOrbits(InWords):
-    """Periodic motions from a region of starts, stable and unstable, and statistics of the
-    search."""
+    """Periodic motions from a region of starts, stable and unstable, and search statistics."""
 
     orbits: Orbits
     """The motions, by period and then by least position; each with its multipliers."""

@@ -287,8 +287,8 @@ def basins(
     """Find the motions that starts in a region settle on, and the motion of each start.
 
     No motion must be known in advance. The final motion of each start is compared with those found
-    so far, including phase shifts, and a new motion is added if needed. Starts beyond a stop count
-    as failed.
+    so far, including phase shifts, and a new one is added if needed. Starts beyond a stop count as
+    failed.
 
     **Arguments:**
 
@@ -302,8 +302,7 @@ def basins(
     - `longest`, `tolerance`: as in `Regime`.
     - `apart`: section states farther apart than this belong to different motions; relative to the
       size of each number, as in `Regime`.
-    - `method`, `start`, `progress`, and further options: as for `scan` (`store` to interrupt and
-      resume).
+    - `method`, `start`, `progress`, and further options: as for `scan` (`store` to resume).
 
     **Returns:** `Basins`.
 
@@ -499,8 +498,7 @@ def _labelled(
     return label, [motions[i] for i in order]
 
 
-# From one value to the next, sections of a motion move less than this share of the region. A
-# choice.
+# From one value to the next, sections of a motion move less than this share of the region: choice.
 _MOVES = 0.25
 
 # The variables of each motion at each value, with their values if it does not exist.

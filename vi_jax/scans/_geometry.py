@@ -47,7 +47,7 @@ class Uncertainty(NamedTuple):
     distances: np.ndarray
     """The errors ε, in cells of the grid; shape (distances,)."""
     fractions: np.ndarray
-    """The share of starts with another outcome at this distance, up or down the axis; (axes,
+    """The share of starts with another outcome at this distance along an axis; (axes,
     distances)."""
 
     @property
@@ -113,11 +113,11 @@ def uncertainty_of(
     """Return the uncertainty exponents of the boundaries between labels on a grid of any dimension;
     `there` is True for cells with a start (all by default); other cells have no outcome.
 
-    The distances are eight, in cells, from 1 to a sixteenth of the shortest axis or 3. The starts
-    are those with neighbours at the largest distance. An exponent is the slope of ln(fraction) over
-    ln(distance) by least squares. Its interval has two parts, added in quadrature. One is the
-    variation of the slope if one tile of the grid at a time is left out (jackknife), due to the
-    position of the region. The other is the scatter about the straight line.
+    The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, at least 3. The
+    starts are those with neighbours at the largest distance. An exponent is the slope of
+    ln(fraction) over ln(distance) by least squares. Its interval has two parts, added in
+    quadrature. One is the variation of the slope if one tile of the grid at a time is left out
+    (jackknife), due to the position of the region. The other is the scatter about the line.
     """
     there = np.ones(label.shape, bool) if there is None else there
     farthest = max(int(min(label.shape) * _FARTHEST), 3)

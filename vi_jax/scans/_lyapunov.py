@@ -84,9 +84,8 @@ class Lyapunov(Summarized):
     def to_xarray(
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
-        """Return the exponents, or a batch of them, as an `xarray.Dataset`. The final state has a
-        variable for each component (`state_Y`), and `result` is the reason's name. Not to be
-        traced.
+        """Return the exponents, or a batch, as an `xarray.Dataset`. The final state has a variable
+        for each component (`state_Y`), and `result` is the reason's name. Not to be traced.
 
         **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only variables
         with one dimension: `"exponent"`, or a batch axis.

@@ -86,7 +86,7 @@ class Sweep(Summarized):
     impact_speed: Float[Array, "..."]
     """Greatest V⁻ over the observed cycles."""
     impact_energy: Float[Array, "..."]
-    """Energy lost in impacts per observed cycle, the mean (see `Run.impact_energy`)."""
+    """Mean energy lost in impacts per observed cycle (see `Run.impact_energy`)."""
     sections: State
     """Section states of the observed cycles; leaves (values, cycles)."""
     result: RESULTS
@@ -226,7 +226,7 @@ def sweep(
     - `tolerance`: the largest difference of sections that repeat, as in `Regime`.
     - `max_steps`: the largest number of steps at each value; with more, it counts as failed.
     - `noise`, `key`: a `WhiteNoise`, by default none, and with it one JAX key; value number n has
-      the key `jax.random.fold_in(key, n)`. There are no periods with noise: use sections.
+      the key `jax.random.fold_in(key, n)`. With noise, use extremes and sections, not periods.
     - `progress`: show a bar, in a terminal or a notebook; not within `jit` or `vmap`.
 
     **Returns:** a `Sweep`. A value that fails is NaN; the next one continues from the value before.

@@ -30,12 +30,11 @@ from ..machine import (
 )
 from ._lyapunov import lyapunov
 
-# The largest difference of sections a period apart; its factor for longer periods, if some period
+# The largest difference of sections a period apart; its factor for the least period, if some period
 # fits; and the largest ratio of differences of two periods that fit. Choices.
 _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
-# The least tolerance of sections: multiples of their error under the method, and of rounding:
-# choices.
+# The least tolerance of sections: multiples of their error by the method, and of rounding: choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
@@ -129,8 +128,8 @@ class AbstractMeasure(eqx.Module):
     `AbstractMachine.units`)."""
 
     record: ClassVar[str] = "motion"
-    """The required record, as in `simulate`: `"motion"`, or `"sections"` with counts of impacts and
-    steps."""
+    """The required record, as in `simulate`: `"motion"`, or only `"sections"` and the numbers of
+    impacts and steps."""
 
     def described(self, start: State) -> About:
         """Return attributes of the variables, for states like `start`."""
@@ -143,7 +142,7 @@ class AbstractMeasure(eqx.Module):
 
     @property
     def instants(self) -> int:
-        """The number of samples in a cycle that it needs (`Run.samples`)."""
+        """The number of samples in a cycle that it needs (`Run.samples`), or 0."""
         return 0
 
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
@@ -333,7 +332,7 @@ class Regime(AbstractMeasure):
     meanwhile, or is about to. `REGIMES` has the numbers for these kinds in `period`.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
-    later. A longer `lasting` makes this rarer and chaotic lanes more expensive; 0 omits it.
+    later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass.
     """
 
     longest: int = eqx.field(static=True, default=64)
@@ -556,8 +555,8 @@ class Density(_Observed):
     the share of instants outside of all bins.
 
     The density times the size of a bin is the share of the instants in it, relative to all
-    instants. The bins' edges are attributes of `density`, by the component's name. The scatter of
-    lanes with their own paths gives its error.
+    instants, also those outside. The bins' edges are attributes of `density`, by the component's
+    name. The scatter of lanes with their own paths gives its error.
 
     **Arguments:**
 
@@ -622,8 +621,7 @@ class Escape(_Observed):
     For a lane without escape, `escape_cycle` is the observed time: its escape time is censored,
     known to be longer. Means of `escape_cycle` alone are too small; see `escape_rate`. A lane that
     lies outside at the beginning has 0. A passage is detected at the observed instants only. If the
-    motion may return between them, use the extremes `"y_min"` and `"y_max"` of each cycle, which
-    are exact.
+    motion may return between them, use `"y_min"` and `"y_max"` of each cycle, which are exact.
 
     **Arguments:**
 

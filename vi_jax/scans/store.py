@@ -414,8 +414,8 @@ def identity(thing: object) -> str:
 
 
 def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """Yield the words that describe `thing`. Visited objects are in `seen`, as references may be
-    cyclic."""
+    """Yield the words that describe `thing`. Visited objects are in `seen`: references may form
+    cycles."""
     if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
         yield repr(thing)
     elif isinstance(thing, np.ndarray | np.generic | jax.Array):
