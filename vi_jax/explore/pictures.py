@@ -1,4 +1,4 @@
-"""The pictures of the page. A motion's is SVG, written in milliseconds."""
+"""The page's pictures. A motion's is SVG: written in milliseconds, sharp at any size."""
 
 import html
 import tempfile

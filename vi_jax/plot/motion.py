@@ -197,7 +197,7 @@ def _with_impacts(
 
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
-    """Return whether periods are in crank angle, as for the paper's machine or `None`."""
+    """Return whether periods are in crank angle, as for the paper's machine or no machine."""
     return machine is None or cycles_in_words(machine, 1) == "2π"
 
 
