@@ -1,8 +1,8 @@
 """The base class of all machines, and their contacts and events sorted by kind.
 
-A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, kinds that
-the user defines), each with the coordinate that it acts on. A time step needs the stops, the
-switches, the other events, and by index the coordinates that stops limit.
+A user lists contacts (rigid and soft stops, dry friction) and events (switches, resets, other
+kinds). Each contact has the coordinate that it acts on. A time step needs the stops, the switches,
+the other events, and by index the coordinates that stops limit.
 """
 
 import abc

@@ -138,8 +138,8 @@ def with_friction_impulse(
 
 
 def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the amounts of the stop's push and of the push along it, which is `ratio` times as
-    large, for the change `wanted` of the velocity normal to the stop."""
+    """Return the amounts of the stop's push and of the push along it, for the change `wanted` of
+    the normal velocity. The latter is `ratio` times as large."""
     pushed = wanted / (1 + ratio * gains[0][1])
     return pushed, ratio * pushed
 

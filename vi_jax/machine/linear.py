@@ -292,8 +292,8 @@ def _(matrices, _):
 
 
 def _steady(forces: Any, found: _Basis, omega: Scalar) -> tuple[Any, Flag]:
-    """Return the steady response to constant, cosine and sine, and whether a mode is so close to
-    resonance that the response cancels against the free motion. There it is zero."""
+    """Return the steady response to constant, cosine and sine, and whether a mode is close to
+    resonance. There it would cancel against the free motion, and is zero."""
     if all(f is None for f in forces):
         return None, jnp.zeros((), bool)
     kappa, c = found.stiffness, found.damping

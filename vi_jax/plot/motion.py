@@ -77,8 +77,8 @@ def motion_path(
     corners at stops; `window`, the first and the last cycle to keep; `coordinate`, by number or by
     name, with its own impacts.
 
-    **Raises:** `ValueError` if the run has no samples or is a batch, if its states lack `Y` and `V`
-    without a machine that replaces them, or for an unknown coordinate.
+    **Raises:** `ValueError` for a run without samples, a batch, or an unknown coordinate; or
+    without a machine for states without `Y` and `V`.
     """
     if isinstance(motion, Orbit):
         raise TypeError("Argument `motion` must be a `Run`: give `orbit.trajectory()` of an orbit.")

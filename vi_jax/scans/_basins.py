@@ -512,8 +512,8 @@ class IntegrityProfile(NamedTuple):
     """Basins over one parameter of a machine: the share and the integrity of each motion, also
     called an erosion profile. The steep decrease is Thompson's Dover cliff.
 
-    Motions at neighbouring values count as the same if they have the same period and number of
-    impacts, and their sections differ by less than a quarter of the region.
+    A motion is the same as one at an earlier value if its period and number of impacts are equal.
+    Its sections must differ from the last ones by less than a quarter of the region.
     """
 
     parameter: str

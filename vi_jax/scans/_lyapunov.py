@@ -220,8 +220,8 @@ def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lya
 
 @compiled
 def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
-    """Return the state as a row where the observation begins, with the machine's own modes (or
-    `None`), the first tangent vectors, and the result of the run to there."""
+    """Return the carry where the observation begins: the state as a row with the machine's own
+    modes (or `None`), the first tangent vectors, and the result of the run so far."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     before = simulate(
         machine, start, 1, settle=settle, method=method, rests=rests, record="sections"

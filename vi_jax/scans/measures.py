@@ -695,8 +695,8 @@ def escape_rate(
 
     The rate is the number of escapes over the observed time of all lanes, also of those without
     escape (maximum likelihood for escapes at a constant rate). Its interval is that of a Poisson
-    number (Garwood 1936), with a lower end of 0 without escapes. It is taken into account that an
-    escape observed at instants, `step` apart, happened between two. Host-side: not to be traced.
+    number (Garwood 1936), with a lower end of 0 without escapes. Escapes are observed at instants,
+    `step` apart; the estimate allows for their time between two. Host-side: not to be traced.
 
     **Arguments:**
 
