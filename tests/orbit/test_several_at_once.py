@@ -47,6 +47,16 @@ def branch_of(coupling, excess=0.0, **options):
     )
 
 
+@pytest.fixture(scope="module")
+def uncoupled():
+    return branch_of(0.0)
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    return branch_of(0.1)
+
+
 def places(branch, kind):
     """The parameters of the special points of a kind, in increasing order."""
     return sorted(point.parameter for point in branch.special if point.kind == kind)
@@ -80,10 +90,11 @@ def monodromy(point):
 
 
 @pytest.mark.slow
-def test_of_two_oscillators_each_bifurcation_is_seen():
+def test_of_two_oscillators_each_bifurcation_is_seen(uncoupled):
     """Uncoupled, slightly coupled and slightly different: within one step two multipliers pass 1,
     or -1, and leave no sign in the determinants."""
-    one, weak, strong, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001)))
+    others = (branch_of(*at) for at in ((0.003,), (0.01,), (0.0, 0.001)))
+    one, weak, strong, unlike = uncoupled, *others
     doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
     np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
     np.testing.assert_allclose(doublings[1], [0.19582944, 0.19916897], atol=1e-8)
@@ -100,13 +111,12 @@ def test_of_two_oscillators_each_bifurcation_is_seen():
 
 
 @pytest.mark.slow
-def test_a_branch_that_leaves_another_to_both_sides():
+def test_a_branch_that_leaves_another_to_both_sides(coupled):
     """The one on which both oscillators differ touches the other one where its own parameter turns
     back: that is a branch point, and no fold, and a switch leads to the other one."""
-    branch = branch_of(0.1)
     wanted = [0.1034185332, 0.1281540734]
-    np.testing.assert_allclose(places(branch, "branch-point"), wanted, atol=1e-10)
-    point = next(point for point in branch.special if point.kind == "branch-point")
+    np.testing.assert_allclose(places(coupled, "branch-point"), wanted, atol=1e-10)
+    point = next(point for point in coupled.special if point.kind == "branch-point")
     off = vi.continue_orbit(point.switch(), parameter="force", bounds=(0.05, 0.25), progress=False)
     assert off.ends == ("closed", "closed")
     np.testing.assert_allclose(places(off, "branch-point"), wanted, atol=1e-10)
@@ -116,10 +126,10 @@ def test_a_branch_that_leaves_another_to_both_sides():
 
 
 @pytest.mark.slow
-def test_a_curve_of_folds_of_both_oscillators():
+def test_a_curve_of_folds_of_both_oscillators(uncoupled):
     """Two multipliers are 1 all along it. It is that of one oscillator: folds in (f, ω) that meet
     in a cusp, found by an independent shooting code."""
-    fold = next(point for point in branch_of(0.0).special if point.kind == "fold")
+    fold = next(point for point in uncoupled.special if point.kind == "fold")
     curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert curve.ends == ("bounds", "bounds")
     (cusp,) = curve.special
@@ -131,10 +141,10 @@ def test_a_curve_of_folds_of_both_oscillators():
 
 
 @pytest.mark.slow
-def test_curves_of_branch_points():
+def test_curves_of_branch_points(coupled):
     """Both end where the oscillators are uncoupled and fold, and one touches the curve of folds:
     that is no resonance, since each multiplier 1 has its own eigenvector."""
-    points = [point for point in branch_of(0.1).special if point.kind == "branch-point"]
+    points = [point for point in coupled.special if point.kind == "branch-point"]
     bounds = ((0.02, 0.25), (0.0, 0.3))
     for point, fold in zip(points, (0.1082731067, 0.0799657809), strict=True):
         curve = vi.boundary(point, parameter="coupling", bounds=bounds, progress=False)
