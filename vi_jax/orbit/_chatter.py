@@ -57,7 +57,7 @@ class Hops(NamedTuple):
     """True if there is no next impact, or if it comes too late."""
 
 
-def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: int) -> Hops:
+def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: Scalar) -> Hops:
     """Return the first impact of a chatter with a slow rebound, or the last one before the clock
     `until`; `free` is the flight with the body free, `begin` the first impact."""
     stop = stops_of(free.machine)[number]

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
 
 from .. import lanes
 from .._types import Scalar, Scalars, State, Vector
@@ -128,10 +127,12 @@ class Flight(eqx.Module):
         return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
 
     def fly(
-        self, s0: Scalar, s1: Scalar, u: Vector, steps: int, averages: tuple[str, ...] = ()
-    ) -> tuple[Vector, Integrals, tuple[Float[Array, " steps"], Float[Array, "steps states"]]]:
+        self, s0: Scalar, s1: Scalar, u: Vector, steps: int | Scalar,
+        averages: tuple[str, ...] = (), *, rows: int = 0,
+    ) -> tuple[Vector, Integrals, tuple[Any, Any]]:  # fmt: skip
         """Integrate from `u` at clock `s0` to clock `s1` in equal steps. Return the final state;
-        time and integrals of `averages`; clock and state before each step."""
+        time and integrals of `averages`; clock and state before each of the first `rows` steps.
+        Without rows one program serves any number of steps."""
         form = prepared(self.machine)
         if form.machine is not self.machine:
             inward = form.inward(self.like)
@@ -141,12 +142,12 @@ class Flight(eqx.Module):
                 return ravel_pytree(form.outward(inner.unravel(u)))[0]
 
             start = ravel_pytree(form.inward(self.unravel(u)))[0]
-            u, passed, (clock, states) = inner.fly(s0, s1, start, steps, averages)
+            u, passed, (clock, states) = inner.fly(s0, s1, start, steps, averages, rows=rows)
             return outward(u), passed, (clock, jax.vmap(outward)(states))
         numbers, rest = eqx.partition(self, eqx.is_array)
         (u, passed), path = lanes.run(
-            partial(_begin, averages), partial(_step, rest, steps), _end,
-            (numbers, s0, (s1 - s0) / steps, u), rows=steps,
+            partial(_begin, averages), partial(_step, rest), _end,
+            (numbers, s0, (s1 - s0) / steps, u, jnp.asarray(steps, s0.dtype)), rows=rows,
         )  # fmt: skip
         return u, passed, path
 
@@ -156,13 +157,13 @@ def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any
 
 
 def _begin(averages: tuple[str, ...], inputs: Any) -> tuple[Any, lanes.Emitted]:
-    _, s0, _, u = inputs
+    _, s0, _, u, _ = inputs
     zero = jnp.zeros_like(s0)
     return (u, {name: zero for name in (TIME, *averages)}, zero), lanes.Emitted(True, True, (s0, u))
 
 
-def _step(rest: Flight, steps: int, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:
-    (numbers, s0, h, _), (u, passed, i) = inputs, carry
+def _step(rest: Flight, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:
+    (numbers, s0, h, _, steps), (u, passed, i) = inputs, carry
     s = s0 + i * h
     u, passed = eqx.combine(numbers, rest).step(s, s + h, u, passed)
     i = i + 1

@@ -212,7 +212,7 @@ def _rooms(problem: Shooting, x):
     def follow(leg, s0, s1, u):
         after = problem.after(machine, leg, s0, u)
         flight = problem.flight(machine, leg)
-        _, _, path = flight.fly(s0, s1, after, problem.steps)
+        _, _, path = flight.fly(s0, s1, after, problem.steps, rows=problem.steps)
         h = (s1 - s0) / problem.steps
         _, rooms = turning(Path(flight, path[0], path[1], h, not problem.events))
         return jnp.stack([room for room, _ in rooms]), jnp.stack([s for _, s in rooms])

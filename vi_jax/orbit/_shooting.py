@@ -10,7 +10,6 @@ motion; the sign of V⁻ or of the clearance shows this. (`hspo` of COCO has the
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, reduce
-from math import ceil
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -338,14 +337,15 @@ class Shooting(eqx.Module):
 
     def fly_leg(
         self, machine: AbstractMachine, leg: Leg, begin: Hops, s: Scalar,
-        averages: tuple[str, ...] = (),
+        averages: tuple[str, ...] = (), *, steps: int | Scalar | None = None, rows: int = 0,
     ) -> Any:  # fmt: skip
         """Integrate the flight of a leg after its chatter, to clock `s`; see `Flight.fly`."""
+        steps = self.steps if steps is None else steps
         flight, u = self.flight(machine, leg), begin.u
         for number, lands in self._landing(leg):
             put = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
             u = jnp.where(lands, put, u)
-        end, passed, path = flight.fly(begin.s, s, u, self.steps, averages)
+        end, passed, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
             passed = {name: x + begin.passed[name] for name, x in passed.items()}
         return end, passed, path
@@ -358,14 +358,15 @@ class Shooting(eqx.Module):
 
     def hopped(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, until: Scalar, u: Vector,
-        averages: tuple[str, ...] = (),
+        averages: tuple[str, ...] = (), *, steps: int | Scalar | None = None,
     ) -> Hops:  # fmt: skip
         """Return the last impact before `until` of the chatter that begins a leg, or the begin."""
         hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
             free, begin = self.departing(machine, leg), hops._replace(over=~lands | hops.over)
-            steps = max(2, ceil(_HOP * self.steps / self.cycles))
-            last = hopped(free, number, begin, until=until, steps=steps)
+            share = _HOP * (self.steps if steps is None else steps) / self.cycles
+            each = jnp.maximum(2.0, jnp.ceil(share))
+            last = hopped(free, number, begin, until=until, steps=each)
             hops = last._replace(over=jnp.where(lands, last.over, hops.over))
         return hops
 
@@ -380,19 +381,21 @@ class Shooting(eqx.Module):
         more = [condition.missing(self, x, seen, chatters) for condition in self.conditions]
         return jnp.concatenate([missing, jnp.stack(more)])
 
-    def lacks(self, x: Vector) -> Vector:
+    def lacks(self, x: Vector, steps: Scalar | None = None) -> Vector:
         """Return the left sides of the motion's own equations, zero for a periodic motion: the
-        difference from the end of each leg to the begin of the next, then the guards."""
-        return self._arrivals(x)[0]
+        difference from the end of each leg to the begin of the next, then the guards. `steps` is
+        the number of steps of a flight, if not `self.steps`."""
+        return self._arrivals(x, steps)[0]
 
-    def _arrivals(self, x: Vector) -> tuple[Vector, Hops]:
+    def _arrivals(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Hops]:
         """Return the same, and the end of the chatter with which each leg begins."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
         def arrive(leg, s0, s1, u):
-            begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
-            end, _, _ = self.fly_leg(machine, leg, begin, s1)
+            after = self.after(machine, leg, s0, u)
+            begin = self.hopped(machine, leg, s0, s1, after, steps=steps)
+            end, _, _ = self.fly_leg(machine, leg, begin, s1, steps=steps)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype), begin
             return end, self.guard(machine, leg, s0, u)[None], begin
@@ -417,7 +420,7 @@ class Shooting(eqx.Module):
         def follow(leg, s0, s1, u):
             def end(u):
                 begin = self.hopped(machine, leg, s0, s1, u, averages)
-                end, passed, path = self.fly_leg(machine, leg, begin, s1, averages)
+                end, passed, path = self.fly_leg(machine, leg, begin, s1, averages, rows=self.steps)
                 return end, (passed, path, begin)
 
             after = self.after(machine, leg, s0, u)
@@ -519,7 +522,7 @@ class Shooting(eqx.Module):
         for i, contact in enumerate(self.contacts):
             if any(contact):
                 begin = last(i)
-                path = self.fly_leg(machine, i, begin, ends[i])[2]
+                path = self.fly_leg(machine, i, begin, ends[i], rows=self.steps)[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
                 pull = pull_of(Path(flight, path[0], path[1], h, not self.events))
                 least = jnp.minimum(least, pull.room)

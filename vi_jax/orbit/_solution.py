@@ -125,15 +125,15 @@ def observe(problem: Shooting, x):
 
 
 @on_host
-def _lacks(problem: Shooting, x):
-    ends = problem.lacks(x)[: problem.legs * problem.states]
+def _lacks(problem: Shooting, x, steps):
+    ends = problem.lacks(x, steps)[: problem.legs * problem.states]
     return ends.reshape(-1, problem.states) / problem.sizes[1:]
 
 
 def off_by(problem: Shooting, x: Unknowns) -> float:
     """Return the relative change of the ends of the flights by doubling the steps."""
-    finer = dataclasses.replace(problem, steps=2 * problem.steps)
-    return float(np.max(np.abs(_lacks(finer, x) - _lacks(problem, x))))
+    shared, steps = dataclasses.replace(problem, steps=1), float(problem.steps)
+    return float(np.max(np.abs(_lacks(shared, x, 2 * steps) - _lacks(shared, x, steps))))
 
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
