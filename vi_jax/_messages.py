@@ -15,7 +15,7 @@ from tqdm import tqdm
 P = ParamSpec("P")
 R = TypeVar("R")
 
-Tell = Callable[[int], Any]
+ReportProgress = Callable[[int], Any]
 """A function of the number of further units of work that are done."""
 
 
@@ -52,7 +52,7 @@ def at_work(
     unit: str = "it",
     total: int | None = None,
     done: int = 0,
-) -> Iterator[Tell]:
+) -> Iterator[ReportProgress]:
     """Show a progress bar during a long part of a function, and keep its results on Ctrl-C.
 
     Yield a function of the number of units done since its last call. It updates the bar, and raises
@@ -65,14 +65,14 @@ def at_work(
 
     **Raises:** on Ctrl-C the result of `kept`, or the `KeyboardInterrupt` itself.
     """
-    from .lanes import interrupts_heard, raise_dropped  # here, since it loads JAX
+    from .lanes import raise_dropped, raise_interrupts_within  # here, since it loads JAX
 
     def tell(done: int) -> None:
         bar.update(done)
         raise_dropped()
 
     try:
-        with interrupts_heard(), tqdm(
+        with raise_interrupts_within(), tqdm(
             desc=what, total=total, initial=done, unit=f" {unit}", unit_scale=True,
             disable=None if progress else True,
         ) as bar:  # fmt: skip
@@ -125,15 +125,15 @@ _SKIPPED = {
 
 def warning_once(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator: give each warning once in a call, even if JAX traces several times. Interrupts
-    that Python drops are raised (`interrupts_heard`)."""
+    that Python drops are raised (`raise_interrupts_within`)."""
 
     @functools.wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
-        from .lanes import interrupts_heard
+        from .lanes import raise_interrupts_within
 
         token = _GIVEN.set(set()) if _GIVEN.get() is None else None
         try:
-            with interrupts_heard():
+            with raise_interrupts_within():
                 return function(*args, **kwargs)
         finally:
             if token is not None:
@@ -155,7 +155,7 @@ def warn(words: str) -> None:
     warnings.warn(words, stacklevel=level)
 
 
-def so_many(number: int | np.integer, noun: str) -> str:
+def count_of(number: int | np.integer, noun: str) -> str:
     """Return a number with its noun, in the plural unless the number is 1."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 

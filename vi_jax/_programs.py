@@ -19,7 +19,7 @@ import jax
 import jax.tree_util as jtu
 from jax.core import Tracer
 
-from .lanes import Unsupported, current_backend, interrupts_heard, vector_only
+from .lanes import Unsupported, current_backend, raise_interrupts_within, vector_only
 
 # With these options XLA compiles two to three times faster. Most of the run time is spent in the
 # lanes, whose code XLA does not compile. `PLAIN` alone saves half of the compile time and costs no
@@ -138,7 +138,7 @@ class CompiledFunction:
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Return the function's result, computed by its compiled program. **Raises:**
         `KeyboardInterrupt`, also for an interrupt during the call that Python dropped."""
-        with interrupts_heard():
+        with raise_interrupts_within():
             return self._called(arguments, keywords)
 
     def _called(self, arguments: tuple, keywords: dict[str, Any]) -> Any:

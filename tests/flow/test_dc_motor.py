@@ -149,7 +149,7 @@ def test_periodic_motions_and_what_follows_from_them():
     spectrum = vi.lyapunov(scene, orbit.state, cycles=96)
     growth = np.sort(np.log(np.abs(orbit.multipliers)))[::-1] / float(orbit.duration)
     np.testing.assert_allclose(spectrum.exponents, growth, atol=2e-3)
-    timed = vi.lyapunov(scene, scene.in_clock("time").adopt(orbit.state), cycles=96)
+    timed = vi.lyapunov(scene, scene.in_clock("time").convert_start(orbit.state), cycles=96)
     np.testing.assert_array_equal(timed.exponents, spectrum.exponents)
     # The motor's mean torque pays for the mean load: over a period the armature keeps nothing.
     run = orbit.trajectory(samples=256)
@@ -181,7 +181,7 @@ def test_starts():
     assert float(scene.start(W=0.0).M) == pytest.approx(0.65 * 0.9)
     timed = scene.in_clock("time")
     assert isinstance(timed.start(), vi.TimedDCMotorState)
-    assert isinstance(timed.adopt(scene.start()), vi.TimedDCMotorState)
+    assert isinstance(timed.convert_start(scene.start()), vi.TimedDCMotorState)
     plain = vi.Parameters().scene()
     with pytest.raises(TypeError, match=r"must be a `DCMotorState`.*got a `MotorState`"):
         vi.simulate(scene, plain.start(), 1)

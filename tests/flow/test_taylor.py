@@ -196,9 +196,11 @@ def test_what_rounding_moves_when_a_body_is_let_go_is_no_turn():
         return 0.1 * float(rising_root(facing, iterations=8))
 
     assert turn(Along(series)) < 1e-15
-    assert abs(turn(Along(series).without_flutter(jnp.asarray(4e-14))) - 0.05) < 1e-9
+    assert abs(turn(Along(series).without_rounding_after_release(jnp.asarray(4e-14))) - 0.05) < 1e-9
     moving = [*series[:2], jnp.asarray(-1e-3), *series[3:]]
-    assert turn(Along(moving).without_flutter(jnp.asarray(4e-14))) == turn(Along(moving))
+    assert turn(Along(moving).without_rounding_after_release(jnp.asarray(4e-14))) == turn(
+        Along(moving)
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import vi_jax as vi
 from vi_jax.lanes import _interrupts
-from vi_jax.lanes.call import registered
+from vi_jax.lanes.call import register_handler
 
 made, both = _interrupts.engine_of, threading.Barrier(2)
 engines = []
@@ -21,7 +21,7 @@ def slowly(text):
 
 def first():
     both.wait()
-    registered()
+    register_handler()
 
 
 _interrupts.engine_of = slowly

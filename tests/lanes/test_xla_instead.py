@@ -109,7 +109,7 @@ def test_another_version_of_the_calls_of_xla(difference, monkeypatch):
     else:
         monkeypatch.setattr(call, "_Buffers", call._Frame)  # of another size
     monkeypatch.setattr(call, "TARGET", f"vi_jax_lanes_of_another_{difference}")
-    monkeypatch.setattr(_primitive, "registered", call.registered.__wrapped__)
+    monkeypatch.setattr(_primitive, "register_handler", call.register_handler.__wrapped__)
     _primitive._warn.cache_clear()
     heights = jnp.linspace(1.0, 2.0, 5)
     words = r"version 0\.\d+ of XLA's call interface .* is incompatible"

@@ -135,7 +135,7 @@ def test_grazing_of_the_paper():
     assert found.checked[1] > 1e3 * found.checked[0] and found.agreement == 1
     # What the machine does instead is in the picture; unasked, that nothing near attracts.
     labels = [text.get_text() for text in vi.plot_grazing(found).get_legend().get_texts()]
-    assert labels == [f"the machine, far away: {found.afar}", "grazing"]
+    assert labels == [f"the machine, far away: {found.distant_in_words}", "grazing"]
     ax = vi.plot_grazing(dataclasses.replace(found, machine=None, far=None))
     assert [text.get_text() for text in ax.texts] == ["forecast: no attractor near"]
 

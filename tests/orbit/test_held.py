@@ -171,9 +171,9 @@ def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     (pair_held,) = _conditions.as_held({"multiplier": 0.7}, np.array([*pair, 0.3]))
     assert pair_held.pair
 
-    def overtaken(*values):
+    def dominance_margin(*values):
         rest = dict.fromkeys(Observed._fields[1:])
-        return pair_held.overtaken(Observed(multipliers=np.array(values), **rest))
+        return pair_held.dominance_margin(Observed(multipliers=np.array(values), **rest))
 
-    assert overtaken(*pair, 0.3) < 0
-    assert overtaken(0.75, 0.49 / 0.75, 0.3) > 0 and overtaken(0.8, *pair) > 0
+    assert dominance_margin(*pair, 0.3) < 0
+    assert dominance_margin(0.75, 0.49 / 0.75, 0.3) > 0 and dominance_margin(0.8, *pair) > 0

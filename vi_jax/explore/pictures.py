@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..machine import logged_turn, name_in, stops_of
 from ..plot import BLUE, GREEN, RED, animate
-from .subject import SHOWN, WINDOW, Diagram, Motion, seen_evenly
+from .subject import SHOWN, WINDOW, Diagram, Motion, observed_evenly
 
 MAPS = ("section map", "impact map", "drive's speed")
 """The choices of the third picture of a motion."""
@@ -174,7 +174,7 @@ def draw_diagram(found: Diagram, chosen: float, shown: str) -> Axes:
 
 def gif_of(motion: Motion) -> bytes:
     """Return an animation of the drawn cycles as a GIF, which takes seconds."""
-    evenly = seen_evenly(motion.machine, motion.window.last)
+    evenly = observed_evenly(motion.machine, motion.window.last)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "motion.gif"
         animate(motion.window, evenly, seconds=4, fps=15).save(path)

@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import machines
 from .._checks import fields_with, interval
-from .._messages import so_many
+from .._messages import count_of
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, Run, chosen, simulate
@@ -24,9 +24,9 @@ from ..machine import (
     AbstractMachine,
     Parameters,
     Scene,
-    adopt,
     check_again,
     components,
+    convert_start,
     cycles_in_words,
     in_brackets,
     is_autonomous,
@@ -37,7 +37,7 @@ from ..machine import (
 )
 from ..orbit import STABILITY, complex_in_words, cycle_map, multipliers_of, stability_of
 from ..plot import MotionPath, axis_name, motion_path
-from ..scans import REGIMES, Regime, lyapunov, taken_along
+from ..scans import REGIMES, Regime, lyapunov, moved_by_stops
 
 START, SETTLE = "start.", "cycles before"
 """The prefix of the start's sliders, and the name of that of the cycles before the drawn ones."""
@@ -112,7 +112,7 @@ class Motion(NamedTuple):
     def regime(self) -> str:
         """The regime in words: its period and impacts, or the kind of a motion without a period."""
         if self.period > 0:
-            impacts = so_many(round(self.impacts), "impact")
+            impacts = count_of(round(self.impacts), "impact")
             return f"period {cycles_in_words(self.machine, self.period)} with {impacts}"
         kind = REGIMES(self.period).meaning
         if self.period == REGIMES.failed:
@@ -155,7 +155,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     met = np.asarray(log.stop) >= 0
     return Motion(
         machine=scene,
-        path=motion_path(window, machine=seen_evenly(scene, run.last)),
+        path=motion_path(window, machine=observed_evenly(scene, run.last)),
         impact_phase=np.asarray(log.phase)[met],
         impact_speed=np.asarray(log.speed)[met],
         frequency_ratio=np.full(OBSERVED, np.nan) if ratio is None else np.asarray(ratio),
@@ -176,11 +176,11 @@ def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, 
     """Return the observed run, its first cycles sampled, regime, multipliers, section points."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
-    start = taken_along(scene, adopt(scene, start))
+    start = moved_by_stops(scene, convert_start(scene, start))
     run = simulate(scene, start, OBSERVED, settle=settle, impact_log=_MAPPED, **options)
     first = jtu.tree_map(lambda x: x[0], run.sections)
     window = simulate(
-        seen_evenly(scene, first), first, WINDOW, samples=_SAMPLES, impact_log=_DRAWN, **options
+        observed_evenly(scene, first), first, WINDOW, samples=_SAMPLES, impact_log=_DRAWN, **options
     )
     found = _REGIME(scene, run)
     places = tuple(jax.vmap(f)(run.sections) for f in (scene.position, scene.velocity))
@@ -188,7 +188,7 @@ def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, 
     return run, window, found, multipliers, places
 
 
-def seen_evenly(machine: AbstractMachine, state: State) -> AbstractMachine:
+def observed_evenly(machine: AbstractMachine, state: State) -> AbstractMachine:
     """Return the machine; an autonomous one is observed at equal intervals, for samples."""
     if not is_autonomous(machine, state):
         return machine
@@ -250,7 +250,7 @@ class Subject:
     def __init__(
         self, machine: AbstractMachine, ranges: Mapping[str, tuple[float, float]] | None = None
     ):
-        self.machine, self.start = machine, adopt(machine, machine.start())
+        self.machine, self.start = machine, convert_start(machine, machine.start())
         given = {**getattr(machine, "slider_ranges", {}), **(ranges or {})}
         real = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
         numbers = {name: float(x) for name, x in components(machine).items() if real(x)}
@@ -419,7 +419,9 @@ def _fitting(do: Callable[[int], Any]) -> int:
 def _settled(machine: Any, names: tuple[str, ...], rows: Any, start: Any, settle: Any) -> Any:
     def one(row):
         here = with_leaves(machine, dict(zip(names, row, strict=True)))
-        run = simulate(here, taken_along(here, adopt(here, start)), CYCLES, settle=settle)
+        run = simulate(
+            here, moved_by_stops(here, convert_start(here, start)), CYCLES, settle=settle
+        )
         assert run.y_min is not None and run.impact_speed is not None
         Y, V = (jax.vmap(f)(run.sections)[1:] for f in (here.position, here.velocity))
         return Y, V, run.y_min, run.impact_speed

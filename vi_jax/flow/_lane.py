@@ -112,7 +112,7 @@ class Lane(NamedTuple):
     """Length of the next step."""
     target: Scalar
     """The target of the next step."""
-    aims: Scalar
+    attempts: Scalar
     """Number of attempts to reach a target since the last accepted step."""
     part: Scalar
     """Index of the interval within its cycle."""
@@ -138,15 +138,15 @@ class Lane(NamedTuple):
         number = code(reason) if isinstance(reason, str) else reason
         return self._replace(fault=jnp.where(where & when, number, self.fault))
 
-    def completing(self, when: Flag) -> "Lane":
+    def complete_interval(self, when: Flag) -> "Lane":
         """Return the lane with its interval marked as complete where `when` is true."""
         assert self.completed is not None
         return self._replace(completed=self.completed | when)
 
-    def recording(self, **changes: Any) -> "Lane":
+    def update_record(self, **changes: Any) -> "Lane":
         return self._replace(record=self.record._replace(**changes))
 
-    def noting(
+    def log_event(
         self, when: Flag, clock: Scalar, kind: EventKind | Scalar, number: Any, value: Any
     ) -> "Lane":
         """Return the lane with an entry added to the event log if `when` is true and there is room;
@@ -155,7 +155,7 @@ class Lane(NamedTuple):
         if events is None:
             return self
         place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
-        return self.recording(events=written(events, when, place, clock, kind, number, value))
+        return self.update_record(events=written(events, when, place, clock, kind, number, value))
 
 
 def written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:

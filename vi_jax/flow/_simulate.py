@@ -20,13 +20,13 @@ from ..lanes import elementwise_primitive
 from ..machine import (
     AbstractMachine,
     as_logged,
-    bare,
     cycle_time,
     frequency_ratio,
     modes_of,
     others_of,
     outcomes_of,
     stated,
+    without_modes,
 )
 from ._lane import Plan, Record
 from ._own import has_quantities
@@ -199,7 +199,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     """Return the run of a lane from its ends, and the states (`points`) and records of its
     intervals, as `run_lane` returns them. If `sampled`, the states are also returned as samples."""
     machine, parts = plan.machine, plan.parts
-    points, modes = bare(points), modes_of(points) or ()
+    points, modes = without_modes(points), modes_of(points) or ()
     records = jtu.tree_map(lambda x: x[1:], records)
 
     def per_cycle(values, reduce):

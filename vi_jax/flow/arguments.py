@@ -35,9 +35,8 @@ from ..machine import (
     AbstractMachine,
     Scene,
     ShaftMachine,
-    adopt,
-    bare,
     begin_modes,
+    convert_start,
     field_in,
     has_velocity,
     in_clock,
@@ -46,6 +45,7 @@ from ..machine import (
     modes_at_start,
     modes_of,
     stops_of,
+    without_modes,
 )
 from ._lane import Plan
 from ._own import average_names, check_parts, quantity_names
@@ -132,7 +132,7 @@ def planned(
     if options.clock is not None:
         machine = in_clock(machine, options.clock)
     require_session("machine", machine)
-    own, start = modes_of(start), adopt(machine, bare(start))
+    own, start = modes_of(start), convert_start(machine, without_modes(start))
     start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)

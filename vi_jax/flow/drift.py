@@ -61,7 +61,9 @@ def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) 
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def unmoved(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
+def with_flow_derivatives(
+    rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
+) -> Any:
     """Return `drifted` for an offset that is zero in value, but has derivatives: `moving` itself,
     with those of the flow."""
     return moving
@@ -89,11 +91,11 @@ def _carried_jvp(carried, rate, primals, tangents):
 
 
 drifted.defjvp(partial(_carried_jvp, drifted), symbolic_zeros=True)
-unmoved.defjvp(partial(_carried_jvp, unmoved), symbolic_zeros=True)
+with_flow_derivatives.defjvp(partial(_carried_jvp, with_flow_derivatives), symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def met_after(
+def event_offset(
     rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
 ) -> Scalar:
     """Return the offset in s to the zero of a guard: `offset` itself, which must be accurate to
@@ -103,7 +105,7 @@ def met_after(
 
 def _met_after_jvp(rate, guard, primals, tangents):
     _, moving, fixed, rest = primals
-    offset = met_after(rate, guard, *primals)
+    offset = event_offset(rate, guard, *primals)
     moves, numbers = _numbers(tangents[1:3])
     if not any(moves):
         return offset, jnp.zeros_like(offset)
@@ -118,7 +120,7 @@ def _met_after_jvp(rate, guard, primals, tangents):
     return offset, -change / jnp.where(speed == 0, 1.0, speed)
 
 
-met_after.defjvp(_met_after_jvp, symbolic_zeros=True)
+event_offset.defjvp(_met_after_jvp, symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -150,7 +152,7 @@ def _height_of_turn_jvp(rate, place, primals, tangents):
         return jax.jvp(lambda x: place(x, fixed, rest), (moving,), (onward,))[1]
 
     def top(moving, fixed):
-        there = met_after(rate, speed, offset, moving, fixed, rest)
+        there = event_offset(rate, speed, offset, moving, fixed, rest)
         return place(drifted(rate, there, moving, fixed, rest), fixed, rest)
 
     def slope_of(function: Callable) -> Scalar:
@@ -187,14 +189,14 @@ class FlowToEvent:
         """Return s, state and integrals after a further `offset`, by default from the start."""
         return drifted(self._pure_rate, offset, *self._given(moving))
 
-    def unmoved(self, offset: Scalar) -> Any:
+    def with_flow_derivatives(self, offset: Scalar) -> Any:
         """Return the same for an offset that is zero in value, but has derivatives."""
-        return unmoved(self._pure_rate, offset, *self._given())
+        return with_flow_derivatives(self._pure_rate, offset, *self._given())
 
-    def met_after(self, guard: Callable, offset: Scalar) -> Scalar:
+    def event_offset(self, guard: Callable, offset: Scalar) -> Scalar:
         """Return `offset`, to the zero of a guard or a force, with its derivatives."""
         guard = self._pure(guard)
-        return met_after(self._pure_rate, guard, offset, *self._given())
+        return event_offset(self._pure_rate, guard, offset, *self._given())
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
         """Return the `height` of coordinate number k with derivatives (`drift.height_of_turn`)."""

@@ -22,7 +22,6 @@ from ..machine import (
     AbstractMachine,
     ContactFriction,
     angles_in,
-    bare,
     begin_modes,
     events_of,
     guard_of,
@@ -38,6 +37,7 @@ from ..machine import (
     size_of,
     stops_of,
     struck_modes,
+    without_modes,
 )
 from ._lane import Lane, Plan, Record, to_event, total
 from ._own import check_events, check_field, check_laws
@@ -76,7 +76,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
 
     **Arguments:** `start`, the initial state; `rows`, other states of the motion, (..., states).
     """
-    state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), bare(start))  # integers too
+    state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(start))  # integers too
     row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
         return jnp.ones_like(row)
@@ -216,7 +216,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         length=length,
         attempt=length,
         target=zero,
-        aims=zero,
+        attempts=zero,
         part=plan.first_part(zero) if plan.instants > 1 else zero,
         done=zero,
         fault=jnp.where(bad, code("bad_start"), zero),
@@ -293,7 +293,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         rows=plan.kept + 1, backend=plan.backend,
     )  # fmt: skip
     if not own:
-        states = replaced(states, jax.vmap(form.outward)(bare(states)))
+        states = replaced(states, jax.vmap(form.outward)(without_modes(states)))
     return ends, states, records
 
 

@@ -14,20 +14,20 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .._checks import one_of
-from .._messages import so_many
+from .._messages import count_of
 from .._types import Scalar, State, xr
 from ..machine import (
     PLAIN,
     Shown,
     Stated,
     Summarized,
-    bare,
     by_name,
     in_unit,
     name_in,
     state_in_words,
     with_modes,
     with_units,
+    without_modes,
 )
 
 # A batch of at most this many members is listed one by one: a choice, as many as fit a line.
@@ -348,8 +348,8 @@ def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
     used = np.asarray(used)
     if used.ndim > 2:
         return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"
-    many = so_many(int(used.sum()), what)
-    lines = [f"{many} listed in {so_many(len(used), 'cycle')}"]
+    many = count_of(int(used.sum()), what)
+    lines = [f"{many} listed in {count_of(len(used), 'cycle')}"]
     some = np.flatnonzero(used.any(axis=1))
     for i in some[:_CYCLES]:
         places = np.flatnonzero(used[i])
@@ -552,10 +552,10 @@ class Run(Summarized):
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"
         cycles = self.impacts.shape[-1]
         lines = [
-            f"Run of {so_many(cycles, 'cycle')}, {so_many(int(jnp.sum(self.impacts)), 'impact')}"
+            f"Run of {count_of(cycles, 'cycle')}, {count_of(int(jnp.sum(self.impacts)), 'impact')}"
         ]
         units = dict(self.units)
-        lines.append(f"  last section: {state_in_words(bare(self.last), 9, units)}")
+        lines.append(f"  last section: {state_in_words(without_modes(self.last), 9, units)}")
         if self.y_min is not None and self.y_max is not None:
             span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
             span = in_unit(span, units, "position")

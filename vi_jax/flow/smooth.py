@@ -14,20 +14,20 @@ from jax.extend.core import Jaxpr
 from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
-from ..lanes import called, walked
+from ..lanes import called, propagate_marks
 from ..machine import (
     AbstractMachine,
     Coordinate,
     added,
+    constrained_rate,
     field_in,
-    gained,
     has_contact_friction,
-    held_flow,
     holds_anywhere,
     push_of,
     scales_known,
     shown_modes,
     stops_of,
+    velocity_change,
 )
 
 # Thresholds in `s` are for cycles of about 2π, and hold for cycles up to this factor shorter or
@@ -73,7 +73,7 @@ class SmoothMachine(eqx.Module):
         limited = limited_of(machine) if self.contact else []
         several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
-            flow = held_flow(machine, flow, s, state, self.modes, self.contact)[0]
+            flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]
         for k in () if several else limited:  # no rounding if one body rests
             flow = _held_still(machine.coordinates[k], state, flow, self.contact[k] > 0)
         return flow
@@ -89,7 +89,7 @@ def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) 
     """Return the rate of a state along `flow` with this coordinate's position and velocity constant
     if it `rests`: without the part along `push`, else by the derivative of `placed`."""
     if coordinate.push is not None:
-        taken = jnp.where(rests, -gained(coordinate, state, flow), 0.0)
+        taken = jnp.where(rests, -velocity_change(coordinate, state, flow), 0.0)
         return added(flow, (taken,), (push_of(coordinate, state),))
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     zero = jnp.zeros_like(place)
@@ -137,7 +137,7 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     def moved(eqn: Any, moves: list[bool]) -> list[bool]:
         name, body = eqn.primitive.name, called(eqn)
         if body is not None:
-            return walked(body if isinstance(body, Jaxpr) else body.jaxpr, moves, moved)
+            return propagate_marks(body if isinstance(body, Jaxpr) else body.jaxpr, moves, moved)
         linear = name in _LINEAR or (name in _BILINEAR and sum(moves) == 1)
         if not linear and (name != "div" or moves[1]):
             others.append(name)
@@ -145,7 +145,7 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
 
     others: list[str] = []
     jaxpr = jax.make_jaxpr(function)(state).jaxpr
-    walked(jaxpr, [True] * len(jaxpr.invars), moved)
+    propagate_marks(jaxpr, [True] * len(jaxpr.invars), moved)
     return not others
 
 

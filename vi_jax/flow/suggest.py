@@ -18,7 +18,7 @@ from jaxtyping import Array
 from .._checks import count, one_of, require
 from .._messages import warning_once
 from .._types import Scalar, State
-from ..machine import AbstractMachine, adopt, bare, in_rows, size_of
+from ..machine import AbstractMachine, convert_start, in_rows, size_of, without_modes
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .loop import row_sizes, sizes_on_host
@@ -113,7 +113,7 @@ def suggest_method(
         )
     if start is None:
         start = machine.start()
-    start = adopt(machine, start)
+    start = convert_start(machine, start)
     check_start(machine, start)
     bench = _Bench(machine, start, quantity, cycles, lanes)
     best = preset(machine, "reference")
@@ -204,10 +204,10 @@ class _Bench:
         self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
-        row, unravel = ravel_pytree(bare(start))
+        row, unravel = ravel_pytree(without_modes(start))
         sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(row))))
         # Stops limit everything except velocities.
-        self.speed = size_of(machine.coordinates[0].velocity, bare(start), sizes)
+        self.speed = size_of(machine.coordinates[0].velocity, without_modes(start), sizes)
         self.nudges = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
@@ -233,8 +233,8 @@ class _Bench:
                 most = jnp.stack([jnp.asarray(machine.cycle), jnp.nanmax(found[1], initial=0.0)])
                 sizes = jnp.broadcast_to(most[:, None, None], found.shape)
             else:
-                found = in_rows(bare(run.last), 0)
-                sizes = row_sizes(machine, start, in_rows(bare(run.sections)))
+                found = in_rows(without_modes(run.last), 0)
+                sizes = row_sizes(machine, start, in_rows(without_modes(run.sections)))
             return found, (sizes, run.successful)
 
         if self.quantity == "derivative":

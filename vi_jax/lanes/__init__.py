@@ -1,11 +1,11 @@
 """One lane's loop, run for any number of lanes: vector code by LLVM on a CPU, else XLA."""
 
-from ._interrupts import interrupts_heard as interrupts_heard
 from ._interrupts import raise_dropped as raise_dropped
+from ._interrupts import raise_interrupts_within as raise_interrupts_within
 from ._primitive import vector_only as vector_only
 from ._program import called as called
 from ._program import dependent_results as dependent_results
-from ._program import walked as walked
+from ._program import propagate_marks as propagate_marks
 from ._vector import Unsupported as Unsupported
 from .call import interruptible as interruptible
 from .elementary import elementwise_primitive as elementwise_primitive

@@ -27,7 +27,6 @@ from ._arrays import (
     fill,
     held,
     in_lanes,
-    in_one,
     is_cheap,
     joined,
     mapped,
@@ -41,6 +40,7 @@ from ._arrays import (
     stored,
     times,
     uniform,
+    without_cuts,
 )
 from ._operations import (
     ELEMENTWISE,
@@ -71,7 +71,7 @@ placed = partial(register, PLACED)
 # --- views
 
 
-class _Along(NamedTuple):
+class _AxisMap(NamedTuple):
     """The indices along one axis of an array, as a linear function of indices of another shape."""
 
     axis: int | None
@@ -85,7 +85,7 @@ class _Along(NamedTuple):
         return plus(t, times(t, index[self.axis], self.by), self.begin)
 
 
-def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_Along]) -> Array:
+def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_AxisMap]) -> Array:
     """Return a view of an array's numbers in another shape.
 
     **Arguments:** the text; the array; the new shape; the indices along each axis of the array.
@@ -122,7 +122,7 @@ def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
     mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
     if [x.shape[i] for i in mine] == [shape[i] for i in other]:
         axes = dict(zip(mine, other, strict=True))
-        return _moved(t, x, shape, [_Along(axes.get(a)) for a in range(x.ndim)])
+        return _moved(t, x, shape, [_AxisMap(axes.get(a)) for a in range(x.ndim)])
     if not isinstance(x, Strided) or [x.strides[i] for i in mine] != [
         contiguous(x.shape)[i] for i in mine
     ]:
@@ -137,14 +137,14 @@ def _(t, p, avals, x):
 
 def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
     order = list(order)
-    along = [_Along(order.index(a)) for a in range(x.ndim)]
+    along = [_AxisMap(order.index(a)) for a in range(x.ndim)]
     return _moved(t, x, [x.shape[a] for a in order], along)
 
 
 @structural("rev")
 def _(t, p, avals, x):
     turned = p["dimensions"]
-    along = [_Along(a, -1, n - 1) if a in turned else _Along(a) for a, n in enumerate(x.shape)]
+    along = [_AxisMap(a, -1, n - 1) if a in turned else _AxisMap(a) for a, n in enumerate(x.shape)]
     return _moved(t, x, x.shape, along)
 
 
@@ -152,14 +152,14 @@ def _(t, p, avals, x):
 def _(t, p, avals, x):
     # The transposes of JAX have NumPy integers here.
     ways = zip(p["strides"] or [1] * x.ndim, p["start_indices"], strict=True)
-    along = [_Along(a, int(by), int(begin)) for a, (by, begin) in enumerate(ways)]
+    along = [_AxisMap(a, int(by), int(begin)) for a, (by, begin) in enumerate(ways)]
     return _moved(t, x, avals[0].shape, along)
 
 
 def part_along(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
     """Return the part of an array between two indices of an axis."""
     shape = [end - begin if a == axis else n for a, n in enumerate(x.shape)]
-    return _moved(t, x, shape, [_Along(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
+    return _moved(t, x, shape, [_AxisMap(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
 
 
 @structural("split")
@@ -189,7 +189,7 @@ def _(t, p, avals, x, *sizes):
     if x.size < size:  # else each number is used once
         x = settled(t, x)
     pairs = zip(where, x.shape, strict=True)
-    return _moved(t, x, shape, [_Along(a if n != 1 else None) for a, n in pairs])
+    return _moved(t, x, shape, [_AxisMap(a if n != 1 else None) for a, n in pairs])
 
 
 def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
@@ -302,7 +302,7 @@ def _starts(t: Text, starts, dtypes, sizes, shape) -> list[Index]:
 
 @placed("dynamic_slice")
 def _(t, p, avals, d, x, *starts):
-    begin, x = _starts(t, starts, d[1:], p["slice_sizes"], x.shape), in_one(t, x)
+    begin, x = _starts(t, starts, d[1:], p["slice_sizes"], x.shape), without_cuts(t, x)
     number = lambda index: x.at(t, [plus(t, i, j) for i, j in zip(index, begin, strict=True)])
     return Formula(tuple(avals[0].shape), x.kind, number)
 
@@ -342,7 +342,7 @@ def _copy(t: Text, x: Array, in_memory: bool) -> Registers | Strided:
     return Registers(x.values.copy(), x.kind)
 
 
-class _Asked(NamedTuple):
+class _IndexedBlocks(NamedTuple):
     """Blocks of an array at indices that depend on data."""
 
     indices: Array
@@ -372,11 +372,16 @@ class _Asked(NamedTuple):
 
 @placed("gather")
 def _(t, p, avals, d, x, indices):
-    n, aval, x, indices = p["dimension_numbers"], avals[0], in_one(t, x), in_one(t, indices)
+    n, aval, x, indices = (
+        p["dimension_numbers"],
+        avals[0],
+        without_cuts(t, x),
+        without_cuts(t, indices),
+    )
     gone = (*n.collapsed_slice_dims, *n.operand_batching_dims)
     inner = [a for a in range(x.ndim) if a not in gone]
 
-    asked = _Asked(
+    asked = _IndexedBlocks(
         indices, d[1], n.start_index_map,
         tuple(zip(n.operand_batching_dims, n.start_indices_batching_dims, strict=True)),
         [size - own for size, own in zip(x.shape, p["slice_sizes"], strict=True)],
@@ -412,8 +417,8 @@ def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices
     gone = (*d.inserted_window_dims, *d.operand_batching_dims)
     inner, axes = [a for a in range(x.ndim) if a not in gone], d.update_window_dims
     sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
-    asked = _Asked(
-        in_one(t, indices), dtypes[1], d.scatter_dims_to_operand_dims,
+    asked = _IndexedBlocks(
+        without_cuts(t, indices), dtypes[1], d.scatter_dims_to_operand_dims,
         tuple(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True)),
         [n - sizes.get(a, 1) for a, n in enumerate(x.shape)], "CLIP" in str(p["mode"]),
     )  # fmt: skip
@@ -570,7 +575,7 @@ def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
             out[i : i + 1] = mapped(t, how, before, here).values
         out = out[::-1] if p["reverse"] else out
         return Registers(np.moveaxis(out, 0, p["axis"]), x.kind)
-    x = in_one(t, x)
+    x = without_cuts(t, x)
     axis, out = p["axis"], room(t, x.shape, x.kind)
     length = x.shape[axis]
     others = [1 if a == axis else n for a, n in enumerate(x.shape)]

@@ -505,7 +505,7 @@ def settled(t: Text, x: Array) -> Array:
     return x if is_cheap(x) else stored(t, x)
 
 
-def in_one(t: Text, x: Array) -> Array:
+def without_cuts(t: Text, x: Array) -> Array:
     """Return an array without cuts, for indices known only at run time."""
     return stored(t, x) if x.cuts else settled(t, x)
 

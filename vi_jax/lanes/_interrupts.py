@@ -231,7 +231,7 @@ _dropped: list[bool] = []
 
 
 @contextmanager
-def interrupts_heard() -> Iterator[None]:
+def raise_interrupts_within() -> Iterator[None]:
     """Raise an interrupt that Python drops within this context, at its end at the latest. One
     dropped earlier within an outer context is raised at the beginning.
 

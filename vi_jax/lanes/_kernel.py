@@ -109,7 +109,7 @@ class _Writer:
         t.join(head.values(), (ready.values(), "ready"), (stepped.values(), step_end), at=place)
         if t.arena.size * t.width * 8 > _MOST_BYTES:
             raise Unsupported(f"{t.arena.size * t.width * 8 >> 30} GB for its arrays")
-        claimed, released = claim(t)
+        claimed, released = allocation_lines(t)
         t.lines += ["exit:", *released, "  ret void", "}"]
         declared = t.declared.values()
         return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes(bits), RARE, ""])
@@ -405,7 +405,7 @@ def over_rows(
     t.follow(after)
 
 
-def claim(t: Text) -> tuple[list[str], list[str]]:
+def allocation_lines(t: Text) -> tuple[list[str], list[str]]:
     """Return the lines that allocate and free memory for large arrays, aligned to a cache line."""
     if not t.arena.size:
         return [], []

@@ -153,9 +153,9 @@ ELEMENTWISE["weighted_quotient"] = lambda t, p, d, a, b: weighted(t, a, div(t, a
 ELEMENTWISE["neg"] = lambda t, p, d, a: neg(t, a)
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_name: compare(t, how, a, b, is_unsigned(d[0]))
-SAME = "stop_gradient copy copy_p name pvary reshard pin".split()
+IDENTITY_PRIMITIVES = "stop_gradient copy copy_p name pvary reshard pin".split()
 """Primitives that return their argument."""
-for _name in SAME:
+for _name in IDENTITY_PRIMITIVES:
     ELEMENTWISE[_name] = lambda t, p, d, a: a
 ELEMENTWISE["square"] = lambda t, p, d, a: mul(t, a, a)
 ELEMENTWISE["rsqrt"] = lambda t, p, d, a: div(t, t.constant(1, a.kind), t.intrinsic("sqrt", a))

@@ -22,7 +22,7 @@ from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of
 from ._shared import within
 from ._vector import Unsupported
-from .call import header, registered
+from .call import header, register_handler
 from .runtime import AnyProgram, kernel_of
 
 _vector_only: ContextVar[bool] = ContextVar("strict", default=False)
@@ -207,7 +207,7 @@ partial_eval.partial_eval_jaxpr_custom_rules[lanes_p] = _partially_known_equatio
 
 # Steps between two checks whether any lane continues. The result travels from a GPU to the
 # processor; a check at each step took a sixth of the time of 10,000 lanes.
-_UNASKED = 8
+_STEPS_PER_CHECK = 8
 
 
 def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
@@ -273,7 +273,7 @@ def _run_together(
     state = (carry, active, filled + complete, stored(rows, filled, complete, row))
     carry, _, _, rows = jax.lax.while_loop(
         lambda state: jnp.any(state[1]),
-        lambda state: jax.lax.fori_loop(0, _UNASKED, iteration, state),
+        lambda state: jax.lax.fori_loop(0, _STEPS_PER_CHECK, iteration, state),
         state,
     )
     return [*end(*inputs, *carry), *rows]
@@ -307,7 +307,7 @@ def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]
         avals = list(zip(ctx.avals_in, program.in_avals, strict=True))
         one_for_all = tuple(a.size > MOST_IN_REGISTERS and x.ndim == a.ndim for x, a in avals)
         kernel = kernel_of(program, _lane_count(program, ctx.avals_in), one_for_all)
-        target = registered()
+        target = register_handler()
     except Unsupported as reason:
         if _vector_only.get():
             raise

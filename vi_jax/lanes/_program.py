@@ -216,7 +216,7 @@ def inner(jaxpr: ClosedJaxpr | Jaxpr) -> Jaxpr:
 _INLINED = ("jit", "closed_call")
 
 
-def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
+def evaluate_inlined(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
     """Return the results of a jaxpr, with its calls inlined. JAX would differentiate and transpose
     each call separately, which takes several times as long."""
     jaxpr, known = inner(closed), {}
@@ -229,7 +229,7 @@ def evaluated(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
     for eqn in jaxpr.eqns:
         given, name = [read(a) for a in eqn.invars], eqn.primitive.name
         if name in _INLINED:
-            out = evaluated(eqn.params[CALLS[name]], *given)
+            out = evaluate_inlined(eqn.params[CALLS[name]], *given)
         elif name in OWN_DERIVATIVE:
             names = list(dict.fromkeys(a for a in eqn.invars if not isinstance(a, Literal)))
             alone = jaxpr.replace(constvars=[], invars=names, outvars=eqn.outvars, eqns=[eqn])
@@ -284,7 +284,7 @@ def size_of(jaxpr: Jaxpr) -> int:
 _ZERO_DERIVATIVE = ("stop_gradient", "sign", "round", "floor", "ceil")
 
 
-def walked(
+def propagate_marks(
     jaxpr: Jaxpr,
     marks: Sequence[bool],
     rule: Callable[[Any, list[bool]], list[bool]],
@@ -315,7 +315,7 @@ def dependent_results(jaxpr: Jaxpr, sources: Sequence[bool], *, smooth: bool) ->
 # Cached: a step calls the jaxpr of the field some sixty times, and loops are analysed repeatedly.
 @functools.lru_cache(maxsize=1024)
 def _dependent_results(jaxpr: Jaxpr, sources: tuple[bool, ...], smooth: bool) -> list[bool]:
-    return walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=smooth))
+    return propagate_marks(jaxpr, sources, functools.partial(dependent_of_equation, smooth=smooth))
 
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
@@ -370,7 +370,7 @@ def loop_depends(jaxpr: Jaxpr, sources: Sequence[bool]) -> bool:
         elif any(args) and name not in OWN_DERIVATIVE and (body := called(eqn)) is not None:
             found.append(loop_depends(inner(body), args))
 
-    walked(jaxpr, sources, functools.partial(dependent_of_equation, smooth=True), visit)
+    propagate_marks(jaxpr, sources, functools.partial(dependent_of_equation, smooth=True), visit)
     return any(found)
 
 

@@ -26,11 +26,11 @@ from ._program import (
     dependent_of_equation,
     dependent_parts,
     dependent_results,
-    evaluated,
+    evaluate_inlined,
     inner,
     loop_depends,
+    propagate_marks,
     shape_of,
-    walked,
 )
 from ._vector import Unsupported, check
 from .elementary import elementwise_primitive
@@ -64,7 +64,7 @@ def _(weight, slope, *, weight_first: bool, **params):
     return ShapedArray(out.shape, out.dtype)
 
 
-def with_weights(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:
+def with_zero_safe_products(closed: ClosedJaxpr, weights: Sequence[bool]) -> ClosedJaxpr:
     """Return the jaxpr with these products where a factor, or the dividend, depends on one of the
     arguments flagged in `weights`. Its results must be linear in these, or not depend on them."""
     return closed.replace(jaxpr=_rewritten(closed.jaxpr, weights))
@@ -76,7 +76,7 @@ def _rewritten(jaxpr: Jaxpr, weights: Sequence[bool]) -> Jaxpr:
     def visit(eqn: Any, args: list[bool], _: list[bool]) -> None:
         eqns.append(_equation(eqn, args) if any(args) else eqn)
 
-    walked(jaxpr, weights, functools.partial(dependent_of_equation, smooth=False), visit)
+    propagate_marks(jaxpr, weights, functools.partial(dependent_of_equation, smooth=False), visit)
     return jaxpr.replace(eqns=eqns)
 
 
@@ -97,7 +97,7 @@ def _equation(eqn: Any, args: list[bool]) -> Any:
     if name in CALLS:
         return eqn.replace(params=_with(params, CALLS[name], args))
     if name == "cond":
-        branches = tuple(with_weights(b, args[1:]) for b in params["branches"])
+        branches = tuple(with_zero_safe_products(b, args[1:]) for b in params["branches"])
         return eqn.replace(params={**params, "branches": branches})
     if name == "scan":
         return eqn.replace(params=_with(params, "jaxpr", dependent_in_scan(eqn, args)))
@@ -110,7 +110,7 @@ def _with(params: dict[str, Any], key: str, weights: Sequence[bool]) -> dict[str
     return {**params, key: held.replace(jaxpr=new) if isinstance(held, ClosedJaxpr) else new}
 
 
-class BothWays(NamedTuple):
+class ForwardBackward(NamedTuple):
     """The two jaxprs of one of a lane's functions. Their arguments are the function's own, followed
     by the given cotangents: first those of the carry, then those of rows or results."""
 
@@ -132,9 +132,9 @@ class ReverseProgram(eqx.Module):
     carried: tuple[bool, ...] = eqx.field(static=True)
     """Flags of the parts of the carry that have one: they depend on a wanted input, and a result or
     row with a cotangent depends on them."""
-    begin: BothWays = eqx.field(static=True)
-    step: BothWays = eqx.field(static=True)
-    end: BothWays = eqx.field(static=True)
+    begin: ForwardBackward = eqx.field(static=True)
+    step: ForwardBackward = eqx.field(static=True)
+    end: ForwardBackward = eqx.field(static=True)
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
@@ -183,9 +183,9 @@ def reverse(
     try:
         found = ReverseProgram(
             program, varied, given, carried,
-            begin=_both_ways(program, "begin", varied, emitted, len(carried) + 2),
-            step=_both_ways(program, "step", (*varied, *carried), emitted, len(carried) + 2),
-            end=_both_ways(program, "end", (*varied, *carried), outs, 0),
+            begin=_split_passes(program, "begin", varied, emitted, len(carried) + 2),
+            step=_split_passes(program, "step", (*varied, *carried), emitted, len(carried) + 2),
+            end=_split_passes(program, "end", (*varied, *carried), outs, 0),
         )  # fmt: skip
         for jaxpr in found.jaxprs:
             check(jaxpr.jaxpr)
@@ -215,13 +215,13 @@ def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
     return tuple(i in needed for i in range(n))
 
 
-def _both_ways(
+def _split_passes(
     program: LaneProgram,
     name: str,
     varied: Sequence[bool],
     weighted: Sequence[bool],
     kept: int,
-) -> BothWays:
+) -> ForwardBackward:
     """Return the forward and the backward jaxpr of a function.
 
     **Arguments:** the program; the name of its function; flags of the arguments to differentiate;
@@ -253,7 +253,9 @@ def _both_ways(
     cotangents = len(whole.out_avals) - kept
     there = _pruned(whole, [True] * kept + [False] * cotangents)
     back = _pruned(whole, [False] * kept + [True] * cotangents)
-    return BothWays(there, with_weights(back, [i >= number for i in range(len(shapes))]))
+    return ForwardBackward(
+        there, with_zero_safe_products(back, [i >= number for i in range(len(shapes))])
+    )
 
 
 def _along(
@@ -263,7 +265,7 @@ def _along(
     the derivatives of the `weighted` ones. Widening comes after it (see `forward`)."""
     widening, number = program.widening, len(varied)
     source = program if widening is None else widening.program
-    function = functools.partial(evaluated, with_quotients(getattr(source, name)))
+    function = functools.partial(evaluate_inlined, with_quotients(getattr(source, name)))
 
     def along(*args):
         primals, tangents = args[:number], args[number:]

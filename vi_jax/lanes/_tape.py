@@ -337,7 +337,7 @@ class _Writer:
         self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value
     ) -> tuple[list[Array], list[Array]]:
         """Return cotangents of inputs and carry after a reverse step, zero outside `mask`."""
-        out = only_in(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
+        out = masked_to(t, mask, write(t, jaxpr, args, mask), jaxpr.out_avals)
         return out[: len(self.varied)], out[len(self.varied) :]
 
     # The functions
@@ -443,7 +443,7 @@ class _Writer:
 # --- whole arrays of a group of lanes: kept in memory, selected, added
 
 
-def only_in(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:
+def masked_to(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> list[Array]:
     """Return the arrays in lanes where the flag holds, else zeros. `Masked` arrays are returned as
     they are; their masks must imply the flag."""
     chosen = select_all(t, flag, arrays, zeros(t, avals))

@@ -23,7 +23,6 @@ from ._arrays import (
     counted,
     fill,
     held,
-    in_one,
     joined,
     mapped,
     over,
@@ -37,8 +36,9 @@ from ._arrays import (
     table,
     times,
     uniform,
+    without_cuts,
 )
-from ._operations import ELEMENTWISE, SAME, kind_of
+from ._operations import ELEMENTWISE, IDENTITY_PRIMITIVES, kind_of
 from ._program import called, inner, scan_counts, shape_of, size_of
 from ._text import Text, Value
 
@@ -195,7 +195,7 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
             for out, value in zip(outs, results(*(x[i] for x in values)), strict=True):
                 out[i] = value
         return [Registers(out, kind) for out, kind in zip(outs, kinds, strict=True)]
-    if name in SAME:
+    if name in IDENTITY_PRIMITIVES:
         return args[:1]
 
     def results_at(index: tuple) -> tuple[Value, ...]:
@@ -436,7 +436,7 @@ def _row_of(t: Text, x: Array, i: Index) -> Array:
 def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
     """Write a loop of known length with a scalar counter. Its rows are in memory."""
     (n, m), length = scan_counts(params), params["length"]
-    fixed, rows = args[:n], [addressable(t, in_one(t, x)) for x in args[n + m :]]
+    fixed, rows = args[:n], [addressable(t, without_cuts(t, x)) for x in args[n + m :]]
     first = [x if isinstance(x, Registers) else stored(t, x) for x in args[n : n + m]]
     made: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]
     columns = [room(t, (length, *a.shape), kind_of(a.dtype)) for a in made]

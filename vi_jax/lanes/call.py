@@ -220,7 +220,7 @@ def _run_number(frame: _Frame) -> int:
 
 
 @made_once
-def registered() -> str:
+def register_handler() -> str:
     """Register the handler with XLA on first use, on any thread, and return its name.
 
     **Raises:** `Unsupported` if this XLA refuses the handler's version.

@@ -30,9 +30,9 @@ from .friction import ContactFriction
 from .numbers import PLAIN, Shown, unit_in
 from .own import (
     by_default,
+    defines,
     derived,
     is_own,
-    says,
     stops_of,
     switches_of,
     with_own_defaults,
@@ -41,7 +41,7 @@ from .own import (
 from .stop import RigidStop, SoftStop, Wall
 
 # Required members, each with advice for an error message.
-_MUST_SAY = {
+_REQUIRED = {
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
 }
@@ -152,7 +152,7 @@ def number_on(machine: Machine, name: str) -> int | None:
 def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
     """Return the names of a coordinate's position and velocity in the state, by its index; `None`
     if contacts do not name them, or the machine defines `coordinates`."""
-    if says(machine, "coordinates"):
+    if defines(machine, "coordinates"):
         return None
     on = next((on for on, k in _places(contacts_in(machine)).items() if k == number), None)
     return machine._names_on(on)
@@ -244,8 +244,8 @@ class AbstractMachine(Shown):
     def __new__(cls, *args: Any, **kwargs: Any):
         missing = {*cls.__abstractmethods__, *getattr(cls, "__abstractvars__", ())}
         if missing:
-            name = next((x for x in _MUST_SAY if x in missing), min(missing))
-            how = f": {_MUST_SAY[name]}" if name in _MUST_SAY else ""
+            name = next((x for x in _REQUIRED if x in missing), min(missing))
+            how = f": {_REQUIRED[name]}" if name in _REQUIRED else ""
             raise TypeError(f"A machine must have `{name}`, but `{cls.__name__}` has none{how}.")
         lost = _unlisted(cls)
         if lost is not None:
@@ -448,7 +448,7 @@ def has_velocity(machine: AbstractMachine, state: State) -> bool:
 
 def names_coordinates(machine: AbstractMachine) -> bool:
     """Return whether a machine has `coordinates`, or contacts that name coordinates."""
-    if says(machine, "coordinates"):
+    if defines(machine, "coordinates"):
         return True
     walls = (x for x in contacts_in(machine) if isinstance(x, Wall))
     return any(x.on is not None for x in walls)  # pyright: ignore[reportAttributeAccessIssue]

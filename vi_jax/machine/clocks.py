@@ -7,7 +7,7 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from .._checks import in_range
-from .._messages import so_many
+from .._messages import count_of
 from .._types import Flag, Machine, Number, Scalar, State
 from .cycles import Turn, counter_of
 from .linear import LinearMachine, Prepared
@@ -48,9 +48,11 @@ def phase_at(machine: Machine, since_section: Number) -> Any:
     return machine.phase_at(since_section) if isinstance(machine, Scene) else since_section
 
 
-def adopt(machine: Machine, start: State) -> State:
+def convert_start(machine: Machine, start: State) -> State:
     """Return a start in the form that a machine needs. **Raises:** `TypeError` for others."""
-    return machine.adopt(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
+    return (
+        machine.convert_start(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
+    )
 
 
 def in_cycle_state(machine: Machine, name: str, state: State) -> State:
@@ -61,9 +63,9 @@ def in_cycle_state(machine: Machine, name: str, state: State) -> State:
     return state
 
 
-def rewound(machine: Machine, state: State) -> State:
+def with_earlier_clock(machine: Machine, state: State) -> State:
     """Return the state with its clock set back by one cycle."""
-    return machine.rewound(state) if isinstance(machine, ShaftMachine) else state
+    return machine.with_earlier_clock(state) if isinstance(machine, ShaftMachine) else state
 
 
 def cycle_time(machine: Machine) -> Scalar | float:
@@ -91,7 +93,7 @@ def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
 
 def cycles_in_words(machine: Machine, cycles: int) -> str:
     """Return the duration of a number of cycles in words: 2 cycles, or 4π."""
-    return f"{2 * cycles}π" if isinstance(machine, Scene) else so_many(cycles, "cycle")
+    return f"{2 * cycles}π" if isinstance(machine, Scene) else count_of(cycles, "cycle")
 
 
 def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
@@ -99,7 +101,7 @@ def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
     if isinstance(machine, Scene):
         angle = float(machine.phase_at(since_section))
         return f"crank angle φ = {angle:.6g} of {2 * cycles}π"
-    words = so_many(cycles, "cycle")
+    words = count_of(cycles, "cycle")
     return f"clock {since_section:.6g} after its section (motion of {words})"
 
 

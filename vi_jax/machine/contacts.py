@@ -36,14 +36,16 @@ def push_of(coordinate: Any, state: State) -> State:
     return jax.jvp(lambda V: coordinate.placed(state, place, V), (velocity,), (one,))[1]
 
 
-def gained(coordinate: Any, state: State, change: State) -> Scalar:
+def velocity_change(coordinate: Any, state: State, change: State) -> Scalar:
     """Return the change of a coordinate's velocity for this change of the state."""
     return jnp.asarray(jax.jvp(coordinate.velocity, (state,), (change,))[1])
 
 
 def shares(coordinates: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
     """Return the change of each coordinate's velocity (row) by each push (column)."""
-    return [[gained(coordinate, state, push) for push in pushes] for coordinate in coordinates]
+    return [
+        [velocity_change(coordinate, state, push) for push in pushes] for coordinate in coordinates
+    ]
 
 
 def forces(
@@ -144,7 +146,7 @@ def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple
     return pushed, ratio * pushed
 
 
-class Held(NamedTuple):
+class ContactConstraints(NamedTuple):
     """The constraints of bodies at rest on stops: a row for each coordinate that stops limit, in
     their order, then a row for each friction on a stop."""
 
@@ -154,18 +156,18 @@ class Held(NamedTuple):
     """The change of the state by each force; for a stop with the friction on a slipping body."""
     acts: list[Flag]
     """True in the rows that hold; a friction holds while the body sticks."""
-    rubbing: list[tuple[int, Any, int, Scalar]]
+    stop_frictions: list[tuple[int, Any, int, Scalar]]
     """For each friction on a stop: its index among the switches, the friction, the row of its stop,
     and the share of the friction's push in the stop's."""
     masses: list[Any]
     """The effective mass of each row; empty without friction on stops."""
 
 
-def held_by(
+def contact_constraints(
     machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
-) -> Held:
+) -> ContactConstraints:
     """Return the constraints of bodies at rest on stops. **Arguments:** `modes`, those of switches
-    first; `contact`, as in `Around`; empty for no rest."""
+    first; `contact`, as in `EventContext`; empty for no rest."""
     limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
     stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
@@ -174,7 +176,7 @@ def held_by(
     each = {k: push_of(coordinates[k], state) for k in numbers}
     pushes, acts = [each[k] for k in numbers], [contact[k] > 0 for k in limited]
     masses = {k: coordinates[k].mass_at(s, state) for k in numbers} if frictions else {}
-    rubbing = []
+    stop_frictions = []
     for i, friction in frictions:
         stop = stops[friction.friction_stop]
         at = limited.index(stop.coordinate)
@@ -185,25 +187,29 @@ def held_by(
         slips = jnp.where(here, ratio, 0.0)
         pushes[at] = added(pushes[at], (slips,), (each[friction.along],))
         acts = [*acts, here & (modes[i] == 0)]
-        rubbing.append((i, friction, at, slips))
+        stop_frictions.append((i, friction, at, slips))
     bodies = [coordinates[k] for k in numbers]
-    return Held(bodies, pushes, acts, rubbing, [masses[k] for k in numbers if frictions])
+    return ContactConstraints(
+        bodies, pushes, acts, stop_frictions, [masses[k] for k in numbers if frictions]
+    )
 
 
-def held_flow(
+def constrained_rate(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:  # fmt: skip
     """Return the rate of the state along `flow`, corrected so that resting coordinates keep their
     velocities. Forces on shared bodies depend on each other and are solved for together.
 
-    **Arguments:** `modes`, those of the switches first; `contact`, as in `Around`.
+    **Arguments:** `modes`, those of the switches first; `contact`, as in `EventContext`.
 
     **Returns:** the rate; and for each friction, by its index among the switches, the force along
     the surface, the normal force (`None` without a stop), and the effective mass.
     """
-    bodies, pushes, acts, rubbing, masses = held_by(machine, s, state, modes, contact)
-    wanted = [-gained(body, state, flow) for body in bodies]
+    bodies, pushes, acts, stop_frictions, masses = contact_constraints(
+        machine, s, state, modes, contact
+    )
+    wanted = [-velocity_change(body, state, flow) for body in bodies]
     first, dry = len(bodies), []
     for i, friction in enumerate(switches_of(machine)):
         if friction.is_dry:  # not in impacts: its forces are finite
@@ -218,7 +224,7 @@ def held_flow(
     for (i, mass), amount in zip(dry, amounts[first:], strict=True):
         force = amount * mass
         found[i] = force if pace is None else force / pace, None, mass
-    for row, (i, friction, at, _) in enumerate(rubbing, start=first - len(rubbing)):
+    for row, (i, friction, at, _) in enumerate(stop_frictions, start=first - len(stop_frictions)):
         sign = stops_of(machine)[friction.friction_stop].sign
         found[i] = amounts[row] * masses[row], -sign * amounts[at] * masses[at], masses[row]
     return added(flow, amounts, pushes), found

@@ -87,7 +87,7 @@ class _TurnOver(Reset):
     """The end of a turn. Its guard, an angle, falls by a whole turn there."""
 
     from_below: ClassVar = False
-    looked_at_within: ClassVar = False  # a shaft does not reverse twice in a step
+    checked_within_step: ClassVar = False  # a shaft does not reverse twice in a step
 
 
 class Passing(Counter):

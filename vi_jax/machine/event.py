@@ -12,8 +12,8 @@ from .numbers import Shown
 Modes = Scalars
 
 
-class Around(NamedTuple):
-    """Arguments of some events besides their own mode (see `AbstractEvent.sees_around`)."""
+class EventContext(NamedTuple):
+    """Arguments of some events besides their own mode (see `AbstractEvent.needs_all_modes`)."""
 
     modes: Modes
     """All modes of the machine."""
@@ -53,16 +53,16 @@ class AbstractEvent(Shown):
     """True if the event has one of the machine's modes; then it has `begin` and `struck`."""
     is_dry: ClassVar[bool] = False
     """True for friction that may hold a body anywhere."""
-    sees_around: ClassVar[bool] = False
+    needs_all_modes: ClassVar[bool] = False
     """True if `guard`, `after` and `struck` of an event with a mode have a keyword argument
-    `around`, an `Around`."""
+    `around`, an `EventContext`."""
     may_slide: ClassVar[bool] = False
     """True if the field may point at the guard's surface from both sides, and the event has no mode
     for sliding along it. Such a lane ends as `RESULTS.sliding`."""
     from_below: ClassVar[bool] = True
     """True if the guard must have been negative since the last jump before the event can happen.
     False if the guard is another function after the event."""
-    looked_at_within: ClassVar[bool] = True
+    checked_within_step: ClassVar[bool] = True
     """True if the guard may be positive for a part of a step only, and must be evaluated within
     each step. False if the length of steps depends on it already."""
 

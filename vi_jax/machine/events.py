@@ -2,7 +2,7 @@
 resets that users define by functions.
 
 An argument `number` is that of an event. `modes` are all of the machine, before the event, and
-`contact` is as in `Around`.
+`contact` is as in `EventContext`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import called, field_in, rate_of, shown_modes, with_friction_impulse
-from .event import AbstractEvent, AbstractSwitch, Around, Modes, Section
+from .event import AbstractEvent, AbstractSwitch, EventContext, Modes, Section
 from .friction import chosen_together, frictions_in
 from .numbers import Shown, size_of
 from .own import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
@@ -122,13 +122,13 @@ def own_modes(machine: Machine, modes: Modes) -> Modes:
 
 def event_of(
     machine: Machine, number: int, modes: Modes, contact: Scalars
-) -> tuple[AbstractEvent, slice, dict[str, Around]]:
+) -> tuple[AbstractEvent, slice, dict[str, EventContext]]:
     """Return an event, the slice of the modes that its methods receive, and their keywords."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
     own = mode_number(machine, number)
-    more = {"around": Around(modes, own, contact)} if event.sees_around else {}
+    more = {"around": EventContext(modes, own, contact)} if event.needs_all_modes else {}
     return event, slice(own, own + 1), more
 
 
@@ -142,7 +142,7 @@ def begin_modes(
     own = modes_at_start(machine, s, state) if own is None else own
     modes = [*(event.begin(machine, s, state) for event in held), *own]
     modes = settled_modes(modes, s)
-    if any(event.sees_around for event in held):  # whose mode depends on the others
+    if any(event.needs_all_modes for event in held):  # whose mode depends on the others
         modes = struck_modes(machine, s, state, modes)
     return modes
 
@@ -231,7 +231,7 @@ class HybridState(Shown):
         return self.state[place]
 
 
-def bare(state: State) -> State:
+def without_modes(state: State) -> State:
     """Return the state without modes."""
     return state.state if isinstance(state, HybridState) else state
 
@@ -268,7 +268,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
 def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:
     """Return `ravel_pytree` of a state whose modes are no unknowns: they stay unchanged."""
-    row, unravel = ravel_pytree(bare(state))
+    row, unravel = ravel_pytree(without_modes(state))
     return row, lambda row: replaced(state, unravel(row))
 
 
@@ -299,7 +299,7 @@ class Switch(AbstractSwitch):
         return self.slides
 
     @property
-    def sees_around(self) -> bool:  # pyright: ignore
+    def needs_all_modes(self) -> bool:  # pyright: ignore
         """True if it slides: the fields on both sides depend on the other modes."""
         return self.slides
 
@@ -311,7 +311,7 @@ class Switch(AbstractSwitch):
         positive = (value > 0) | ((value == 0) & (rate >= 0))
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
 
-    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+    def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the mode after an impact or another jump: the sign of the function, or 0 on a
         surface that both fields point at."""
         side = self.begin(machine, s, state)
@@ -325,7 +325,7 @@ class Switch(AbstractSwitch):
         here = jnp.abs(stop_gradient(function(state))) <= stop_gradient(rounding)
         return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
 
-    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+    def guard(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the function, with the sign for which it rises at the event. While the motion
         slides, return the rate of the field that points away first."""
         value = -mode * self.function(machine, s, state)
@@ -334,7 +334,7 @@ class Switch(AbstractSwitch):
         up, down = self._rates(machine, s, state, around)
         return jnp.where(mode == 0, jnp.maximum(up, -down), value)
 
-    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+    def sides(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard; while the motion slides, the two rates of which it is the maximum."""
         value = -mode * self.function(machine, s, state)
         if around is None:
@@ -342,7 +342,7 @@ class Switch(AbstractSwitch):
         up, down = self._rates(machine, s, state, around)
         return jnp.where(mode == 0, up, value), jnp.where(mode == 0, -down, value)
 
-    def after(self, machine, s, state, mode, *, around: Around | None = None):
+    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the state, and the mode of the other side or of sliding along the surface."""
         if around is None:
             return state, -mode
@@ -351,7 +351,7 @@ class Switch(AbstractSwitch):
         leaves = jnp.where(up > -down, 1.0, -1.0)
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
-    def _rates(self, machine: Machine, s: Scalar, state: State, around: Around) -> Scalars:
+    def _rates(self, machine: Machine, s: Scalar, state: State, around: EventContext) -> Scalars:
         up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
         return tuple(rate_of(self.function, machine, s, state, x) for x in (up, down))
 

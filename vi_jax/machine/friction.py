@@ -27,8 +27,17 @@ from .._checks import (
     require_ranges,
 )
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .contacts import added, field_in, forces, gained, held_flow, push_of, rate_of, shares
-from .event import AbstractSwitch, Around
+from .contacts import (
+    added,
+    constrained_rate,
+    field_in,
+    forces,
+    push_of,
+    rate_of,
+    shares,
+    velocity_change,
+)
+from .event import AbstractSwitch, EventContext
 from .own import stops_of, switches_of
 from .state import with_components
 
@@ -44,7 +53,7 @@ class Friction(AbstractSwitch):
     roundings: ClassVar[int]
     """A slip below this number of roundings of the state counts as zero."""
 
-    sees_around: ClassVar = True  # a holding force depends on all other forces
+    needs_all_modes: ClassVar = True  # a holding force depends on all other forces
     may_slide: ClassVar = False  # there the body sticks
 
     @abc.abstractmethod
@@ -56,13 +65,13 @@ class Friction(AbstractSwitch):
         self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
     ) -> tuple[Any, Any, Any]:
         """Return the force that holds a body, the largest possible one, and the effective mass.
-        **Arguments:** `contact`, as in `Around`; `found`, from `held_flow`."""
+        **Arguments:** `contact`, as in `EventContext`; `found`, from `constrained_rate`."""
 
     def touches(self, machine: Machine, contact: Scalars) -> Flag:
-        """Return whether the body touches the surface; `contact` is as in `Around`."""
+        """Return whether the body touches the surface; `contact` is as in `EventContext`."""
         return jnp.ones((), bool)
 
-    def is_known(self, around: Around | None) -> bool:
+    def is_known(self, around: EventContext | None) -> bool:
         """Return whether the other forces on the body are known."""
         return around is not None
 
@@ -81,19 +90,19 @@ class Friction(AbstractSwitch):
         """Return the initial mode: the sign of the slip, sticking without slip."""
         return self.slip_sign(machine, s, state)
 
-    def struck(self, machine, s, state, mode, *, around: Around | None = None):
+    def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the mode after an impact or another jump: the direction of slip or its onset."""
         slips = self.slip_sign(machine, s, state)
         if not self.is_known(around):
             return slips
         return jnp.where(slips == 0, self._from_rest(machine, s, state, around, True), slips)
 
-    def guard(self, machine, s, state, mode, *, around: Around | None = None):
+    def guard(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard of slip that vanishes, or of a force that exceeds friction. It is
         negative for a body that does not rest on the stop with this friction."""
         return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
 
-    def sides(self, machine, s, state, mode, *, around: Around | None = None):
+    def sides(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard for a force forward and for one backward."""
         slows = -mode * self.speed_of_slip(machine, s, state)
         if around is None or not self.is_known(around):
@@ -134,8 +143,8 @@ class Friction(AbstractSwitch):
 def _held(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
-    """Return `held_flow`, jitted: a step calls it often, and JAX differentiates it once."""
-    return held_flow(machine, field_in(machine, s, state, modes), s, state, modes, contact)
+    """Return `constrained_rate`, jitted: a step calls it often, and JAX differentiates it once."""
+    return constrained_rate(machine, field_in(machine, s, state, modes), s, state, modes, contact)
 
 
 class DryFriction(Friction):
@@ -205,7 +214,7 @@ class DryFriction(Friction):
         else:
             none = jtu.tree_map(jnp.zeros_like, state)
             push = with_components(none, self.push, "`push` of a DryFriction", all_of_them=False)
-        gain = gained(self.as_velocity(machine, s), state, push)
+        gain = velocity_change(self.as_velocity(machine, s), state, push)
         return jtu.tree_map(lambda x: x / gain, push), 1 / gain
 
     @property
@@ -238,7 +247,7 @@ class DryFriction(Friction):
         push, mass = self.row(machine, s, state)
         return -mode * self.sliding(machine, s, state, mode) / mass, push
 
-    def after(self, machine, s, state, mode, *, around: Around | None = None):
+    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         new = self.stopped(machine, s, state)
         return new, self._from_rest(machine, s, new, around, mode != 0)
 
@@ -303,7 +312,7 @@ class ContactFriction(Friction):
     def speed_of_slip(self, machine, s, state):
         return machine.coordinates[self.along].velocity(state)
 
-    def after(self, machine, s, state, mode, *, around: Around | None = None):
+    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         # The slip vanishes to rounding. Its correction must not change the velocity at the stop.
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
@@ -324,7 +333,7 @@ class ContactFriction(Friction):
         return force, self.level * pressing, mass
 
     def push_in(self, machine, s, state, mode):
-        """Return `None`: the force is solved for together with that of the stop (`held_flow`)."""
+        """Return `None`: the force is solved for together with the stop's (`constrained_rate`)."""
         return None
 
 
@@ -351,8 +360,8 @@ def chosen_together(
 
     A friction with slip keeps its direction. Each of the others sticks or slips either way.
 
-    **Arguments:** `modes`, all of the machine; `contact`, as in `Around`; `released`, the index of
-    a friction that does not stick again, and whether this holds.
+    **Arguments:** `modes`, all of the machine; `contact`, as in `EventContext`; `released`, the
+    index of a friction that does not stick again, and whether this holds.
     """
     places = frictions_in(machine)
     switches = switches_of(machine)

@@ -59,9 +59,9 @@ class ModalMachine(AbstractMachine):
     """κ of each mode, per unit of mass."""
     damping: Numbers
     """Diagonal of the damping c, per unit of mass."""
-    pace_of: Numbers
+    modal_frequency: Numbers
     """√|κ|, the frequency of each mode."""
-    slowness: Numbers
+    inverse_frequency: Numbers
     """1/√|κ|; 1 for a rigid-body motion."""
     swing: Numbers
     """√(κ - c²/4), the frequency of a damped mode, or 1 without oscillation; no derivatives."""
@@ -69,7 +69,7 @@ class ModalMachine(AbstractMachine):
     """1/`swing`."""
     oscillates: Scalar
     """1 if all modes oscillate, else 0."""
-    fades: Scalar
+    all_decay: Scalar
     """1 if all modes oscillate and none grows, else 0."""
     fastest: Scalar
     """A bound of all rates."""
@@ -125,7 +125,7 @@ class ModalMachine(AbstractMachine):
     def step_limit(self, s: Scalar, state: State) -> Scalar:
         """Return a fifth of the shortest period, of the modes or the force."""
         # A choice, as for soft stops (`SoftStop.longest_step`).
-        return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.pace_of), self.frequency)
+        return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.modal_frequency), self.frequency)
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
         """Return the shortest time constant of a mode's decay."""
@@ -217,12 +217,12 @@ def modal(machine: Any) -> Modes:
         frequency=omega,
         stiffness=found.stiffness,
         damping=found.damping,
-        pace_of=pace,
-        slowness=1 / jnp.where(pace > 0, pace, 1.0),
+        modal_frequency=pace,
+        inverse_frequency=1 / jnp.where(pace > 0, pace, 1.0),
         swing=swing,
         swing_time=1 / swing,
         oscillates=jnp.where(jnp.all(square > 0), 1.0, 0.0).astype(pace.dtype),
-        fades=jnp.where(jnp.all((square > 0) & (c >= 0)), 1.0, 0.0).astype(pace.dtype),
+        all_decay=jnp.where(jnp.all((square > 0) & (c >= 0)), 1.0, 0.0).astype(pace.dtype),
         fastest=stop_gradient(jnp.maximum(found.fastest, omega)),
         coupling=found.coupling,
         forces=forces,
@@ -441,7 +441,7 @@ class LinearMachine(AbstractMachine):
             found.append(jnp.broadcast_to(value, (self.size,)))
         return StructureState(*found)
 
-    def adopt(self, start: State) -> StructureState:
+    def convert_start(self, start: State) -> StructureState:
         """**Raises:** `TypeError` for a state of another class, `ValueError` for one of other n."""
         return self.in_cycle_state("start", start)
 

@@ -59,7 +59,7 @@ class derived:
         return self.found(part)
 
 
-def says(part: object, name: str) -> bool:
+def defines(part: object, name: str) -> bool:
     """Return whether a machine itself defines a member that is otherwise `derived`."""
     return hasattr(type(part), name) or name in vars(part)
 

@@ -91,7 +91,7 @@ class ShaftMachine(AbstractMachine):
         one_of("clock", clock, ("phase", "time"))
         return dataclasses.replace(self, clock_name=clock)
 
-    def adopt(self, start: State) -> State:
+    def convert_start(self, start: State) -> State:
         """Return a start made for either clock in the form of this machine's clock."""
         wanted = self.state_type
         if self.clock_name == "time" and self.timed_type is not None:
@@ -119,7 +119,7 @@ class ShaftMachine(AbstractMachine):
     def _clock(self, state: State) -> Scalar | None:
         return state.phase if self.is_timed(state) else None
 
-    def rewound(self, state: State) -> State:
+    def with_earlier_clock(self, state: State) -> State:
         """Return the state with a full turn subtracted from the angle."""
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
 
@@ -297,7 +297,7 @@ class Scene(ShaftMachine):
         require("Y", Y)
         require("V", V)
         own = self.drive.begin(M=M, W=W, **others)
-        return self.adopt(self.state_type(Y, V, *own.values()))
+        return self.convert_start(self.state_type(Y, V, *own.values()))
 
     @property
     def state_type(self) -> type:

@@ -146,7 +146,7 @@ class RigidStop(Wall, AbstractEvent):
     def after(self, machine, s, state, *modes):
         """Return the state of the rebound, exactly on the stop, and the modes after an impact."""
         body = machine.coordinates[self.coordinate]
-        new = body.placed(state, self.place, self.leaving(body.velocity(state)))
+        new = body.placed(state, self.place, self.velocity_after(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
 
     def modes_after(
@@ -164,7 +164,7 @@ class RigidStop(Wall, AbstractEvent):
     def jump(self, machine, s, state, *modes):
         """Return the state after the rebound, without a correction of the position."""
         body = machine.coordinates[self.coordinate]
-        return body.placed(state, body.position(state), self.leaving(body.velocity(state)))
+        return body.placed(state, body.position(state), self.velocity_after(body.velocity(state)))
 
     def speed(self, machine, state, rate):
         """Return V⁻, the speed of approach."""
@@ -184,19 +184,19 @@ class RigidStop(Wall, AbstractEvent):
         """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper)."""
         return -self.coefficient(self.approach(V)) * V
 
-    def leaving(self, V: Number) -> Any:
+    def velocity_after(self, V: Number) -> Any:
         """Return the velocity after an impact: the `rebound`, but zero for a speed whose square is
         below the smallest number, so that a body may come to rest on the stop."""
         return self.rebound(_unless_tiny(V))
 
-    def rebound_and_share(self, approach: Any) -> tuple[Any, Any]:
-        """Return the velocity (`leaving`) and the `share` of the speed after an impact at this
-        speed of approach. The law, which may be a network, is evaluated once for both."""
+    def velocity_and_ratio(self, approach: Any) -> tuple[Any, Any]:
+        """Return the velocity (`velocity_after`) and the `share` of the speed after an impact at
+        this speed of approach. The law, which may be a network, is evaluated once for both."""
         V = self.sign * approach
         if not is_own(type(self).rebound):
             k = self.coefficient(approach)
             return -k * _unless_tiny(V), k
-        return self.leaving(V), self.share(approach)
+        return self.velocity_after(V), self.share(approach)
 
     def share(self, approach: Any) -> Any:
         """Return the share of the speed that is left after an impact: k, or that by a `rebound`."""
@@ -368,7 +368,9 @@ class SoftStop(Wall, AbstractSwitch):
     mass: Float[Array, "..."] | None
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
-    looked_at_within: ClassVar = False  # steps are short compared with a contact (`longest_step`)
+    checked_within_step: ClassVar = (
+        False  # steps are short compared with a contact (`longest_step`)
+    )
     ranges: ClassVar = {
         "gap": REAL, "stiffness": POSITIVE, "damping": NOT_NEGATIVE, "dashpot": NOT_NEGATIVE,
         "prestress": NOT_NEGATIVE, "mass": POSITIVE,

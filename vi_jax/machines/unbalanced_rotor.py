@@ -145,7 +145,7 @@ class UnbalancedRotor(ShaftMachine, PhaseMachine):
         Y, V, P = number("Y", Y), number("V", V), number("W", speed)
         for name, value in (("Y", Y), ("V", V), ("W", P)):
             require(name, value)
-        return self.adopt(RotorState(Y, V, P))
+        return self.convert_start(RotorState(Y, V, P))
 
     def mirrored(self, state: State) -> Any:
         """Return -Y half a turn later, unless there is a stop on one side only."""

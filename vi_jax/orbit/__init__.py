@@ -3,8 +3,8 @@
 from ._continuation import boundary as boundary
 from ._continuation import continue_orbit as continue_orbit
 from ._cycle_map import CycleMap as CycleMap
-from ._cycle_map import adopted as adopted
 from ._cycle_map import cycle_map as cycle_map
+from ._cycle_map import map_state as map_state
 from .closed_form import ClosedFormOrbits as ClosedFormOrbits
 from .closed_form import closed_form_orbits as closed_form_orbits
 from .curve import Boundary as Boundary
@@ -12,7 +12,7 @@ from .curve import Branch as Branch
 from .curve import branch_hits_in_words as branch_hits_in_words
 from .curve import column_names as column_names
 from .find import find_orbit as find_orbit
-from .find import stands_still as stands_still
+from .find import is_equilibrium as is_equilibrium
 from .grazing import SCENARIOS as SCENARIOS
 from .grazing import Grazing as Grazing
 from .grazing import Motions as Motions

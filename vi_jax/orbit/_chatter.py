@@ -159,7 +159,7 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     first = along(force)
     second = along(first)
     beta, mu, nu = -first(s, state), second(s, state), -along(second)(s, state)
-    left, free = s - hops.s, held.letting_go(stop.coordinate)
+    left, free = s - hops.s, held.releasing(stop.coordinate)
     speed = -_rates(free, stop, hops.s, hops.u).v
     # Derivative with respect to the speed y' from the stop, along the change by an impact.
     push = push_of(body, state)

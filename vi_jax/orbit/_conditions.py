@@ -108,7 +108,7 @@ class AbstractCondition(eqx.Module):
         return missing
 
 
-class Held(AbstractCondition):
+class ContactConstraints(AbstractCondition):
     """The condition that a quantity of the motion, one of `names_of`, has a given value."""
 
     name: str = eqx.field(static=True)
@@ -133,7 +133,7 @@ class HeldMultiplier(AbstractCondition):
             matrix, root = compound(matrix), self.value**2
         return jnp.linalg.det(matrix - root * jnp.eye(len(matrix), dtype=matrix.dtype))
 
-    def overtaken(self, seen: Observed) -> float:
+    def dominance_margin(self, seen: Observed) -> float:
         """Return a number that is negative while the held multiplier is the greatest, or the held
         pair is complex and the greatest; host-side."""
         values, value = np.asarray(seen.multipliers), float(self.value)
@@ -172,14 +172,17 @@ def as_held(values: dict[str, float], multipliers: np.ndarray) -> tuple[Abstract
     return tuple(
         HeldMultiplier(jnp.asarray(sign * value, float), pair)
         if name == "multiplier"
-        else Held(name, jnp.asarray(value, float))
+        else ContactConstraints(name, jnp.asarray(value, float))
         for name, value in values.items()
     )
 
 
 def held_in_words(problem: Shooting) -> str:
-    held = (c for c in problem.conditions if isinstance(c, Held | HeldMultiplier))
-    named = ((c.name if isinstance(c, Held) else "multiplier", float(c.value)) for c in held)
+    held = (c for c in problem.conditions if isinstance(c, ContactConstraints | HeldMultiplier))
+    named = (
+        (c.name if isinstance(c, ContactConstraints) else "multiplier", float(c.value))
+        for c in held
+    )
     units = units_of(problem.machine)
     return ", ".join(
         f"{name} = {in_unit(f'{value:.9g}', units, measured(name) or name)}"
@@ -206,7 +209,7 @@ class Exchange(eqx.Module):
     """The vector r there."""
 
     def instead(self, problem: Shooting, missing: Array, x: Array) -> Array:
-        jacobian, n = jax.jacfwd(problem.lacks)(x), self.left.size
+        jacobian, n = jax.jacfwd(problem.motion_residual)(x), self.left.size
         corner = jnp.zeros((1, 1), x.dtype)
         bordered = jnp.block([[jacobian[:, :n].T, self.right[:, None]], [self.left[None], corner]])
         left = jnp.linalg.solve(bordered, jnp.eye(n + 1, dtype=x.dtype)[-1])[:n]
@@ -224,7 +227,7 @@ def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
     return Exchange(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * scale[:-2]))
 
 
-class Apart(AbstractCondition):
+class FixedComponent(AbstractCondition):
     """The condition that the unknowns have a given component along a row."""
 
     row: Float[Array, " unknowns"]

@@ -14,7 +14,14 @@ from ..machine import check_leaf, leaf, may_rest
 from ._conditions import Special, as_held, exchange_at, is_defective, names_of, rates_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
-from ._problem import check_parameter, cycles_to_fly, legs_of, problem_of, sized, steps_of
+from ._problem import (
+    check_parameter,
+    cycles_to_fly,
+    problem_of,
+    resting_problem_of,
+    sized,
+    steps_of,
+)
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._solution import Step, advance, tangent_at
@@ -96,7 +103,7 @@ def continue_orbit(
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
     if bool(orbit.rests > 0) or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
-        problem, x = legs_of(orbit, parameter, bounds, method)
+        problem, x = resting_problem_of(orbit, parameter, bounds, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
     sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)

@@ -32,16 +32,16 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     HybridState,
-    adopt,
     at_section,
-    bare,
     begun,
     clock_of,
+    convert_start,
     in_cycle_clock,
     in_cycle_state,
     may_rest,
     modes_of,
     raveled,
+    without_modes,
 )
 
 
@@ -54,7 +54,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @eqx.filter_custom_jvp
     def wrapped(*args):
-        return tied(f(*args), args)
+        return batch_together(f(*args), args)
 
     @wrapped.def_jvp
     def _(primals, tangents):
@@ -80,7 +80,7 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def tied(out: object, args: object) -> Any:
+def batch_together(out: object, args: object) -> Any:
     """Return `out`, batched by `vmap` in every leaf if a leaf of `args` is.
 
     JAX mixes up the axes of a staged custom derivative whose values are batched in other leaves
@@ -108,19 +108,21 @@ class CycleMap(eqx.Module):
 
     def __call__(self, state: State) -> State:
         """Return the state `cycles` drive cycles later; a `HybridState` with discrete modes."""
-        return _end(self, adopted(self.machine, state))
+        return _end(self, map_state(self.machine, state))
 
     def residual(self, state: State) -> State:
         """Return the mapped state minus `state`, zero for a periodic motion."""
-        state = adopted(self.machine, state)
-        return jtu.tree_map(lambda a, b: a - b, bare(_end(self, state)), bare(state))
+        state = map_state(self.machine, state)
+        return jtu.tree_map(
+            lambda a, b: a - b, without_modes(_end(self, state)), without_modes(state)
+        )
 
     def jacobian(self, state: State) -> Float[Array, "states states"]:
         """Return the map's derivative: the monodromy matrix if `state` lies on a periodic motion.
 
         Rows and columns are in the order of the state's leaves: Y, V, and W for a motor.
         """
-        x, unravel = raveled(adopted(self.machine, state))
+        x, unravel = raveled(map_state(self.machine, state))
         return jax.jacfwd(lambda x: raveled(_end(self, unravel(x)))[0])(x)
 
 
@@ -173,10 +175,10 @@ def cycle_map(
     return CycleMap(machine, carried, count("cycles", cycles, least=1), may_rest(machine))
 
 
-def adopted(machine: AbstractMachine, state: State, name: str = "state") -> State:
+def map_state(machine: AbstractMachine, state: State, name: str = "state") -> State:
     """Convert a state for a cycle map: floating-point arrays of one type, with its modes."""
-    modes, state = modes_of(state), bare(state)
-    state = adopt(machine, in_cycle_state(machine, name, state))
+    modes, state = modes_of(state), without_modes(state)
+    state = convert_start(machine, in_cycle_state(machine, name, state))
     check_reals(name, state)
     if clock_of(machine, state) is not None:
         raise ValueError(
@@ -194,5 +196,5 @@ def adopted(machine: AbstractMachine, state: State, name: str = "state") -> Stat
 def axes_of(machine: AbstractMachine, state: State) -> int:
     """Return the number of batch axes of a guess, the dimension of its position."""
     with contextlib.suppress(AttributeError, TypeError, LookupError):  # invalid states raise later
-        return jnp.ndim(machine.position(bare(state)))
-    return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(bare(state))))
+        return jnp.ndim(machine.position(without_modes(state)))
+    return int(any(jnp.ndim(leaf) for leaf in jtu.tree_leaves(without_modes(state))))

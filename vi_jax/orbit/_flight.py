@@ -70,7 +70,7 @@ def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
     """Return the acceleration d²/ds² of the resting body towards its stop, if it were free."""
     stop = stops_of(flight.machine)[number]
-    field = flight.letting_go(stop.coordinate).smooth.field
+    field = flight.releasing(stop.coordinate).smooth.field
     return guard_rates(field, partial(stop.guard, flight.machine), s, state).a
 
 
@@ -100,7 +100,7 @@ class Flight(eqx.Module):
     def holding(self, contact: Scalars) -> "Flight":
         return Flight(self.machine, self.modes, self.method, self.like, contact)
 
-    def letting_go(self, coordinate: int) -> "Flight":
+    def releasing(self, coordinate: int) -> "Flight":
         others = (0.0 * x if k == coordinate else x for k, x in enumerate(self.contact))
         return self.holding(tuple(others) if len(self.contact) > 1 else ())
 

@@ -17,12 +17,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._checks import count, given_number
-from .._messages import Interrupted, Tell, at_work, warn
+from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import angles_in, nearest_images
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
-from ._solution import Step, advance, distance_along, located, off_by, on_host
+from ._solution import Step, advance, distance_along, located, on_host, step_error
 from ._surgery import halves_apart
 from .special import Point
 
@@ -187,7 +187,7 @@ class _Walk:
         self.special: list[Point] = []
         self._vain, self._worst = 0.0, (0.0, 0.0)  # error that more steps leave; largest, and where
 
-    def follow(self, tell: Tell, *, step: float, max_step: float, max_points: int) -> str:
+    def follow(self, tell: ReportProgress, *, step: float, max_step: float, max_points: int) -> str:
         """Walk on in the direction of the first point's tangent; return the reason to end."""
         length, failed, steady, end, points = step, 0, 0, "max_points", 1
         while points < max_points:
@@ -282,7 +282,7 @@ class _Walk:
         table = self.table
         if not sized_by_motion(table.problem):
             return False
-        off = off_by(table.problem, new.x)
+        off = step_error(table.problem, new.x)
         if off > max(COARSE, 10 * self._vain):  # otherwise rounding
             better = finer(table.problem, new.x, off)
             if better is not None:

@@ -150,10 +150,10 @@ class MotionTable(Table):
             rows.append(Event(left, lambda at: Ending(at, "long")))
         for held in self.problem.conditions:
             if isinstance(held, HeldMultiplier):
-                ahead = lambda step, held=held: -held.overtaken(step.seen)
+                ahead = lambda step, held=held: -held.dominance_margin(step.seen)
                 rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
         rows += self._lost(here)
-        return [*rows, *self._springs_off(here), *self.closing.rows(here, new)]
+        return [*rows, *self._origin_events(here), *self.closing.rows(here, new)]
 
     def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
         return self.advance(here.x, here.tangent, share * distance_along(self.problem, here, last))
@@ -179,7 +179,7 @@ class MotionTable(Table):
         old, at = alone(self.problem, at)
         new, x = without_events(old, at.x, both)
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
-        return point_at(new, at, REST, detail, springs=True)
+        return point_at(new, at, REST, detail, is_origin=True)
 
     def _lost(self, here: Step) -> Iterator[Event]:
         """Yield the rows of lost events, of touches, and of changes in the order of events."""
@@ -197,7 +197,7 @@ class MotionTable(Table):
             lost = partial(self._named, REST, detail=detail, impact=event)
             yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
         if self.problem.rests:
-            yield Event(pulled, self._divided)
+            yield Event(least_hold_force, self._divided)
         anew = lambda _: "a switch goes into another mode: the motion sticks or slips anew"
         coincidence = partial(coincidence_in_words, self.problem)
         ended = partial(self._ended, here)
@@ -236,7 +236,7 @@ class MotionTable(Table):
         at = at._replace(seen=at.seen._replace(monodromy=M, multipliers=values))
         return self._named(GRAZING, at, detail, impact)._replace(until=short)
 
-    def _springs_off(self, here: Step) -> Iterator[Event]:
+    def _origin_events(self, here: Step) -> Iterator[Event]:
         """Yield the rows of places where both halves of the period become equal, or images of each
         other. Beyond, the same motions repeat, half a period later or mirrored."""
         for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self.images)):
@@ -246,7 +246,7 @@ class MotionTable(Table):
 
             def ending(at: Step, kind=kind, apart=apart) -> Ending | None:
                 if kind == DOUBLING:
-                    sprung = self._sprung(at)
+                    sprung = self._find_origin(at)
                     if sprung is None:
                         return None
                     at, point = sprung
@@ -264,10 +264,10 @@ class MotionTable(Table):
     def stalled(self, steps: list[Step]) -> Ending:
         """Return the end at the motion of half the period, if the branch begins at it close by."""
         apart = np.linalg.norm(self._halves(steps[-1]))
-        sprung = self._sprung(steps[-1]) if apart > ROUNDED else None
+        sprung = self._find_origin(steps[-1]) if apart > ROUNDED else None
         return super().stalled(steps) if sprung is None else Ending(sprung[0], DOUBLING, sprung[1])
 
-    def _sprung(self, at: Step) -> tuple[Step, Point] | None:
+    def _find_origin(self, at: Step) -> tuple[Step, Point] | None:
         """Return the step where the branch begins at a motion of half the period, and that one."""
         apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at)
         if apart > _ALMOST * ALIKE:
@@ -277,7 +277,7 @@ class MotionTable(Table):
             return None
         at = at if self.problem.conditions else begins
         detail = "the branch begins at a motion of half the period"
-        point = point_at(half, step, DOUBLING, detail, springs=True)
+        point = point_at(half, step, DOUBLING, detail, is_origin=True)
         return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
     def passed(self, here: Step, last: Step) -> Passed:
@@ -458,7 +458,7 @@ def room(step: Step) -> float:
     return float(np.clip(step.seen.nearest.room / step.seen.length, -1.0, 1.0))
 
 
-def pulled(step: Step) -> float:
+def least_hold_force(step: Step) -> float:
     """Return the least force on a body within its rest, relative to the motion's; at most 1."""
     unit = step.seen.length * (2 * np.pi / float(step.seen.duration)) ** 2
     return float(np.clip(step.seen.pull.room / unit, -1.0, 1.0))
@@ -591,7 +591,7 @@ def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
 
 
 @on_host
-def _lacks(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
+def _residual(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple[Vector, Array]:
     """Return the residual of the equations of an equilibrium u with an eigenvector v to iω, and its
     derivative. The unknowns (u, p, ω, Re v, Im v) are y·scale; `like` fixes v in length and
     phase."""
@@ -621,7 +621,7 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
     like = np.stack([np.real(first), np.imag(first)])
     y, size = np.concatenate([guess[1:] / scale[: n + 1], [1.0], like.ravel()]), np.inf
     for _ in range(20):
-        missing, jacobian = _lacks(problem, y, scale, like)
+        missing, jacobian = _residual(problem, y, scale, like)
         if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):
             return None
         move = np.linalg.lstsq(jacobian, missing)[0]  # the smallest if a component is neutral

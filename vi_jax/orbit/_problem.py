@@ -1,5 +1,5 @@
 """The equations from event to event of an orbit that was found: of a motion in flight
-(`problem_of`), or of one that rests (`legs_of`)."""
+(`problem_of`), or of one that rests (`resting_problem_of`)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,6 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     after_event,
-    bare,
     begin_modes,
     check_again,
     events_of,
@@ -50,10 +49,11 @@ from ..machine import (
     switches_of,
     with_leaf,
     with_modes,
+    without_modes,
 )
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from ._shooting import Shooting, Unknowns
-from ._solution import off_by
+from ._solution import step_error
 from .results import Orbit
 
 
@@ -188,12 +188,14 @@ def problem_of(
             f"Argument `orbit` must list all its {int(orbit.impacts)} impacts, but lists "
             f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
-    found, autonomous = events_in(orbit), is_autonomous(machine, bare(orbit.state))
+    found, autonomous = events_in(orbit), is_autonomous(machine, without_modes(orbit.state))
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
     places, events = [place for place, _ in found], tuple(event for _, event in found)
     needed = longest_leg(places, events, period, cycles)
-    steps = steps_of(carried, corners, bare(orbit.state), needed)
-    blank = Shooting(machine, carried, bare(orbit.state), cycles, (), (), steps, (parameter,))
+    steps = steps_of(carried, corners, without_modes(orbit.state), needed)
+    blank = Shooting(
+        machine, carried, without_modes(orbit.state), cycles, (), (), steps, (parameter,)
+    )
     states, modes = _followed(blank, orbit.state, found, period)
     _check_instants(blank, found, states, modes)
     while sized_by_motion(blank) and 2 * blank.steps <= _MOST:
@@ -265,12 +267,12 @@ def sized_by_motion(problem: Shooting) -> bool:
 
 def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
     """Return the equations with the steps and the tolerance that a solution needs; `off` is its
-    present `off_by`. `None` if more steps change nothing or are not allowed."""
+    present `step_error`. `None` if more steps change nothing or are not allowed."""
     more = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
         problem = dataclasses.replace(problem, method=method, steps=steps)
-        before, off = off, off_by(problem, x)
+        before, off = off, step_error(problem, x)
         if not off < 0.5 * before:  # rounding
             break
         more = problem
@@ -284,7 +286,7 @@ def _followed(
 ) -> tuple[np.ndarray, Modes]:
     """Return the states just before each event and at the end of one period, and the modes."""
     machine = blank.machine
-    own, state = modes_of(state), bare(state)
+    own, state = modes_of(state), without_modes(state)
     modes = begin_modes(machine, jnp.zeros(()), state, own)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
@@ -307,7 +309,7 @@ def _followed(
 def events_in(orbit: Orbit) -> list[Placed]:
     """Return the events of a motion in order, with their clocks since the section."""
     machine, cycles = orbit.machine, int(orbit.cycles)
-    autonomous = is_autonomous(machine, bare(orbit.state))
+    autonomous = is_autonomous(machine, without_modes(orbit.state))
     clock = np.asarray(orbit.impact_phase) - float(phase_at(machine, 0.0))
     stops = np.asarray(orbit.impact_stop)
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
@@ -317,7 +319,7 @@ def events_in(orbit: Orbit) -> list[Placed]:
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found
-    if section_in(machine, bare(orbit.state)) is not None or renews(machine):
+    if section_in(machine, without_modes(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     # An event that coincides with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
@@ -333,7 +335,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
         )
     begins = np.concatenate([[0.0], np.cumsum(np.asarray(run.duration))])
-    if not is_autonomous(machine, bare(orbit.state)):
+    if not is_autonomous(machine, without_modes(orbit.state)):
         begins = float(machine.cycle) * np.arange(cycles + 1)
     found, events = [], events_of(machine)
     for n, s, kind, i in logged_events(machine, run):
@@ -385,12 +387,12 @@ _INSTEAD = (
 _ON = 1e-9
 
 
-def legs_of(
+def resting_problem_of(
     orbit: Orbit, parameter: str, bounds: tuple[float, float], method: MethodLike
 ) -> tuple[Shooting, np.ndarray]:
     """Return the equations of a motion that rests on stops, and its values of the unknowns. Bodies
     must chatter one at a time, and no switch may change with their hops."""
-    machine, state, cycles = orbit.machine, bare(orbit.state), int(orbit.cycles)
+    machine, state, cycles = orbit.machine, without_modes(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
     if is_autonomous(machine, state) or renews(machine) or has_contact_friction(machine):
         raise ValueError(
@@ -419,7 +421,7 @@ def legs_of(
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
     problem = sized(problem, x)
-    off = off_by(problem, x) if sized_by_motion(problem) else 0.0
+    off = step_error(problem, x) if sized_by_motion(problem) else 0.0
     if off > COARSE:
         problem = finer(problem, x, off) or problem
     return problem, x
@@ -434,7 +436,9 @@ def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
         n = whole % len(sections)
         row, own = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
         place = jnp.asarray(clock - whole * cycle)
-        found.append(_state_at(orbit.machine, orbit.method, bare(orbit.state), row, own, place))
+        found.append(
+            _state_at(orbit.machine, orbit.method, without_modes(orbit.state), row, own, place)
+        )
     return np.reshape(found, (len(clocks), sections.shape[1]))
 
 
@@ -450,7 +454,7 @@ def _state_at(machine, method, like, row, own, clock):
 def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
     """Return the machine's modes in each leg, from the first state and each event's."""
     machine, start = problem.machine, jnp.zeros(())
-    modes = begin_modes(machine, start, bare(state), modes_of(state))
+    modes = begin_modes(machine, start, without_modes(state), modes_of(state))
     found = [modes] * problem.legs
     first = int(np.searchsorted(clocks, float(problem.cycles * machine.cycle)))
     for i in [*range(first, len(clocks)), *range(first)]:

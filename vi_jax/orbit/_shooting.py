@@ -98,7 +98,7 @@ class Observed(NamedTuple):
         return max(usual, np.abs(np.asarray(self.approach)).max(initial=0.0))
 
 
-# A hop has this share of a cycle's steps: the longest hop of a chatter (see `legs_of`).
+# A hop has this share of a cycle's steps: the longest hop of a chatter (see `resting_problem_of`).
 _HOP = 0.2
 
 # The number of a leg; it may be traced.
@@ -325,7 +325,7 @@ class Shooting(eqx.Module):
         flight = Flight(machine, self.modes_in(leg), self.method, self.like)
         return flight.holding(self._contact(self.contacts, leg)) if self.rests else flight
 
-    def departing(self, machine: AbstractMachine, leg: Leg) -> Flight:
+    def flight_after_event(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """Return the flight of a leg just after the event that begins it."""
         if not self.landings:
             return self.flight(machine, leg)
@@ -363,7 +363,10 @@ class Shooting(eqx.Module):
         """Return the last impact before `until` of the chatter that begins a leg, or the begin."""
         hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
-            free, begin = self.departing(machine, leg), hops._replace(over=~lands | hops.over)
+            free, begin = (
+                self.flight_after_event(machine, leg),
+                hops._replace(over=~lands | hops.over),
+            )
             share = _HOP * (self.steps if steps is None else steps) / self.cycles
             each = jnp.maximum(2.0, jnp.ceil(share))
             last = hopped(free, number, begin, until=until, steps=each)
@@ -381,7 +384,7 @@ class Shooting(eqx.Module):
         more = [condition.missing(self, x, seen, chatters) for condition in self.conditions]
         return jnp.concatenate([missing, jnp.stack(more)])
 
-    def lacks(self, x: Vector, steps: Scalar | None = None) -> Vector:
+    def motion_residual(self, x: Vector, steps: Scalar | None = None) -> Vector:
         """Return the left sides of the motion's own equations, zero for a periodic motion: the
         difference from the end of each leg to the begin of the next, then the guards. `steps` is
         the number of steps of a flight, if not `self.steps`."""
@@ -496,7 +499,7 @@ class Shooting(eqx.Module):
         landing = self.events[i]
         if self.events[(i + 1) % self.legs] == landing._replace(use=LEAVES):
             return jnp.full_like(until, jnp.inf)
-        return until - last.s - remaining(self.departing(machine, i), landing.number, last)
+        return until - last.s - remaining(self.flight_after_event(machine, i), landing.number, last)
 
     def _escape(
         self, machine: AbstractMachine, i: int, last: Hops, clock: Array, states: Array,
@@ -537,7 +540,10 @@ class Shooting(eqx.Module):
         event. The jump is differentiated where the body is, without moving it onto its stop
         (`jump_of`): ∇g accounts for the change of the event's time.
         """
-        old, new = self.flight(machine, leg - 1).smooth, self.departing(machine, leg).smooth
+        old, new = (
+            self.flight(machine, leg - 1).smooth,
+            self.flight_after_event(machine, leg).smooth,
+        )
 
         def field(machine, u):
             return ravel_pytree(machine.field(s, self.unravel(u)))[0]
@@ -592,6 +598,6 @@ class Shooting(eqx.Module):
         end = self.fly_leg(machine, leg, begin, s)[0]
         if self.landings:
             last = self.hopped(machine, leg, s0, s, u)
-            within = self.departing(machine, leg).fly(last.s, s, last.u, self.steps)[0]
+            within = self.flight_after_event(machine, leg).fly(last.s, s, last.u, self.steps)[0]
             end = jnp.where(s < begin.s, within, end)
         return self.unravel(end)

@@ -125,15 +125,15 @@ def observe(problem: Shooting, x):
 
 
 @on_host
-def _lacks(problem: Shooting, x, steps):
-    ends = problem.lacks(x, steps)[: problem.legs * problem.states]
+def _residual(problem: Shooting, x, steps):
+    ends = problem.motion_residual(x, steps)[: problem.legs * problem.states]
     return ends.reshape(-1, problem.states) / problem.sizes[1:]
 
 
-def off_by(problem: Shooting, x: Unknowns) -> float:
+def step_error(problem: Shooting, x: Unknowns) -> float:
     """Return the relative change of the ends of the flights by doubling the steps."""
     shared, steps = dataclasses.replace(problem, steps=1), float(problem.steps)
-    return float(np.max(np.abs(_lacks(shared, x, 2 * steps) - _lacks(shared, x, steps))))
+    return float(np.max(np.abs(_residual(shared, x, 2 * steps) - _residual(shared, x, steps))))
 
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
@@ -337,7 +337,7 @@ class Hits(NamedTuple):
 @compiled
 def _sections(problem: Shooting, x: Array):
     states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(*problem.sections(x))
-    return states, jnp.max(jnp.abs(problem.lacks(x)))
+    return states, jnp.max(jnp.abs(problem.motion_residual(x)))
 
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:

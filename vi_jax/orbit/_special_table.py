@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._messages import so_many
+from .._messages import count_of
 from ._conditions import Special, is_defective, minors
 from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
 from ._local_map import LocalMap, graze_at
-from ._motion_table import pulled, room, tests_of
+from ._motion_table import least_hold_force, room, tests_of
 from ._shooting import ROUNDING, Shooting
 from ._solution import (
     BESIDE,
@@ -114,7 +114,7 @@ class SpecialTable(Table):
         if kind not in TOUCHING or kind == REST or grazes is not None:
             yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
         if self.problem.rests and (kind != REST or grazes is not None):
-            yield Event(pulled, lambda at: Ending(at, REST), noise=ROUNDING)
+            yield Event(least_hold_force, lambda at: Ending(at, REST), noise=ROUNDING)
         for i, event in enumerate(self.problem.landings):
             if kind != REST or event != grazes:
                 lost = lambda step, i=i: -float(step.seen.escape[i])
@@ -259,7 +259,7 @@ def _resonances(
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
         begins = AT_CODIMENSION_TWO[RESONANT] if both else begins
-        what = f"{begins} of the motion with one impact in {so_many(n, 'period')}"
+        what = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
         test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
         values = [each.resonance(n, sign) for each in known]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
@@ -288,7 +288,7 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     fold, doubling = (
         plain(lambda s, kind=kind: tests_of(s)[kind]) for kind in (CROSSING, DOUBLING)
     )
-    bare = dataclasses.replace(problem, conditions=())
+    without_modes = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
     # The product of all eigenvalues of M ± I but one, if that one is zero.
@@ -296,14 +296,14 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     shifted = lambda s: s.seen.monodromy + sign * np.eye(len(s.seen.monodromy))
     double = plain(lambda s: float(minors(shifted(s))))
     if condition.kind == FOLD:
-        tests = {CUSP: _cusp(bare, 2 if condition.double else 1), FLIP: doubling}
+        tests = {CUSP: _cusp(without_modes, 2 if condition.double else 1), FLIP: doubling}
         return tests if condition.double else tests | {RESONANCE_1: double}
     if condition.kind == DOUBLING:
-        return {DEGENERATE: _cubic(bare, twice=True), FLIP: fold, RESONANCE_2: double}
+        return {DEGENERATE: _cubic(without_modes, twice=True), FLIP: fold, RESONANCE_2: double}
     if condition.kind == CROSSING:
         return {RESONANCE_1: double}
     if condition.kind == SYMMETRY:
-        return {DEGENERATE_SYMMETRY: _cubic(bare, twice=False), RESONANCE_1: double}
+        return {DEGENERATE_SYMMETRY: _cubic(without_modes, twice=False), RESONANCE_1: double}
     # M has a pole at a grazing impact, but not at a touched stop.
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
 
@@ -322,7 +322,7 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp(bare: Shooting, many: int) -> Test:
+def _cusp(without_modes: Shooting, many: int) -> Test:
     """Return a test for cusps: the signed rate of the parameters along a curve of folds.
 
     With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
@@ -331,8 +331,8 @@ def _cusp(bare: Shooting, many: int) -> Test:
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
-        jacobian = np.array(jacobian_at(bare, step.x))
-        jacobian[:, -2:] *= bare.scale[-2:]
+        jacobian = np.array(jacobian_at(without_modes, step.x))
+        jacobian[:, -2:] *= without_modes.scale[-2:]
         nulls = _nulls(jacobian[:, :-2], like)
         if many > 1:
             lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
@@ -351,7 +351,7 @@ def _bent(problem: Shooting, x, right, bend):
     """Return the equations' second and third derivatives d/dt along x + t right + t² bend/2."""
 
     def along(t):
-        return problem.lacks(x + t * right + 0.5 * t * t * bend)
+        return problem.motion_residual(x + t * right + 0.5 * t * t * bend)
 
     def derivative(function):
         return lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]
@@ -361,7 +361,7 @@ def _bent(problem: Shooting, x, right, bend):
     return jax.jvp(second, (zero,), (jnp.ones_like(zero),))
 
 
-def _cubic(bare: Shooting, *, twice: bool) -> Test:
+def _cubic(without_modes: Shooting, *, twice: bool) -> Test:
     """Return the cubic coefficient of the motions that begin at a doubling or a symmetry breaking.
 
     Let F be the equations of the motion gone through twice, or of the symmetric motion, with null
@@ -369,10 +369,10 @@ def _cubic(bare: Shooting, *, twice: bool) -> Test:
     B(r, w))/6, F_x w = -B(r, r) (Kuznetsov, Elements of Applied Bifurcation Theory, 2004, section
     5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
     """
-    whole = several(bare, 2) if twice else bare
+    whole = several(without_modes, 2) if twice else without_modes
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
-        x = repeated(bare, step.x, whole) if twice else np.asarray(step.x)
+        x = repeated(without_modes, step.x, whole) if twice else np.asarray(step.x)
         matrix = jacobian_at(whole, x)[:, :-2]
         nulls = _nulls(matrix)
         right = np.append(nulls.right, [0.0, 0.0])

@@ -13,7 +13,7 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
-from ._conditions import AbstractCondition, Apart, Special
+from ._conditions import AbstractCondition, FixedComponent, Special
 from ._flight import Event
 from ._local_map import graze_at
 from ._motion_table import tests_of
@@ -74,7 +74,7 @@ def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
 
 def _doubled(point: Point, distance: float) -> Orbit:
     """Return a motion of twice the period, or of half of it if the branch begins at one."""
-    if point.springs:
+    if point.is_origin:
         problem, x = point.problem, point.step.x
         step = advance(problem, x, tangent_at(problem, x), distance)
         return _found(problem, step, "half the period", distance)
@@ -108,7 +108,7 @@ def _held_otherwise(point: Point, distance: float) -> Orbit:
 
 def _resting_otherwise(point: Point, distance: float) -> Orbit:
     """Return the motion with one rest more or less; where two become one, that with one."""
-    if not point.springs:
+    if not point.is_origin:
         other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
         return _beside(point, distance, "another number of rests", other)
     found = admissible_beside(point.problem, point.step.x, distance)
@@ -266,7 +266,7 @@ def _of_periods(n: int, point: Point, distance: float) -> Orbit:
     new, x, vectors = _repeated(point, n)
     second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
     row = first[:-1] / new.scale
-    apart = Apart(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
+    apart = FixedComponent(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
     two, begin = _in_two(point, new, x, apart)
     step = advance(two, begin + distance * first * two.scale, second, 0.0)
     return _found(two, step, f"{n} times the period", distance)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, given_number, one_of
-from .._messages import so_many
+from .._messages import count_of
 from .._types import State, xr
 from ..flow import average_names, in_names, quantities_on, quantity_names, tidy
 from ..machine import (
@@ -389,7 +389,7 @@ class Branch(Curve):
         period = cycles_in_words(machine, self.cycles)
         span = in_unit(f"[{low:.6g}, {high:.6g}]", units_of(machine), self.name)
         lines = [
-            f"Branch of {so_many(len(self.parameter), 'motion')} of period {period} with "
+            f"Branch of {count_of(len(self.parameter), 'motion')} of period {period} with "
             f"{branch_hits_in_words(self)}, {self.name} in {span}, "
             f"{int(self.stable.sum())} of them stable; ends: {self.ends[0]}, {self.ends[1]}",
             *self._freed_in_words(),
@@ -442,8 +442,8 @@ class Boundary(Curve):
     def __str__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
         lines = [
-            f"Curve of {so_many(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} in "
-            f"[{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
+            f"Curve of {count_of(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} "
+            f"in [{low[0]:.6g}, {high[0]:.6g}], {self.names[1]} in [{low[1]:.6g}, {high[1]:.6g}]; "
             f"ends: {self.ends[0]}, {self.ends[1]}",
             *(f"  {point}" for point in self.special),
         ]
@@ -454,4 +454,4 @@ def branch_hits_in_words(branch: Branch) -> str:
     """Describe the impacts of a branch's motions, or that they rest: then the number varies."""
     if branch.problem.rests:
         return "rest on a stop"
-    return so_many(branch.impact_speed.shape[1], "impact")
+    return count_of(branch.impact_speed.shape[1], "impact")

@@ -28,7 +28,6 @@ from ..machine import (
     HybridState,
     Scene,
     angles_in,
-    bare,
     begin_modes,
     frequency_ratio,
     in_rows,
@@ -39,8 +38,9 @@ from ..machine import (
     raveled,
     replaced,
     with_modes,
+    without_modes,
 )
-from ._cycle_map import CycleMap, adopted, axes_of, cycle_map, forward_jacobian, tied
+from ._cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 
@@ -50,7 +50,10 @@ def _missing(
 ) -> Float[Array, "arcs states"]:
     """Return F, each arc's end minus the next arc's begin; the first arc follows the last."""
     ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
-    angles, after = angles_in(arc.machine, bare(unravel(arcs[0]))), jnp.roll(arcs, -1, axis=0)
+    angles, after = (
+        angles_in(arc.machine, without_modes(unravel(arcs[0]))),
+        jnp.roll(arcs, -1, axis=0),
+    )
     return nearest_images(angles, ends, after) - after
 
 
@@ -109,10 +112,10 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 def _places(the_map: CycleMap, state: State) -> int:
     """Return the number of samples of the state in a cycle; 1 for an autonomous machine."""
-    return 1 if is_autonomous(the_map.machine, bare(state)) else _PLACES
+    return 1 if is_autonomous(the_map.machine, without_modes(state)) else _PLACES
 
 
-def moved_from_impacts(
+def move_section(
     the_map: CycleMap, guess: State, impact_log: int
 ) -> tuple[CycleMap, State, Int[Array, ""]]:
     """Return map, guess and their place (in eighths of a cycle) for the section of the search.
@@ -131,7 +134,7 @@ def moved_from_impacts(
     place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
     kept = with_modes(run.samples.state, run.samples.modes)
     there = jtu.tree_map(lambda x: x[place], kept)
-    lost = ~jnp.all(jnp.isfinite(in_rows(bare(there), 0)))
+    lost = ~jnp.all(jnp.isfinite(in_rows(without_modes(there), 0)))
     place = jnp.where(lost, 0, place)
     there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
     moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
@@ -218,7 +221,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
 
 
 @eqx.filter_custom_jvp
-def found_and_seen(
+def find_and_observe(
     arc: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int, second: bool
 ) -> tuple[Found, ObservedArc]:
     """Return the root found from a guess (`root_of`), and the observations of its arcs, in rows.
@@ -229,13 +232,13 @@ def found_and_seen(
     """
     root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
     see = lambda x: observe_arc(arc, unravel(x), impact_log, second)
-    return tied((root, jax.vmap(see)(root.x)), root.x)
+    return batch_together((root, jax.vmap(see)(root.x)), root.x)
 
 
-@found_and_seen.def_jvp
+@find_and_observe.def_jvp
 def _(primals, tangents):
     arc, guess, _, impact_log, second = primals
-    root, seen = found_and_seen(*primals)
+    root, seen = find_and_observe(*primals)
     _, unravel = raveled(guess)
     still = jtu.tree_map(jnp.zeros_like, (root, seen))
     if not jtu.tree_leaves(tangents[0]):
@@ -264,7 +267,7 @@ def _(primals, tangents):
     return (root, seen), (still[0]._replace(x=move), jtu.tree_map(rates, slopes))
 
 
-def by_the_first_state(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
+def chain_jacobians(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
     """Return the derivatives of the states after all cycles with respect to the first state: a
     running product of those with respect to the first state of their own arc."""
     passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
@@ -288,7 +291,7 @@ def error_of(
     return jnp.max(jnp.abs(step / sizes)), drifts
 
 
-def in_order(
+def order_impacts(
     seen: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
     machine: AbstractMachine, place: Int[Array, ""] | None,
 ) -> Impacts:  # fmt: skip
@@ -382,7 +385,7 @@ def find_orbit(
             f"{cycles} cycles, but has {root_finder.arcs} arcs."
         )
     guess = guess.state if isinstance(guess, Orbit) else guess
-    state = adopted(the_map.machine, guess, "guess")
+    state = map_state(the_map.machine, guess, "guess")
     _check_guess(the_map.machine, state)
     if modes_of(state) and root_finder.arcs > 1:
         raise ValueError(
@@ -405,7 +408,7 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
         )
     many = axes > 0
     if not many:
-        shape_of("guess", machine, bare(state))
+        shape_of("guess", machine, without_modes(state))
     shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
     if len(shapes) > 1:
         whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
@@ -440,13 +443,13 @@ def _judged(
 ) -> Orbit:  # fmt: skip
     machine, cycles = the_map.machine, the_map.cycles
     guess = _in_later_modes(the_map, jax.lax.stop_gradient(guess))
-    moved, start, place = moved_from_impacts(the_map, guess, impact_log)
+    moved, start, place = move_section(the_map, guess, impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
-    root, seen = found_and_seen(arc, start, root_finder, impact_log, multipliers)
+    root, seen = find_and_observe(arc, start, root_finder, impact_log, multipliers)
     x = root.x
-    jacobians = by_the_first_state(seen.jacobians)
-    angles = angles_in(machine, bare(guess))
-    sizes = row_sizes(machine, start, in_rows(bare(seen.states), 3))
+    jacobians = chain_jacobians(seen.jacobians)
+    angles = angles_in(machine, without_modes(guess))
+    sizes = row_sizes(machine, start, in_rows(without_modes(seen.states), 3))
     error, drifts = error_of(angles, seen, x, sizes)
     seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
 
@@ -460,18 +463,18 @@ def _judged(
     unit = jax.lax.stop_gradient(root.unit)
     scale = unit * (sizes if modes is None else jnp.append(sizes, jnp.ones(modes.shape[1])))
     least = _least_period(rows, error / unit, scale, angles)
-    again = _comes_back(start, seen)
+    again = _must_slide(start, seen)
     monodromy = jacobians[least - 1] if multipliers else jnp.full_like(jacobians[0], jnp.nan)
     within = jnp.arange(cycles) < least
     hit = (seen.listed.stop >= 0) & within[:, None]
-    listed = in_order(seen, hit, least, machine, place if last else None)
+    listed = order_impacts(seen, hit, least, machine, place if last else None)
     duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
     sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
     clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
-    unravel = ravel_pytree(bare(guess))[1]
+    unravel = ravel_pytree(without_modes(guess))[1]
     state = unravel(sections[0])
     state = state if modes is None else HybridState(state, tuple(modes[0]))
-    still = stands_still(machine, state, duration, unit * sizes)
+    still = is_equilibrium(machine, state, duration, unit * sizes)
     close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
     found = (root.converged > 0) & again & ~still & close
     y_min = jnp.min(jnp.where(within, seen.y_min, jnp.inf))
@@ -518,10 +521,12 @@ def _in_later_modes(the_map: CycleMap, guess: State) -> State:
         return guess
     later = the_map(guess)
     there = jnp.all(jnp.isfinite(raveled(later)[0]))
-    return jtu.tree_map(lambda a, b: jnp.where(there, a, b), replaced(later, bare(guess)), guess)
+    return jtu.tree_map(
+        lambda a, b: jnp.where(there, a, b), replaced(later, without_modes(guess)), guess
+    )
 
 
-def _comes_back(start: State, seen: ObservedArc) -> Flag:
+def _must_slide(start: State, seen: ObservedArc) -> Flag:
     """Return whether a motion ends in its first modes, after all cycles of the search."""
     modes = modes_of(start)
     if modes is None or seen.modes is None:
@@ -543,10 +548,10 @@ def _least_period(
     return least
 
 
-def stands_still(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
+def is_equilibrium(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
     """Return whether an autonomous machine is at an equilibrium: at the rate of the state it would
     not move in its period, relative to `unit` + |state|."""
-    own, state = modes_of(state), bare(state)
+    own, state = modes_of(state), without_modes(state)
     if not is_autonomous(machine, state):
         return jnp.zeros((), bool)
     x = ravel_pytree(state)[0]

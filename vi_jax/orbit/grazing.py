@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._checks import count, flag, instance_of
-from .._messages import Interrupted, at_work, so_many
+from .._messages import Interrupted, at_work, count_of
 from ..flow import NamedEnumeration, simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
 from ._flight import Event
@@ -339,7 +339,7 @@ def alike(forecast: Settled, machine: Simulated) -> np.ndarray:
 DECADES = 4
 
 # The machine is simulated at every 6th value, and on the other side at every 4th of these.
-ASKED, _SPARSE = 6, 4
+SIMULATE_EVERY, _SPARSE = 6, 4
 
 # The machine agrees over a range of the parameter if it does in this share of each half decade: the
 # local map is of first order and does not decide at the edges of windows.
@@ -490,7 +490,11 @@ class Grazing(Summarized):
         lines = [
             f"Grazing at {self.parameter} = {at}: touches the {self.touched}",
             f"  what follows: {SCENARIOS[self.outcome]}",
-            *([] if self.far is None else [f"  far away: the machine settles on {self.afar}"]),
+            *(
+                []
+                if self.far is None
+                else [f"  far away: the machine settles on {self.distant_in_words}"]
+            ),
             f"  impacts appear: as {self.parameter} {'rises' if self.side > 0 else 'falls'}",
             f"  multipliers without impact: {values}",
             f"  second derivative of the distance: {', '.join(f'{a:.6g}' for a in self.rate)}",
@@ -510,14 +514,14 @@ class Grazing(Summarized):
         return "\n".join(lines)
 
     @property
-    def afar(self) -> str:
+    def distant_in_words(self) -> str:
         """The machine's attractor if none is near, `far` in words; "" if `None`."""
         if self.far is None:
             return ""
         period, impacts = self.far
         if not period:
             return "no short period"
-        return f"a motion of {so_many(period, 'cycle')} with {so_many(impacts, 'impact')}"
+        return f"a motion of {count_of(period, 'cycle')} with {count_of(impacts, 'impact')}"
 
     def _windows_in_words(self) -> list[str]:
         if self.windows is None:
@@ -568,12 +572,12 @@ def grazing(
     unchecked, settles = _unchecked(graze, periods)
     if not check:
         return unchecked
-    offsets = unchecked.forecast.offset[::ASKED]
+    offsets = unchecked.forecast.offset[::SIMULATE_EVERY]
     with at_work(
         "grazing", lambda: Interrupted("check of the grazing", unchecked),
         progress=progress, unit="value", total=len(offsets),
     ) as tell:  # fmt: skip
-        some = jax.tree.map(lambda a: a[::ASKED], settles)
+        some = jax.tree.map(lambda a: a[::SIMULATE_EVERY], settles)
         beside, same, far = beside_grazing(graze, offsets, some)
         checked, agreement = stretch(np.abs(offsets), *same)
         tell(len(offsets))

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._checks import given_number, short
-from .._messages import so_many
+from .._messages import count_of
 from .._types import State, xr
 from ..flow import (
     AbstractMethod,
@@ -33,7 +33,6 @@ from ..machine import (
     AbstractMachine,
     Summarized,
     angles_in,
-    bare,
     cycles_in_words,
     first_few,
     in_rows,
@@ -47,6 +46,7 @@ from ..machine import (
     summary_table,
     units_of,
     with_units,
+    without_modes,
 )
 
 
@@ -325,7 +325,7 @@ class Orbit(Summarized):
         period = cycles_in_words(self.machine, cycles)
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
-            f"  section: {state_in_words(bare(self.state), 9, units)}",
+            f"  section: {state_in_words(without_modes(self.state), 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
         if is_autonomous(self.machine, self.state):
@@ -387,15 +387,15 @@ def _nearly(orbit: Orbit) -> str:
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
     """Return whether a body rests on a stop on the section."""
-    x, machine = bare(orbit.state), orbit.machine
+    x, machine = without_modes(orbit.state), orbit.machine
     bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 
 def hits_in_words(orbit: Orbit) -> str:
-    words, rests = so_many(int(orbit.impacts), "impact"), int(orbit.rests)
+    words, rests = count_of(int(orbit.impacts), "impact"), int(orbit.rests)
     if rests:
-        return f"{words} and {so_many(rests, 'rest')} on a stop"
+        return f"{words} and {count_of(rests, 'rest')} on a stop"
     return f"{words} and rest on a stop" if lies_on_a_stop(orbit) else words
 
 
@@ -437,14 +437,14 @@ class Orbits(InWords, list[Orbit]):
     """Several periodic motions: a list that prints as a table, one motion a line."""
 
     def __str__(self) -> str:
-        return "\n".join([so_many(len(self), "orbit"), *map(in_one_line, self)])
+        return "\n".join([count_of(len(self), "orbit"), *map(in_one_line, self)])
 
 
 def in_one_line(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
     stable = STABILITY[orbit.stability].partition(":")[0]
-    where = state_in_words(bare(orbit.state), 6, units_of(orbit.machine))
+    where = state_in_words(without_modes(orbit.state), 6, units_of(orbit.machine))
     size = f"; greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     size = "" if orbit.stability == STABILITY.unknown else size
     found = f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span_in_words(orbit, 6)}"

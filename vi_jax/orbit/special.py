@@ -54,7 +54,7 @@ class Point(InWords):
     """Value and size of each additional parameter of the curve, by name."""
     curve: str | None = None
     """The kind of the boundary on which it lies; `None` on a branch."""
-    springs: bool = False
+    is_origin: bool = False
     """True if the branch begins here at another motion, that of `orbit`: one of half its period, or
     one without the flight that divides a rest."""
     quantity: str | None = None

@@ -17,7 +17,6 @@ from ..machine import (
     AbstractMachine,
     SoftStop,
     Turn,
-    bare,
     component,
     components,
     counter_of,
@@ -34,6 +33,7 @@ from ..machine import (
     switches_of,
     unit_of,
     units_of,
+    without_modes,
     without_turns,
 )
 from ..orbit import Orbit
@@ -135,7 +135,7 @@ def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str
     Y = _course(machine, coordinate_of(machine, coordinate), samples.state)[0]
     counter = counter_of(machine)
     turn = counter.name if isinstance(counter, Turn) else None
-    named = components(bare(samples.state), lead=1).items()
+    named = components(without_modes(samples.state), lead=1).items()
     angles = (x for name, x in named if name == turn or is_angle(machine, name))
     return any(np.array_equal(Y, angle, equal_nan=True) for angle in angles)
 

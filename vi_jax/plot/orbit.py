@@ -337,7 +337,7 @@ def _draw_machine(ax: Axes, found: Grazing, machine: Motions) -> None:
         across, up = _dots(machine.offset[~near], machine.position[~near])
         dots = {"marker": ".", "ms": 2, "color": "0.6", "ls": "none"}
         ax.plot(across, up, **dots)
-        ax.plot([], [], ".", color="0.6", label=f"the machine, far away: {found.afar}")
+        ax.plot([], [], ".", color="0.6", label=f"the machine, far away: {found.distant_in_words}")
 
 
 def _dots(offset: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

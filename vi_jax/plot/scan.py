@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._checks import flag, instance_of, one_of
-from .._messages import so_many
+from .._messages import count_of
 from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
@@ -127,7 +127,7 @@ def _entry(
 def _word_of(data: xr.Dataset) -> Callable[[int], str]:
     """Return the function that names periods in data from a machine of this class."""
     if data.attrs.get("machine_class", "Scene") != "Scene":
-        return lambda cycles: so_many(cycles, "cycle")
+        return lambda cycles: count_of(cycles, "cycle")
     return lambda cycles: f"{2 * cycles}π"
 
 
@@ -160,7 +160,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         color = colors[a.label + irregular]
         parts = [a.sections[name.removeprefix("start.")] for name in (x, y)]
         ax.plot(*parts, "o", color=color, mec="k", mew=1.0, ms=6, zorder=3)
-        motion = f"{found.period_of(a.period)}, {so_many(round(a.impacts), 'impact')}"
+        motion = f"{found.period_of(a.period)}, {count_of(round(a.impacts), 'impact')}"
         entries.append((f"{motion}: {100 * a.fraction:.1f} %", color))
     if len(entries) > _NAMED:
         rest = sum(a.fraction for a in found.attractors[_NAMED:])

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import count, flag
-from .._messages import Interrupted, Tell, at_work, silent
+from .._messages import Interrupted, ReportProgress, at_work, silent
 from .._types import State
 from ..flow import MethodLike
-from ..machine import AbstractMachine, Summarized, bare, in_rows
-from ..orbit import Orbit, adopted
+from ..machine import AbstractMachine, Summarized, in_rows, without_modes
+from ..orbit import Orbit, map_state
 from ._settling import (
     ELSEWHERE,
     INADMISSIBLE,
@@ -111,7 +111,7 @@ def edge_state(
     longest, rounds = count("longest", longest, least=1), count("rounds", rounds, least=1)
     settling, start = settling_on(machine, inside, settle, tolerance, longest, method, "inside")
     beyond = outside.state if isinstance(outside, Orbit) else outside
-    beyond = in_row(bare(adopted(settling.the_map.machine, beyond, "outside")))
+    beyond = in_row(without_modes(map_state(settling.the_map.machine, beyond, "outside")))
     first, second = settling.judge(np.stack([start, beyond]))
     for name, verdict, wanted in (("inside", first, RETURNS), ("outside", second, ELSEWHERE)):
         if verdict == INADMISSIBLE:
@@ -122,13 +122,17 @@ def edge_state(
                 f"`{name}` {'does not come' if wanted else 'comes'} back to that of `inside`. See "
                 "`settle` and `tolerance`."
             )
-    trail: list[Rows] = []
+    section_states: list[Rows] = []
 
     def kept() -> Interrupted | None:
-        return Interrupted("edge", _described(settling, trail, None)) if trail else None
+        return (
+            Interrupted("edge", _described(settling, section_states, None))
+            if section_states
+            else None
+        )
 
     with at_work("edge", kept, progress=progress, unit="round", total=rounds) as tell:
-        return tracked(settling, start, beyond, longest, rounds, trail, tell)
+        return tracked(settling, start, beyond, longest, rounds, section_states, tell)
 
 
 def tracked(
@@ -137,33 +141,36 @@ def tracked(
     outside: Row,
     longest: int,
     rounds: int,
-    trail: list[Rows] | None = None,
-    tell: Tell = silent,
+    section_states: list[Rows] | None = None,
+    tell: ReportProgress = silent,
 ) -> EdgeState:
-    """Find the edge state between a start that returns and one that does not; extend `trail`."""
-    recurs, trail = _RECURS, [] if trail is None else trail
+    """Find the edge state between a start that returns and one that does not. Extend
+    `section_states`."""
+    recurs, section_states = _RECURS, [] if section_states is None else section_states
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)
         pair, sections = _followed(settling, np.stack([inside, outside]))
         if not len(sections):
             break
-        trail.append(sections)
+        section_states.append(sections)
         tell(1)
         inside, outside = pair
-        met = _met_again(np.concatenate(trail)[-4 * longest - 1 :], longest, recurs, settling)
+        met = _met_again(
+            np.concatenate(section_states)[-4 * longest - 1 :], longest, recurs, settling
+        )
         if met is not None:
             orbit = settling.orbit_near(*met, _NEAR * recurs)
             if orbit is not None and not bool(orbit.stable):
-                return _described(settling, trail, orbit)
+                return _described(settling, section_states, orbit)
             recurs *= 0.1
-    return _described(settling, trail, None)
+    return _described(settling, section_states, None)
 
 
 def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     """Follow two neighbours until they are apart; return them and their mean section states."""
     parts = []
     for _ in range(_PIECES):
-        both = settling.trail(pair, TRAIL)
+        both = settling.section_states(pair, TRAIL)
         both[1] = settling.near(both[1], both[0])
         far = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or NaN
         end = far[0] if far.size else TRAIL
@@ -176,16 +183,20 @@ def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
 
 
 def _met_again(
-    trail: Rows, longest: int, recurs: float, settling: Settling
+    section_states: Rows, longest: int, recurs: float, settling: Settling
 ) -> tuple[Row, int] | None:
     """Return the last state if the motion has returned near to it, and the fewest cycles."""
-    last = trail[-1]
-    back = np.flatnonzero(settling.distance_to(trail[:-1], last)[::-1][:longest] <= recurs)
+    last = section_states[-1]
+    back = np.flatnonzero(settling.distance_to(section_states[:-1], last)[::-1][:longest] <= recurs)
     return (last, int(back[0]) + 1) if back.size else None
 
 
-def _described(settling: Settling, trail: list[Rows], orbit: Orbit | None) -> EdgeState:
-    rows = np.concatenate(trail) if trail else np.zeros((0, settling.motion.shape[1]))
+def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | None) -> EdgeState:
+    rows = (
+        np.concatenate(section_states)
+        if section_states
+        else np.zeros((0, settling.motion.shape[1]))
+    )
     if orbit is not None:
         outside = int(np.sum(np.abs(np.asarray(orbit.multipliers)) > 1))
         kind = "saddle" if outside == 1 else "unstable"

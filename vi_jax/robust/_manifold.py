@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from .._checks import flag, given_number, one_of
 from .._messages import Interrupted, at_work
 from .._types import State
-from ..machine import AbstractMachine, Summarized, bare, in_rows, is_autonomous
+from ..machine import AbstractMachine, Summarized, in_rows, is_autonomous, without_modes
 from ..orbit import Orbit, cycle_map
 from ._settling import Row, Rows, Settling, in_row, one_orbit
 
@@ -140,8 +140,8 @@ class _Saddle:
 
     def __init__(self, orbit: Orbit):
         the_map = cycle_map(orbit.machine, method=orbit.method)
-        place = in_row(bare(orbit.state))
-        self.map = Settling(the_map, bare(orbit.state), place[None], 1, 1.0)
+        place = in_row(without_modes(orbit.state))
+        self.map = Settling(the_map, without_modes(orbit.state), place[None], 1, 1.0)
         unit = self.map.unit
         self.place = place / unit
         period = int(orbit.cycles)

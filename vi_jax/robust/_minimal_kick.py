@@ -161,9 +161,9 @@ def first_exits(
     while np.isfinite(found.outside).any():
         least = found.outside.min()
         closer = exits(settling, kick, rays, 0.0, least, points)
-        nearer = closer.outside < found.outside
-        inside = np.where(nearer, closer.inside, found.inside)
-        found = Exits(rays, inside, np.where(nearer, closer.outside, found.outside))
+        refine_direction = closer.outside < found.outside
+        inside = np.where(refine_direction, closer.inside, found.inside)
+        found = Exits(rays, inside, np.where(refine_direction, closer.outside, found.outside))
         if found.outside.min() > 0.5 * least:
             break
     return narrowed(settling, kick, found, _COARSE)
@@ -180,7 +180,7 @@ def nearest_first(found: Exits, most: int) -> list[int]:
     return [int(i) for i in order if least[i]][:most]
 
 
-def nearer(
+def refine_direction(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, rounds: int, seed: int
 ) -> tuple[Row, float, float]:
     """Refine a direction around the best in ever smaller angles; return that with the earliest
@@ -247,8 +247,8 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     # A motion that begins within rounding of the manifold stays near it for so many periods.
     growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
     longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
-    trail = settling.trail(kick.rows(z)[None], longest * period)[0]
-    apart = settling.distance_to(trail[1:, None], rows)
+    section_states = settling.section_states(kick.rows(z)[None], longest * period)[0]
+    apart = settling.distance_to(section_states[1:, None], rows)
     near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
     if not near.size:
         return None
@@ -311,12 +311,12 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
         hessian = (slopes[1 : size + 1] - slopes[size + 1 :]) / (2 * step * unit)
         if multiplier is None:
             multiplier = float(z @ slope)
-        lacks = np.concatenate([z - multiplier * slope, [value]])
+        residual = np.concatenate([z - multiplier * slope, [value]])
         matrix = np.zeros((size + 1, size + 1))
         matrix[:size, :size] = np.eye(size) - multiplier * 0.5 * (hessian + hessian.T)
         matrix[:size, size], matrix[size, :size] = -slope, slope
         try:
-            change = np.linalg.solve(matrix, -lacks)
+            change = np.linalg.solve(matrix, -residual)
         except np.linalg.LinAlgError:
             return None
         length, norm = float(np.linalg.norm(change[:size])), float(np.linalg.norm(z))
@@ -324,7 +324,7 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
         z = z + change[:size]
         multiplier = None if length > _STEP * norm else multiplier + float(change[size])
         if _stands(length / norm, last):
-            return z, float(np.max(np.abs(lacks)) / norm)
+            return z, float(np.max(np.abs(residual)) / norm)
         last = length / norm
     return None
 
@@ -511,7 +511,7 @@ def _exact(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, longest: int, seed: int
 ) -> _Found:
     """Return the shortest kick near a ray that leaves the basin at a radius."""
-    unit, inside, outside = nearer(settling, kick, unit, radius, angle, _LOOKS, seed)
+    unit, inside, outside = refine_direction(settling, kick, unit, radius, angle, _LOOKS, seed)
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
     line = narrowed(settling, kick, line, _ROUNDING)
     outside = float(line.outside[0])
@@ -525,7 +525,9 @@ def _exact(
         if better is not None and -_SHORTER <= longer <= _LONGER:
             return *better, True, edge
     narrow = angle / NARROWER**_LOOKS
-    unit, inside, outside = nearer(settling, kick, unit, outside, narrow, _MORE_LOOKS, seed)
+    unit, inside, outside = refine_direction(
+        settling, kick, unit, outside, narrow, _MORE_LOOKS, seed
+    )
     return unit * outside, (outside - inside) / outside, False, edge
 
 

@@ -13,29 +13,29 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import count, given_number
-from .._messages import Tell, silent
+from .._messages import ReportProgress, silent
 from .._programs import compiled
 from .._types import State
 from ..flow import RESULTS, MethodLike, Run, RunOptions, simulate, simulate_pool, sizes_on_host
 from ..machine import (
     AbstractMachine,
     angles_in,
-    bare,
     begun,
     in_rows,
     is_autonomous,
     modes_of,
     nearest_images,
+    without_modes,
 )
 from ..orbit import (
     CycleMap,
     Orbit,
-    adopted,
     check_multipliers,
     cycle_map,
     distance,
     find_orbit,
-    stands_still,
+    is_equilibrium,
+    map_state,
 )
 
 Row = Float[np.ndarray, " _"]
@@ -80,7 +80,7 @@ class Settling:
         self.begin = 0.0
         """Time of the starts after the section, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
-        self.tell: Tell = silent
+        self.tell: ReportProgress = silent
         """Callback with the number of starts that are judged."""
 
     def starting(self, begin: float) -> "Settling":
@@ -167,7 +167,7 @@ class Settling:
         there = verdict[np.arange(rays), np.minimum(first, points - 1)]
         return first, (first < points) & (there == ELSEWHERE)
 
-    def trail(self, rows: Rows, cycles: int) -> Float[np.ndarray, "lanes sections states"]:
+    def section_states(self, rows: Rows, cycles: int) -> Float[np.ndarray, "lanes sections states"]:
         """Return the section states of some motions, from their starts on."""
         parts, here, begin = [rows[:, None]], rows, self.begin
         for _ in range(math.ceil(cycles / TRAIL)):
@@ -194,7 +194,7 @@ class Settling:
         last = self.carried(start[None], self.settle)
         if not np.isfinite(last).all():
             return None
-        rows = self.starting(0.0).trail(last, 2 * longest)[0]
+        rows = self.starting(0.0).section_states(last, 2 * longest)[0]
         for period in range(1, longest + 1):
             if self.distance_to(rows[:-period], rows[period:]).max() <= _SAME:
                 return rows[:period]
@@ -218,7 +218,7 @@ class Settling:
         """Return a classifier of starts `phase` after a section state of the motion, and that
         state."""
         machine, method = self.the_map.machine, self.the_map.method
-        if bool(stands_still(machine, self.state(start), machine.cycle, self.unit)):
+        if bool(is_equilibrium(machine, self.state(start), machine.cycle, self.unit)):
             raise ValueError("Argument `phase` must be 0 for an equilibrium, which does not move.")
         row = self.motion[self.distance_to(start, self.motion).argmin()]
         state, autonomous = self.state(row), is_autonomous(machine, self.like)
@@ -236,7 +236,7 @@ class Settling:
             # With equal intervals it meets no section, and needs no clock.
             every = machine.observed_every(phase)
             run = simulate(every, state, 1, method=method, record="sections")
-            return self, in_row(bare(run.last))
+            return self, in_row(without_modes(run.last))
         there = _until(self.the_map, self.like, jnp.asarray(row), jnp.asarray(phase))
         return self.starting(phase), np.asarray(there)
 
@@ -271,9 +271,9 @@ def settling_on(
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
-    here = adopted(the_map.machine, motion.state if isinstance(motion, Orbit) else motion, name)
+    here = map_state(the_map.machine, motion.state if isinstance(motion, Orbit) else motion, name)
     _refuse_other_modes(_in_other_modes(the_map, jtu.tree_map(lambda x: x[None], here)))
-    like = bare(here)
+    like = without_modes(here)
     if isinstance(motion, Orbit):
         if not bool(one_orbit(name, motion).stable):
             raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
@@ -281,7 +281,7 @@ def settling_on(
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)
     settling = Settling(the_map, like, start[None], settle, tolerance)
-    if bool(stands_still(the_map.machine, like, the_map.machine.cycle, settling.unit)):
+    if bool(is_equilibrium(the_map.machine, like, the_map.machine.cycle, settling.unit)):
         return settling, start
     rows = settling.settled_rows(start, longest)
     if rows is None:
@@ -313,7 +313,10 @@ def _advanced(
 
 def _in_other_modes(the_map: CycleMap, states: State) -> Any:
     """Return whether the machine's modes in some states differ from those of a new motion there."""
-    modes, new = modes_of(states) or (), modes_of(begun(the_map.machine, bare(states), 1)) or ()
+    modes, new = (
+        modes_of(states) or (),
+        modes_of(begun(the_map.machine, without_modes(states), 1)) or (),
+    )
     pairs = zip(modes, new, strict=True) if modes else ()
     return sum((one != other for one, other in pairs), start=jnp.zeros((), bool))
 

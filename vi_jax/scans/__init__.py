@@ -17,8 +17,8 @@ from ._scan import LanesFailed as LanesFailed
 from ._scan import ScanInterrupted as ScanInterrupted
 from ._scan import scan as scan
 from ._sweep import Sweep as Sweep
+from ._sweep import moved_by_stops as moved_by_stops
 from ._sweep import sweep as sweep
-from ._sweep import taken_along as taken_along
 from .measures import REGIMES as REGIMES
 from .measures import AbstractMeasure as AbstractMeasure
 from .measures import Density as Density

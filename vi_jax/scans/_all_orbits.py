@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from .._checks import count, given_number
-from .._messages import in_parts, so_many, warning_once
+from .._messages import count_of, in_parts, warning_once
 from .._types import State, xr
 from ..flow import MethodLike, in_names, machine_of, tidy
 from ..machine import AbstractMachine, components, cycles_in_words, units_of, with_units
@@ -120,11 +120,11 @@ class AllOrbits(InWords):
         count, stable = len(self.orbits), int(self.stable.sum())
         longest = max(searched.cycles for searched in self.searched)
         lines = [
-            f"{so_many(count, 'periodic motion')} of at most "
+            f"{count_of(count, 'periodic motion')} of at most "
             f"{cycles_in_words(self.machine, longest)}, {stable} of them stable"
         ]
         for orbit, found in zip(self.orbits, self.found, strict=True):
-            lines.append(f"{in_one_line(orbit)}; found {so_many(found.sum(), 'time')}")
+            lines.append(f"{in_one_line(orbit)}; found {count_of(found.sum(), 'time')}")
         where = ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.region.items())
         lines.append(f"searched from random starts, {where}:")
         for s in self.searched:

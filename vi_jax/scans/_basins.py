@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import axes_of, count, fits_records, given_number, require
-from .._messages import at_work, so_many, warning_once
+from .._messages import at_work, count_of, warning_once
 from .._types import State, xr
 from ..flow import (
     REASON_NAMES,
@@ -219,13 +219,13 @@ class Basins(NamedTuple):
         return tidy(self.data.assign(variables), along)
 
     def __str__(self) -> str:
-        lines = [f"Basins of {so_many(len(self.attractors), 'periodic motion')}"]
+        lines = [f"Basins of {count_of(len(self.attractors), 'periodic motion')}"]
         for a in self.attractors:
             first = {name: x[0] for name, x in a.sections.items()}
             where = state_in_words(first, 6, units_of(self.machine))
             lines.append(
                 f"  {a.label}: period {self.period_of(a.period)}, "
-                f"{so_many(round(a.impacts), 'impact')}, {where}: "
+                f"{count_of(round(a.impacts), 'impact')}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
         lines += [f"  {name}: {100 * x:.2f} %" for name, x in self.irregular.items() if x]
@@ -553,7 +553,7 @@ class IntegrityProfile(NamedTuple):
     def name_of(self, motion: int) -> str:
         """Return a motion in words: its period and its impacts."""
         period = self.basins[0].period_of(int(self.period[motion]))
-        return f"{period}, {so_many(round(float(self.impacts[motion])), 'impact')}"
+        return f"{period}, {count_of(round(float(self.impacts[motion])), 'impact')}"
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """Return the profile as an `xarray.Dataset` over `motion` and the parameter.
@@ -576,7 +576,7 @@ class IntegrityProfile(NamedTuple):
         low, high = self.values[[0, -1]]
         lines = [
             f"Integrity over {self.parameter}, {self.values.size} values from {low:.6g} to "
-            f"{high:.6g}: {so_many(len(self.period), 'motion')}"
+            f"{high:.6g}: {count_of(len(self.period), 'motion')}"
         ]
         for i in range(min(len(self.period), 8)):
             here = self.values[self.share[i] > 0]

@@ -36,7 +36,6 @@ from ..machine import (
     Stated,
     Summarized,
     attributes,
-    bare,
     cycle_time,
     in_rows,
     in_unit,
@@ -51,8 +50,9 @@ from ..machine import (
     with_modes,
     with_unit,
     with_units,
+    without_modes,
 )
-from ..orbit import CycleMap, adopted, cycle_map
+from ..orbit import CycleMap, cycle_map, map_state
 
 
 class Lyapunov(Summarized):
@@ -168,7 +168,7 @@ def lyapunov(
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
-    if is_autonomous(machine, bare(start)):
+    if is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(
                 "Argument `machine` must not have both a section and a `renewed`, as a "
@@ -181,7 +181,7 @@ def lyapunov(
     carried = cycle_map(machine, method=method)
     if rests is not None:
         carried = dataclasses.replace(carried, rests=flag("rests", rests))
-    start = adopted(carried.machine, start, "start")
+    start = map_state(carried.machine, start, "start")
     states = raveled(start)[0].size
     number = states if number is None else count("number", number, least=1)
     if number > states:
@@ -251,13 +251,13 @@ def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
 def _observer(the_map: CycleMap, start, window: int) -> Any:
     """Return a function that continues from `_begun`, with rates, durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
-    unravel = ravel_pytree(bare(start))[1]
+    unravel = ravel_pytree(without_modes(start))[1]
     # Directions are relative to the sizes of components. With units of very different sizes,
     # rounding of large components would hide small ones.
     unit = row_sizes(machine, start)
 
     # With cycles of equal duration, turning points are not needed.
-    plain = has_fixed_cycle(machine, bare(start)) and not has_averages(machine)
+    plain = has_fixed_cycle(machine, without_modes(start)) and not has_averages(machine)
     record = "sections" if plain else "motion"
 
     def image(x, modes):
@@ -302,7 +302,7 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
         exponents=exponents,
         per_cycle=exponents * jnp.mean(duration),
         spread=jnp.where(halves[0] == halves[1], 0.0, jnp.abs(halves[0] - halves[1])),
-        state=with_modes(ravel_pytree(bare(start))[1](x), modes),
+        state=with_modes(ravel_pytree(without_modes(start))[1](x), modes),
         result=result,
         averages=means(sums, jnp.sum(duration)),
         unit=unit_of(units_of(machine), "rate"),

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import concrete, count, fits_records, flag, number
-from .._messages import in_parts, so_many, warning_once
+from .._messages import count_of, in_parts, warning_once
 from .._programs import compiled, is_outermost
 from .._types import State, xr
 from ..flow import (
@@ -34,11 +34,10 @@ from ..machine import (
     AbstractMachine,
     Stated,
     Summarized,
-    adopt,
-    bare,
     begun,
     check_again,
     check_leaf,
+    convert_start,
     cycles_in_words,
     frequency_ratio,
     in_clock,
@@ -51,6 +50,7 @@ from ..machine import (
     with_leaf,
     with_unit,
     with_units,
+    without_modes,
 )
 from .measures import CODES, REGIMES, Regime, Usual, flags
 from .program import lane_noise_of
@@ -158,7 +158,7 @@ class Sweep(Summarized):
         }
         return [
             names.get(int(p))
-            or f"{self.periods[int(p) - 1]} with {so_many(round(float(n)), 'impact')}"
+            or f"{self.periods[int(p) - 1]} with {count_of(round(float(n)), 'impact')}"
             for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
         ]
 
@@ -254,15 +254,15 @@ def sweep(
     regime = Regime(cycles // 2, tolerance=tolerance).under(method)
     if clock is not None:
         machine = in_clock(machine, clock)
-    start = replaced(start, adopt(machine, bare(start)))
+    start = replaced(start, convert_start(machine, without_modes(start)))
     check_reals("start", start)
     start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
     if numbers is not None:
-        check_start(with_leaf(machine, parameter, numbers[0]), bare(start))
+        check_start(with_leaf(machine, parameter, numbers[0]), without_modes(start))
     lane_noise = lane_noise_of(noise, key)
     if lane_noise is not None:
-        check_noise(machine, bare(start), noise)
-    options = (settle, cycles, method, rests, regime, max_steps, lane_noise, bare(start))
+        check_noise(machine, without_modes(start), noise)
+    options = (settle, cycles, method, rests, regime, max_steps, lane_noise, without_modes(start))
     # With noise, the index of the value is carried along: each has its own path.
     begin = start if lane_noise is None else (start, jnp.uint32(0))
     if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
@@ -298,9 +298,9 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
     return values, numbers
 
 
-def taken_along(machine: AbstractMachine, state: State) -> State:
+def moved_by_stops(machine: AbstractMachine, state: State) -> State:
     """Return the state with the body moved to a stop that is beyond it, at rest."""
-    here = bare(state)
+    here = without_modes(state)
     for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
         Y = body.position(here)
@@ -326,7 +326,7 @@ def _sweep(
                 "noise": lane_noise.noise,
                 "key": lane_key(lane_noise.key, jnp.asarray(number)),
             }
-        state = taken_along(here, state)
+        state = moved_by_stops(here, state)
         run = simulate(
             here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
             **noise,

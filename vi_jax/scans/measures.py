@@ -21,12 +21,12 @@ from ..flow import AbstractMethod, Run, has_quantities, row_sizes
 from ..machine import (
     AbstractMachine,
     angles_in,
-    bare,
     by_default,
     components,
     frequency_ratio,
     in_rows,
     nearest_images,
+    without_modes,
 )
 from ._lyapunov import lyapunov
 
@@ -366,7 +366,7 @@ class Regime(AbstractMeasure):
         return dataclasses.replace(self, wander=method.wander)
 
     def begun(self, start):
-        return dataclasses.replace(self, start=bare(start))
+        return dataclasses.replace(self, start=without_modes(start))
 
     @property
     def cycles(self):

@@ -38,11 +38,10 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
-    adopt,
-    bare,
     check_again,
     check_name,
     components,
+    convert_start,
     in_clock,
     is_own,
     leaf,
@@ -51,6 +50,7 @@ from ..machine import (
     replaced,
     with_leaf,
     with_leaves,
+    without_modes,
 )
 from .measures import MEASURES, AbstractMeasure, Average, Escape, Numbers
 
@@ -208,7 +208,7 @@ class ScanProgram(eqx.Module):
             machine = in_clock(machine, self.options.clock)
         start = machine.start() if self.start is None else self.start
         of_start = {name: x for name, x in values.items() if part_of(name) == START}
-        start = replaced(start, start_with(bare(start), of_start))
+        start = replaced(start, start_with(without_modes(start), of_start))
         return machine, self._nudged(start, START, nudge)
 
     def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
@@ -231,7 +231,7 @@ class ScanProgram(eqx.Module):
             return tree
         for name, change in zip(self.derivatives, nudge, strict=True):
             if part_of(name) == prefix:
-                own, here = name.removeprefix(prefix), bare(tree)
+                own, here = name.removeprefix(prefix), without_modes(tree)
                 tree = replaced(tree, with_leaf(here, own, leaf(here, own) + change))
         return tree
 
@@ -382,7 +382,7 @@ _Known = tuple[AbstractMethod, bool, tuple[str, ...]]
 def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known:
     averages: tuple[str, ...] = ()
     if has_averages(machine):
-        first = machine.start() if start is None else adopt(machine, start)
+        first = machine.start() if start is None else convert_start(machine, start)
         averages = average_names(machine, first)
     return chosen(machine, method), may_rest(machine), averages
 
@@ -437,8 +437,8 @@ def check_leaf_name(
     """Raise `ValueError` if machine, start and noise have no number with this name."""
     if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
-    of_start, names = part_of(name) == START, [START + n for n in components(bare(start))]
-    tree, own = (bare(start), name.removeprefix(START)) if of_start else (machine, name)
+    of_start, names = part_of(name) == START, [START + n for n in components(without_modes(start))]
+    tree, own = (without_modes(start), name.removeprefix(START)) if of_start else (machine, name)
     if own not in leaf_names(tree):
         names = names if of_start else [*components(machine), *names]
         check_name(names, name, argument, machine)
@@ -479,7 +479,7 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         for name in program.derivatives:
             check_leaf_name(machine, start, name, "derivatives", program.lane_noise)
         program.method.check(machine)
-        start = adopt(machine, start)
+        start = convert_start(machine, start)
         check_reals("start", start)
         check_values(machine, start)
         if program.lane_noise is not None:

@@ -176,12 +176,12 @@ def may_turn_twice(plan: Plan, direction: Scalar, path: Path, h: Scalar) -> Flag
     begin, end = path.begin, path.end
     a0, a1 = direction * begin.a, direction * end.a
     dips = (a0 < 0) & (a1 > 0) & (h > plan.in_units(_SHORTEST_DIP))
-    if path.surge is None:
+    if path.force_rates is None:
         # lowest < 0.1 (v0 + v1), times a1 - a0: without a division in each step.
         room = direction * (begin.v - 0.1 * (begin.v + end.v))
         return dips & (room * (a1 - a0) < 0.5 * h * a0 * a0)
     drop = 0.5 * h * a0 * (a0 / jnp.where(dips, a0 - a1, 1.0))
-    j0, j1 = direction * path.surge[0], direction * path.surge[1]
+    j0, j1 = direction * path.force_rates[0], direction * path.force_rates[1]
     sags = dips & (j0 * h < a1 - a0) & (a1 - a0 < j1 * h)
     corner, low, _ = _corner((a0, j0), (a1, j1), h, sags)
     deep = 0.5 * corner * (a0 + low) - 0.5 * low * low / jnp.where(sags, j1, 1.0)
@@ -195,8 +195,8 @@ def force_may_turn(lane: Lane, k: int, path: Path, h: Scalar) -> tuple[Flag, Sca
     """Return whether the force, of one sign at both ends, may have changed sign in between for a
     body slow enough to be affected, and the place of its extremum. Such a force releases a body at
     rest for a moment, or turns a body twice that has just left the stop."""
-    assert path.surge is not None
-    begin, end, (rate0, rate1, brief) = path.begin, path.end, path.surge
+    assert path.force_rates is not None
+    begin, end, (rate0, rate1, brief) = path.begin, path.end, path.force_rates
     a0, a1 = begin.a, end.a
     bent = rate0 * rate1 < 0
     _, bound, place = _corner((a0, rate0), (a1, rate1), h, bent)
@@ -399,7 +399,7 @@ def _foreseen(
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     if not exact(machine, lane.state):
         shortest = 64 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s))
-        paths = [path.without_flutter(shortest) for path in paths]
+        paths = [path.without_rounding_after_release(shortest) for path in paths]
     for k, path in enumerate(paths):
         begin, end = path.ends(h)
         turned = (lane.direction[k] * end.v < 0) & may_matter(plan, lane, k, begin, end, h)
@@ -507,7 +507,7 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
     goal = goal.cut(seen.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
-        if path.surge is not None:
+        if path.force_rates is not None:
             # An event may have come before the one that was met: step to the force's extremum.
             hidden, place = force_may_turn(lane, k, path, h)
             goal = goal.cut(trial.good & hidden & ~met, place)

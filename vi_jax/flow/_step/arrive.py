@@ -31,8 +31,8 @@ from ..events import Rates, guard_rates, rates, to_turn
 from ..results import EventKind, code_of_outcome
 from ..smooth import exact, holding, in_modes, limited_of
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
-from .impact import is_compound, settle, stilled, strike_in_turn, strike_once
-from .trial import Release, Situation, Trial
+from .impact import is_compound, resolve_impact_sequence, settle, stilled, strike_once
+from .trial import AppliedStep, Release, Trial
 
 # Each event of one instant may happen this often, by choice, before the lane ends: some trigger
 # each other for ever.
@@ -49,7 +49,7 @@ class _Due(NamedTuple):
     """For each event that happens from below, 1 if its guard is zero and it has not happened."""
 
 
-def happened(
+def apply_events(
     plan: Plan, taken: Flag, lane: Lane, due: dict[int, Flag], near: dict[int, Flag]
 ) -> Lane:
     """Return the lane after the events that are no impacts, and after all that they trigger.
@@ -81,7 +81,7 @@ def happened(
     return end.lane
 
 
-def set_off(
+def trigger_events(
     plan: Plan, lane: Lane, when: Flag, before: tuple[State, Scalars],
     turns: dict[int, Flag], near: Scalars,
 ) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
@@ -132,7 +132,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
-            slides = _comes_back(plan, number, lane._replace(state=its_state, modes=its_modes))
+            slides = _must_slide(plan, number, lane._replace(state=its_state, modes=its_modes))
             lane = lane.ended(turns[number], slides, "sliding")
             its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
@@ -140,7 +140,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
             its_kind, its_value = EventKind.reset, value_of(*met)
             its_number = its_number - len(switches_of(machine))
         if event.ends_cycle:
-            lane = lane.completing(here)
+            lane = lane.complete_interval(here)
         lane = with_outcome(machine, event, lane, here)
         new, modes = select(here, (its_state, its_modes), (new, modes))
         its_own = its_kind, its_number, its_value
@@ -148,20 +148,20 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
             its_own = select(here, its_own, (kind, listed, value))
         (kind, listed, value), happens = its_own, happens | here
     clock = plan.clock(lane.s, old)
-    lane = lane.noting(taken & happens, clock, kind, listed, value)
+    lane = lane.log_event(taken & happens, clock, kind, listed, value)
     lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
     lane = release_pulled(plan, lane, taken, happens, (old, modes_before))
     off, near, before = {}, x.near, (old, modes_before)
     if others_of(machine):
-        lane, off, near = set_off(plan, lane, happens, before, turns, near)
+        lane, off, near = trigger_events(plan, lane, happens, before, turns, near)
     due = [jnp.where(turns[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
     for i, number in enumerate(numbers):
         if events_of(machine)[number].holds_mode and len(numbers) > 1:
-            off[number] = _turned_over(plan, lane, happens & ~turns[number], number, before)
+            off[number] = _guard_jumped(plan, lane, happens & ~turns[number], number, before)
         due[i] = jnp.where(off[number], 1.0, due[i]) if number in off else due[i]
     last = off.get(section_number(machine))
     if last is not None:
-        lane = lane.completing(last)
+        lane = lane.complete_interval(last)
     return _Due(lane, tuple(due), near)
 
 
@@ -173,7 +173,7 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
     return lane.ended(here, jnp.ones_like(here), outcome)
 
 
-def _comes_back(plan: Plan, i: int, lane: Lane) -> Flag | None:
+def _must_slide(plan: Plan, i: int, lane: Lane) -> Flag | None:
     """Return whether the field behind a switch, event number i, points back at its surface, like
     the field before it: the motion would slide along it. `None` for switches that cannot slide."""
     machine = plan.machine
@@ -190,7 +190,7 @@ def _comes_back(plan: Plan, i: int, lane: Lane) -> Flag | None:
     return (jnp.abs(here.x) <= slack) & (speed > slack)
 
 
-def _turned_over(
+def _guard_jumped(
     plan: Plan, lane: Lane, when: Flag, number: int, before: tuple[State, Scalars]
 ) -> Flag:
     """Return whether the guard of a switch has jumped above zero with state or modes, for example
@@ -230,7 +230,7 @@ def release_pulled(
         if resting is not None:
             goes = goes & (resting[k] == contact[k])
         clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
-        lane = lane.noting(taken & goes, clock, EventKind.release, stop, jnp.nan)
+        lane = lane.log_event(taken & goes, clock, EventKind.release, stop, jnp.nan)
         freed[k] = jnp.where(goes, 0.0, contact[k])
         direction[k] = jnp.where(goes, -sign, direction[k])
     return lane._replace(contact=tuple(freed), direction=tuple(direction))
@@ -287,7 +287,7 @@ def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> S
     return tuple(found)
 
 
-def disarmed_itself(plan: Plan, lane: Lane, c: Crossing) -> Lane:
+def disarm(plan: Plan, lane: Lane, c: Crossing) -> Lane:
     """Return the lane with `below` = 0 for an event that was met."""
     numbers = plan.from_below(lane.state)
     if c.number not in numbers:
@@ -303,18 +303,18 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
     arrived = lane._replace(
         s=trial.s, state=trial.state, direction=_directions_at_end(plan, lane, trial),
         below=trial.below, completed=trial.ends_interval,
-    ).recording(integrals=trial.integrals)  # fmt: skip
+    ).update_record(integrals=trial.integrals)  # fmt: skip
     # Y at the step's end, and Y before the state jumps there, if an event may change it.
     here = position(trial.state)
     places = (here, here) if others_of(plan.machine) else (here,)
     flow = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
-    at = Situation(plan, lane, trial, taken, flow)
+    at = AppliedStep(plan, lane, trial, taken, flow)
     if trial.crossings:
         leaves = [path.leaves.landed for path in trial.paths if path.leaves is not None]
         met = any_of(taken, [*(c.landed for c in trial.crossings), *leaves])
         # Rare: skipped if no lane of a group has met anything.
         arrived, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (arrived, places))
-    arrived = arrived.recording(**_reached(at, places))
+    arrived = arrived.update_record(**_reached(at, places))
     assert arrived.completed is not None
     completed = taken & arrived.completed
     arrived = lane._replace(
@@ -356,7 +356,7 @@ def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
     return tuple(direction)
 
 
-def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
+def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     """Return the lane after the event on which the step landed, and Y there and before a jump. The
     motion first goes on to the event, then comes the jump. Another event at the same instant is met
     by the next step, which has length zero."""
@@ -371,7 +371,7 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         met = any_of(at.taken, landed.values())
         integrals = select(met, passed, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
-        lane = lane.recording(integrals=integrals)
+        lane = lane.update_record(integrals=integrals)
         before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
         lane = _landed(at, lane, at_event)
     for k, path in enumerate(trial.paths):
@@ -384,7 +384,7 @@ def _met(at: Situation, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     return (_at_fixed_clock(at, lane) if fixed else lane), places
 
 
-def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
+def _landed(at: AppliedStep, lane: Lane, at_event: State) -> Lane:
     """Return the lane after the event on which the step landed, and after all that it triggers;
     `at_event`: the state before it."""
     plan, machine, trial = at.plan, at.plan.machine, at.trial
@@ -395,26 +395,26 @@ def _landed(at: Situation, lane: Lane, at_event: State) -> Lane:
         lane = _impact(at, lane, landed, at_event)
         for number, stop in enumerate(stops_of(machine)):
             if stop.ends_cycle:
-                lane = lane.completing(landed[number])
+                lane = lane.complete_interval(landed[number])
             lane = with_outcome(machine, stop, lane, landed[number])
     if stops_of(machine) and others_of(machine):
         met = any_of(at.taken, (landed[n] for n in range(len(stops_of(machine)))))
         close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
         # A stop may have changed the modes already.
-        lane, off, _ = set_off(plan, lane, met, (at_event, at.old.modes), {}, close)
+        lane, off, _ = trigger_events(plan, lane, met, (at_event, at.old.modes), {}, close)
     due = {}
     for c in trial.crossings:
         if c.coordinate is None:
             lane = lane._replace(state=select(c.landed, at_event, lane.state))
             here = c.landed | off[c.number] if c.number in off else c.landed
             if c.number == section_number(machine):
-                lane = disarmed_itself(plan, lane.completing(here), c)
+                lane = disarm(plan, lane.complete_interval(here), c)
             else:
                 due[c.number] = here
-    return happened(plan, at.taken, lane, due, near) if due else lane
+    return apply_events(plan, at.taken, lane, due, near) if due else lane
 
 
-def _near(at: Situation) -> dict[int, Flag]:
+def _near(at: AppliedStep) -> dict[int, Flag]:
     """Return for each event that happens from below whether its guard is at zero to rounding at
     another event on which the step landed."""
     plan, trial = at.plan, at.trial
@@ -432,7 +432,7 @@ def _near(at: Situation) -> dict[int, Flag]:
     return found
 
 
-def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
+def _at_fixed_clock(at: AppliedStep, lane: Lane) -> Lane:
     """Return the lane with its derivatives at a fixed clock. After an event whose time depends on a
     parameter, s has a derivative. It is transferred to the state, so that later steps need no
     derivative with respect to `s`."""
@@ -443,15 +443,15 @@ def _at_fixed_clock(at: Situation, lane: Lane) -> Lane:
     s = stop_gradient(lane.s) + moved
     moving = lane.s, lane.state, lane.record.integrals
     flow = FlowToEvent(at.plan, smooth, lane.part, moving)
-    _, state, integrals = flow.unmoved(s - lane.s)
-    return lane._replace(s=s, state=state).recording(integrals=integrals)
+    _, state, integrals = flow.with_flow_derivatives(s - lane.s)
+    return lane._replace(s=s, state=state).update_record(integrals=integrals)
 
 
-def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
+def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
     plan, flow, contact = at.plan, at.flow, lane.contact
     assert contact is not None
     free, offset = leaves.landed, stop_gradient(leaves.offset)
-    offset = flow.met_after(flow.force(k), offset)
+    offset = flow.event_offset(flow.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.drifted(offset, moving)
     if not exact(plan.machine, state):
@@ -462,8 +462,8 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
         state = select(walls[k] > 0, put, state)
     direction = jnp.where(free, -at.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
-    lane = lane.noting(at.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
-    lane = lane.recording(integrals=select(free, integrals, lane.record.integrals))
+    lane = lane.log_event(at.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
+    lane = lane.update_record(integrals=select(free, integrals, lane.record.integrals))
     return lane._replace(
         s=s,
         state=select(free, state, lane.state),
@@ -472,7 +472,7 @@ def _released(at: Situation, lane: Lane, k: int, leaves: Release) -> Lane:
     )
 
 
-def _offset(at: Situation, c: Crossing) -> Scalar:
+def _offset(at: AppliedStep, c: Crossing) -> Scalar:
     """Return the offset in s from the step's end to an event, with the derivatives of the event's
     time; its value is 0 if the step landed on another event."""
     plan, trial, flow = at.plan, at.trial, at.flow
@@ -484,16 +484,16 @@ def _offset(at: Situation, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(at.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # These derivatives have no meaning if the event was not met.
-    met = flow.met_after(flow.guard(c.number), offset)
+    met = flow.event_offset(flow.guard(c.number), offset)
     return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
-def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
+def _impact(at: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
     """Return the lane after the rebound from the stops in `landed`, or at rest on them; `at_event`:
     the state before the impact."""
     plan, machine, before = at.plan, at.plan.machine, at.old
     landed = {number: landed[number] for number in range(len(stops_of(machine)))}
-    strike = strike_in_turn if is_compound(machine) else strike_once
+    strike = resolve_impact_sequence if is_compound(machine) else strike_once
     lane, blows = strike(plan, at.taken, lane, landed, at_event)
     met = any_of(at.taken, landed.values())
     lane = settle(at, lane, at_event, met, blows)
@@ -524,7 +524,7 @@ def _impact(at: Situation, lane: Lane, landed: dict[int, Flag], at_event: State)
     return release_pulled(plan, lane, at.taken, met, (at_event, before.modes), before.contact)
 
 
-def _reached(at: Situation, places: Scalars) -> dict[str, Scalar | None]:
+def _reached(at: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
     """Return the extremes of Y in this interval so far, and the smallest distance to a stop at a
     turning point; `None` if not recorded. `places` are Y at the step's end and before a jump."""
     plan, lane, trial, taken = at.plan, at.old, at.trial, at.taken

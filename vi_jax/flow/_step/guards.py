@@ -64,19 +64,19 @@ class Within(NamedTuple):
         return self._replace(forces=forces, events=events)
 
 
-def looks_within(plan: Plan, state: State) -> bool:
+def checks_within_step(plan: Plan, state: State) -> bool:
     """Return whether some guards have to be evaluated at stages; known at trace time."""
-    return plan.rests or bool(events_looked_at(plan, state))
+    return plan.rests or bool(events_within_step(plan, state))
 
 
-def events_looked_at(plan: Plan, state: State) -> list[int]:
+def events_within_step(plan: Plan, state: State) -> list[int]:
     """Return the numbers of the events whose guards are evaluated at stages: not those of stops on
     coordinates that are as accurate as the state."""
     machine, events, stops = plan.machine, events_of(plan.machine), []
     if not exact(machine, state):
         known = [is_affine(x.position, state) for x in machine.coordinates]
         stops = [i for i, stop in enumerate(stops_of(machine)) if not known[stop.coordinate]]
-    others = [number for number in plan.others(state) if events[number].looked_at_within]
+    others = [number for number in plan.others(state) if events[number].checked_within_step]
     return [*stops, *others]
 
 
@@ -118,7 +118,7 @@ def within(
     machine, around = plan.machine, (lane.modes, lane.contact or ())
     limited = limited_of(machine) if plan.rests else []
     contacts: Any = lane.contact
-    looked_at = events_looked_at(plan, lane.state)
+    looked_at = events_within_step(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
         return rates(alone[k].field, machine.coordinates[k].position, s, state)
@@ -487,13 +487,13 @@ def _seen(
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
-        again = again & ~sudden & (lane.aims < _PATIENCE)
+        again = again & ~sudden & (lane.attempts < _PATIENCE)
     return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
 def leniency(plan: Plan, lane: Lane) -> Scalar:
     """Return the factor of a lane's landing tolerance: its unit, and 1,000 after many attempts."""
-    return plan.in_units(jnp.where(lane.aims >= _PATIENCE, 1e3, jnp.ones_like(lane.aims)))
+    return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, 1e3, jnp.ones_like(lane.attempts)))
 
 
 def landing_tolerance(x: Scalar) -> float:

@@ -25,12 +25,12 @@ from ...machine import (
     SoftStop,
     is_alive,
     others_of,
-    rewound,
     section_in,
     section_number,
     stops_of,
     struck_modes,
     switches_of,
+    with_earlier_clock,
 )
 from .._lane import FREE, Lane, Plan, Record, select, to_event, total
 from ..noise import with_impulse
@@ -73,7 +73,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     length = _resized(plan, lane, trial, taken, rejected)
     arrived, completed = arrive(plan, lane, trial, taken)
     if section_in(plan.machine, lane.state) is not None:
-        completed = completed | taken & _stands_on_section(plan, lane, arrived)
+        completed = completed | taken & _is_equilibrium_on_section(plan, lane, arrived)
     reached = completed = pin_flag(completed, lane.s)
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
@@ -82,7 +82,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
         length=length,
         attempt=jnp.where(aim, goal, _next_attempt(plan, lane, trial, taken, length)),
         target=jnp.where(aim, target, FREE),
-        aims=jnp.where(aim, lane.aims + 1, 0.0),
+        attempts=jnp.where(aim, lane.attempts + 1, 0.0),
         done=done,
         steps=lane.steps + jnp.where(active, 1.0, 0.0),
         # Counted anew in each interval: in single precision the total does not increase beyond 2²⁴.
@@ -108,7 +108,7 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
     return jnp.where(short, jnp.minimum(stop_gradient(trial.h), length), length)
 
 
-def _stands_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
+def _is_equilibrium_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     """Return whether a motion has died out, to rounding, in an equilibrium on the machine's
     section. Then a step changes nothing, and the cycle has lasted twice as long as expected. The
     motion would meet the section by rounding only, or never."""
@@ -135,7 +135,7 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
         turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
     if not plan.ticks(state):
-        state = select(turned, rewound(plan.machine, state), state)
+        state = select(turned, with_earlier_clock(plan.machine, state), state)
     lane = arrived._replace(s=jnp.where(turned, 0.0, arrived.s), state=state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
@@ -221,8 +221,8 @@ def _faults(
         broken = code("stalled")
     ends = [
         (impacts > plan.max_impacts, code("chatter")),
-        (((new.aims >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
-        (new.aims >= _LOST, _reason_for_giving_up(plan, lane, new.target)),
+        (((new.attempts >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
+        (new.attempts >= _LOST, _reason_for_giving_up(plan, lane, new.target)),
         (new.steps >= plan.max_steps, code("max_steps")),
         (new.spent >= _STUCK, code("max_steps")),
     ]

@@ -20,10 +20,10 @@ from ...machine import (
     Coordinate,
     RigidStop,
     added,
+    contact_constraints,
     forces,
     friction_on,
     has_contact_friction,
-    held_by,
     holds_anywhere,
     push_of,
     shares,
@@ -36,14 +36,14 @@ from ..drift import FlowToEvent
 from ..events import force_rate, rates
 from ..results import EventKind
 from ..smooth import SmoothMachine, holding, in_modes, limited_of
-from .trial import Situation
+from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
 # the one or two of a law's own arithmetic.
 _FASTER = 16.0
 
 
-class Blow(NamedTuple):
+class ImpactResult(NamedTuple):
     """The impacts of one instant on one coordinate."""
 
     struck: Scalar
@@ -81,24 +81,24 @@ def recorded(
     if log is not None:
         log = written(log, hit, impacts, clock, approach, number)
     impacts = impacts + jnp.where(hit, 1.0, 0.0)
-    lane = lane.recording(impact_speed=speed, log=log, impacts=impacts)
-    return lane.noting(hit, clock, EventKind.impact, number, approach)
+    lane = lane.update_record(impact_speed=speed, log=log, impacts=impacts)
+    return lane.log_event(hit, clock, EventKind.impact, number, approach)
 
 
 def strike_once(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
-) -> tuple[Lane, dict[int, Blow]]:
-    """Return the lane after an impact, and its `Blow` by the coordinate's number, if stops limit
-    one coordinate and there is no contact friction. `landed`: for each stop, whether the step
+) -> tuple[Lane, dict[int, ImpactResult]]:
+    """Return the lane after an impact, and its `ImpactResult` by the coordinate's number, if stops
+    limit one coordinate and there is no contact friction. `landed`: for each stop, whether the step
     landed on it; `at_event`: the state there."""
     machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
-    blow = Blow(*(jnp.zeros_like(lane.s) for _ in range(3)))
+    blow = ImpactResult(*(jnp.zeros_like(lane.s) for _ in range(3)))
     velocity = body.velocity(at_event)
     for number, met in landed.items():
         stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
-        rebound, share = stop.rebound_and_share(approach)
+        rebound, share = stop.velocity_and_ratio(approach)
         lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
         lane = recorded(plan, lane._replace(state=state), at_event, taken & met, number, approach)
@@ -107,8 +107,8 @@ def strike_once(
             lost = stop.loss(approach, share)
             if not (isinstance(body.mass, float) and body.mass == 1.0):
                 lost = body.mass_at(lane.s, at_event) * lost
-            lane = lane.recording(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
-        new = Blow(jnp.where(met, to_event(number), 0.0), approach, share)
+            lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
+        new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, share)
         blow = new if len(landed) == 1 else select(met, new, blow)
     return lane, {k: blow}
 
@@ -135,7 +135,7 @@ class _Round(NamedTuple):
 
     lane: Lane
     struck: dict[int, Scalar]
-    """For each coordinate, as in `Blow`."""
+    """For each coordinate, as in `ImpactResult`."""
     approach: dict[int, Scalar]
     most: Scalar
     """The greatest speed of approach so far."""
@@ -172,9 +172,9 @@ class _Instant(NamedTuple):
         return dict(zip(self.bodies, found, strict=True))
 
 
-def strike_in_turn(
+def resolve_impact_sequence(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
-) -> tuple[Lane, dict[int, Blow]]:
+) -> tuple[Lane, dict[int, ImpactResult]]:
     """Return the results of `strike_once` for stops on several coordinates or with friction.
 
     If bodies touch, an impact on one contact closes the next one at the same instant. The contact
@@ -203,7 +203,7 @@ def strike_in_turn(
         struck, fastest = end.struck[k], end.approach[k]
         leaves = -plan.wall(k, struck)[0] * body.velocity(lane.state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
-        blows[k] = Blow(struck, fastest, jnp.clip(share, 0.0, 1.0))
+        blows[k] = ImpactResult(struck, fastest, jnp.clip(share, 0.0, 1.0))
     return lane, blows
 
 
@@ -266,7 +266,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     for number, stop in enumerate(stops):
         hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
         hits[number] = hit
-        rebounds[number] = stop.leaving(stop.sign * jnp.where(hit, closing[number], 0.0))
+        rebounds[number] = stop.velocity_after(stop.sign * jnp.where(hit, closing[number], 0.0))
     alone = _each_by_itself(instant, velocities, hits, rebounds)
     found = jnp.zeros_like(goes_on)
     for number, hit in hits.items():
@@ -388,7 +388,7 @@ def _with_losses(
     energy = lane.record.impact_energy
     if energy is not None:
         hit = instant.taken & instant.met
-        lane = lane.recording(impact_energy=energy + jnp.where(hit, lost, 0.0))
+        lane = lane.update_record(impact_energy=energy + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
     return lane.ended(instant.met, wrong, "bad_impact")
 
@@ -402,7 +402,9 @@ _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 _CLOSED = 1e-9
 
 
-def settle(at: Situation, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Lane:
+def settle(
+    at: AppliedStep, lane: Lane, at_event: State, met: Flag, blows: dict[int, ImpactResult]
+) -> Lane:
     """Return the lane at rest on those stops whose impacts were the last ones. `lane` is after the
     impacts, `at_event` the state before them, `met` whether there were any."""
     if lane.contact is None:
@@ -412,7 +414,7 @@ def settle(at: Situation, lane: Lane, at_event: State, met: Flag, blows: dict[in
         sign, _ = at.plan.wall(k, blow.struck)
         path, alone = at.trial.paths[k], at.trial.alone[k]
         speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
-        growth = None if path.surge is None else path.surge[1]
+        growth = None if path.force_rates is None else path.force_rates[1]
         known = k, blow, speed, lane._replace(state=at_event), growth
         ends, left = _ends(at.plan, alone, *known)
         rests = {k: pin_flag((blow.struck > 0) & ends, lane.s)}
@@ -424,7 +426,7 @@ def settle(at: Situation, lane: Lane, at_event: State, met: Flag, blows: dict[in
 
 
 def _held(
-    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], blows: dict[int, Blow],
+    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], blows: dict[int, ImpactResult],
     waits: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
@@ -456,17 +458,17 @@ def _held(
         contact = select(clear, contact, lane.contact)
     any_rests = any_of(taken, rests.values())
     s, state, integrals = select(any_rests, (later, still, passed), (s, state, integrals))
-    lane = lane._replace(s=s, state=state, contact=contact).recording(integrals=integrals)
+    lane = lane._replace(s=s, state=state, contact=contact).update_record(integrals=integrals)
     for k, ends in rests.items():
         here, blow, count = taken & ends, blows[k], lane.record.rests
         number = blow.struck - 1.0
-        lane = lane.noting(here, plan.clock(s, state), EventKind.rest, number, blow.approach)
+        lane = lane.log_event(here, plan.clock(s, state), EventKind.rest, number, blow.approach)
         if count is not None:
-            lane = lane.recording(rests=count + jnp.where(here, 1.0, 0.0))
+            lane = lane.update_record(rests=count + jnp.where(here, 1.0, 0.0))
     energy = lane.record.impact_energy
     if energy is not None:
         energy = energy + jnp.where(taken & any_rests, lost, 0.0)
-        lane = lane.recording(impact_energy=energy)
+        lane = lane.update_record(impact_energy=energy)
     return lane
 
 
@@ -481,14 +483,16 @@ def _without_rebounds(
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
         contact[k] = jnp.where(ends, walls[k], zero)
-    held = held_by(machine, s, state, modes, contact)
+    held = contact_constraints(machine, s, state, modes, contact)
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
     amounts = forces(
         shares(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
     )
     new, pushed = added(state, amounts, held.pushes), list(amounts)
-    for row, (_, _, at, drag) in enumerate(held.rubbing, start=len(bodies) - len(held.rubbing)):
+    for row, (_, _, at, drag) in enumerate(
+        held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
+    ):
         pushed[row] = pushed[row] + drag * amounts[at]
     lost = zero
     for body, amount, V in zip(bodies, pushed, before, strict=True):
@@ -524,7 +528,7 @@ def stilled(
 
 
 def _ends(
-    plan: Plan, free: SmoothMachine, k: int, blow: Blow, speed: Scalar, lane: Lane,
+    plan: Plan, free: SmoothMachine, k: int, blow: ImpactResult, speed: Scalar, lane: Lane,
     growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
@@ -571,7 +575,9 @@ def _before_it_presses(
     return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
 
 
-def _broken(plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int, Blow]) -> Scalars:
+def _broken(
+    plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int, ImpactResult]
+) -> Scalars:
     """Return `Lane.contact` without those contacts that the impacts struck or pulled apart;
     `at_event`: the state before them."""
     assert lane.contact is not None
@@ -586,7 +592,7 @@ def _broken(plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int,
 
 
 def _together(
-    plan: Plan, lane: Lane, blows: dict[int, Blow]
+    plan: Plan, lane: Lane, blows: dict[int, ImpactResult]
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
     """Return for each coordinate that was struck whether it comes to rest, and the time until then.
     A body may be pressed on by another that comes to rest at the same instant. Therefore each is

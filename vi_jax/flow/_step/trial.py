@@ -19,11 +19,11 @@ from .guards import (
     Crossing,
     Side,
     Within,
+    checks_within_step,
     crossings,
     guards_error,
     landing_tolerance,
     leniency,
-    looks_within,
     separated,
     turn_tolerance,
     within,
@@ -76,7 +76,7 @@ def release(
     left = rising & (after > 0) & ~landed
     place = stop_gradient(h + offset)
     # If the force is barely positive, but for long, chords hardly advance: bisect.
-    share = jnp.where(lane.aims >= _PATIENCE, 0.5, 1 - short)
+    share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > straight, share * place, place)
     # Late rather than early by a rounding error, when it would be pressed on again; and no step
     # towards the release is too short to advance the clock.
@@ -100,7 +100,7 @@ class Path(NamedTuple):
     """True if the step was aimed at a turning point of the coordinate, and met it."""
     leaves: Release | None
     """Its release, if it can rest."""
-    surge: tuple[Scalar, Scalar, Scalar] | None
+    force_rates: tuple[Scalar, Scalar, Scalar] | None
     """Rates of the force at both ends, and the length of the shortest step that is cut at an
     extremum of the force; `None` if the body cannot rest."""
     pull: Side | None
@@ -139,7 +139,7 @@ class Trial(NamedTuple):
     """True if nothing can be met within the step; `None` if that is never known in advance."""
 
 
-class Situation(NamedTuple):
+class AppliedStep(NamedTuple):
     """A tried step while its events are applied."""
 
     plan: Plan
@@ -178,7 +178,7 @@ def attempt(
 
     old = lane.record.integrals
     beside = carried(smooth, lane.s, lane.state, old)
-    stages, looks = [], looks_within(plan, lane.state)
+    stages, looks = [], checks_within_step(plan, lane.state)
     if motion is not None:
         (new, beside), error = motion.at(h), jnp.zeros_like(h)
         stages = stages_to_step_to(SHARES, lane.s, h) if looks else stages
@@ -280,11 +280,11 @@ def _path(
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(stops_of(plan.machine))))
     at_turn = good & aimed & met
-    leaves, surge, pull = None, None, None
+    leaves, force_rates, pull = None, None, None
     limited = any(stop.coordinate == k for stop in stops_of(plan.machine))
     if lane.contact is not None and limited:
         leaves = release(plan, lane, k, begin, end, good, h)
-        surge = (
+        force_rates = (
             force_rate(free, position, smooth, lane.s, lane.state),
             force_rate(free, position, smooth, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
@@ -298,7 +298,7 @@ def _path(
                     jnp.where(rests, away * rate, jnp.where(slow, along * r.a, 0.0)),
                     r.a,
                 )
-                for r, rate in ((begin, surge[0]), (end, surge[1]))
+                for r, rate in ((begin, force_rates[0]), (end, force_rates[1]))
             )
             pull = Side(first, last, seen.forces[k], seen.slack[k], rests | slow)
-    return Path(begin, end, at_turn, leaves, surge, pull)
+    return Path(begin, end, at_turn, leaves, force_rates, pull)

@@ -52,7 +52,7 @@ def stages_to_step_to(shares: Sequence[float], s: Scalar, h: Scalar) -> list[Sta
     return [Stage(share, s + share * h, None) for share in shares]
 
 
-def fading_is_known(machine: AbstractMachine, s: Scalar, state: State) -> bool:
+def has_relaxation(machine: AbstractMachine, s: Scalar, state: State) -> bool:
     """Return whether a machine defines its fastest decay (`relaxation`); known at trace time."""
     return jax.eval_shape(machine.relaxation, s, state) is not None
 
@@ -94,7 +94,7 @@ class AbstractMethod(eqx.Module):
         """Raise a `ValueError` if this method cannot integrate `machine`."""
 
     @property
-    def follows_fading(self) -> bool:
+    def is_limited_by_decay(self) -> bool:
         """True if steps must be short compared with the fastest decay, since decaying components
         would grow otherwise; static."""
         return True
@@ -111,7 +111,7 @@ class AbstractMethod(eqx.Module):
         that explicit Runge–Kutta methods are stable, and the series of `ExactFlight` accurate.
         """
         limit = machine.step_limit(s, state)
-        fading = machine.relaxation(s, state) if self.follows_fading else None
+        fading = machine.relaxation(s, state) if self.is_limited_by_decay else None
         if fading is not None:
             limit = jnp.minimum(limit, 0.8 * pi * fading)
         return limit * (5 / self.steps_per_cycle)

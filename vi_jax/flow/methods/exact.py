@@ -76,8 +76,8 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     cannot make or hide an event. Decayed modes thus cost no steps."""
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
-    pace = machine.pace_of
-    moves = jnp.abs(q - place) + jnp.abs(p - rate) * machine.slowness
+    pace = machine.modal_frequency
+    moves = jnp.abs(q - place) + jnp.abs(p - rate) * machine.inverse_frequency
     fastest, least = machine.frequency, _MATTERS * jnp.finfo(pace.dtype).eps
     for row in machine.rows:
         part = jnp.abs(row) * moves
@@ -116,7 +116,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
         never = -stop.beyond(middle) > _WIDER * reach
         until = jnp.where(never, jnp.inf, jnp.where(room > 0, until, 0.0))
         length = jnp.minimum(length, until)
-    return jnp.where(machine.plain * machine.fades > 0, length / _WIDER, 0.0)
+    return jnp.where(machine.plain * machine.all_decay > 0, length / _WIDER, 0.0)
 
 
 def _steady_response(machine: ModalMachine, s: Scalar) -> tuple[Any, Any]:

@@ -20,7 +20,7 @@ from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
 from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals, unit_of
-from .base import AbstractMethod, Stage, fading_is_known
+from .base import AbstractMethod, Stage, has_relaxation
 from .verner import Verner9
 
 Vector = Float[Array, " n"]
@@ -344,7 +344,7 @@ class Adaptive(_RungeKutta):
         return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
 
     @property
-    def follows_fading(self):
+    def is_limited_by_decay(self):
         """True for an explicit solver."""
         return not self.solver.implicit
 
@@ -436,7 +436,7 @@ class FixedStep(_RungeKutta):
 
     def may_be_unstable(self, machine, s, state):
         """Return whether the fastest decay of the machine is unknown."""
-        return self.follows_fading and not fading_is_known(machine, s, state)
+        return self.is_limited_by_decay and not has_relaxation(machine, s, state)
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, whether it is unstable, and its stages."""
@@ -487,7 +487,7 @@ class ImplicitSteps(FixedStep):
         return dataclasses.replace(self, sizes=sizes)
 
     @property
-    def follows_fading(self):
+    def is_limited_by_decay(self):
         """False, as for `Adaptive` with such a solver."""
         return False
 

@@ -25,7 +25,7 @@ from ...lanes import called
 from ...machine import switches_of
 from ..events import Rates
 from ..smooth import Integrals, SmoothMachine, rate_of_integrals
-from .base import AbstractMethod, fading_is_known
+from .base import AbstractMethod, has_relaxation
 
 Coefficient = Any
 """An array, or `None` for zero."""
@@ -403,7 +403,7 @@ class Along(NamedTuple):
 
     series: Series
 
-    def without_flutter(self, shortest: Scalar) -> "Along":
+    def without_rounding_after_release(self, shortest: Scalar) -> "Along":
         """Return the series without speed and acceleration of a body that has just been released,
         if its jerk outweighs both within the time `shortest`: they are rounding errors."""
         if len(self.series) < 4 or any(x is None for x in self.series[1:4]):
@@ -608,7 +608,7 @@ class Taylor(AbstractMethod):
                 )
 
     @property
-    def follows_fading(self):
+    def is_limited_by_decay(self):
         """True for fixed steps; others are sized by their errors."""
         return self.rtol is None
 
@@ -625,7 +625,7 @@ class Taylor(AbstractMethod):
             treedef, series = expand(field, s, (state, beside), self.order)
         if self.rtol is not None:
             return Expansion(treedef, series, self.rtol)
-        known = fading_is_known(smooth.machine, s, state)
+        known = has_relaxation(smooth.machine, s, state)
         return Expansion(treedef, series, None if known else self._coarsest, rarely=True)
 
     @property
