@@ -1,5 +1,6 @@
 """Pages in plain English: sentences with a subject, the field's words, code that fits a column."""
 
+import ast
 import inspect
 import re
 from pathlib import Path
@@ -67,6 +68,15 @@ def test_docstrings_of_public_names():
             assert told.split()[0] not in CLAUSES, name
         found = [x for x in paragraphs(told) if HEADLESS.search(x) or PHRASES.search(x)]
         assert not found, name
+
+
+def test_docstrings_within_the_package():
+    """They begin with a verb or a noun, too."""
+    for path in sorted(Path(inspect.getfile(vi)).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
+                told = ast.get_docstring(node) or "None"
+                assert told.split()[0] not in [*CLAUSES, *"Of That Those Whether".split()], told
 
 
 def test_the_patterns_find_what_they_are_for():

@@ -4,6 +4,7 @@ The numbers of the two Duffing oscillators were found by an independent shooting
 checked here by their variational equations, integrated by SciPy.
 """
 
+import functools
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ class Twins(vi.AbstractMachine):
         }  # fmt: skip
 
 
+@functools.cache
 def branch_of(coupling, excess=0.0, **options):
     """The branch of the motion in one well that both oscillators share."""
     machine = Twins(coupling=coupling, excess=excess)
@@ -45,16 +47,6 @@ def branch_of(coupling, excess=0.0, **options):
     return vi.continue_orbit(
         orbit, parameter="force", bounds=(0.05, 0.25), progress=False, **options
     )
-
-
-@pytest.fixture(scope="module")
-def uncoupled():
-    return branch_of(0.0)
-
-
-@pytest.fixture(scope="module")
-def coupled():
-    return branch_of(0.1)
 
 
 def places(branch, kind):
@@ -90,11 +82,10 @@ def monodromy(point):
 
 
 @pytest.mark.slow
-def test_of_two_oscillators_each_bifurcation_is_seen(uncoupled):
+def test_of_two_oscillators_each_bifurcation_is_seen():
     """Uncoupled, slightly coupled and slightly different: within one step two multipliers pass 1,
     or -1, and leave no sign in the determinants."""
-    others = (branch_of(*at) for at in ((0.003,), (0.01,), (0.0, 0.001)))
-    one, weak, strong, unlike = uncoupled, *others
+    one, weak, strong, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001)))
     doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
     np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
     np.testing.assert_allclose(doublings[1], [0.19582944, 0.19916897], atol=1e-8)
@@ -111,12 +102,13 @@ def test_of_two_oscillators_each_bifurcation_is_seen(uncoupled):
 
 
 @pytest.mark.slow
-def test_a_branch_that_leaves_another_to_both_sides(coupled):
+def test_a_branch_that_leaves_another_to_both_sides():
     """The one on which both oscillators differ touches the other one where its own parameter turns
     back: that is a branch point, and no fold, and a switch leads to the other one."""
+    branch = branch_of(0.1)
     wanted = [0.1034185332, 0.1281540734]
-    np.testing.assert_allclose(places(coupled, "branch-point"), wanted, atol=1e-10)
-    point = next(point for point in coupled.special if point.kind == "branch-point")
+    np.testing.assert_allclose(places(branch, "branch-point"), wanted, atol=1e-10)
+    point = next(point for point in branch.special if point.kind == "branch-point")
     off = vi.continue_orbit(point.switch(), parameter="force", bounds=(0.05, 0.25), progress=False)
     assert off.ends == ("closed", "closed")
     np.testing.assert_allclose(places(off, "branch-point"), wanted, atol=1e-10)
@@ -126,10 +118,10 @@ def test_a_branch_that_leaves_another_to_both_sides(coupled):
 
 
 @pytest.mark.slow
-def test_a_curve_of_folds_of_both_oscillators(uncoupled):
+def test_a_curve_of_folds_of_both_oscillators():
     """Two multipliers are 1 all along it. It is that of one oscillator: folds in (f, ω) that meet
     in a cusp, found by an independent shooting code."""
-    fold = next(point for point in uncoupled.special if point.kind == "fold")
+    fold = next(point for point in branch_of(0.0).special if point.kind == "fold")
     curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert curve.ends == ("bounds", "bounds")
     (cusp,) = curve.special
@@ -141,10 +133,10 @@ def test_a_curve_of_folds_of_both_oscillators(uncoupled):
 
 
 @pytest.mark.slow
-def test_curves_of_branch_points(coupled):
+def test_curves_of_branch_points():
     """Both end where the oscillators are uncoupled and fold, and one touches the curve of folds:
     that is no resonance, since each multiplier 1 has its own eigenvector."""
-    points = [point for point in coupled.special if point.kind == "branch-point"]
+    points = [point for point in branch_of(0.1).special if point.kind == "branch-point"]
     bounds = ((0.02, 0.25), (0.0, 0.3))
     for point, fold in zip(points, (0.1082731067, 0.0799657809), strict=True):
         curve = vi.boundary(point, parameter="coupling", bounds=bounds, progress=False)
@@ -197,16 +189,15 @@ class Turning(Kicked):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("apart", [0.02, 0.005])
-def test_a_fold_and_a_branch_point_in_one_step(apart):
+def test_a_fold_and_a_branch_point_in_one_step():
     """One branch point was named, at the place of the fold. A branch that begins at the fold has
     the other point, too."""
-    orbit = vi.find_orbit(Turning((0.5 - apart) ** 2, apart), at(0.5, 0.0), throw=True)
+    orbit = vi.find_orbit(Turning(0.495**2, 0.005), at(0.5, 0.0), throw=True)
     way = {"parameter": "a", "bounds": (-1.0, 0.6), "max_step": 0.3}
     branch = vi.continue_orbit(orbit, **way)
     assert [point.kind for point in branch.special] == ["branch-point", "fold"]
     places = [point.parameter for point in branch.special]
-    np.testing.assert_allclose(places, [apart**2, 0.0], atol=1e-12)
+    np.testing.assert_allclose(places, [0.005**2, 0.0], atol=1e-12)
     begun = vi.continue_orbit(branch.special[1].orbit, **way)
     assert [point.kind for point in begun.special] == ["branch-point"]
 
