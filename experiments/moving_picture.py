@@ -20,17 +20,17 @@ from vi_jax.plot import BLUE, RED
 from vi_jax.plot.schematic import pen_for, sketch
 
 TARGET = Path(__file__).parent / "figures" / "moving_picture.gif"
-# Starts along each axis, cycles that are shown, frames in each of them.
+# Starts along each axis, cycles shown, frames per cycle.
 GRID, CYCLES, FRAMES = 20, 12, 8
-# Here two motions of period 4π are stable (`examples/minimal_kick.py`).
+# With these parameters two motions of period 4π are stable (`examples/minimal_kick.py`).
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 MOTIONS = {"one motion": (1.283, 1.007), "the other one": (1.528, 1.314)}
 LOW, HIGH = (-4.0, -4.0), (2.0, 4.0)
 
 
 def simulated() -> tuple[np.ndarray, np.ndarray, Any]:
-    """Sections of all starts, (starts, cycles + 1, 2); the motion that each settles on, by its
-    number; the samples of the one start that is drawn as a machine."""
+    """Return the sections of all starts, (starts, cycles + 1, 2); the number of the motion that
+    each settles on; the sampled run that is drawn as a machine."""
     Y, V = (x.ravel() for x in jnp.meshgrid(*map(lambda a, b: jnp.linspace(a, b, GRID), LOW, HIGH)))
     run = jax.vmap(lambda Y, V: vi.simulate(SCENE, SCENE.start(Y=Y, V=V), CYCLES))(Y, V)
     ends = jax.vmap(lambda x: vi.simulate(SCENE, x, 600).last)(run.last)
@@ -48,7 +48,7 @@ def simulated() -> tuple[np.ndarray, np.ndarray, Any]:
 
 
 def drawn(sections: np.ndarray, settled: np.ndarray, rest: vi.Run) -> Iterator[Image.Image]:
-    """The pictures, one for each sample."""
+    """Yield the pictures, one for each sample."""
     figure = Figure(figsize=(7.0, 2.6), dpi=90, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     above, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
@@ -85,7 +85,7 @@ def _at(states: Any, i: int) -> Any:
 
 
 def main() -> None:
-    """One palette for all pictures, so that what does not move costs nothing."""
+    """Write the pictures with one palette, so that unchanged pixels take no space in the file."""
     frames = list(drawn(*simulated()))
     exact, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     palette = frames[FRAMES].quantize(20, method=exact, dither=plain)

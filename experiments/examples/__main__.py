@@ -1,7 +1,7 @@
-"""Runs the examples and writes their notebooks: `python experiments/examples [name ...]`.
+"""Run the examples and write their notebooks: `python experiments/examples [name ...]`.
 
-The pictures go to `experiments/figures/examples`; with `--notebooks` nothing is run, and what the
-notebooks have printed stays in them.
+The pictures go to `experiments/figures/examples`. With `--notebooks` no example is run, and the
+notebooks keep their printed output.
 """
 
 import argparse
@@ -50,9 +50,9 @@ json.dump(_texts, open(_told, "w", encoding="utf-8"))
 
 
 def cells(text: str) -> list[tuple[str, str]]:
-    """The cells of a script in percent format: "markdown" or "code", and what is in them.
+    """Return the cells of a script in percent format: "markdown" or "code", and the content.
 
-    A title after `# %%` is a cell of text before the code.
+    A title after `# %%` becomes a Markdown cell before the code.
     """
     found = []
     for part in ("\n" + text).split("\n# %%")[1:]:
@@ -68,7 +68,7 @@ def cells(text: str) -> list[tuple[str, str]]:
 
 
 def printed(path: Path) -> list[str]:
-    """Run a script cell by cell, as a notebook does, and give what each code cell prints."""
+    """Run a script cell by cell, as a notebook does, and return the output of each code cell."""
     with TemporaryDirectory() as folder:
         asked, told = Path(folder) / "cells.json", Path(folder) / "printed.json"
         sources = [source for kind, source in cells(path.read_text("utf-8")) if kind == "code"]
@@ -79,16 +79,16 @@ def printed(path: Path) -> list[str]:
 
 
 def printed_in(book: str) -> list[str]:
-    """What the code cells of a notebook have printed, the cell that installs left out."""
+    """Return the printed output of a notebook's code cells, without the cell that installs."""
     code = [cell for cell in json.loads(book)["cells"] if cell["cell_type"] == "code"]
     texts = [[out["text"] for out in x["outputs"] if out.get("name") == "stdout"] for x in code]
     return ["".join(lines for text in each for lines in text) for each in texts[1:]]
 
 
 def notebook(path: Path, texts: Sequence[str]) -> str:
-    """The notebook of an example, with what it prints and, below its last cell, its picture.
+    """Return the notebook of an example, with its output and, below the last cell, its picture.
 
-    **Arguments:** the script; what each of its code cells prints.
+    **Arguments:** the script; the printed output of each of its code cells.
     """
     parts = cells(path.read_text(encoding="utf-8"))
     parts.insert(1, ("code", INSTALL))
@@ -115,7 +115,7 @@ def notebook(path: Path, texts: Sequence[str]) -> str:
 
 
 def main() -> None:
-    """Make the notebooks and pictures of all examples, or of those named."""
+    """Make the notebooks and pictures of the named examples, or of all examples."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="examples; all of them if left out")
     parser.add_argument("--notebooks", action="store_true", help="only write the notebooks")

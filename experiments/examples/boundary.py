@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Boundaries in two parameters
 
-A period doubling of the 2π motion is followed over frequency ratio ζ and restitution k, and so is
-the grazing at which the 4π motion ends.
+Two curves are followed over the frequency ratio ζ and the restitution k: the period doubling of the
+2π motion, and the grazing at which the 4π motion ends.
 """
 
 # %%
@@ -16,7 +16,7 @@ scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 bounds = ((0.7, 1.02), (0.05, 0.95))
 
 
-# %% A branch for each motion, and a curve from its first special point of the kind wanted
+# %% Continue each motion in ζ, then follow its first special point of a kind in ζ and k
 def curve(Y, V, cycles, kind):
     orbit = vi.find_orbit(scene, scene.start(Y=Y, V=V), cycles=cycles)
     branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=bounds[0])

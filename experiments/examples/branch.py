@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Follow a motion and switch where it bifurcates
 
-The 2π motion is followed in the frequency ratio ζ. At a period doubling a 4π motion with two
-impacts begins; it loses an impact and continues as the paper's 4π motion.
+The 2π motion is continued in the frequency ratio ζ. At its period doubling a 4π motion with two
+impacts begins. At a grazing this motion loses an impact and becomes the paper's 4π motion.
 """
 
 # %%

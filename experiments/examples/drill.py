@@ -1,8 +1,8 @@
 # %% [markdown]
 """# How fast a percussion drill goes into the rock
 
-A vibrating bit of 5 kg strikes rock that yields like a spring and a dashpot, and moves on where it
-is pushed by 20 kN. Too little feed force wastes blows, too much of it stops the progression.
+A vibrating bit of 5 kg strikes rock. The contact is a spring with a dashpot, and a force of 20 kN
+moves the rock. Too little feed force wastes blows, and too much of it stops the progress.
 """
 
 # %%

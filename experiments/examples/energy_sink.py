@@ -1,7 +1,7 @@
 # %% [markdown]
 """# A vibro-impact energy sink flattens a resonance
 
-A 100 g ball in a 10 kg machine takes energy by an impact on each side in a cycle (dotted: no ball).
+A 100 g ball in a 10 kg machine absorbs energy by one impact per side and cycle (dotted: no ball).
 """
 
 # %%
@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import vi_jax as vi
 
 
-# %% SI units; the machine alone has its resonance at 5 Hz
+# %% SI units; the machine without the ball has its resonance at 5 Hz
 class Sink(vi.Mechanical):
     q, mass = ("body", "ball"), (10.0, 0.1)
     frequency: float = 5.0

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import vi_jax as vi
 
 
-# %% Positions of a body with these numbers, six cycles from rest, 32 samples in each
+# %% Positions of the body over six cycles from rest, 32 samples per cycle; x holds k, ξ and d
 def positions(x):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=x[0], gap=x[2], damping_ratio=x[1])
     run = vi.simulate(scene, scene.start(), cycles=6, samples=32)
@@ -23,7 +23,7 @@ def positions(x):
 truth, guess = jnp.array([0.5, 0.045, 1.2]), jnp.array([0.75, 0.1, 1.5])
 record = positions(truth) + 0.05 * jax.random.normal(jax.random.key(0), (193,))
 
-# %% Gauss and Newton's steps, and the errors that the last Jacobian gives
+# %% Gauss–Newton steps, and standard errors from the last Jacobian
 value, slopes, x = vi.jit(positions), vi.jit(jax.jacfwd(positions)), guess
 for _ in range(12):
     x = x + jnp.linalg.lstsq(slopes(x), record - value(x))[0]

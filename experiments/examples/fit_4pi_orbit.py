@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Initial conditions without a transient, fitted with optax
 
-Started at the right state, the machine moves in its stable 4π motion at once. Adam minimises the
-change over two cycles, with gradients through the impacts; Newton's method needs five steps.
+From the right initial state, the machine is in its stable 4π motion at once. Adam minimises the
+change over two cycles, with gradients through the impacts. Newton's method needs five steps.
 """
 
 # %%

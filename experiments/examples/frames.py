@@ -1,7 +1,7 @@
 # %% [markdown]
 """# Two frames pound each other, shaken by an unbalanced motor
 
-A motor lags at the resonance of its frame (△), then jumps: sooner if it hits a neighbour (blue).
+Run up (△), the motor stays at its frame's resonance, then jumps: sooner if frames collide (blue).
 """
 
 # %%

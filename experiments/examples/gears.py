@@ -1,8 +1,8 @@
 # %% [markdown]
 """# When a loose gear rattles
 
-An engine's speed varies within a turn. Its gear carries a loose one with it across a backlash of
-0.1 mm, and drag holds the teeth together until the ripple exceeds drag over inertia (dashed).
+An engine's speed varies within a turn. Its gear drives a loose gear with a backlash of 0.1 mm.
+Drag keeps the teeth in contact until the ripple exceeds drag over inertia (dashed).
 """
 
 # %%
@@ -16,7 +16,7 @@ import vi_jax as vi
 INERTIA, RADIUS, PLAY = 1e-3, 0.04, 1e-4  # kg m², m, m
 
 
-# %% Y: the loose tooth in its backlash, along the line of action; SI units, 50 Hz
+# %% Y: position of the loose tooth in the backlash, along the line of action; SI units, 50 Hz
 class Gears(vi.AbstractMachine):
     drag: float = 0.3
     ripple: float = 800.0

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# What stops do to a vibration harvester
 
-A magnet of 10 g on a spring (30 Hz) moves in a coil. Its base has a random acceleration w, 20 m/s²
-in a band 3 Hz wide. Stops cost power at resonance, but widen the band (a gap of 1 m: no stops).
+A 10 g magnet on a spring (30 Hz) moves in a coil. Its base has a random acceleration w of 20 m/s²
+(rms) in a band 3 Hz wide. Stops cost power at resonance but widen the band (gap 1 m: no stops).
 """
 
 # %%
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import vi_jax as vi
 
-OWN, LOSS, WIDTH = 60 * jnp.pi, 0.08 * 60 * jnp.pi, 6 * jnp.pi  # rad/s; 3/4 of the loss: the coil
+OWN, LOSS, WIDTH = 60 * jnp.pi, 0.08 * 60 * jnp.pi, 6 * jnp.pi  # rad/s; coil: 3/4 of the loss
 
 
 class Harvester(vi.AbstractMachine):

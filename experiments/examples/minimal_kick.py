@@ -12,7 +12,7 @@ jax.config.update("jax_enable_x64", True)
 import matplotlib.pyplot as plt
 import vi_jax as vi
 
-# %% Each motion, kicked on the section
+# %% The smallest kick to each motion, applied on the section
 scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 kicks = []
 for Y, V in ((1.283, 1.007), (1.528, 1.314)):
@@ -20,7 +20,7 @@ for Y, V in ((1.283, 1.007), (1.528, 1.314)):
     kicks.append((orbit, vi.minimal_kick(scene, orbit)))
     print(kicks[-1][1])
 
-# %% Beside the basins
+# %% The basins of both motions, with the kicks as arrows
 region = {"start.Y": (0.9, 1.8), "start.V": (0.7, 1.6)}
 found = vi.basins(scene, region, resolution=150, progress=False)
 figure, ax = plt.subplots(figsize=(8, 4.6), layout="constrained")

@@ -2,7 +2,7 @@
 """# The motion that two methods of the paper disagree about
 
 At ζ = 0.9 and k = 0.5 the paper computes a motion of period 2π by one method and of 4π by the
-other. Both exist: without damping the 2π motion is unstable, with that of Table 1 it is stable.
+other. Both exist. The 2π motion is unstable without damping, and stable with that of Table 1.
 """
 
 # %%
@@ -16,7 +16,7 @@ import vi_jax as vi
 damping = {"without damping": 0.0, "damping of Table 1, ξ = 0.0448": 0.0448368}
 cycles = 60
 
-# %% The lowest point of each drive cycle; the motion between sections is looked at as well
+# %% The position from rest, and the lowest point of each drive cycle
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
 for ax, (title, xi) in zip(axes, damping.items(), strict=True):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=xi)

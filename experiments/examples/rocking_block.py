@@ -1,7 +1,7 @@
 # %% [markdown]
 """# Which ground motion overturns a block
 
-One cycle of a sine overturns a block of 0.5 m by 2 m (yellow), where a stronger one may not.
+One sine cycle of the ground can overturn a 0.5 m by 2 m block (yellow); a stronger one may not.
 """
 
 # %%
@@ -14,7 +14,7 @@ import vi_jax as vi
 lands = lambda m, t, z, side: -side * z.tilt
 
 
-# %% Housner's block; `peak` is in g, time counts from uplift, 7.13/s² is 3g/(4R)
+# %% Housner's block: `peak` is in g, `time` begins at uplift, and 7.13/s² is 3g/(4R)
 class Block(vi.AbstractMachine):
     peak: float = 0.5
     frequency: float = 1.0

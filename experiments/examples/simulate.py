@@ -2,7 +2,7 @@
 """# Simulate a machine and look at its motion
 
 The machine of the paper's Table 1: a motor turns a crank, the crank shakes a body on a spring, and
-the body hits a stop. The last two of 200 drive cycles are drawn.
+the body hits a stop. The motion settles for 200 drive cycles, and the next two are drawn.
 """
 
 # %%
@@ -18,9 +18,9 @@ scene = machine.scene(drive="motor")
 settled = vi.simulate(scene, scene.start(), cycles=200)
 print(settled)
 
-# %% Two more cycles from where it is now, with dense samples and each impact
+# %% Two more cycles from the last state, with dense samples and a log of the impacts
 run = vi.simulate(scene, settled.last, cycles=2, samples=200, impact_log=4)
-assert run.impact_log is not None  # it was asked for
+assert run.impact_log is not None  # set by `impact_log=4`
 speed = float(machine.metres_per_second(run.impact_log.speed[0, 0]))
 print(f"hits the stop at {speed:.2f} m/s")
 

@@ -1,1 +1,1 @@
-"""What the studies and benchmarks share: how they are run, their tables, clocks and pictures."""
+"""Shared code of the studies and benchmarks: running, tables, timing and pictures."""

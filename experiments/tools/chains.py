@@ -10,7 +10,7 @@ AMPLITUDE, DAMPING, GAP, RESTITUTION = 1.0, 0.05, 1.5, 0.7
 
 
 def linear_chain(frequency: Any, size: int) -> vi.machines.Structure:
-    """N masses of 1 on springs of 1 and dashpots in proportion, shaken at the first one."""
+    """Return N unit masses on unit springs with proportional dashpots, shaken at the first mass."""
     stiffness = 2 * jnp.eye(size) - jnp.eye(size, k=1) - jnp.eye(size, k=-1)
     stiffness = stiffness.at[-1, -1].set(1.0)
     last = jnp.zeros(size).at[-1].set(1.0)
@@ -25,7 +25,7 @@ def linear_chain(frequency: Any, size: int) -> vi.machines.Structure:
 
 
 class CubicChain(vi.AbstractMachine):
-    """The same chain, with springs that pull with e + cubic e³ at the stretch e."""
+    """The same chain, with springs of force e + cubic e³ at the stretch e."""
 
     frequency: Any
     cubic: Any
@@ -65,5 +65,5 @@ class CubicChain(vi.AbstractMachine):
 
 
 def cubic_chain(frequency: Any, cubic: Any, size: int) -> CubicChain:
-    """A `CubicChain` of N masses."""
+    """Return a `CubicChain` of N masses."""
     return CubicChain(frequency, cubic, size)  # pyright: ignore[reportCallIssue]

@@ -13,7 +13,7 @@ _SIZE = 512  # points in one call: one program for any number
 
 
 def machine(zeta: Any, k: Any, xi: Any) -> vi.Scene:
-    """The machine at a frequency ratio, a restitution and a damping ratio."""
+    """Return the machine at a frequency ratio, a restitution and a damping ratio."""
     return vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=GAP, damping_ratio=xi)
 
 
@@ -23,10 +23,10 @@ def _closed_forms(points: jax.Array, *, cycles: int) -> vi.ClosedFormOrbits:
 
 
 def closed_forms(points: np.ndarray, cycles: int) -> vi.ClosedFormOrbits:
-    """The motions with one impact in so many cycles: two, or fewer, at every point.
+    """Return the motions with one impact in `cycles` cycles, at most two at each point.
 
-    **Arguments:** points (ζ, k, ξ), of the shape `(n, 3)`; the cycles of the motions. The fields of
-    what is returned are NumPy arrays with `n` as their first dimension.
+    **Arguments:** points (ζ, k, ξ) of shape `(n, 3)`; the number of cycles. The fields of the
+    result are NumPy arrays whose first dimension is `n`.
     """
     full = np.concatenate([points, np.repeat(points[-1:], -len(points) % _SIZE, axis=0)])
     parts = [_closed_forms(jnp.asarray(part), cycles=cycles) for part in full.reshape(-1, _SIZE, 3)]
@@ -34,11 +34,11 @@ def closed_forms(points: np.ndarray, cycles: int) -> vi.ClosedFormOrbits:
 
 
 def vibration(zeta: Any, xi: Any) -> Any:
-    """Complex amplitude 1/(1 - ζ² + 2iξζ) of the steady vibration without impacts."""
+    """Return the complex amplitude 1/(1 - ζ² + 2iξζ) of the steady vibration without impacts."""
     return 1 / (1 - zeta**2 + 2j * xi * zeta)
 
 
 def births(xi: Any) -> list[Any]:
-    """The smaller and the larger ζ at which that vibration just reaches the stop."""
+    """Return the smaller and the larger ζ at which that vibration just reaches the stop."""
     middle, half = 1 - 2 * xi**2, np.sqrt((1 - 2 * xi**2) ** 2 - 1 + GAP**-2)
     return [np.sqrt(middle + s * half) for s in (-1, 1)]

@@ -1,4 +1,4 @@
-"""A shaken oscillator of which a network is a part, by whose weights it is differentiated."""
+"""A shaken oscillator that contains a neural network, for gradients with respect to its weights."""
 
 from typing import Any
 
@@ -12,12 +12,12 @@ FREQUENCY, GAP, RESTITUTION, AMPLITUDE, DAMPING = 0.9, 0.6, 0.7, 1.0, 0.02
 
 
 def network(width: int) -> Any:
-    """Of one number, with two hidden layers of this width."""
+    """Return a network of one input and one output, with two hidden layers of this width."""
     return eqx.nn.MLP("scalar", "scalar", width, 2, jnp.tanh, key=jax.random.key(0))
 
 
 class Law(eqx.Module):
-    """k of the speed of approach, from 0.3 to 0.7."""
+    """The restitution as a function of the speed of approach, between 0.3 and 0.7."""
 
     network: Any
 
@@ -26,8 +26,8 @@ class Law(eqx.Module):
 
 
 class Oscillator(vi.AbstractMachine):
-    """A body on a spring; `part` says what the network is: its `law` of restitution, a part of its
-    `spring`'s force, or that `without` a stop."""
+    """A body on a spring. `part` selects the use of the network: `"law"` of restitution, a term of
+    the `"spring"` force, or such a term in a machine `"without"` a stop."""
 
     network: Any
     part: str = eqx.field(static=True)
@@ -43,33 +43,33 @@ class Oscillator(vi.AbstractMachine):
         return 2 * jnp.pi / FREQUENCY
 
     def start(self, *, Y):  # pyright: ignore
-        """At rest in a place."""
+        """Return the state of rest at the position Y."""
         return vi.OscillatorState(Y, 0 * Y)
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, self.rate(s, state.Y, state.V))
 
     def rate(self, s, Y, V):
-        """dV/ds."""
+        """Return dV/ds."""
         force = Y if self.part == "law" else Y + 0.1 * self.network(Y)
         return AMPLITUDE * jnp.cos(FREQUENCY * s) - 2 * DAMPING * V - force
 
 
 def oscillator(width: int, part: str) -> Oscillator:
-    """With a network of this width in this part."""
+    """Return an oscillator with a network of this width in this part."""
     return Oscillator(network(width), part)  # pyright: ignore[reportCallIssue]: stops are no field
 
 
 def flat(tree: Any) -> tuple[jax.Array, Any]:
-    """All numbers of a machine or network in one row, and the function from such a row to it."""
+    """Return all numbers of a machine or network as one array, and the function from it back."""
     leaves, rest = eqx.partition(tree, eqx.is_inexact_array)
     row, shaped = ravel_pytree(leaves)
     return row, lambda numbers: eqx.combine(shaped(numbers), rest)
 
 
 def last_places(machine: Any, starts: jax.Array, cycles: int, method: Any) -> tuple[Any, jax.Array]:
-    """The sum of the squares of where lanes end, as a function of the machine's numbers in a row,
-    and that row."""
+    """Return the sum of the squared final positions of lanes, as a function of the array of the
+    machine's numbers, and that array."""
     row, whole = flat(machine)
 
     def lane(numbers, Y):

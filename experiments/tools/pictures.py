@@ -1,4 +1,4 @@
-"""What the pictures have in common."""
+"""Shared parts of the pictures."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,31 +8,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-# Of a picture in the repository.
+# Dots per inch of a picture in the repository.
 _DPI = 110
 
 
 def open_frames(panels: Iterable[Axes]) -> None:
-    """Panels without the upper and the right line of their frames."""
+    """Remove the upper and the right line of the frames of panels."""
     for ax in panels:
         ax.spines[["top", "right"]].set_visible(False)
 
 
 def gridded(panels: Iterable[Axes], titles: Iterable[str]) -> None:
-    """Panels with a pale grid and a title each."""
+    """Give each panel a pale grid and a title."""
     for ax, title in zip(panels, titles, strict=True):
         ax.grid(alpha=0.3)
         ax.set_title(title)
 
 
 def legend_below(figure: Any, handles: Iterable[Any], columns: int, **look: Any) -> None:
-    """One legend for all panels, below them."""
+    """Draw one legend for all panels, below them."""
     look = {"frameon": False, "fontsize": 9, **look}
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **look)
 
 
 def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure, Any]:
-    """A figure of a size in inches, and its panels as `Figure.subplots` gives them."""
+    """Return a figure of a size in inches, and its panels as `Figure.subplots` returns them."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(*grid, **look)
 
@@ -40,7 +40,7 @@ def panels(width: float, height: float, *grid: int, **look: Any) -> tuple[Figure
 def save_picture(figure: Figure, path: str | Path, *, dpi: int = _DPI, colors: int = 200) -> None:
     """Write a figure as a small PNG; the same figure gives the same file.
 
-    **Arguments:** the file; dots per inch; `colors`, how many colours are kept, 256 at most.
+    **Arguments:** the file; dots per inch; `colors`, the number of colours, at most 256.
     """
     figure.savefig(path, dpi=dpi)
     shrink(path, colors=colors)

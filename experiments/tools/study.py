@@ -1,7 +1,7 @@
-"""How a study is run: `--quick` or in full, what it reports on its way, and what it writes.
+"""The frame of a study: its `--quick` option, its progress lines, its page and its picture.
 
-A study's page ends with its headline numbers as JSON, which a test computes again with the library
-as it is.
+A study's page ends with its headline numbers as JSON. A test computes them again with the current
+library.
 """
 
 import json
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from .pictures import save_picture
 
 QUICK = "--quick" in sys.argv
-"""Whether to take few values, and to write nothing."""
+"""True if the study takes few values and writes nothing."""
 
 _EXPERIMENTS = Path(__file__).parents[1]
 _BEGIN = time.perf_counter()
@@ -33,10 +33,10 @@ def say(text: object) -> None:
 def write(
     study: str, text: str, numbers: dict[str, float], figure: Figure | None = None, **look: Any
 ) -> None:
-    """Write a study's page and picture; nothing with `--quick`.
+    """Write a study's page and picture; with `--quick`, write nothing.
 
-    **Arguments:** the study's name, which is that of its file; its page in Markdown; its headline
-    numbers by name; its picture, and options of `save_picture`.
+    **Arguments:** the name of the study, which is that of its file; its page in Markdown; its
+    headline numbers by name; its picture; options of `save_picture`.
     """
     if QUICK:
         return

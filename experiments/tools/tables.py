@@ -4,14 +4,13 @@ from collections.abc import Iterable, Sequence
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table.
+    """Return a Markdown table.
 
-    **Arguments:** the columns' headings; the rows, with a cell for each of them, shown as `str`
-    shows it.
+    **Arguments:** the columns' headings; the rows, each with one cell per column, written by `str`.
 
-    **Raises:** `ValueError` if a row has another number of cells.
+    **Raises:** `ValueError` if the number of cells of a row is not that of the headings.
     """
-    # A heading without text is one blank wide.
+    # An empty heading is one space wide.
     lines = [_line(heads).replace("  ", " "), "|" + "---|" * len(heads)]
     for row in rows:
         if len(row) != len(heads):

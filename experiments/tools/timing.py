@@ -1,4 +1,4 @@
-"""The clock of several programs side by side."""
+"""Run times of several programs, measured in turn."""
 
 import statistics
 import time
@@ -9,7 +9,7 @@ import jax
 
 
 def side_by_side(programs: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
-    """Median seconds of each program, run in turn, so that a busy machine delays all alike."""
+    """Return the median seconds of each program, run in turn, so that a busy machine delays all."""
     times: list[list[float]] = [[] for _ in programs]
     for _ in range(rounds):
         for program, own in zip(programs, times, strict=True):

@@ -1,1 +1,1 @@
-"""Examples of other codes, each computed again in a short script beside their own numbers."""
+"""Published examples of other codes, each computed again in a short script and compared."""

@@ -1,6 +1,6 @@
-"""Runs the scripts and writes `docs/validated.md`: `python experiments/validated [name ...]`.
+"""Run the scripts and write `docs/validated.md`: `python experiments/validated [name ...]`.
 
-With names only these are run, and nothing is written.
+If names are given, only these scripts are run, and nothing is written.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 PAGE = HERE.parents[1] / "docs" / "validated.md"
 SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
-# In the order of the page: what most people know first.
+# The order of the page: the best known examples first.
 ORDER = (
     "siconos_balls", "matlab_balls", "contact_gradients", "heyoka_ramp", "heyoka_sensitivity",
     "coco_grazing", "coco_stick_slip", "pwsdde_pair", "mpgos_valve", "siconos_friction",
@@ -36,20 +36,20 @@ their equations by an independent integrator. Times include compilation.
 
 
 def comparison_of(path: Path) -> Any:
-    """What a script compares; it prints nothing."""
+    """Run a script without its output, and return its comparison."""
     with contextlib.redirect_stdout(io.StringIO()):
         return runpy.run_path(str(path))["comparison"]
 
 
 def described(path: Path) -> tuple[str, str]:
-    """The title and the text that a script begins with."""
+    """Return the title and the text at the beginning of a script."""
     text = path.read_text(encoding="utf-8").split('"""')[1]
     title, _, body = text.partition("\n")
     return title.lstrip("# "), body.strip()
 
 
 def section(path: Path, comparison: Any, seconds: float) -> str:
-    """A section of the page."""
+    """Return a section of the page."""
     title, text = described(path)
     source = re.sub(r"https://[^\s,;]+", r"<\g<0>>", comparison.source)
     return (
@@ -60,7 +60,7 @@ def section(path: Path, comparison: Any, seconds: float) -> str:
 
 
 def main() -> None:
-    """Run all scripts and write the page, or run those that are named."""
+    """Run all scripts and write the page, or only run the named scripts."""
     names = sys.argv[1:]
     assert sorted(ORDER) == [path.stem for path in SCRIPTS]
     sections = []

@@ -1,4 +1,4 @@
-"""Numbers of other people's examples beside those that vi_jax gives: what the gallery shares."""
+"""Published numbers compared with those of vi_jax: shared code of the scripts."""
 
 import sys
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ from tools.tables import table
 class Number:
     """One number of an example, theirs and ours.
 
-    **Arguments:** what it is, with its unit; theirs, written as it was published, digits and all;
-    ours; how far apart they may be, by default half a unit of the last digit of theirs and the
-    rounding of a run (1e-12 of it).
+    **Arguments:** the quantity, with its unit; theirs, with all digits as published; ours; the
+    allowed difference, by default half a unit of the last digit of theirs plus the rounding of a
+    run (1e-12 of the number).
     """
 
     quantity: str
@@ -26,12 +26,12 @@ class Number:
 
     @property
     def difference(self) -> float:
-        """How far apart they are."""
+        """The absolute difference of both numbers."""
         return abs(float(self.ours) - float(self.theirs))
 
     @property
     def allowed(self) -> float:
-        """How far apart they may be."""
+        """The allowed difference."""
         if self.within is not None:
             return self.within
         return 0.5 * last_digit(self.theirs) + 1e-12 * max(1.0, abs(float(self.theirs)))
@@ -47,13 +47,12 @@ class Number:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An example of others beside what vi_jax gives; shown as the table of its numbers.
+    """A published example compared with vi_jax; printed as a table of its numbers.
 
-    **Arguments:** the code or the authors that it is of; where it is published; how their numbers
-    were obtained; `(quantity, theirs, ours)` or `(quantity, theirs, ours, within)` of each
-    `Number`.
+    **Arguments:** the code or the authors; the source; the origin of their numbers;
+    `(quantity, theirs, ours)` or `(quantity, theirs, ours, within)` of each `Number`.
 
-    **Raises:** `ValueError` if a number of ours is farther from theirs than it may be.
+    **Raises:** `ValueError` if a number of ours differs from theirs by more than is allowed.
     """
 
     code: str
@@ -77,6 +76,6 @@ class Comparison:
 
 
 def last_digit(number: str) -> float:
-    """A unit of the last digit of a number that is written in decimals."""
+    """Return one unit of the last digit of a number written in decimals."""
     mantissa, _, exponent = number.lower().partition("e")
     return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A block on a belt, and how many starts come to rest
 
-A block on a spring on a belt of speed v either comes to rest on the sliding belt, or sticks and
-slips for ever. The share of the starts in [-2, 2] × [0, 2] that come to rest:
+A block on a spring lies on a belt of speed v. It either comes to rest on the sliding belt, or
+sticks and slips for ever. The share of starts in [-2, 2] × [0, 2] that come to rest is compared.
 """
 
 # %%
@@ -29,7 +29,7 @@ class Belt(vi.AbstractMachine):
         return dict(Y=z.V, V=-z.Y - 0.1 * z.V)
 
 
-def rests(speed, Y, V):  # as they judge it: it moves by less than ±0.2 from t = 400 to 500
+def rests(speed, Y, V):  # by their criterion: it moves by less than ±0.2 from t = 400 to 500
     run = vi.simulate(Belt(speed), vi.OscillatorState(Y, V), 1, settle=4)
     return run.y_max[0] - run.y_min[0] < 0.4
 

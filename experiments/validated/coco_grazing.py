@@ -14,7 +14,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The branch in A ends where the wall is touched, and that point is followed in ω
+# %% The branch in A ends at the grazing of the wall, which is followed in ω
 machine = vi.machines.Duffing(amplitude=0.05, two_sided=False)  # pyright: ignore[reportCallIssue]
 orbit = vi.find_orbit(machine, machine.start())
 branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.02, 0.3))

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# An impactor that makes what it hits slide
 
-A voltage draws a body on a spring to a base at q = 0.5. An impact makes the base slide, until
-friction holds it.
+A voltage attracts a body on a spring to a base at q = 0.5. An impact makes the base slide until
+friction stops it.
 """
 
 # %%
@@ -15,7 +15,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The state: place q and speed of the impactor, and how fast the base slides
+# %% The state: position q and speed of the impactor, and the sliding speed of the base
 class Impactor(vi.AbstractMachine):
     cycle: float = 8 * np.pi / 0.92
     events: tuple = (
@@ -46,7 +46,7 @@ comparison = Comparison(
     "H. Dankowicz and F. Schilder, Recipes for Continuation, SIAM, 2013 (stick and slip)",
     "from the equations of the example, at V = 0.57, by SciPy's DOP853 from event to event",
     [
-        ("first impact: time", "2.9054088655", time[0], 1e-9),  # of tolerances of 1e-12
+        ("first impact: time", "2.9054088655", time[0], 1e-9),  # their tolerances: 1e-12
         ("its speed", "0.3200474159", speed[0], 1e-9),
         ("sixth impact: time", "23.1264321092", time[10], 1e-9),
     ],

@@ -35,7 +35,7 @@ def ends(height, restitution, gravity, speed):
 flies, drops = (2.95, 1.0, 0.0, -5.0), (1.0, 0.8, 9.81, 0.0)
 apart = (ends(1.0 + 1e-5, *drops[1:]) - ends(1.0 - 1e-5, *drops[1:])) / 2e-5
 
-# %% v is the speed of the first impact, e v that behind it
+# %% v is the speed before the first impact, e v the speed after it
 g, e, v = 9.81, 0.8, np.sqrt(2 * 9.81)
 by_height, again = g * (1 + e) / v - 1 - 2 * e, -(g**2) * (1 + e) / v**3
 comparison = Comparison(
@@ -47,7 +47,7 @@ comparison = Comparison(
         ("no gravity, with respect to the height: forward", "-1", jax.jacfwd(ends)(*flies)),
         ("backward", "-1", jax.grad(ends)(*flies)),
         ("with gravity", f"{by_height:.12f}", jax.grad(ends)(*drops)),
-        ("the same by differences of runs", f"{by_height:.12f}", apart, 1e-8),  # h² and 1e-14/h
+        ("the same by differences of runs", f"{by_height:.12f}", apart, 1e-8),  # h² and rounding/h
         ("second derivative", f"{again:.12f}", jax.jacfwd(jax.jacfwd(ends))(*drops)),
         ("with respect to the restitution", f"{v - v**2 / g:.12f}", jax.grad(ends, 1)(*drops)),
     ],

@@ -30,7 +30,7 @@ two, five = (
     )
 )
 
-# %% Of random starts, whose shares have standard errors: 1,000 of the first, 10,000 of the second
+# %% Their shares have standard errors: 1,000 random starts of the first, 10,000 of the second
 within = lambda share, number: 3 * np.sqrt(share * (1 - share) / number)
 comparison = Comparison(
     "Attractors.jl; bSTAB, pyBasin",

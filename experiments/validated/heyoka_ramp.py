@@ -1,7 +1,7 @@
 # %% [markdown]
 """# A ball on a wavy ramp
 
-A ball (e = 0.8) bounces ten times down a ramp, y = 1 - x + 0.05 cos 11πx, and then along the
+A ball (e = 0.8) bounces ten times down a ramp, y = 1 - x + 0.05 cos 11πx. Then it bounces along the
 ground, until two impacts follow within 1e-6.
 """
 
@@ -15,7 +15,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The state is (x, y, x', y'); the ramp is a rule of one's own, the ground a stop
+# %% The state is (x, y, x', y'); the ramp is a user-defined reset, the ground a stop
 def bounced(ramp, s, z):
     normal = 1 + 0.55 * jnp.pi * jnp.sin(11 * jnp.pi * z[0])
     change = 1.8 * (normal * z[2] + z[3]) / (normal**2 + 1)

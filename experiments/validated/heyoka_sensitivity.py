@@ -1,8 +1,8 @@
 # %% [markdown]
 """# How the time of an event changes
 
-A mass on a spring of stiffness k starts with speed 1. The derivatives of the time of its first turn
-and of a misfit (x - 10.123)² there.
+A mass on a spring of stiffness k starts with speed 1. The derivatives of the time of its first
+turning point and of the misfit (x - 10.123)² there are compared.
 """
 
 # %%
@@ -24,7 +24,7 @@ class Spring(vi.AbstractMachine):
 
 
 def turn(stiffness):
-    """Its time, and the misfit of its place."""
+    """Return the time of the turning point, and the misfit of its position."""
     start = vi.OscillatorState(jnp.array(0.0), jnp.array(1.0))
     run = vi.simulate(Spring(stiffness), start, 1, method=vi.Adaptive(rtol=1e-13))
     return run.duration[0], (run.last.Y - 10.123) ** 2

@@ -26,7 +26,7 @@ class Ball(vi.AbstractMachine):
 
 
 def events(gravity, restitution, height, speed):
-    """Times of the impacts, and when the ball comes to rest."""
+    """Return the times of the impacts, and the time at which the ball comes to rest."""
     start = vi.OscillatorState(jnp.array(height), jnp.array(speed))
     ball = Ball(gravity, (vi.RigidStop(0.0, restitution, "left"),))
     log = vi.simulate(ball, start, 1, event_log=250).event_log
@@ -36,7 +36,7 @@ def events(gravity, restitution, height, speed):
 
 tossed, _ = events(9.8, 0.9, 0.0, 20.0)
 thrown, rest = events(9.81, 0.8, 10.0, 15.0)
-# %% A flight takes 2 v/g, and each is e times as long as the one before
+# %% A flight lasts 2 v/g, and each flight is e times as long as the one before
 fall = np.sqrt(15.0**2 + 2 * 9.81 * 10)
 lands = (15 + fall) / 9.81
 comparison = Comparison(

@@ -26,7 +26,7 @@ chatters, hums = settled(3.0), settled(7.8)
 page = Path(__file__).parents[1] / "studies" / "relief_valve.md"
 hopf = headlines(page.read_text(encoding="utf-8"))["Hopf, q"]
 
-# %% Orbits are right to 1e-10 as they are searched for here
+# %% The search finds these orbits to 1e-10
 comparison = Comparison(
     "MPGOS",
     "https://github.com/FerencHegedus/Massively-Parallel-GPU-ODE-Solver, tutorial T6; "

@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 # %% State (x1, x2, x1', x2'); the clock is the phase ωt, and the coordinate is x2 - x1
-def placed(z, Y, V):  # with the momentum of both, of which the second has 1/20 of the mass
+def placed(z, Y, V):  # keeps the momentum of both; the second has 1/20 of the mass
     far, fast = (Y - z[1] + z[0]) / 1.05, (V - z[3] + z[2]) / 1.05
     return z[0] - 0.05 * far, z[1] + far, z[2] - 0.05 * fast, z[3] + fast
 

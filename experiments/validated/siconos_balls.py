@@ -26,7 +26,7 @@ class Ball(vi.AbstractMachine):
 
 
 def events(ball, height, speed):
-    """Times of the impacts, and when the ball comes to rest."""
+    """Return the times of the impacts, and the time at which the ball comes to rest."""
     start = vi.OscillatorState(jnp.array(height), jnp.array(speed))
     log = vi.simulate(ball, start, 1, event_log=200).event_log
     kind, time = np.asarray(log.kind[0]), np.asarray(log.phase[0])
@@ -46,7 +46,7 @@ comparison = Comparison(
         ("dropped: first impact (s)", "0.4515236409857308", drop[0]),
         ("third impact (s)", "1.995734493156927", drop[2]),
         ("impacts in the first 8.5 s", "44", np.sum(drop < 8.5)),
-        ("last of them (s)", "8.491374025642981", drop[43], 1e-11),  # theirs: a sum of flights
+        ("last of them (s)", "8.491374025642981", drop[43], 1e-11),  # theirs adds up flights
         ("between two walls: first impact (s)", "0.05131670194948630", box[0]),
         ("tenth impact (s)", "4.774390309357649", box[9]),
         ("at rest (s)", "6.20723724208632", rest[0]),

@@ -26,11 +26,11 @@ bar = vi.machines.Structure(  # pyright: ignore[reportCallIssue]
 )  # fmt: skip
 start = vi.machines.StructureState(jnp.full(n, 5e-5), jnp.full(n, -0.1))
 run = vi.simulate(bar, start, 1, event_log=8)
-# Nothing presses the end on its stop until it is deformed: by rounding it may hop once, for 1e-9 s.
+# No force presses the undeformed end on its stop: rounding may make it hop once, for 1e-9 s.
 strikes, leaves = jnp.nanmin(run.event_log.phase), jnp.nanmax(run.event_log.phase)
 impulse = np.ones(n) @ mass @ (np.asarray(run.last.velocity) + 0.1)
 
-# %% Theirs are seen within some steps of 2e-6 s
+# %% Their times are known to some steps of 2e-6 s
 wave = np.sqrt(youngs / density)
 comparison = Comparison(
     "Siconos",

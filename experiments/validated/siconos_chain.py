@@ -14,7 +14,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The state: places, counted from where all touch, and velocities
+# %% The state: displacements from the positions where all touch, and velocities
 class Chain(vi.AbstractMachine):
     stiffness: jax.Array | float = 1.0
     cycle: float = 60.0

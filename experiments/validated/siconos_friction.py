@@ -14,7 +14,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The field of each sign of the velocity; between them the block sticks
+# %% One field for each sign of the velocity; at zero velocity the block can stick
 class Block(vi.AbstractMachine):
     friction: jax.Array | float = 1.0
     events = vi.Switch(lambda block, s, state: state.V, slides=True)
@@ -27,7 +27,7 @@ class Block(vi.AbstractMachine):
 start = vi.OscillatorState(jnp.array(12.0), jnp.array(6.0))
 run = vi.simulate(Block(), start, 8, method=vi.Adaptive(rtol=1e-12))
 
-# %% Of the reference file the row after each turn, which is within a step of 0.01
+# %% Theirs is the row of the reference file after each turn, within a step of 0.01
 comparison = Comparison(
     "Siconos",
     "https://github.com/siconos/siconos-tutorials, `examples/mechanics/FrictionOscillator`",
@@ -39,7 +39,7 @@ comparison = Comparison(
         ("third turn", "9.3179", run.y_max[2], 5e-4),
         ("sixth turn", "-3.3179", run.y_min[5], 5e-4),
         ("where it stops", "0.6820", run.last.Y, 5e-4),
-        # Of a run of 22 units of time at 1e-12.
+        # The run lasts 8π units of time, with a tolerance of 1e-12.
         ("where it stops, in closed form", "0.682178936724", run.last.Y, 1e-10),
     ],
 )

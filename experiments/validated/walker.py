@@ -14,7 +14,7 @@ from _comparison import Comparison
 jax.config.update("jax_enable_x64", True)
 
 
-# %% The state: angle of the leg that stands, its rate, the angle between both legs, its rate
+# %% The state: angle of the stance leg, its rate, the angle between both legs, its rate
 def legs(a, w):  # just after a heel strike
     return tuple(map(jnp.asarray, (a, w, 2 * a, w * (1 - jnp.cos(2 * a)))))
 
@@ -26,7 +26,7 @@ apart = lambda walker, s, x: x[2] < -0.05  # the foot scuffs the ground as the l
 
 class Walker(vi.AbstractMachine):
     slope: jax.Array | float = 0.009
-    cycle: float = 4.0  # about how long a step takes
+    cycle: float = 4.0  # about the duration of a step
     events: tuple = (vi.Reset(strikes, changed, when=apart, ends_cycle=True),)
 
     def field(self, s, x):

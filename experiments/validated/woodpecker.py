@@ -1,8 +1,8 @@
 # %% [markdown]
 """# A woodpecker toy
 
-A sleeve with play on a pole and a bird on a spring at it: three contacts with friction, a sleeve
-that jams and slips, nothing that drives it but its weight. The cycle on which it settles:
+A sleeve with play slides down a pole and carries a bird on a spring. There are three contacts with
+friction; the sleeve jams and slips; weight alone drives the toy. Its periodic motion is compared.
 """
 
 # %%
@@ -13,7 +13,7 @@ from _comparison import Comparison
 
 jax.config.update("jax_enable_x64", True)
 
-# %% The friction is 0.3, as in theirs
+# %% The friction coefficient is 0.3, as in theirs
 toy = vi.machines.Woodpecker()
 run = vi.simulate(toy, toy.start(), 1, settle=150, event_log=16)
 assert run.duration is not None and run.event_log is not None
