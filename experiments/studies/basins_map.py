@@ -1,11 +1,11 @@
 # %% [markdown]
 # # Basins of coexisting motions
 #
-# Where several motions are stable at one parameter point, the start decides. `vi.basins` simulates
-# a grid of starts, finds the motions on the way and labels each start. Does it find all? For
-# comparison `vi.all_orbits` searches from random starts for motions of 1 to 6 cycles by Newton's
-# method, stable or not. The shares of the grid are compared with those of random starts, and the
-# stability of each motion with its Lyapunov exponents.
+# If several motions are stable for the same parameters, the start decides between them. `vi.basins`
+# simulates a grid of starts, finds the motions and labels each start. Does it find all of them? For
+# comparison, `vi.all_orbits` searches for motions of 1 to 6 cycles, stable or not, by Newton's
+# method from random starts. The shares of the grid are compared with those of random starts. The
+# stability of each motion is compared with its Lyapunov exponents.
 #
 # Run with `python experiments/studies/basins_map.py` (`--quick` for a coarse grid and few cycles).
 
@@ -30,7 +30,7 @@ SIDE, SETTLE, SAMPLES = (32, 400, 400) if QUICK else (160, 3000, 8192)
 GUESSES, PERIODS = (128, 2) if QUICK else (4096, 6)
 WATCHED = 600  # a whole number of periods of every motion found here
 LETTERS = "ABCDEFGHIJ"
-# Impacts lie near φ = 0; look half a turn later.
+# Impacts lie near φ = 0, so the section is half a turn later.
 MACHINE = vi.Scene.ideal(
     frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.002
 ).at_section(np.pi)
@@ -55,7 +55,7 @@ say(searched)
 
 
 def twin(one: vi.Attractor, others: Any) -> vi.Attractor | None:
-    """The same motion among others."""
+    """Return the same motion among others; `None` if it is not there."""
     here = np.array([one.sections["Y"][0], one.sections["V"][0]])
     for other in others:
         points = np.stack([other.sections["Y"], other.sections["V"]], axis=1)
@@ -65,7 +65,7 @@ def twin(one: vi.Attractor, others: Any) -> vi.Attractor | None:
 
 
 def size_of(one: vi.Attractor) -> float:
-    """The size of its greatest multiplier over the period, from Lyapunov exponents."""
+    """Return the modulus of the largest multiplier over the period, from Lyapunov exponents."""
     start = MACHINE.start(Y=one.sections["Y"][0], V=one.sections["V"][0])
     seen = vi.lyapunov(MACHINE, start, WATCHED, settle=0, method=vi.ExactFlight())
     return float(np.exp(one.period * seen.per_cycle[0]))

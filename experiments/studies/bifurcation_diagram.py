@@ -1,15 +1,15 @@
 # %% [markdown]
 # # From the 4π motion to chaos, and how
 #
-# The paper's k = 0.8 without damping (ideal drive, d = 2), between ζ = 0.94, where the 4π motion
-# with one impact is stable, and ζ = 1, where the 2π motion is. In between the 4π motion doubles its
-# period. What comes then is computed twice: as a brute-force bifurcation diagram (two starts for
-# each ζ, thousands of drive cycles discarded, one compiled call for all), and as the branches that
-# `continue_orbit` follows.
+# The machine has the paper's k = 0.8 and no damping (ideal drive, d = 2). At ζ = 0.94 the 4π motion
+# with one impact is stable, at ζ = 1 the 2π motion. In between, the 4π motion doubles its period.
+# The motions that follow are computed in two ways. A brute-force bifurcation diagram uses two
+# starts for each ζ, discards thousands of drive cycles, and is one compiled call. `continue_orbit`
+# follows the branches.
 #
-# Shown is the speed V⁻ of every impact: a motion with n impacts in its period is n points, and an
-# impact that is born in a grazing begins at zero. The section is at φ = π, because impacts lie near
-# φ = 0.
+# The figure shows the speed V⁻ of every impact: a motion with n impacts per period gives n points.
+# An impact that appears in a grazing begins at zero speed. The section is at φ = π, because impacts
+# lie near φ = 0.
 #
 # Run with `python experiments/studies/bifurcation_diagram.py` (`--quick` for few values and short
 # runs).
@@ -37,7 +37,7 @@ from tools.study import QUICK, say, write
 from tools.tables import table
 
 K = 0.8
-# Ranges of ζ: the whole, and three stretches of it that are magnified.
+# Ranges of ζ: the whole range, and three parts of it that are magnified.
 PARTS = {
     "wide": (0.94, 1.0), "left": (0.9540, 0.9547), "middle": (0.9920, 0.9934),
     "right": (0.9936, 0.9940),
@@ -60,7 +60,7 @@ def at_half_turn(zeta: Any) -> vi.Scene:
 
 # %%
 def settled(zeta: Any, start: Any) -> tuple[Any, ...]:
-    """Sections Y, impact speeds, the last state and the largest Lyapunov exponent of a lane."""
+    """Return the sections Y, impact speeds, last state and largest Lyapunov exponent of a lane."""
     there, exact = at_half_turn(zeta), vi.ExactFlight()
     begin = there.start(Y=start[0], V=start[1])
     seen = vi.simulate(there, begin, SEEN, settle=SETTLE, method=exact, impact_log=3)
@@ -83,14 +83,15 @@ for p in (8, 4, 2, 1):
 # %% [markdown]
 # ## The branches
 #
-# They begin at two motions that brute force settled on and go on from the special points: from the
-# doublings of the 4π motion to its 8π motion, from where that touches the stop a second time to the
-# 8π motion with three impacts, and from the doubling of the 2π motion to its 4π motion.
+# The first two branches begin at motions that brute force found. The others begin at special
+# points: the 8π motion at the doublings of the 4π motion; the 8π motion with three impacts at the
+# second touch of the stop by the 8π motion; the 4π motion with two impacts at the doubling of the
+# 2π motion.
 
 
 # %%
 def orbit_near(ratio: float, which: int, cycles: int) -> vi.Orbit:
-    """Return the orbit on which the lane of a start that is nearest to this ζ ended."""
+    """Return the orbit reached from start `which` in the lane whose ζ is nearest to `ratio`."""
     mine = np.flatnonzero(start == which)
     i = mine[np.argmin(np.abs(zeta[mine] - ratio))]
     guess = jax.tree.map(lambda x: x[i], last)
@@ -108,7 +109,7 @@ def follow(orbit: vi.Orbit, max_step: float = 0.02) -> vi.Branch:
 
 
 def of(branch: vi.Branch, kind: str) -> list[vi.Point]:
-    """Return the special points of a kind, by ζ."""
+    """Return the special points of a kind, sorted by ζ."""
     return sorted((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
 
 
@@ -117,7 +118,7 @@ paired = follow(of(two_pi, "period-doubling")[0].switch(distance=0.003))
 four_pi = follow(orbit_near(0.945, 1, 2), 0.05)
 eight = [follow(p.switch(distance=0.003)) for p in of(four_pi, "period-doubling")]
 three = follow(of(eight[0], "grazing")[0].switch(distance=0.003))
-# Each branch with its name (none: it is in the legend already) and its colour.
+# Each branch with its name in the legend (empty if the name is there already) and its colour.
 DRAWN = [
     (two_pi, "2π, 1 impact", color_of(1, 1)), (paired, "4π, 2 impacts", color_of(2, 2)),
     (four_pi, "4π, 1 impact", color_of(2, 1)), (eight[0], "8π, 2 impacts", color_of(4)),
@@ -127,7 +128,7 @@ DRAWN = [
 # %% [markdown]
 # ## What was found
 #
-# The closed form's multipliers do not come from the continuation: where one is -1 a period doubles.
+# The closed form's multipliers are independent of the continuation: at -1 the period doubles.
 
 
 # %%
@@ -155,7 +156,7 @@ held = zeta[(period == 2) & (extra == 0) & (zeta > 0.9935)].max(initial=0.0)
 
 
 def in_words(values: np.ndarray, form: str) -> str:
-    """Return the median and the range."""
+    """Return the median and the range as text."""
     return f"{np.median(values):{form}} ({values.min():{form}} … {values.max():{form}})"
 
 
@@ -217,7 +218,7 @@ numbers = {
 
 # %%
 def draw_branches(ax: Axes, growth: bool, bounds: tuple[float, float]) -> None:
-    """Draw impact speeds or growth of all branches: stable solid, unstable dashed."""
+    """Draw the impact speeds or the growth rates of all branches: stable solid, unstable dashed."""
     for branch, _, color in DRAWN:
         size = np.abs(np.asarray(branch.multipliers)).max(axis=1)[:, None]
         what = np.log(size) / branch.cycles if growth else np.asarray(branch.impact_speed)

@@ -1,15 +1,15 @@
 # %% [markdown]
 # # Designing an impact machine by gradient
 #
-# A body on a spring is shaken by an ideal crank and strikes a stop. A striking machine is built for
-# the energy that its impacts leave in the stop: ½ m_C (1 - k²) (V⁻)² each, here per second of the
-# cycle. Which drive frequency ζ, gap Δ and damping c make this power the greatest, if the motion
-# must stay stable with something in hand (largest |Floquet multiplier| ≤ 0.8)?
+# An ideal crank shakes a body on a spring, and the body strikes a stop. The purpose of a percussion
+# machine is the energy that its impacts leave in the stop, ½ m_C (1 - k²) (V⁻)² each. Divided by
+# the time of a cycle, it is a power. Which drive frequency ζ, gap Δ and damping c maximise it, if
+# the motion must stay stable with a margin (largest |Floquet multiplier| ≤ 0.8)?
 #
 # Power and stability are functions of a periodic orbit, and the orbit is a function of the design.
-# `find_orbit` is differentiable by the implicit function theorem, so that one compiled
-# `value_and_grad` gives the power, the multipliers and their slopes. Each step starts its search
-# from the orbit of the step before.
+# `find_orbit` is differentiable by the implicit function theorem. One compiled `value_and_grad`
+# therefore gives the power, the multipliers and the gradient. Each step starts its search from the
+# orbit of the previous step.
 #
 # Run with `python experiments/studies/design_percussion.py` (`--quick` for fewer steps).
 
@@ -35,25 +35,25 @@ from tools.study import QUICK, say, write
 from tools.tables import table
 
 STEPS = 60 if QUICK else 300
-MACHINE = vi.Parameters(restitution=0.5)  # Table 1 of the paper in SI units
+MACHINE = vi.Parameters(restitution=0.5)  # the paper's Table 1, SI units
 LOW, HIGH = np.array([0.5, 0.0, 0.2]), np.array([1.9, 0.12, 1.0])  # ζ, Δ (m), c (N·s/m)
 FIRST = jnp.asarray((np.array([0.9, 0.08, 0.5]) - LOW) / (HIGH - LOW))  # the paper's machine
-# Largest |multiplier| allowed, and largest gap as a part of the amplitude of the free motion.
+# Largest |multiplier| allowed, and largest gap relative to the amplitude of the free motion.
 DESIGNS = {"A": (0.8, np.inf), "B": (0.5, np.inf), "C": (0.8, 0.95)}
 
 # %% [markdown]
 # ## Power and stability of a design
 #
 # A design is a point of the unit cube between the bounds. The modulus of a multiplier has a kink
-# where two real ones become a complex pair, and its slope is infinite there. Jury's conditions say
-# the same without it: both multipliers lie within radius r if and only if
-# |trace|/r ≤ 1 + det/r² and det ≤ r². Here det = k² exp(-2ξT) < 0.25, so that only the first can
-# bind, once for each sign of the trace.
+# where two real ones become a complex pair, and its slope is infinite there. Jury's conditions are
+# equivalent and smooth: both multipliers lie within radius r if and only if |trace|/r ≤ 1 + det/r²
+# and det ≤ r². Here det = k² exp(-2ξT) < 0.25, so only the first can be active, once for each sign
+# of the trace.
 #
-# A stable orbit is of no use to a machine that never gets there. With a gap wider than the
-# amplitude of the free motion the body can go on for ever without a single impact. So there is a
-# third condition, that the gap is at most a part of this amplitude. Design A does without it, B
-# asks for more stability instead, and C is to start by itself.
+# A stable orbit is useless if the machine never reaches it. If the gap is wider than the amplitude
+# of the free motion, the body can move for ever without an impact. A third condition therefore
+# limits the gap relative to this amplitude. Design A has no such limit, B must be more stable
+# instead, and C must start by itself.
 
 
 # %%
@@ -70,12 +70,12 @@ def loss(machine: vi.Parameters, speed: Any) -> Any:
 
 
 class Force(NamedTuple):
-    """The state of the augmented Lagrangian: numbers only, so that nothing recompiles."""
+    """The parameters of the augmented Lagrangian: only numbers, so that nothing is recompiled."""
 
     limit: Any
     """Largest modulus allowed."""
     reach: Any
-    """Largest gap allowed, as a part of the amplitude of the free motion."""
+    """Largest gap allowed, relative to the amplitude of the free motion."""
     price: Any
     """Multiplier of each of the three conditions, W."""
     weight: Any = 5.0
@@ -84,12 +84,12 @@ class Force(NamedTuple):
 
 class Outcome(NamedTuple):
     power: Any
-    """In W."""
+    """Power of the impacts, W."""
     modulus: Any
     excess: Any
-    """Of the three conditions; at most 0 where they are met."""
+    """Violation of each of the three conditions; at most 0 if the condition is met."""
     allowed: Any
-    """Whether an orbit was found, and nowhere is its clearance negative."""
+    """True if an orbit was found and its clearance is nowhere negative."""
     orbit: vi.Orbit
 
 
@@ -125,11 +125,10 @@ class Ascent(NamedTuple):
 
 
 def climb(origin: Any, limit: float, reach: float) -> Ascent:
-    """Follow Adam on the augmented Lagrangian, from `FIRST` with its motion at `origin`.
+    """Minimise the augmented Lagrangian by Adam, from `FIRST` with its orbit near `origin`.
 
-    A step to a design without an admissible orbit of one cycle (beyond a fold, or where the body
-    would pass through the stop) is halved until there is one. Every 20 steps the prices of the
-    conditions are brought up to date.
+    A step is halved until the new design has an admissible orbit of one cycle, which may not exist
+    beyond a fold. The prices of the conditions are updated every 20 steps.
     """
     force = Force(*(jnp.array(x, float) for x in (limit, reach, np.zeros(3), 5.0)))
     design, memory = FIRST, OPTIMISER.init(FIRST)
@@ -162,8 +161,8 @@ say(f"{STEPS * len(ascents)} steps")
 # %% [markdown]
 # ## A check that uses neither the search nor the gradient
 #
-# Direct simulation over 500 cycles, from rest and from random starts: do they come to the orbit,
-# and is its power the one that was promised?
+# Direct simulations over 500 cycles begin at rest and at random starts. Do they reach the orbit,
+# and do they have the predicted power?
 
 # %%
 STARTS = 32 if QUICK else 512
@@ -172,10 +171,8 @@ SPREAD = jax.random.uniform(jax.random.key(0), (2, STARTS))
 
 @jax.jit
 def simulated(design: Any, Y: Any, V: Any) -> tuple[Any, Any, Any]:
-    """Return the last state, the power over the last 100 of 500 cycles, and whether it got there.
-
-    The starts are between 0 and 1.
-    """
+    """Return the last state, the power over the last 100 of 500 cycles, and the run's success.
+    The starts Y and V are scaled to lie between 0 and 1."""
     machine = parameters(design)
     scene = machine.scene(drive="ideal")
 

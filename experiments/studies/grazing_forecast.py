@@ -1,12 +1,12 @@
 # %% [markdown]
 # # Forecasts of what follows a grazing, compared with simulation
 #
-# `vi.grazing` predicts from derivatives at one point what follows when a motion comes to touch a
-# stop. Is it right? Machines are drawn at random: the paper's with an ideal drive, and two bodies
-# on cubic springs. Of each a stable motion of one cycle is followed to where it touches a stop once
-# more. The forecast is taken, and then the machine is simulated at 192 random values of the
-# parameter on each side of the grazing, in the range over which the forecast claims to hold. Rules
-# that use no local map name what these lanes do.
+# When a motion begins to touch a stop, `vi.grazing` predicts the motions that follow, from
+# derivatives at one point. Is it right? Machines are drawn at random: the paper's with an ideal
+# drive, and two bodies on cubic springs. A stable motion of one cycle is continued until it touches
+# a stop once more. The forecast is compared with simulations at 192 random values of the parameter
+# on each side of the grazing, within the range of the forecast. Rules that use no local map
+# classify these simulations.
 #
 # Run with `python experiments/studies/grazing_forecast.py` (`--quick`: one machine of each kind).
 
@@ -37,18 +37,20 @@ from tools.tables import table
 
 LANES, SETTLE, WATCHED, LONGEST = 192, 1000, 128, 40
 METHOD = vi.FixedStep(vi.Verner9(), steps_per_cycle=48)
-# Motions whose largest multiplier is above this are not taken: simulation settles too slowly.
+# Motions with a larger multiplier are not used: simulations of them settle too slowly.
 REMEMBERS = 0.95
-# Sections that differ by less than this share of what they span repeat; and by less than this
-# altogether, where rounding decides.
+# Sections repeat if they differ by less than this share of their range, or by less than this
+# absolute amount, which is due to rounding.
 REPEATS, ROUNDING = 1e-3, 1e-11
-# The size of a motion that begins at the grazing rises with a power of the distance from it in the
-# parameter (1/2 for a rigid stop): the least power that counts.
+# The size of a motion that begins at the grazing grows with a power of the parameter's distance
+# from it (1/2 for a rigid stop). This is the least power that counts as such growth.
 GROWS = 0.15
-# A lane so many times farther away than others, over the root of its offset, has left.
+# A lane has left if its distance, divided by the root of its offset, is this multiple of the
+# median.
 LEFT = 10.0
-# Shares of lanes without a period below which windows lie next to each other, and above which there
-# is chaos alone; and of lanes with period 1 above which the motion persists.
+# With fewer aperiodic lanes than the first share, periodic windows adjoin. With more than the
+# second share there is only chaos. With more lanes of period 1 than the second, the motion
+# persists.
 FEW, ALL = 0.02, 0.96
 
 # %% [markdown]
@@ -57,18 +59,18 @@ FEW, ALL = 0.02, 0.96
 
 # %%
 class TwoBodies(vi.AbstractMachine):
-    """Two bodies on cubic springs, the first shaken; one of them meets a stop. By the phase ωt."""
+    """Two bodies on cubic springs over the phase ωt: the first is shaken, one meets a stop."""
 
     frequency: Any
     damping: Any
     cubic: Any
     coupling: Any
     mass: Any
-    """Of the second over that of the first."""
+    """Mass of the second body over that of the first."""
     gap: Any
     restitution: Any
     second: bool = eqx.field(static=True)
-    """Whether it is the second that meets the stop."""
+    """True if the second body meets the stop, false if the first does."""
     cycle = 2 * np.pi
 
     @property
@@ -88,7 +90,7 @@ class TwoBodies(vi.AbstractMachine):
 
 
 class Drawn(NamedTuple):
-    """A machine whose motion from rest is followed in one of its numbers."""
+    """A machine whose motion from rest is continued in one of its parameters."""
 
     machine: Any
     parameter: str
@@ -100,7 +102,7 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def scene(rng: np.random.Generator) -> Drawn:
-    """The paper's machine with an ideal drive."""
+    """Return the paper's machine with an ideal drive."""
     zeta, xi = rng.uniform(0.25, 2.5), log_uniform(rng, 0.05, 2.5)
     reach = 1 / abs(1 - zeta**2 + 2j * xi * zeta)
     gap = reach * rng.choice([rng.uniform(0.1, 0.95), 1.2])
@@ -113,7 +115,7 @@ def scene(rng: np.random.Generator) -> Drawn:
 
 
 def two_bodies(rng: np.random.Generator) -> Drawn:
-    """Two bodies, the stop just beyond their reach without it, or half of the time well within."""
+    """Return two bodies, with the stop beyond the reach of the free motion or, as often, within."""
     machine = TwoBodies(  # pyright: ignore
         frequency=rng.uniform(0.3, 2.5), damping=log_uniform(rng, 0.1, 3.0),
         cubic=rng.uniform(0.0, 0.5), coupling=rng.uniform(0.2, 2.0), mass=rng.uniform(0.3, 2.0),
@@ -125,8 +127,8 @@ def two_bodies(rng: np.random.Generator) -> Drawn:
 
 
 def grazing_of(drawn: Drawn) -> vi.Point | None:
-    """The first grazing at which the motion of one cycle that the machine settles on from rest
-    touches a stop and is stable until then; `None` without one."""
+    """Return the first grazing with multipliers below `REMEMBERS` on the branch of the one-cycle
+    motion that is reached from rest, or `None`."""
     machine = drawn.machine
     run = vi.simulate(machine, machine.start(), 1, settle=400)
     if not bool(run.successful):
@@ -147,7 +149,7 @@ def grazing_of(drawn: Drawn) -> vi.Point | None:
 
 
 def machines(draw: Any, count: int, seed: int) -> list[tuple[str, vi.Point]]:
-    """So many machines of a kind that graze: the parameter's name and the grazing of each."""
+    """Return the parameter's name and the grazing of `count` machines of a kind."""
     rng, found = np.random.default_rng(seed), []
     while len(found) < count:
         drawn = draw(rng)
@@ -158,27 +160,27 @@ def machines(draw: Any, count: int, seed: int) -> list[tuple[str, vi.Point]]:
 
 
 # %% [markdown]
-# ## The judge: lanes beyond the grazing, named without a local map
+# ## The simulations, classified without a local map
 
 
 # %%
 class Lanes(NamedTuple):
-    """What lanes do, each at its offset of the parameter on the side of the impacts."""
+    """The motions of lanes, each at its parameter's offset on the side with impacts."""
 
     offset: np.ndarray
     distance: np.ndarray
-    """From the motion that grazes, the largest on a section."""
+    """Largest distance of a section from that of the grazing motion."""
     period: np.ndarray
-    """0 without one."""
+    """Period in cycles; 0 without one."""
     touches: np.ndarray
-    """In a period, beyond those of the motion that grazes; NaN without a period."""
+    """Touches in a period, in addition to those of the grazing motion; NaN without a period."""
     side: int
-    """In which sense of the parameter there are more touches."""
+    """Sign of the parameter's change towards more touches."""
 
 
 @jax.jit(static_argnames="name")
 def settled(machine: Any, name: str, values: Any, state: Any) -> tuple[Any, Any, Any]:
-    """Sections, touches and whether it was followed, of each value."""
+    """Return the sections, the touches and the success of the run at each value."""
 
     def one(value):
         there = with_leaf(machine, name, value)
@@ -192,7 +194,7 @@ def settled(machine: Any, name: str, values: Any, state: Any) -> tuple[Any, Any,
 
 @jax.jit(static_argnames="name")
 def goes_on(machine: Any, name: str, values: Any, state: Any) -> Any:
-    """Touches of the motion of one cycle near a state at each value; -1 where none was found."""
+    """Return the touches of the one-cycle motion near a state at each value; -1 if not found."""
 
     def one(value):
         orbit = vi.find_orbit(with_leaf(machine, name, value), state, cycles=1, method=METHOD)
@@ -203,13 +205,13 @@ def goes_on(machine: Any, name: str, values: Any, state: Any) -> Any:
 
 
 def lanes_of(point: vi.Point, name: str, low: float, high: float, seed: int) -> Lanes:
-    """Lanes with random offsets between two sizes, evenly spread by their logarithm."""
+    """Return lanes with random offsets between two sizes, uniform in the logarithm."""
     rng = np.random.default_rng(seed)
     size = np.sort(np.exp(rng.uniform(np.log(low), np.log(high), LANES)))
     machine, state, base = point.orbit.machine, point.orbit.state, int(point.orbit.impacts)
     at = np.concatenate([point.parameter + size, point.parameter - size])
     rows, hits, good = map(np.asarray, settled(machine, name, jnp.asarray(at), state))
-    # The motion that grazes goes on, with its touches, on the side without impacts.
+    # The grazing motion persists, with its number of touches, on the side without impacts.
     counts = np.asarray(goes_on(machine, name, jnp.asarray(at[:: LANES // 8]), state)) == base
     above, below = counts.reshape(2, -1).sum(axis=1)
     side = 1 if below >= above else -1
@@ -227,7 +229,7 @@ def origin(point: vi.Point) -> np.ndarray:
 
 
 def period_of(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
-    """The least period of a lane, or 0."""
+    """Return the least period of a lane, or 0."""
     span = np.ptp(rows, axis=0).max()
     for p in range(1, LONGEST + 1):
         apart = np.abs(rows[p:] - rows[:-p]).max()
@@ -238,8 +240,8 @@ def period_of(rows: np.ndarray, more: np.ndarray, distance: float) -> int:
 
 
 def folds(point: vi.Point, name: str, side: int) -> bool:
-    """Whether the motion of one cycle with a touch more is on the side without impacts. It has to
-    repeat when it is simulated, and to touch once more."""
+    """Return whether the motion of one cycle with one more touch is on the side without impacts.
+    The simulated motion must repeat, and must have that touch."""
     for distance in (1e-4, 1e-5, 1e-3):
         with contextlib.suppress(ValueError):
             orbit = point.switch(distance=distance)
@@ -253,10 +255,10 @@ def folds(point: vi.Point, name: str, side: int) -> bool:
 
 
 def verdict(point: vi.Point, name: str, lanes: Lanes) -> str:
-    """The name in `vi.SCENARIOS` of what the lanes do.
+    """Return the name in `vi.SCENARIOS` of the scenario that the lanes show.
 
     The rules are on the study's page. Distances are compared between the third of the lanes nearest
-    to the grazing and the farthest third; of lanes that stay near, periods and touches count.
+    to the grazing and the farthest third. Periods and touches are taken from lanes that stay near.
     """
     third = LANES // 3
     near, far = (np.median(lanes.distance[part]) for part in (slice(third), slice(-third, None)))
@@ -281,8 +283,8 @@ def verdict(point: vi.Point, name: str, lanes: Lanes) -> str:
 
 
 def rises(offset: np.ndarray, period: np.ndarray, single: np.ndarray) -> bool:
-    """Whether the periods of motions with one touch rise towards the grazing, one of them next to
-    another."""
+    """Return whether the periods of motions with one touch increase towards the grazing, and at
+    least two of these periods are consecutive numbers."""
     kinds = np.unique(period[single])
     places = [np.median(np.log(offset[single & (period == n)])) for n in kinds]
     return len(kinds) > 1 and bool((np.diff(places) < 0).all() and (np.diff(kinds) == 1).any())
@@ -294,13 +296,13 @@ def rises(offset: np.ndarray, period: np.ndarray, single: np.ndarray) -> bool:
 
 # %%
 def compared(kind: str, draw: Any, count: int, seed: int) -> list[dict[str, Any]]:
-    """A forecast and a verdict for each of so many machines of a kind."""
+    """Return a forecast and a verdict for each of `count` machines of a kind."""
     found = []
     for n, (name, point) in enumerate(machines(draw, 1 if QUICK else count, seed)):
         seen = vi.grazing(point, progress=False)
         looked = np.abs(seen.forecast.offset)
         low, high = (looked.min(), looked.max()) if seen.checked is None else seen.checked
-        # Without doubtful small offsets.
+        # Very small offsets are left out, because rounding may decide there.
         low = min(max(low, 1e-9 * abs(point.parameter)), 0.03 * high)
         lanes = lanes_of(point, name, low, high, n)
         forecast, judged = repr(seen.outcome).split(".")[-1], verdict(point, name, lanes)
@@ -313,7 +315,7 @@ def compared(kind: str, draw: Any, count: int, seed: int) -> list[dict[str, Any]
 
 
 def row_of(one: dict[str, Any]) -> list[str]:
-    """A machine in the table."""
+    """Return the table's row of a machine."""
     point, seen, period = one["point"], one["seen"], one["lanes"].period
     common = Counter(int(p) for p in period if p).most_common(4)
     return [
@@ -326,13 +328,13 @@ def row_of(one: dict[str, Any]) -> list[str]:
 
 
 def by_period(period: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
-    """Words, colour and which lanes, by period."""
+    """Return the label, the colour and the mask of the lanes, for each period."""
     few = [(f"period {n}", color, period == n) for n, color in ((1, BLUE), (2, GREEN), (3, ORANGE))]
     return [*few, ("longer", RED, period > 3), ("none", "0.6", period == 0)]
 
 
 def picture(shown: dict[str, dict[str, Any]]) -> Figure:
-    """Lanes of one machine for each verdict: distance from the motion that grazes, and period."""
+    """Draw the lanes of one machine for each verdict: distance from the grazing motion, period."""
     figure = Figure(figsize=(2.8 * len(shown), 3.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(shown)))
     for ax, (name, one) in zip(axes, shown.items(), strict=True):
@@ -343,7 +345,7 @@ def picture(shown: dict[str, dict[str, Any]]) -> Figure:
         ax.set_xlabel(f"distance in {one['name']}", fontsize=8)
         ax.tick_params(labelsize=8)
         for axis, values in ((ax.xaxis, lanes.offset), (ax.yaxis, lanes.distance)):
-            axis.set_minor_formatter(NullFormatter())  # else labels overlap within a decade
+            axis.set_minor_formatter(NullFormatter())  # labels overlap within a decade
             low, high = values.min(), values.max()
             axis.set_view_interval(min(low / 1.3, 0.1 * high), max(high * 1.3, 10 * low))
     axes[0].set_ylabel("distance of the motion", fontsize=8)

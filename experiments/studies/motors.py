@@ -1,12 +1,12 @@
 # %% [markdown]
 # # Motors of limited power
 #
-# The paper's Figure 2 belongs to an ideal drive, which turns at the frequency ratio ζ whatever the
-# machine does to it. A motor obeys its control κ only as far as its torque goes: ζ is an outcome.
+# The paper's Figure 2 has an ideal drive, which turns at the frequency ratio ζ under any load. The
+# torque of a motor is limited: its control κ is a parameter, and ζ is a result.
 #
-# For Table 1's machine κ is run up and closed down with strong and weak motors, with the stop at 2a
-# and out of reach. The 2π motions are continued in κ through their folds. Both are compared with a
-# forecast from the ideal machine's load in closed form (Kononenko's method).
+# For Table 1's machine κ is swept up and down with strong and weak motors. The stop is at 2a or out
+# of reach. The 2π motions are continued in κ through their folds. Both are compared with a forecast
+# from the closed-form load of the ideal machine (Kononenko's method).
 #
 # Run with `python experiments/studies/motors.py` (`--quick` for coarser sweeps, and no files).
 
@@ -38,7 +38,7 @@ Key = tuple[float, float]
 
 # %%
 K, NEAR, FAR = 0.5, 0.08, 0.8  # restitution; gaps in metres, 2a and 20a: the free motion needs 11a
-# The largest κ of the sweeps, beyond each jump.
+# The largest κ of each sweep; every jump lies below it.
 HIGHEST: dict[Key, float] = {
     (100.0, NEAR): 1.9, (10.0, NEAR): 1.9, (2.0, NEAR): 1.9,
     (0.2, NEAR): 2.6, (0.1, NEAR): 3.6, (0.05, NEAR): 5.6,
@@ -62,8 +62,8 @@ COUPLING = float(BASE.drive.coupling)
 
 
 def one_sweep(torque, gap, kappas):
-    """Sweep κ. The strongest motor pulls its shaft back at the rate τ0/κ per radian, 13 at T0 = 100
-    and κ = 0.5, and an explicit solver with 12 steps a cycle diverges there."""
+    """Sweep κ. The speed of the strongest motor relaxes at the rate τ0/κ per radian, which is 13 at
+    T0 = 100 and κ = 0.5. An explicit solver with 12 steps per cycle diverges there."""
     swept = eqx.tree_at(
         lambda s: (s.drive.strength, s.drive.control, s.stops[0].gap),
         BASE,
@@ -94,7 +94,7 @@ def jump(sweep: vi.Sweep) -> tuple[float, float]:
 # %% [markdown]
 # ## The 2π motions in κ, with one impact and with none
 #
-# They begin at motions that the sweeps met.
+# The branches begin at motions that the sweeps found.
 
 # %%
 branches: dict[tuple[Key, int], vi.Branch] = {}
@@ -111,7 +111,7 @@ for key, impacts in [(key, n) for n in (1, 0) for key in HIGHEST if n == 0 or ke
 
 
 def special(key: Key, way: str) -> vi.Point:
-    """Return where the continued branches end or turn, so that a sweep must jump."""
+    """Return the point at which a branch ends or folds, so that a sweep must jump there."""
     up = way == WAYS[0]
     points = branches[key, 1 if up and key[1] == NEAR else 0].special
     folds = [p for p in points if p.kind == "fold"]
@@ -123,15 +123,15 @@ def special(key: Key, way: str) -> vi.Point:
 # %% [markdown]
 # ## The forecast from the ideal machine
 #
-# The shaft's energy returns after a cycle, so that the motor's mean torque pays for the mean load
-# ε <Y sin φ>, a first Fourier coefficient of Y. With an ideal drive the projection of
-# ζ² Y'' + 2ξζ Y' + Y = cos φ - (1+k) V⁻ ζ δ(φ - φ0) on exp(-iφ) gives it in closed form. A motor
-# then runs at κ = ζ + L(ζ)/τ0 if its speed hardly varies within a cycle.
+# The shaft's energy is the same after a cycle. The mean torque of the motor therefore equals the
+# mean load ε <Y sin φ>, a first Fourier coefficient of Y. With an ideal drive,
+# ζ² Y'' + 2ξζ Y' + Y = cos φ - (1+k) V⁻ ζ δ(φ - φ0). Its projection on exp(-iφ) gives the load L in
+# closed form. A motor with nearly constant speed runs at κ = ζ + L(ζ)/τ0.
 
 
 # %%
 def load(zeta: np.ndarray, speed: Any = 0.0, phase: Any = 0.0) -> np.ndarray:
-    """Return the mean load torque in units of Jω²; without impacts if no speed is given."""
+    """Return the mean load torque in units of Jω²; the default speed 0 means no impacts."""
     kick = (1 + K) * speed * zeta * np.exp(-1j * phase) / (2 * np.pi)
     return -COUPLING * np.imag((0.5 - kick) * vibration(zeta, XI))
 
@@ -144,8 +144,8 @@ def ideal(zeta: Any) -> vi.ClosedFormOrbits:
 
 
 ZETAS = np.sort(np.concatenate([np.linspace(0.4, 3.0, 2601), np.linspace(1.40, 1.45, 501)]))
-# In batches of 256: batched LAPACK calls of two thousand matrices may wait for each other forever
-# where XLA has only two threads.
+# Batches of 256 are needed: with only two threads of XLA, batched LAPACK calls of two thousand
+# matrices may deadlock.
 exact = jax.jit(lambda z: jax.lax.map(ideal, z, batch_size=256))(jnp.asarray(ZETAS))
 exact = jax.tree.map(np.asarray, exact)
 HARD = load(ZETAS, exact.impact_speed[:, 0], exact.impact_phase[:, 0])
@@ -222,7 +222,7 @@ axes[2].set(yscale="log", xlim=(0.5, 1.9), ylim=(1e-3, 2), xlabel="mean frequenc
 gridded(axes, ("ζ against κ, stop out of reach", "ζ against κ, stop at 2a", "Load on the motor"))
 for ax in axes:
     handles, labels = ax.get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))  # each once
+    named = dict(zip(labels, handles, strict=True))  # each label once
     ax.legend(named.values(), named, fontsize=8.5, framealpha=0.9)
 figure.suptitle("○ run-up, × close-down; lines: 2π motions continued in κ (dashed: unstable)")
 

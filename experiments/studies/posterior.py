@@ -1,12 +1,12 @@
 # %% [markdown]
-# # What a record tells about a stop: posteriors by NUTS, and whether they can be trusted
+# # Bayesian inference of a stop's parameters by NUTS, and a test of the posteriors
 #
-# A body is watched for four drive cycles as it leaves rest and meets its stop a few times: 64
-# noisy positions. What can be known from them of the restitution k, the gap d and the damping
-# ratio ξ is their posterior. It is sampled here by the no-U-turn sampler of BlackJAX, with
-# gradients that go through the impacts, and kept for ArviZ.
+# A body moves from rest for four drive cycles and meets its stop a few times. Its record is 64
+# noisy positions. The restitution k, the gap d and the damping ratio ξ have a posterior given this
+# record. The no-U-turn sampler of BlackJAX samples it with gradients through the impacts. The draws
+# are stored for ArviZ.
 #
-# Whether such intervals are honest is tested by ranks as Talts et al. (arXiv 1804.06788) do.
+# The calibration of the intervals is tested by ranks, as by Talts et al. (arXiv 1804.06788).
 #
 # Run with `python experiments/studies/posterior.py` (`--quick` for few records, writes nothing).
 # It needs the extra `bayes`: `pip install 'vi_jax[bayes]'`.
@@ -41,40 +41,40 @@ LABELS = ("restitution k", "gap d (a)", "damping ratio ξ")
 # %% [markdown]
 # ## Model and prior
 #
-# The unknowns z are standard normal before the record is seen; what they stand for is in its range
-# whatever they are: k by the normal distribution function, d and ξ by an exponential.
+# The prior of the unknowns z is standard normal. Every z gives valid parameters: k by the normal
+# distribution function, d and ξ by an exponential.
 
 
 # %%
 def numbers_of(z: Any) -> Any:
-    """k, d and ξ."""
+    """Return k, d and ξ."""
     return jnp.stack(
         [0.3 + 0.6 * norm.cdf(z[0]), 1.2 * jnp.exp(0.1 * z[1]), 0.05 * jnp.exp(0.4 * z[2])]
     )
 
 
 def run_of(z: Any) -> vi.Run:
-    """The motion from rest."""
+    """Simulate the motion from rest."""
     k, d, xi = numbers_of(z)
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=k, gap=d, damping_ratio=xi)
     return vi.simulate(scene, scene.start(), CYCLES, method=vi.ExactFlight(), samples=SAMPLES)
 
 
 def positions(z: Any) -> Any:
-    """What would be seen without noise."""
+    """Return the record without noise."""
     samples = run_of(z).samples
     assert samples is not None
     return samples.state.Y[1:]
 
 
 def log_density(z: Any, record: Any) -> Any:
-    """Of the posterior, up to a constant."""
+    """Return the logarithm of the posterior density, up to a constant."""
     missing = (record - positions(z)) / NOISE
     return -0.5 * jnp.sum(missing**2) - 0.5 * jnp.sum(z**2)
 
 
 def posterior(key: Any, record: Any, begin: Any) -> tuple[Any, Any, Any]:
-    """Draws of z, their acceptance, and which of them ended in a divergence."""
+    """Return draws of z, their acceptance rates, and flags of divergent transitions."""
 
     def of_record(z: Any) -> Any:
         return log_density(z, record)
@@ -106,7 +106,7 @@ impacts = np.asarray(vi.jit(jax.vmap(lambda z: run_of(z).impacts.sum()))(truth))
 
 
 def start_of(record: Any) -> Any:
-    """Where a walk begins: at the best of some draws from the prior."""
+    """Return the start of a chain: the most probable of 256 draws from the prior."""
     tried = jax.random.normal(jax.random.key(7), (256, 3))
     return tried[jnp.argmax(jax.vmap(lambda z: log_density(z, record))(tried))]
 
@@ -123,7 +123,7 @@ found = np.asarray(jax.vmap(jax.vmap(numbers_of))(draws))
 # %%
 low, high = np.quantile(found, [0.05, 0.95], axis=1)
 covered = (low <= known) & (known <= high)
-# Neighbouring draws are alike, so that every fourth counts.
+# Neighbouring draws are correlated, so only every fourth is used.
 ranks = (found[:, ::4] < known[:, None]).mean(axis=1)
 p_values = [kstest(ranks[:, i], "uniform").pvalue for i in range(3)]
 prior = np.quantile(
@@ -137,7 +137,7 @@ for i, name in enumerate(LABELS):
 # %% [markdown]
 # ## One of them for ArviZ
 #
-# Four walks from different places: they must agree.
+# Four chains from different starts must agree.
 
 
 # %%
@@ -161,7 +161,7 @@ print(summary)
 
 # %%
 def draw() -> Figure:
-    """One record with its posterior; ranks of the true numbers."""
+    """Draw one record with its posterior, and the ranks of the true parameters."""
     figure = Figure(figsize=(10, 6.2))
     figure.set_layout_engine("constrained")
     grid = figure.add_gridspec(2, 6)
@@ -194,7 +194,7 @@ def draw() -> Figure:
 
 
 def page() -> str:
-    """The tables."""
+    """Return the study's page with its tables."""
     rows = [
         (name, f"{covered[:, i].mean():.1%}", f"{p_values[i]:.2f}", f"{narrower[i]:.2f}")
         for i, name in enumerate(LABELS)

@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Regime maps
 #
-# What the ideally driven machine (d = 2) settles on from rest, at every point of the planes (ζ, k)
-# and (ζ, c): the period in drive cycles, chaos, transient chaos (what was chaotic, and is not any
-# more some thousand cycles later), or not settled within 400 cycles. Each map is
-# 256 × 256 simulations by `vi.scan`. The curves laid over come from elsewhere: `vi.boundary`
-# continues the period doubling and the fold of the 2π motion and the second touch of the 4π motion,
-# and the births by grazing lie where the steady vibration without impacts just reaches the stop,
-# 1/|1 - ζ² + 2iξζ| = d. So each checks the other.
+# The maps show the motion that the ideally driven machine (d = 2) reaches from rest, over the
+# planes (ζ, k) and (ζ, c). Regimes are: a period in drive cycles, chaos, transient chaos (which
+# ends within some thousand cycles), or not settled within 400 cycles. Each map is 256 × 256
+# simulations by `vi.scan`. The curves are computed independently. `vi.boundary` continues the
+# period doubling and the fold of the 2π motion, and the second touch of the 4π motion. The 2π
+# motion appears by grazing at the ζ for which the steady vibration without impacts just reaches the
+# stop, 1/|1 - ζ² + 2iξζ| = d. Maps and curves check each other.
 #
 # Run with `python experiments/studies/regime_maps.py` (`--quick` for coarse maps).
 
@@ -51,8 +51,8 @@ Curves = dict[str, list[np.ndarray]]
 # %% [markdown]
 # ## The curves
 #
-# Points (ζ, k) or (ζ, c). With Table 1's damping the 4π motion with one impact is found at k = 0.8,
-# not at 0.5.
+# The curves are points (ζ, k) or (ζ, c). With Table 1's damping the 4π motion with one impact
+# exists at k = 0.8 but not at k = 0.5.
 
 
 # %%
@@ -89,11 +89,11 @@ class Plane(NamedTuple):
     axes: Lanes
     """Values of ζ, k and c; one of k and c has a single value."""
     other: str
-    """What is varied beside ζ: "k" or "c"."""
+    """Name of the second parameter: "k" or "c"."""
     curves: Curves
 
     def lane(self, i: np.ndarray, j: np.ndarray) -> Lanes:
-        """Return the axes' values at places of the map."""
+        """Return the axes' values at indices of the map."""
         place = {"zeta": i, self.other: j}
         return {name: x[place.get(name, np.zeros_like(i))] for name, x in self.axes.items()}
 
@@ -119,7 +119,7 @@ say("curves")
 
 # %%
 def settled(axes: Lanes) -> xr.Dataset:
-    """Return what the machines with these ζ, k and c settle on from rest."""
+    """Return the regimes that machines with these ζ, k and c reach from rest."""
     return vi.scan(
         lambda zeta, k, c: machine(zeta, k, c * XI_PER_C), axes, measure="regime", settle=SETTLE,
         method=vi.ExactFlight(), lanes=768 if QUICK else 4096, workers=2, progress=False,
@@ -132,9 +132,9 @@ class Seen(NamedTuple):
     plane: Plane
     data: xr.Dataset
     period: np.ndarray
-    """In cycles, or one of `vi.REGIMES`: `(SIDE, SIDE)`."""
+    """Period in cycles, or one of `vi.REGIMES`: `(SIDE, SIDE)`."""
     impacts: np.ndarray
-    """In a period: `(SIDE, SIDE)`."""
+    """Impacts in a period: `(SIDE, SIDE)`."""
 
 
 maps = []
@@ -146,16 +146,15 @@ for plane in PLANES:
 # %% [markdown]
 # ## Checks
 #
-# What cannot be, by the closed form.
+# The closed form excludes some regimes.
 
 
 # %%
 def impossible(seen: Seen) -> tuple[int, int, int]:
-    """Count lanes on a motion with one impact, those that cannot be, and free ones likewise.
+    """Count the checked lanes, those that contradict the closed form, and impossible free lanes.
 
-    A lane on a motion with one impact in one or two cycles must have such a motion, stable and
-    admissible, in the closed form (every third lane is looked at); and no lane can be free
-    between the births.
+    Every third lane with one impact in one or two cycles is checked: the closed form must have
+    such a motion that is stable and admissible. Between the births no lane can be free of impacts.
     """
     total = wrong = 0
     for cycles in (1, 2):
@@ -189,7 +188,7 @@ LOOKS = {
 
 
 def rim(width: float) -> list[Any]:
-    """Return a dark rim, by which a pale line is seen on a pale ground."""
+    """Return a dark outline, which makes a pale line visible on a pale background."""
     return [patheffects.Stroke(linewidth=width, foreground="k"), patheffects.Normal()]
 
 
@@ -230,7 +229,7 @@ figure.suptitle(
 
 # %%
 def shares(seen: Seen) -> list[float]:
-    """Return parts of the lanes (percent) by what they settle on."""
+    """Return the shares of the lanes in each kind of regime, in percent."""
     free, p, n, R = seen.impacts == 0, seen.period, seen.impacts, vi.REGIMES
     parts = [
         free & (p > 0), free & (p == R.unsettled), ~free & (p == 1), ~free & (p == 2) & (n == 1),
@@ -283,7 +282,7 @@ then. {SIDE} × {SIDE} lanes a map by `ExactFlight`.
   after some {lasting:,} cycles.
 """
 print(page)
-# With Table 1's damping nearly all lanes settle, so that a test finds these parts on fewer lanes.
+# With Table 1's damping nearly all lanes settle: a test finds these shares with fewer lanes.
 kept = {KINDS[i]: round(shares(maps[1])[i], 2) for i in (0, 2, 3)}
 numbers = {f"{maps[1].plane.title}: {name}": value for name, value in kept.items()}
 write("regime_maps", page, numbers, figure, dpi=90, colors=200)

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # A relief valve, from rest to chatter
 #
-# A machine that nothing drives: its cycles end where the lift is greatest, and have lengths of
-# their own. Over the flow rate q the open valve loses its rest (Hopf), its oscillation touches the
-# seat (grazing), and chaos and windows follow (Hős and Champneys, Physica D 241, 2012). Branches
-# are followed through all of it, beside what 600 valves settle on.
+# The machine is autonomous. A cycle ends at a maximum of the lift, so its duration varies. The open
+# valve loses its stability as the flow rate q decreases (Hopf). Then its oscillation touches the
+# seat (grazing). Chaos with windows follows (Hős and Champneys, Physica D 241, 2012). Branches are
+# continued through this range and compared with simulations of 600 valves.
 #
 # Run with `python experiments/studies/relief_valve.py` (`--quick` for fewer, writes nothing).
 
@@ -31,7 +31,7 @@ SETTLE, SEEN = (100, 16) if QUICK else (600, 64)
 BOUNDS = (0.3, 9.0)
 
 # %% [markdown]
-# ## What valves settle on
+# ## Simulations of many valves
 
 
 # %%
@@ -49,7 +49,7 @@ lifts, impacts, good = (np.asarray(x) for x in vi.jit(jax.vmap(settled))(jnp.asa
 assert good.all()
 
 # %% [markdown]
-# ## Branches: the oscillation, the one that hits the seat, and those of twice the period
+# ## Branches: the free oscillation, the one with an impact, and those of twice the period
 
 
 # %%
@@ -67,7 +67,7 @@ doubled = [followed(p.switch()) for p in doublings]
 
 
 def growth(rate: float) -> float:
-    """The greatest real part of the eigenvalues of the open valve at rest."""
+    """Return the greatest real part of the eigenvalues of the open valve at rest."""
     lift: Any = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)
     root = np.sqrt(lift + 10)
     jacobian = [[0, 1, 0], [-1, -1.25, 1], [-20 * root, 0, -10 * lift / root]]
