@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Long chains beside heyoka
 #
-# N masses in a row, each tied to its neighbours by springs and dashpots, the first also to a wall
-# that shakes it; the last one strikes a stop. Either the springs are linear, and the chain is a
-# `vi.machines.Structure` flown in closed form, or they have a cubic part as well, and the machine
-# is written with slices of arrays and integrated. heyoka solves the same equations by Taylor series
-# with an event at the stop, in batches of eight, with and without its compact mode, at a tolerance
-# of 1e-9; vi_jax's setting is the fastest of those at least as accurate. One core, which both codes
-# are pinned to; rounds are interleaved, compile time is apart.
+# N masses in a row are coupled by springs and dashpots. A moving wall shakes the first one, and the
+# last one strikes a stop. With linear springs the chain is a `vi.machines.Structure` with a
+# closed-form solution. With cubic springs the machine is written with slices of arrays and
+# integrated. heyoka solves the same equations by Taylor series with an event at the stop, in
+# batches of eight, with and without its compact mode, at a tolerance of 1e-9. vi_jax uses its
+# fastest setting that is at least as accurate. Both codes run on one core. Rounds are interleaved,
+# and compile time is separate.
 #
 # Run with `python experiments/benchmarks/chains.py` (extra `bench`; `--quick` for few masses,
 # writes nothing).
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-# One core for all, chosen before any library counts them.
+# All codes use one core, which is chosen before any library counts the cores.
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
@@ -33,7 +33,7 @@ import vi_jax as vi
 from vi_jax.plot.colors import BLUE, GREEN, RED
 
 jax.config.update("jax_enable_x64", True)
-# What an earlier run compiled would take no time.
+# Without this, heyoka would reuse compiled code of an earlier run.
 hy.llvm_state.set_diskcache_enabled(False)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
@@ -51,17 +51,17 @@ BATCH = 8
 
 # %%
 class Code(NamedTuple):
-    """One way to fly a chain, ready to run."""
+    """One code with its settings, compiled for a chain."""
 
     name: str
     run: Callable[[], Any]
-    """Final displacements of the lanes; (lanes, masses)."""
+    """Return the final displacements of the lanes, (lanes, masses)."""
     compiling: float
-    """Seconds."""
+    """Compile time, seconds."""
 
 
 def ours(name: str, cubic: float, size: int, method: Any, cycles: int = CYCLES) -> Code:
-    """vi_jax with a method."""
+    """Return vi_jax with a method."""
 
     def lane(frequency):
         machine = cubic_chain(frequency, cubic, size) if cubic else linear_chain(frequency, size)
@@ -82,11 +82,11 @@ def ours(name: str, cubic: float, size: int, method: Any, cycles: int = CYCLES) 
 
 
 def heyokas(name: str, cubic: float, size: int, compact: bool) -> Code:
-    """heyoka with a terminal event at the stop."""
+    """Return heyoka with a terminal event at the stop."""
     x = [hy.make_vars(f"x{i}") for i in range(size)]
     v = [hy.make_vars(f"v{i}") for i in range(size)]
     omega = hy.par[0]
-    # Stretch of each spring, and how fast; the wall's motion enters as a force on the first mass.
+    # Stretch and stretch rate of each spring; the wall's motion is a force on the first mass.
     stretch = [x[0], *(x[i] - x[i - 1] for i in range(1, size))]
     rate = [v[0], *(v[i] - v[i - 1] for i in range(1, size))]
     pull = [
@@ -133,13 +133,13 @@ def heyokas(name: str, cubic: float, size: int, compact: bool) -> Code:
 # %% [markdown]
 # ## Measured
 #
-# The error is the median over lanes of the largest difference of a mass's final place from that of
-# the closed form (linear springs), or of series at a tolerance of 1e-14 (cubic ones).
+# The error is the median over lanes of the largest error of a final displacement. The truth is the
+# closed form for linear springs, and series at a tolerance of 1e-14 for cubic ones.
 
 
 # %%
 def codes_of(cubic: float, size: int) -> list[Code]:
-    """The contestants: vi_jax's settings first, heyoka last."""
+    """Return all compared codes: vi_jax's settings first, heyoka last."""
     if not cubic:
         settings: list[tuple[str, Any]] = [("vi_jax, closed form", vi.ExactFlight())]
     else:
@@ -159,7 +159,7 @@ for cubic in (0.0, 0.3):
         exact = vi.ExactFlight() if not cubic else vi.Taylor(rtol=1e-14)
         truth = ours("truth", cubic, size, exact).run()
         errors = [float(np.median(np.abs(x.run() - truth).max(axis=1))) for x in codes]
-        if not cubic:  # The closed form's own error, by series that know nothing of modes.
+        if not cubic:  # The closed form's error, measured by an integrator without modes.
             series = ours("series", 0.0, size, vi.Adaptive(rtol=1e-13)).run()
             errors[0] = float(np.median(np.abs(series - truth).max(axis=1)))
         with vi.threads(1):

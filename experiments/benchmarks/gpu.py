@@ -1,9 +1,9 @@
 # %% [markdown]
 # # vi_jax on a GPU
 #
-# Table 1's machine (T0 = 10 N·m, d = 2, k = 0.5) over κ or ζ from 0.5 to 1.9, 200 drive cycles, in
-# double and in single precision, in batches of 100,000 lanes. Arithmetic is counted by XLA for one
-# step of one lane; a sine, a root or a comparison counts as one operation.
+# Table 1's machine (T0 = 10 N·m, d = 2, k = 0.5) runs for 200 drive cycles, with κ or ζ from 0.5 to
+# 1.9. Precision is double or single, and batches have 100,000 lanes. XLA counts the arithmetic of
+# one step of one lane; a sine, a root or a comparison is one operation.
 #
 # `python experiments/benchmarks/gpu.py` measures JAX's default device and prints a table, with
 # `--batch 500000` in larger batches. With `JAX_PLATFORMS=cpu` it measures the processor instead.
@@ -61,7 +61,7 @@ def measured() -> str:
 
 
 def _machine(task: Task, kappa: jax.Array) -> tuple[vi.Scene, Any]:
-    """The machine and its start, in the precision of κ."""
+    """Return the machine and its start, in the precision of κ."""
     numbers = (task.tau0, task.eps, task.mu, task.xi, task.gap, task.k)
     tau0, eps, mu, xi, gap, k = (jnp.asarray(x, kappa.dtype) for x in numbers)
     motor = vi.Motor(tau0, kappa, eps, mu, jnp.ones_like(kappa))
@@ -73,7 +73,7 @@ def _machine(task: Task, kappa: jax.Array) -> tuple[vi.Scene, Any]:
 
 
 def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
-    """The numbers of one method in one precision, for each number of lanes."""
+    """Return the table's rows of one method in one precision, for each number of lanes."""
     task = Task(drive, 0.5, CYCLES)
 
     def lane(kappa):
@@ -114,7 +114,7 @@ def _rows(drive: str, method: Any, dtype: str) -> list[list[str]]:
 
 # %%
 class _Blocks(vi.Mechanical):
-    """A block on a shaken floor with friction, and another that rubs on a wall and strikes it."""
+    """A block on a shaken floor with friction; a second block with dry friction strikes it."""
 
     q = ("x", "y", "z")
     mass = (1.0, 1.0, 0.5)
@@ -131,7 +131,7 @@ class _Blocks(vi.Mechanical):
 
 
 def _verbs() -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Yield calls of verbs, each with what it is called."""
+    """Yield the name and the call of each verb."""
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
     ready: dict[str, Any] = {"Scene": scene, "Scene with motor": vi.Parameters().scene()}
     kinds = ("ImpactPair", "Capsule", "ReliefValve", "Duffing", "BouncingBall")

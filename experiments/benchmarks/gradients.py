@@ -1,13 +1,14 @@
 # %% [markdown]
 # # Gradients by many numbers
 #
-# What a gradient costs, in simulations of the same lanes: of a motor's lanes by its own numbers, of
-# an oscillator with a stop by the weights of a network that is its spring's force, or its law of
-# restitution. `jax.grad` by more than four numbers goes back along a tape of the steps that were
-# taken. For comparison diffrax differentiates the oscillator without a stop (a loop that ends at
-# events has no reverse mode there): the same network, method and steps, backward by its default,
-# recursive checkpoints. One core, to which all is pinned; rounds are interleaved, compile time is
-# apart.
+# The cost of a gradient is measured in simulations of the same lanes. One machine has a motor, and
+# the gradient is with respect to its parameters. The other is an oscillator with a stop and a
+# neural network, which is its spring's force or its law of restitution. The parameters are the
+# weights. With more than four parameters, `jax.grad` goes backward along a tape of the recorded
+# steps. For comparison, diffrax differentiates the oscillator without a stop, because its loops
+# with events have no reverse mode. It has the same network, method and steps, and its default
+# adjoint, recursive checkpoints. All codes run on one core. Rounds are interleaved, and compile
+# time is separate.
 #
 # Run with `python experiments/benchmarks/gradients.py` (`--quick` for few lanes, writes nothing).
 
@@ -20,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-# One core for all, chosen before any library counts them.
+# All codes use one core, which is chosen before any library counts the cores.
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
@@ -47,7 +48,7 @@ STARTS = jnp.linspace(-0.3, 0.3, LANES)
 
 # %%
 class Task(NamedTuple):
-    """A sum over lanes, and the numbers that it is differentiated by."""
+    """A sum over lanes, and the parameters of its gradient."""
 
     name: str
     code: str
@@ -56,12 +57,12 @@ class Task(NamedTuple):
 
 
 def ours(name: str, machine: Any) -> Task:
-    """By all numbers of a machine."""
+    """Return a gradient with respect to all numbers of a machine."""
     return Task(name, "vi_jax", *last_places(machine, STARTS, CYCLES, METHOD))
 
 
 def by_diffrax(name: str, width: int) -> Task:
-    """The same without a stop, by diffrax."""
+    """Return the same oscillator without a stop in diffrax."""
     machine = oscillator(width, "without")
     numbers, whole = flat(machine)
 
@@ -81,7 +82,7 @@ def by_diffrax(name: str, width: int) -> Task:
 
 
 def tasks() -> list[Task]:
-    """What is measured, by rising number of parameters; without a stop last."""
+    """Return the tasks with increasing number of parameters; those without a stop are last."""
     small, middle, large = (4, 5, 6) if QUICK else (8, 32, 43)
     return [
         ours("motor", vi.Parameters(torque=10.0, restitution=0.5, gap=0.05).scene()),
@@ -100,7 +101,7 @@ def tasks() -> list[Task]:
 
 # %%
 def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
-    """A program, and the seconds that it took to trace and compile."""
+    """Return a program, and the seconds of tracing and compiling."""
     begin = time.perf_counter()
     program = vi.jit(function).lower(*args).compile()
     return program, time.perf_counter() - begin

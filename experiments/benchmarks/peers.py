@@ -1,13 +1,13 @@
 # %% [markdown]
 # # vi_jax beside its peers: same machines, same cores, same error
 #
-# 1,024 lanes with Table 1's machine (T0 = 10 N·m, d = 2), 200 drive cycles, k = 0.5 and 0.8; κ of
-# the motor, or ζ of the ideal drive, from 0.5 to 1.9. Each code runs in its best configuration
-# found (see the files in `peer_codes/`), in processes pinned to their cores before anything is
-# imported: one process for one core, one per core for all of them, the lanes dealt in blocks of
-# neighbours. Where a code has a way of its own to use all cores, that is measured beside it.
-# Rounds are interleaved; compile time is apart. The error is the median difference of the final
-# (Y, V) to a full-precision run, over the lanes that do not amplify 1e-10 beyond 1e-6.
+# 1,024 lanes of Table 1's machine (T0 = 10 N·m, d = 2) run for 200 drive cycles with k = 0.5 and
+# 0.8. The control κ of the motor, or ζ of the ideal drive, is from 0.5 to 1.9. Each code has the
+# best configuration found (see the files in `peer_codes/`). Its processes are pinned to their cores
+# before anything is imported: one process for one core, or one per core. The lanes are distributed
+# in blocks of neighbours. If a code has its own parallel mode, that is measured too. Rounds are
+# interleaved, and compile time is separate. The error is the median error of the final (Y, V),
+# compared with a full-precision run, over the lanes that do not amplify 1e-10 beyond 1e-6.
 #
 # Run with `python experiments/benchmarks/peers.py` (extra `bench`; `--quick` for few lanes, writes
 # nothing).
@@ -35,14 +35,14 @@ from tools.tables import table
 # %% [markdown]
 # ## Ratios at the same error
 #
-# vi_jax's time at a peer's error is read off the straight lines between its own points, both axes
-# logarithmic: the fastest of its points or lines that is at least as accurate. A peer that is more
+# The time of vi_jax at a peer's error is interpolated between its points, with both axes
+# logarithmic. The fastest point or line that is at least as accurate counts. A peer that is more
 # accurate than the most accurate point of vi_jax is compared with that point, and marked with <.
 
 
 # %%
 def at_error(rows: list[dict], error: float) -> tuple[float, bool]:
-    """Seconds of vi_jax at an error, and whether it reaches it."""
+    """Return the seconds of vi_jax at an error, and whether it reaches that error."""
     points = sorted((row["error"], row["seconds"]) for row in rows)
     if error < points[0][0]:
         return points[0][1], False
@@ -59,7 +59,7 @@ HEADS = ["method", "compile, s", "run, s", "median error", "lost", "time / vi_ja
 
 
 def row_of(row: dict[str, Any], compared: list[dict]) -> list[str]:
-    """A code in the table; `compared` are the rows of vi_jax that it is set against."""
+    """Return the table's row of a code; `compared` are the rows of vi_jax for its ratio."""
     sampled = "" if row["lanes"] == LANES else f" ({row['lanes']} lanes, scaled up)"
     known, ratio = np.isfinite(row["error"]), ""
     if known and not row["name"].startswith(OURS):
@@ -76,7 +76,7 @@ def row_of(row: dict[str, Any], compared: list[dict]) -> list[str]:
 
 
 def section(key: str, found: dict[str, Any]) -> str:
-    """One machine on one core or on all."""
+    """Return the section of one machine on one core or on all cores."""
     kind, drive, k, used = key.split(", ")
     rows = found["rows"]
     title = f"{drive.capitalize()} drive, k = {k}, {used} core{'s' * (used == 'all')}"
@@ -95,7 +95,7 @@ def section(key: str, found: dict[str, Any]) -> str:
 
 
 def report(sections: dict[str, dict]) -> str:
-    """All tables."""
+    """Return all tables."""
     about = (
         f"{LANES:,} lanes, {CYCLES} cycles; {len(cores())} cores ({platform.processor() or 'CPU'}, "
         f"{platform.machine()}); medians of {ROUNDS} interleaved rounds, of {SLOW_ROUNDS} for the "
@@ -123,7 +123,7 @@ LOOKS = {
 
 
 def picture(sections: dict[str, dict]) -> Figure:
-    """Time against error at the first restitution, a panel for each drive and number of cores."""
+    """Draw time against error at the first restitution, with a panel for each drive and cores."""
     figure, grid = panels(9, 7, 2, 2, sharex="row", sharey="row")
     handles: dict[str, Any] = {}
     for axes, (drive, used) in zip(
@@ -152,7 +152,7 @@ def picture(sections: dict[str, dict]) -> Figure:
 
 
 def headline(sections: dict[str, dict]) -> dict[str, float]:
-    """What a test can compute again: an error of vi_jax's own."""
+    """Return the error of one method of vi_jax, which a test computes again."""
     wanted = f"{OURS} FixedStep(Verner9, 10)"
     rows = sections[f"states, ideal, {RESTITUTIONS[-1]}, one"]["rows"]
     error = next((row["error"] for row in rows if row["name"] == wanted), None)

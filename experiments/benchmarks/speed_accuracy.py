@@ -1,15 +1,15 @@
 # %% [markdown]
 # # Speed against accuracy
 #
-# Every method on the same lanes: Table 1's machine (d = 2, k = 0.8; the motor with T0 = 10 N·m),
-# 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9, from rest. What a method costs
-# is listed with what it gets wrong: the state after few and after many cycles, impact times and
-# counts, extremes, and how often the *regime* comes out wrong, which is what a scan is for.
+# All methods run the same lanes from rest: Table 1's machine (d = 2, k = 0.8; the motor with T0 =
+# 10 N·m) at 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9. The run time of a method is
+# listed with its errors: of the state after few and after many cycles, of impact times and counts,
+# and of extremes. A scan is judged by the share of wrong *regimes*.
 #
-# Truth is `ExactFlight` for the ideal drive and 40 steps of Verner9 a cycle for the motor. Errors
-# are over the lanes that amplify a displacement of 1e-10 to no more than 1e-6 in 1,000 cycles. Run
-# times are medians of five interleaved rounds of 200 cycles, compiled before; what takes one
-# thread is measured on one thread.
+# Truth is `ExactFlight` for the ideal drive and 40 steps of Verner9 per cycle for the motor. Errors
+# are taken over the lanes that amplify a displacement of 1e-10 to at most 1e-6 in 1,000 cycles. Run
+# times are medians of five interleaved rounds of 200 cycles, without compilation. Single-threaded
+# programs are timed on one thread.
 #
 # Run with `python experiments/benchmarks/speed_accuracy.py` (`--quick` for few methods and lanes of
 # the ideal drive).
@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 jax.config.update("jax_enable_x64", True)
-# Single precision is one of the things compared here.
+# Single precision is used on purpose.
 warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
 warnings.filterwarnings("ignore", message="[0-9,]+ of [0-9,]+ lanes failed")
 
@@ -50,17 +50,17 @@ ROUNDS = 3 if QUICK else 5
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 
 # %% [markdown]
-# ## What goes wrong with the motion, with regimes, and what it costs
+# ## Errors of the motion, errors of regimes, and run times
 #
-# One run of many cycles from rest gives the states after few and after many cycles, and in the
-# first few cycles the impact phases, impact counts and extremes. A scan over ζ (or κ) and k gives
-# labels (period, impacts in a period). A lane where two true methods (the truth and `Adaptive` at
-# 1e-13) differ is chaotic or lies on a border; it is left out.
+# A run of many cycles from rest gives the states after few and after many cycles. Its first cycles
+# give the impact phases, impact counts and extremes. A scan over ζ (or κ) and k gives labels
+# (period, impacts per period). A lane is left out if two accurate methods (the truth and `Adaptive`
+# at 1e-13) differ: it is chaotic or near a border.
 
 
 # %%
 def rows_of(drive: str) -> tuple[list[Row], About]:
-    """Every method with one drive."""
+    """Return the rows of all methods with one drive."""
     truth, displaced = observe(TRUTH[drive], drive), observe(TRUTH[drive], drive, shift=1e-10)
     calm = differ(truth.states, displaced.states) < 1e-6
     sure, _ = regimes(TRUTH[drive], drive)
@@ -99,9 +99,9 @@ say("measured")
 
 # %%
 def fastest(rows: list[Row], target: float) -> list[Row]:
-    """The methods whose error 95 lanes in 100 keep below `target`, the fastest first.
+    """Return the fastest method of each family whose error is below `target` in 95 of 100 lanes.
 
-    The error is that of the state after many cycles; of each family the fastest only.
+    The error is that of the state after many cycles. The fastest method is first.
     """
     good = sorted(
         (row for row in rows if row.errors["late95"] <= target), key=lambda row: row.seconds
@@ -113,17 +113,17 @@ def fastest(rows: list[Row], target: float) -> list[Row]:
 
 
 def scanned(row: Row) -> tuple[str, str]:
-    """What the scan said, where there was one."""
+    """Return the share of wrong regimes and the seconds of the scan, or dashes without a scan."""
     return ("–", "–") if np.isnan(row.wrong) else (f"{row.wrong:.2%}", f"{row.scanning:.1f}")
 
 
 def in_words(row: Row) -> str:
-    """A method and what it costs."""
+    """Return a method's name with its run time and its error."""
     return f"{row.choice.name} ({1e3 * row.seconds:.0f} ms, {row.errors['late95']:.0e})"
 
 
 def front(drive: str, target: float) -> list[str]:
-    """The three fastest families that stay below an error, and how much slower the others are."""
+    """Return the three fastest families below an error, with their times over the fastest one's."""
     best = fastest(results[drive][0], target)[:3]
     cells = [in_words(best[0])] if best else ["none"]
     for row in best[1:]:
@@ -132,7 +132,7 @@ def front(drive: str, target: float) -> list[str]:
 
 
 def all_of(row: Row) -> list[str]:
-    """A method with all its errors."""
+    """Return a method's name with all its errors."""
     e = row.errors
     return [
         row.choice.name, f"{row.compiling:.1f}", f"{1e3 * row.seconds:.0f}",

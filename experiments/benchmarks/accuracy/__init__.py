@@ -1,1 +1,1 @@
-"""Parts of `speed_accuracy.py`: its methods, what is measured of them, and the picture."""
+"""Parts of `speed_accuracy.py`: its methods, its measurements and its picture."""

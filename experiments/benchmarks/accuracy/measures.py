@@ -1,4 +1,4 @@
-"""What `speed_accuracy.py` measures of a method."""
+"""The measurements of a method by `speed_accuracy.py`."""
 
 import time
 from typing import NamedTuple
@@ -17,10 +17,10 @@ GRID = 8 if QUICK else 32
 
 
 class Seen(NamedTuple):
-    """What a method says of all lanes."""
+    """The results of a method for all lanes."""
 
     states: np.ndarray
-    """(lanes, cycles + 1, parts of the state)"""
+    """States on the sections, (lanes, cycles + 1, components of the state)."""
     phase: np.ndarray
     counts: np.ndarray
     y_min: np.ndarray
@@ -28,12 +28,12 @@ class Seen(NamedTuple):
 
 
 def observe(choice: Choice, drive: str, *, shift: float = 0.0) -> Seen:
-    """The motion of all lanes."""
+    """Return the motion of all lanes."""
 
     def lane(method, ratio, shift):
         machine = machine_of(drive, ratio)
         start = machine.start(Y=shift)
-        # With d = 2 nothing presses the body on, which a traced gap does not show.
+        # With d = 2 no force holds the body on the stop, but a traced gap does not show this.
         rests = {"method": method, "rests": False}
         long = vi.simulate(machine, start, MANY, record="sections", **rests)
         short = vi.simulate(machine, start, FEW, impact_log=3, **rests)
@@ -48,19 +48,19 @@ def observe(choice: Choice, drive: str, *, shift: float = 0.0) -> Seen:
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The largest difference in each lane; infinite where one of them is no number."""
+    """Return the largest difference in each lane; infinite if only one of two numbers is NaN."""
     apart = np.abs(a.astype(float) - b.astype(float)).reshape(len(a), -1)
     same = np.isnan(a.reshape(len(a), -1)) & np.isnan(b.reshape(len(b), -1))
     return np.where(same, 0, np.where(np.isfinite(apart), apart, np.inf)).max(axis=1)
 
 
 def most(errors: np.ndarray) -> float:
-    """What 95 of 100 lanes stay under."""
+    """Return the 95 % quantile of the lanes' errors."""
     return float(np.quantile(errors, 0.95, method="higher"))
 
 
 def errors_of(seen: Seen, truth: Seen, calm: np.ndarray) -> dict[str, float]:
-    """Errors over the calm lanes."""
+    """Return the errors over the calm lanes."""
     counted = (seen.counts == truth.counts).all(axis=1)
     both = calm & counted
     few = differ(seen.states[:, FEW], truth.states[:, FEW])[calm]
@@ -79,7 +79,7 @@ def errors_of(seen: Seen, truth: Seen, calm: np.ndarray) -> dict[str, float]:
 
 
 def timed(choice: Choice, drive: str) -> Program:
-    """A run of all lanes, for the clock."""
+    """Return a run of all lanes for the measurement of time."""
 
     def lane(method, ratio):
         machine = machine_of(drive, ratio)
@@ -104,7 +104,7 @@ AXES = {
 
 
 def regimes(choice: Choice, drive: str) -> tuple[np.ndarray, float]:
-    """Labels, and the seconds of a second run."""
+    """Return labels, and the seconds of a second run, which is compiled already."""
     with jax.enable_x64(choice.double):
         machine = jtu.tree_map(jnp.asarray, MACHINES[drive])
         axes = {name: x.astype(jnp.result_type(float)) for name, x in AXES[drive].items()}

@@ -27,36 +27,36 @@ class Choice(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As in the tables."""
+        """The name in the tables."""
         return f"{self.family}, {self.label}"
 
 
 def named(solver: str) -> Any:
-    """A solver of vi_jax's or diffrax's."""
+    """Return a solver of vi_jax or diffrax by its name."""
     return vi.Verner9() if solver == "Verner9" else getattr(diffrax, solver)()
 
 
 def fixed(solver: str, steps: int, *, double: bool = True) -> Choice:
-    """Fixed steps."""
+    """Return a method with a fixed number of steps per cycle."""
     single = "" if double else ", float32"
     method = vi.FixedStep(named(solver), steps)
     return Choice(f"FixedStep {solver}{single}", f"{steps} steps", method, double)
 
 
 def adaptive(solver: str, tolerance: float, *, double: bool = True) -> Choice:
-    """Steps by a tolerance."""
+    """Return a method with steps controlled by a tolerance."""
     single = "" if double else ", float32"
     method = vi.Adaptive(named(solver), rtol=tolerance)
     return Choice(f"Adaptive {solver}{single}", f"{tolerance:.0e}", method, double)
 
 
 def series(order: int, tolerance: float) -> Choice:
-    """Power series, their steps by a tolerance."""
+    """Return power series with steps controlled by a tolerance."""
     return Choice(f"Taylor {order}", f"{tolerance:.0e}", vi.Taylor(order, rtol=tolerance))
 
 
 def series_of(order: int) -> Choice:
-    """Power series in eight steps a cycle."""
+    """Return power series with eight steps per cycle."""
     return Choice("Taylor, 8 steps", f"order {order}", vi.Taylor(order, 8))
 
 
@@ -104,7 +104,7 @@ MACHINES = {drive: jtu.tree_map(np.asarray, TABLE.scene(drive=drive)) for drive 
 
 
 def machine_of(drive: str, ratio: Any, restitution: Any = 0.8) -> vi.Scene:
-    """Table 1's machine at ζ (ideal drive) or κ (motor) = `ratio`, in the precision in force."""
+    """Return Table 1's machine at ζ (ideal) or κ (motor) = `ratio`, in the current precision."""
     machine = jtu.tree_map(jnp.asarray, MACHINES[drive])
 
     def numbers(machine):
@@ -116,12 +116,12 @@ def machine_of(drive: str, ratio: Any, restitution: Any = 0.8) -> vi.Scene:
 
 
 def ratios(lanes: int) -> np.ndarray:
-    """ζ or κ of the lanes."""
+    """Return ζ or κ of the lanes."""
     return np.linspace(0.5, 1.9, lanes)
 
 
 class Program(NamedTuple):
-    """A compiled batch on its arguments."""
+    """A compiled batch with its arguments."""
 
     run: Callable[[], Any]
     compiling: float
@@ -131,7 +131,7 @@ _compiled: dict[tuple, tuple[Any, float]] = {}
 
 
 def carried(kind: str, choice: Choice, function: Callable, *arguments: np.ndarray) -> Program:
-    """`function` of a method and a batch, compiled in the choice's precision.
+    """Compile `function` of a method and a batch in the choice's precision.
 
     Tolerances are arguments of the program: a family of adaptive methods is one program.
     """
@@ -152,7 +152,7 @@ def carried(kind: str, choice: Choice, function: Callable, *arguments: np.ndarra
 
 
 def forget(*kinds: str) -> None:
-    """Let go of compiled programs: a process can hold only so many pieces of memory."""
+    """Delete compiled programs, because the memory maps of a process are limited."""
     for key in [key for key in _compiled if key[0].endswith(kinds)]:
         del _compiled[key]
     jax.clear_caches()

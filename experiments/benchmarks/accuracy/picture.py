@@ -17,17 +17,17 @@ class Row(NamedTuple):
     compiling: float
     seconds: float
     wrong: float
-    """Share of regimes labelled wrongly; NaN where no scan was made."""
+    """Share of regimes labelled wrongly; NaN without a scan."""
     scanning: float
 
 
 class About(NamedTuple):
-    """Of the lanes with one drive."""
+    """Numbers of lanes with one drive."""
 
     calm: int
     """Lanes that hardly amplify a displacement."""
     firm: int
-    """Lanes of the scan on which two true methods agree."""
+    """Lanes of the scan for which two accurate methods agree."""
     grid: int
     """All lanes of the scan."""
 
@@ -52,7 +52,7 @@ _STYLE = {
 
 
 def picture(results: dict[str, tuple[list[Row], About]]) -> Figure:
-    """Run time over the error of the state, and over the share of wrong regimes."""
+    """Draw run time over the error of the state, and over the share of wrong regimes."""
     figure = Figure(figsize=(11, 8.6), layout="constrained")
     panels = figure.subplots(2, len(results), squeeze=False)
     for top, bottom, (drive, found) in zip(*panels, results.items(), strict=True):
@@ -71,7 +71,7 @@ def picture(results: dict[str, tuple[list[Row], About]]) -> Figure:
 
 
 def _panels(top: Any, bottom: Any, rows: list[Row], about: About) -> None:
-    """Every family of methods in its colour."""
+    """Draw each family of methods in its colour."""
     for family in dict.fromkeys(row.choice.family for row in rows):
         mine = [row for row in rows if row.choice.family == family]
         color, marker = _STYLE[family.removesuffix(", float32")]

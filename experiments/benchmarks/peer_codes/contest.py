@@ -1,4 +1,4 @@
-"""The measurement of `peers.py`: codes set up on pinned workers, and their interleaved rounds."""
+"""The measurement of `peers.py`: codes built on pinned workers and timed in interleaved rounds."""
 
 import statistics
 import sys
@@ -24,13 +24,13 @@ RESTITUTIONS = (0.5, 0.8)
 
 
 def note(text: str) -> None:
-    """A line on how far the work is."""
+    """Print a line of progress."""
     print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
 
 
 @dataclass
 class Job:
-    """An entry, set up on the workers that it runs on."""
+    """An entry, built on its workers."""
 
     entry: Entry
     workers: list[Worker]
@@ -39,35 +39,35 @@ class Job:
 
     @property
     def lanes(self) -> np.ndarray:
-        """Indices of the lanes that it runs."""
+        """Indices of its lanes."""
         return np.concatenate(self.shares)
 
     def all(self, *message: Any) -> tuple[list, float]:
-        """The same message to all of its workers."""
+        """Send the same message to all of its workers; return their answers and the seconds."""
         return together(self.workers, [message] * len(self.workers))
 
     def begin_build(self, task: Task) -> None:
-        """Send what is to be set up and compiled, without waiting for it."""
+        """Send the entry to the workers to be compiled, without waiting."""
         for worker, share in zip(self.workers, self.shares, strict=True):
             name, code, options = self.entry.name, self.entry.code, self.entry.options
             worker.ask("build", name, code, task, KAPPA[share], options)
 
     def end_build(self) -> None:
-        """Wait for it; the largest of the workers' compile times is kept."""
+        """Wait for the workers, and keep the largest compile time."""
         self.compiling = max(worker.answer() for worker in self.workers)
         note(f"  built {self.entry.name}")
 
     def result(self) -> np.ndarray:
-        """What it gives for its lanes, in the order of `lanes`."""
+        """Return the results of its lanes, in the order of `lanes`."""
         return np.concatenate(self.all("result", self.entry.name)[0])
 
     def timed(self) -> float:
-        """Seconds for all lanes."""
+        """Return the seconds for all lanes, scaled up if the entry runs a sample."""
         return self.all("run", self.entry.name)[1] * LANES / len(self.lanes)
 
 
 class Bench:
-    """The workers, started when they are first needed."""
+    """The workers, which start when they are first needed."""
 
     def __init__(self):
         self.cores = cores()
@@ -76,20 +76,20 @@ class Bench:
 
     @property
     def pinned(self) -> list[Worker]:
-        """A worker on each core."""
+        """One worker on each core."""
         if not self._pinned:
             self._pinned = [Worker([core]) for core in self.cores]
         return self._pinned
 
     @property
     def whole(self) -> Worker:
-        """A worker on all cores."""
+        """One worker on all cores."""
         if self._whole is None:
             self._whole = Worker(self.cores, devices=len(self.cores))
         return self._whole
 
     def jobs(self, listed: list[Entry], task: Task, *, all_cores: bool) -> list[Job]:
-        """Entries, compiled. For one core each sits on some core, so that they compile together."""
+        """Build entries. Those for one core are on different cores, to compile in parallel."""
         jobs = []
         for i, entry in enumerate(listed):
             shares = task.dealt(
@@ -111,7 +111,7 @@ class Bench:
 
 
 def reference(bench: Bench, task: Task, *, jacobian: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """The full-precision results, and which lanes are regular."""
+    """Return the full-precision results, and the mask of the regular lanes."""
     found = []
     for name, shifted in (("reference", 0.0), ("shifted", 1e-10)):
         start = Task(task.drive, task.k, task.cycles, Y0=shifted)
@@ -128,7 +128,7 @@ def reference(bench: Bench, task: Task, *, jacobian: bool = False) -> tuple[np.n
 
 
 def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: bool) -> list[dict]:
-    """A row for each entry, from interleaved rounds."""
+    """Return a row for each entry, measured in interleaved rounds."""
     exact, regular = truth
     jobs = bench.jobs(listed, task, all_cores=all_cores)
     rows: list[dict[str, Any]] = []
@@ -165,7 +165,7 @@ def measure(bench: Bench, task: Task, listed: list[Entry], truth, *, all_cores: 
 
 
 def contest() -> dict[str, dict]:
-    """All sections."""
+    """Measure all sections of the page."""
     found: dict[str, dict] = {}
     bench = Bench()
     try:

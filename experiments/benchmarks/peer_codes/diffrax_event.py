@@ -2,8 +2,8 @@
 
 Batches of 64 neighbouring lanes were the fastest: all lanes of a batch wait for the longest flight
 of each restart. Tsit5 is the fastest solver at 1e-6 (Dopri8's steps there miss impacts), Dopri8 at
-1e-9 by a factor of three. It is given vi_jax's own sine and cosine (a quarter faster than XLA's)
-and vi_jax's compiler options.
+1e-9 by a factor of three. It uses vi_jax's sine and cosine (a quarter faster than XLA's) and
+vi_jax's compiler options.
 """
 
 import math
@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)
 def build(
     task: Task, kappas: np.ndarray, *, solver: str, tol: float, batch: int = 64
 ) -> tuple[Run, float]:
-    """The restarts are a `while_loop` around `diffeqsolve`."""
-    # Numbers that differ between machines are arguments: another restitution is not compiled again.
+    """Compile the lanes, with a `while_loop` of restarts around `diffeqsolve`."""
+    # The numbers are arguments of the program: a new restitution needs no compilation.
     key = (task.drive, task.cycles, kappas.size, solver, batch)
     numbers = jnp.array([task.k, task.Y0, tol])
     lanes = jnp.asarray(kappas)
@@ -49,7 +49,7 @@ _compiled: dict[tuple, tuple[Any, float]] = {}
 
 
 def _lane(task: Task, solver: Any) -> Any:
-    """Final (Y, V) of a lane from κ and (k, Y0, tolerance)."""
+    """Return a function from κ and (k, Y0, tolerance) to the final (Y, V) of a lane."""
     xi, tau0, eps, mu, gap = task.xi, task.tau0, task.eps, task.mu, task.gap
     end = 2 * math.pi * task.cycles
 

@@ -1,4 +1,4 @@
-"""Which codes `peers.py` runs, with which options, and how their lanes are dealt."""
+"""The codes that `peers.py` runs, their options, and the distribution of their lanes."""
 
 import sys
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ OURS = "vi_jax"
 
 @dataclass(frozen=True)
 class Entry:
-    """A code with its options, and how its lanes are dealt."""
+    """A code with its options, and the distribution of its lanes."""
 
     name: str
     code: str
@@ -24,16 +24,16 @@ class Entry:
     block: int = 16
     every: int = 1
     whole: bool = False
-    """One process on all cores, with the code's own way of using them."""
+    """True for one process on all cores that uses the code's own parallel mode."""
 
     @property
     def rounds(self) -> int:
-        """Fewer for the slow ones."""
+        """The number of rounds, smaller for slow codes."""
         return ROUNDS if self.every == 1 else SLOW_ROUNDS
 
 
 def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any) -> Entry:
-    """An entry of vi_jax."""
+    """Return an entry of vi_jax."""
     inside = "" if not number else f"{number:g}"
     if name == "Taylor" and number > 1:
         inside += ", 8 steps"
@@ -44,12 +44,12 @@ def ours(name: str, number: float = 0.0, *, whole: bool = False, **options: Any)
 
 
 def heyoka(tol: float, **options: Any) -> Entry:
-    """An entry of heyoka in batch mode."""
+    """Return an entry of heyoka in batch mode."""
     return Entry(f"heyoka batch 8, {tol:.0e}", "heyoka_taylor", {"tol": tol, **options})
 
 
 def entries(drive: str, all_cores: bool) -> list[Entry]:
-    """All codes for one machine."""
+    """Return all codes for one machine."""
     sparse = LANES // 8 if not all_cores else LANES // (8 if len(cores()) > 8 else 16)
     motor = [("FixedStep", n) for n in (5, 6, 8, 10, 12, 16, 20, 24)]
     motor += [("Taylor", n) for n in (14, 16, 18)] + [("Taylor", 1e-12), ("Taylor", 1e-13)]
@@ -86,7 +86,7 @@ def entries(drive: str, all_cores: bool) -> list[Entry]:
 
 
 def derivative_entries() -> list[Entry]:
-    """The codes that give derivatives by six parameters, each primal beside its derivatives."""
+    """Return the codes with derivatives in six parameters, each after its primal."""
     listed = []
     for method in (("FixedStep", 6), ("FixedStep", 10), ("FixedStep", 16), ("Taylor", 1e-12)):
         primal = ours(*method)

@@ -19,7 +19,7 @@ from .task import PARAMETERS, Run, Task
 
 
 def equations(task: Task) -> tuple[list, list, Any]:
-    """Variables, right-hand sides and parameters κ, ξ, τ0, ε as symbols."""
+    """Return variables, right-hand sides and parameters κ, ξ, τ0, ε as symbols."""
     Y, V, W = hy.make_vars("Y", "V", "W")
     kappa, xi, tau0, eps = (hy.par[i] for i in range(4))
     c, s = hy.cos(hy.time), hy.sin(hy.time)
@@ -40,7 +40,7 @@ def build(
     jacobian: bool = False,
     threads: int = 0,
 ) -> tuple[Run, float]:
-    """`batch=1` is the scalar integrator, `threads` its own ensemble of batches.
+    """Build the lanes: `batch=1` selects the scalar integrator, `threads` heyoka's ensemble.
 
     `wrapped` restarts the clock in each cycle: slower, and more accurate over a long run.
     """
@@ -78,7 +78,7 @@ def build(
         if jacobian:
             state[size + 2] = 1.0
 
-    # The last batch is filled up with the last lane.
+    # Copies of the last lane fill the last batch.
     parts = np.append(kappas, np.repeat(kappas[-1:], -len(kappas) % batch)).reshape(-1, batch)
 
     def run() -> np.ndarray:
@@ -111,7 +111,7 @@ def build(
 
 
 def _integrator(system: list, event: Any, pars: np.ndarray, tol: float, batch: int) -> Any:
-    """The compiled integrator of one lane or of a batch."""
+    """Return the compiled integrator of one lane or of a batch."""
     rows, scalar = len(system), batch == 1
     return (hy.taylor_adaptive if scalar else hy.taylor_adaptive_batch)(
         system,
@@ -126,7 +126,7 @@ def _integrator(system: list, event: Any, pars: np.ndarray, tol: float, batch: i
 def _bounce(
     task: Task, views: dict[str, Any], *, scalar: bool, jacobian: bool, threads: int
 ) -> Callable[..., bool]:
-    """What is called at an impact; `views` are filled with the integrator's memory later."""
+    """Return the callback of an impact; `views` later receive the integrator's memory."""
     k = task.k
     jump = _saltation(task) if jacobian else None
 
@@ -145,7 +145,7 @@ def _bounce(
 
 
 def _tangent(variables: list, rhs: list, parameters: tuple) -> list:
-    """Variational equations of the six columns; d and k act at impacts only."""
+    """Return the variational equations of the six columns; d and k act at impacts only."""
     system = []
     for j in range(len(PARAMETERS)):
         column = [hy.make_vars(f"{name}{j}") for name in ("dY", "dV", "dW")]
@@ -161,7 +161,7 @@ def _tangent(variables: list, rhs: list, parameters: tuple) -> list:
 
 
 def _saltation(task: Task) -> Any:
-    """The jump of state and tangent at an impact, compiled, since Python would take most of it."""
+    """Return the jump of state and tangent at an impact, compiled because Python is too slow."""
     k = task.k
 
     @nb.njit("void(f8[:,::1], f8[:,::1], i8, f8)", error_model="numpy")

@@ -1,9 +1,10 @@
 """Dormand–Prince 5(4), written for numba: scalars in registers, one lane after the other.
 
-First-same-as-last, proportional-integral step control, restart with the last length after an
-impact, and events on the dense output of fourth order (a landing by a further step was no more
-accurate). Sine and cosine are polynomials and multiplications may fuse with additions: together
-30 % faster than the mathematical library without fusing. No other fast-math flag is set.
+It uses first-same-as-last and proportional-integral step control. After an impact it restarts with
+the last step size. Events are located on the dense output of fourth order (a further step to the
+event was no more accurate). Sine and cosine are polynomials, and multiplications may fuse with
+additions: together 30 % faster than the mathematical library without fusing. No other fast-math
+flag is set.
 """
 
 import math
@@ -24,7 +25,7 @@ _S = tuple((-1) ** n / math.factorial(2 * n + 1) for n in range(8))
 
 @nb.njit(**INLINE)
 def sincos(phase):
-    """Sine and cosine on [0, 2π]: series on a quarter of the argument, doubled twice."""
+    """Return sine and cosine on [0, 2π]: series on a quarter of the argument, doubled twice."""
     x = 0.25 * (phase - math.pi)
     z = x * x
     s = _S[5] + z * (_S[6] + z * _S[7])
@@ -37,7 +38,7 @@ def sincos(phase):
 
 @nb.njit(**INLINE)
 def motor_field(s, y, p):
-    """d(Y, V, W)/dφ; `p` holds κ, ξ, τ0, ε, μ."""
+    """Return d(Y, V, W)/dφ; `p` holds κ, ξ, τ0, ε, μ."""
     sine, cosine = sincos(s)
     inertia = 1 + p[4] * sine * sine
     share = 1 / (y[2] * inertia)
@@ -48,7 +49,7 @@ def motor_field(s, y, p):
 
 @nb.njit(**INLINE)
 def ideal_field(s, y, p):
-    """d(Y, V)/dφ; `p` holds 1/ζ, ξ."""
+    """Return d(Y, V)/dφ; `p` holds 1/ζ, ξ."""
     _, cosine = sincos(s)
     return y[1] * p[0], (cosine - y[0] - 2 * p[1] * y[1]) * p[0]
 
@@ -79,7 +80,7 @@ def bounce2(y, gap, k):
 
 @nb.njit(**INLINE)
 def part(e, a, b, tol):
-    """One squared component of the error norm."""
+    """Return one squared component of the error norm."""
     scaled = e / (tol * (1 + max(abs(a), abs(b))))
     return scaled * scaled
 
@@ -99,21 +100,21 @@ def norm2(e, a, b, tol):
 
 @nb.njit(**INLINE)
 def dense(th, r1, r2, r3, r4, r5):
-    """The dense output of one component at a fraction of the step."""
+    """Return the dense output of one component at a fraction of the step."""
     u = 1 - th
     return r1 + th * (r2 + u * (r3 + th * (r4 + u * r5)))
 
 
 @nb.njit(**INLINE)
 def dense_rate(th, r2, r3, r4, r5):
-    """Its derivative."""
+    """Return the derivative of the dense output."""
     u = 1 - th
     return r2 + (u - th) * r3 + th * (2 * u - th) * r4 + 2 * th * u * (u - th) * r5
 
 
 @nb.njit(**INLINE)
 def hump(y, gap, r2, r3, r4, r5):
-    """The fraction of the step at which the body turns beyond the stop; 0 if it turns before it."""
+    """Return the fraction of the step at which the body turns beyond the stop, or 0."""
     low, high = 0.0, 1.0
     for _ in range(30):
         th = 0.5 * (low + high)
@@ -128,9 +129,9 @@ def hump(y, gap, r2, r3, r4, r5):
 
 @nb.njit(**INLINE)
 def crossing(top, y, rate, gap, r2, r3, r4, r5):
-    """The fraction of the step, below `top`, at which the body meets the stop.
+    """Return the fraction of the step, below `top`, at which the body meets the stop.
 
-    Newton's method, kept within an interval that is halved; `rate` is that at the step's begin.
+    Newton's method is safeguarded by bisection; `rate` is the rate at the beginning of the step.
     """
     low, high = 0.0, top
     th = 0.5 * top
@@ -153,7 +154,7 @@ def crossing(top, y, rate, gap, r2, r3, r4, r5):
 
 
 def stepper(field: Any, add: Any, bounce: Any, norm: Any) -> Any:
-    """The compiled integrator of one lane with one kind of drive."""
+    """Return the compiled integrator of one lane with one kind of drive."""
 
     @nb.njit(**OPTIONS)
     def lane(y, p, k, gap, cycles, tol):
@@ -187,7 +188,7 @@ def stepper(field: Any, add: Any, bounce: Any, norm: Any) -> Any:
             if y1[0] > gap:
                 top = 1.0
             elif k1[0] > 0 and k7[0] < 0 and max(y[0] + h * k1[0] / 2, y1[0] - h * k7[0] / 2) > gap:
-                top = 2.0  # a hump that may reach over the stop within the step
+                top = 2.0  # a maximum within the step may be beyond the stop
             r2 = r3 = r4 = r5 = k1
             if top > 0:
                 r2 = add(y1, -1.0, y)
@@ -251,7 +252,7 @@ _calls: dict[tuple[bool, bool], Any] = {}
 def build(
     task: Task, kappas: np.ndarray, *, tol: float, parallel: bool = False
 ) -> tuple[Run, float]:
-    """`parallel` spreads the lanes over all cores (`prange`)."""
+    """Build the lanes; `parallel` distributes them over all cores (`prange`)."""
     key = (task.motor, parallel)
     if key not in _calls:
         _calls[key] = nb.njit(parallel=parallel, **OPTIONS)(_motor if task.motor else _ideal)

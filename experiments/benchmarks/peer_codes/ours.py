@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def method(name: str, number: float) -> vi.AbstractMethod:
-    """The method by the name that the tables use."""
+    """Return the method by its name in the tables."""
     if name == "ExactFlight":
         return vi.ExactFlight()
     if name == "FixedStep":
@@ -29,13 +29,13 @@ def method(name: str, number: float) -> vi.AbstractMethod:
 
 
 def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -> jax.Array:
-    """Final (Y, V) of one lane; `theta` holds κ, ξ, τ0, ε, d, k."""
+    """Return the final (Y, V) of one lane; `theta` holds κ, ξ, τ0, ε, d, k."""
     kappa, xi, tau0, eps, gap, k = theta
     drive = vi.Motor(tau0, kappa, eps, task.mu) if task.motor else vi.IdealDrive(kappa)
     stops = (vi.RigidStop(gap, k),)
     scene = vi.Scene(oscillator=vi.Oscillator(xi), drive=drive, stops=stops)
     start = scene.start(Y=Y0, W=kappa) if task.motor else scene.start(Y=Y0)
-    # With d = 2 nothing presses the body on, which a traced gap does not show.
+    # With d = 2 no force holds the body on the stop, but a traced gap does not show this.
     run = vi.simulate(scene, start, task.cycles, method=how, record="sections", rests=False)
     return jnp.stack([run.sections.Y[-1], run.sections.V[-1]])
 
@@ -48,9 +48,9 @@ def build(
     number: float = 0.0,
     jacobian: bool = False,
 ) -> tuple[Run, float]:
-    """One process; where it was given several devices, each takes its share of the lanes.
+    """Build the lanes in one process, distributed over its devices.
 
-    Numbers are arguments of the program: another restitution is not another compilation.
+    The numbers are arguments of the program: a new restitution needs no compilation.
     """
     key = (task.drive, task.cycles, kappas.size, name, number, jacobian)
     numbers = jnp.array([task.xi, task.tau0, task.eps, task.gap, task.k, task.Y0])

@@ -1,7 +1,7 @@
-"""Workers: a process pinned to each core, and one that has all cores; pipes say what to run.
+"""Workers: a process pinned to each core, and one with all cores, controlled through pipes.
 
-`python -m peer_codes.pool CORES` is such a process. Pinning it before anything is imported makes
-every library count the cores that it is meant to use.
+`python -m peer_codes.pool CORES` is such a process. It is pinned before any library is imported, so
+that each library counts only the cores that it may use.
 """
 
 import importlib
@@ -19,14 +19,14 @@ import numpy as np
 
 
 def cores() -> list[int]:
-    """The cores that this process may use."""
+    """Return the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
 
 
 class Worker:
-    """A process that builds and runs codes; calls are answered in order."""
+    """A process that builds and runs codes, and answers calls in order."""
 
     def __init__(self, cores: list[int], *, devices: int = 1):
         flags = os.environ.get("XLA_FLAGS", "")
@@ -52,7 +52,7 @@ class Worker:
         _send(self.process.stdin, message)
 
     def answer(self) -> Any:
-        """The answer to the oldest open call. **Raises:** `RuntimeError` with its traceback."""
+        """Return the answer to the oldest call. **Raises:** `RuntimeError` with its traceback."""
         assert self.process.stdout is not None
         good, value = _receive(self.process.stdout)
         if not good:
@@ -67,7 +67,7 @@ class Worker:
 
 
 def together(workers: list[Worker], messages: list[tuple]) -> tuple[list, float]:
-    """The answers of workers that act at the same time, and the seconds until the last."""
+    """Return the answers of workers that run at the same time, and the seconds until the last."""
     begin = time.perf_counter()
     for worker, message in zip(workers, messages, strict=True):
         worker.ask(*message)
@@ -89,7 +89,7 @@ def _receive(pipe: IO[bytes]) -> Any:
 
 
 def _serve() -> None:
-    # What a library prints must not end up among the answers.
+    # Output that a library prints must not mix with the answers.
     pipe = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     runs: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""What every code is asked for: numbers only, so that it travels to a worker."""
+"""The task of every code: only numbers, so that it can be sent to a worker."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 Run = Callable[[], np.ndarray]
 
 PARAMETERS = ("κ", "ξ", "τ0", "ε", "d", "k")
-"""What the derivatives are taken by; the start's W = κ moves with κ."""
+"""The parameters of the derivatives; the start's W = κ changes with κ."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Task:
 
     @property
     def motor(self) -> bool:
-        """Whether the crank's speed is part of the state."""
+        """True if the crank's speed is part of the state."""
         return self.drive == "motor"
 
     def dealt(self, lanes: int, block: int, every: int, shares: int) -> list[np.ndarray]:
-        """Indices of lanes for each worker: whole blocks of neighbours, dealt like cards.
+        """Return the indices of lanes for each worker: blocks of neighbours, in turn.
 
-        `every` takes each so many-th block only: the sample that a slow code is timed on.
+        A slow code is timed on a sample: one of `every` blocks.
         """
         block = min(block, max(1, lanes // (shares * every)))
         blocks = np.arange(lanes).reshape(-1, block)[every // 2 :: every]
