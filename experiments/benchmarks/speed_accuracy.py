@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Speed against accuracy
 #
-# All methods run the same lanes from rest: Table 1's machine (d = 2, k = 0.8; the motor with T0 =
-# 10 N·m) at 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9. The run time of a method is
-# listed with its errors: of the state after few and after many cycles, of impact times and counts,
-# and of extremes. A scan is judged by the share of wrong *regimes*.
+# All methods run the same lanes from rest: Table 1's machine (d = 2, k = 0.8; motor: T0 = 10 N·m)
+# at 256 values of ζ (ideal drive) or κ (motor) from 0.5 to 1.9. The run time of a method is listed
+# with its errors in the state after few and after many cycles, in impact times and counts, and in
+# extremes. A scan is judged by the share of wrong *regimes*.
 #
 # Truth is `ExactFlight` for the ideal drive and 40 steps of Verner9 per cycle for the motor. Errors
 # are taken over the lanes that amplify a displacement of 1e-10 to at most 1e-6 in 1,000 cycles. Run

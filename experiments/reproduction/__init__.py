@@ -1,1 +1,1 @@
-"""The paper's Figures 2, 3 and 4 again: drawn, measured, and compared with what it says."""
+"""Reproduction of the paper's Figures 2, 3 and 4: pictures, measurements, and its claims tested."""

@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-# For both processes, and before JAX is imported. One run is too short for a GPU.
+# Set for both processes, and before JAX is imported. One run is too short for a GPU.
 os.environ["JAX_ENABLE_X64"], os.environ["JAX_PLATFORMS"] = "1", "cpu"
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -16,13 +16,13 @@ BEGIN = time.perf_counter()
 
 
 def tell(step: str) -> None:
-    """Print the step that begins, and the seconds so far."""
+    """Print the step that begins, and the elapsed seconds."""
     count = f"{STEPS.index(step) + 1}/{len(STEPS)}"
     print(f"[{time.perf_counter() - BEGIN:3.0f} s] {count} {step} …", file=sys.stderr, flush=True)
 
 
 def main() -> int:
-    """Reproduce, and return 1 if a verdict or a special point is not what was kept."""
+    """Reproduce; return 1 if a verdict or a special point differs from the kept report."""
     parser = argparse.ArgumentParser(
         prog="python experiments/reproduction",
         description="Draws Figures 1 to 4 of the paper and the boundaries of its discrepancy, and "

@@ -1,4 +1,4 @@
-"""What the paper takes for granted with Figures 3 and 4, each with the number that it costs."""
+"""Assumptions of the paper behind Figures 3 and 4, each with the size of its effect."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from .motions import CYCLES, FREQUENCY_RATIO, GAP, RESTITUTION, Case, last_minim
 from .motors import Motors
 from .orbits import mean_ratio
 
-# Crank angles at the start: eighths of a turn.
+# Number of crank angles at the start: each is a multiple of an eighth of a turn.
 _PHASES = 8
-# A start counts as near the 2π motion within this distance (unit: a): a choice.
+# A start within this distance of the 2π motion counts as near (unit: a): a choice.
 _NEAR = 0.3
 
 

@@ -1,4 +1,4 @@
-"""Where the paper's discrepancy lives: its borders in the planes (ζ, k) and (ζ, c)."""
+"""The boundaries of the paper's discrepancy in the planes (ζ, k) and (ζ, c)."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +31,7 @@ K, XI = "stops.0.restitution", "oscillator.damping_ratio"
 K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 
 SHORT, LONG = color_of(1, 1), color_of(2, 1)
-# Darker, to be seen on its filling.
+# Darker than the filling, to be visible on it.
 LONG_LINE = "#b87f00"
 SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
 
@@ -49,30 +49,29 @@ def xi_per_c() -> float:
 class BoundaryCurves(NamedTuple):
     """Curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both.
 
-    The 2π motion has one impact per drive cycle, the 4π motion one in two.
+    The 2π motion has one impact per drive cycle, the 4π motion has one in two cycles.
     """
 
     doubling_k: Boundary
     """Period doubling of the 2π motion, which is unstable on the side of smaller ζ."""
     touch_k: Boundary
-    """The 4π motion touches the stop a second time: it exists between the curve's two arms.
-    That is the family of the figures' motion; with more damping than the curves begin with there
-    is another one beside the birth."""
+    """The 4π motion touches the stop a second time; it exists between the curve's two arms. This
+    is the family of the figures' motion. At higher damping there is another family near the birth.
+    """
     doubling_c: Boundary
     touch_c: Boundary
     birth_c: Boundary
-    """Grazing in which the 2π motion is born. Without damping it lies at ζ = √(1 - 1/d) for
-    every k, since an impact that slow does nothing."""
+    """Grazing at which the 2π motion appears. Without damping it is at ζ = √(1 - 1/d) for every k,
+    because an impact of zero speed has no effect."""
     fold_k: Boundary
-    """Fold in which the 2π motion ends towards large ζ."""
+    """Fold at which the 2π motion ends towards large ζ."""
     fold_c: Boundary
     long_doubling_k: Boundary
     """Period doubling of the 4π motion, which is unstable between the curve's two arms."""
 
 
-# Where each curve begins: the period in cycles and the k of a branch, the kind of its point, and
-# the number that is changed with ζ. At k = 0.5 the 4π motion is stable wherever it exists; at
-# k = 0.8 it is not.
+# The start of each curve: the period in cycles and the k of a branch, the kind of its point, and the
+# second parameter. At k = 0.5 the 4π motion is stable in its whole range, at k = 0.8 it is not.
 _BEGINNINGS: dict[str, tuple[int, float, str, str]] = {
     "doubling_k": (1, RESTITUTION, "period-doubling", K),
     "touch_k": (2, RESTITUTION, "grazing", K),
@@ -88,10 +87,10 @@ SHORT_CURVES = tuple(name for name, at in _BEGINNINGS.items() if at[0] == 1)
 
 
 def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict[str, Boundary]:
-    """Follow those of `CURVES` that are named.
+    """Follow the named curves of `CURVES`.
 
     **Arguments:** the names; branches in ζ on which the curves may begin, such as those of the
-    undamped response with k = 0.5 (a branch that is missing is followed first).
+    undamped response with k = 0.5. A missing branch is followed first.
     """
     known: dict[tuple[int, float], Branch] = {}
     for cycles, k, *_ in map(_BEGINNINGS.__getitem__, names):
@@ -102,13 +101,13 @@ def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict
         cycles, k, kind, parameter = _BEGINNINGS[name]
         return _follow(_special(known[cycles, k], kind), parameter)
 
-    # What takes the time is compiling, of which two threads do more than one.
+    # Most of the time is compilation, in which two threads are faster than one.
     with ThreadPoolExecutor(2) as threads:
         return dict(zip(names, threads.map(follow, names), strict=True))
 
 
 def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
-    """The undamped branch in ζ with one impact in `cycles` cycles: a known one, or a new one."""
+    """Return the undamped branch in ζ with one impact in `cycles` cycles, a known or a new one."""
     for branch in known:
         scene = branch.problem.machine
         if (
@@ -126,7 +125,7 @@ def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
 
 
 def _special(branch: Branch, kind: str) -> Point:
-    """The first special point of a kind, by ζ."""
+    """Return the special point of a kind with the least ζ."""
     return min((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
 
 
@@ -139,14 +138,14 @@ def plane_points(curve: Boundary) -> np.ndarray:
     """Return points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
     points = curve.parameters.copy()
     if curve.names[1] == XI:
-        points[:, 1] = np.maximum(points[:, 1], 0.0) / xi_per_c()  # -1e-17 at its end
+        points[:, 1] = np.maximum(points[:, 1], 0.0) / xi_per_c()  # may be -1e-17 at its end
     return points
 
 
 def crossings(curve: Boundary, column: int, value: float) -> list[float]:
-    """Return the other number, rising, where a curve has a value of ζ (column 0) or of k or c (1).
+    """Return the other coordinate, sorted, of a curve's points with a value in a column.
 
-    Splines through the curve's points, whose error is below 1e-5 here.
+    Column 0 is ζ, column 1 is k or c. Splines interpolate the points; their error is below 1e-5.
     """
     points = plane_points(curve)
     spline = _spline(points)
@@ -163,7 +162,7 @@ def _spline(points: np.ndarray) -> CubicSpline:
 
 
 def _turn(curve: Boundary, pick: Callable[[np.ndarray], np.intp]) -> tuple[float, float]:
-    """(ζ, other) at the least or the greatest k or c of a curve."""
+    """Return (ζ, k) or (ζ, c) of a curve at its least or greatest k or c."""
     points = plane_points(curve)
     spline = _spline(points)
     fine = spline(np.linspace(spline.x[0], spline.x[-1], 20_001))
@@ -172,7 +171,7 @@ def _turn(curve: Boundary, pick: Callable[[np.ndarray], np.intp]) -> tuple[float
 
 
 def birth_without_damping(curves: BoundaryCurves) -> float:
-    """Return ζ of the grazing in which the 2π motion is born, the same for every k."""
+    """Return ζ of the grazing at which the 2π motion appears, the same for every k."""
     points = plane_points(curves.birth_c)
     return float(points[np.argmin(points[:, 1]), 0])
 
@@ -180,7 +179,7 @@ def birth_without_damping(curves: BoundaryCurves) -> float:
 def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
     """Return numbers of the curves at the figures' ζ and k, and at Table 1's c.
 
-    `None` where a curve does not get there, as that of the 4π motion to Table 1's c.
+    A number is `None` if the curve does not reach this value, as the 4π curve at Table 1's c.
     """
 
     def at(curve: Boundary, column: int, value: float, place: int) -> float | None:
@@ -211,9 +210,9 @@ def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
 
 
 def draw_boundaries(curves: BoundaryCurves) -> Figure:
-    """Draw both planes, the whole of them beside the region of the discrepancy.
+    """Draw both planes: on the left the whole plane, on the right the region of the discrepancy.
 
-    Axes in the order (ζ, k), its region, (ζ, c), its region.
+    The upper row is (ζ, k), the lower row (ζ, c).
     """
     figure = Figure(figsize=(12.5, 9.6), dpi=110)
     figure.set_layout_engine("constrained", w_pad=0.08)
@@ -256,7 +255,7 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
         born = birth_without_damping(curves)
         birth = np.array([[born, low], [born, high]])
     doubling, touch = plane_points(short), plane_points(long)
-    # Birth and doubling have one ζ for each k and each c.
+    # Birth and doubling are functions ζ(k) and ζ(c).
     left, right = (_over(points, levels) for points in (birth, doubling))
     ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
     ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
@@ -292,6 +291,6 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
 
 
 def _over(points: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """ζ of a curve over its other number."""
+    """Return ζ of a curve at values of its other coordinate."""
     order = np.argsort(points[:, 1])
     return np.interp(levels, points[order, 1], points[order, 0])

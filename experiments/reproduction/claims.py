@@ -1,4 +1,4 @@
-"""What the paper says with Figures 3 and 4, and what is measured."""
+"""The paper's claims about Figures 3 and 4, with measurements."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from .motions import Case, closed_form, half_turn_states, last_minima, run_of, s
 CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
 PARTLY = "confirmed in part"
 
-# A motion counts as settled once it stays this close to an orbit (unit: a, a ω): a choice.
+# A motion counts as settled while it stays this close to an orbit (unit: a, a ω): a choice.
 _SETTLED = 1e-3
 
 
@@ -19,7 +19,7 @@ class Claim(NamedTuple):
 
     name: str
     place: str
-    """Where the paper makes it."""
+    """The place of the claim in the paper."""
     claimed: str
     measured: str
     """One sentence with the numbers."""
@@ -30,8 +30,8 @@ class Claim(NamedTuple):
 def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Claim]:
     """Measure each claim about Figures 3 and 4 on the simulated cases.
 
-    **Arguments:** the cases; the panels of Figure 2 (`describe`), without which what is said of the
-    whole figure rests on ζ = 0.90 alone.
+    **Arguments:** the cases; the panels of Figure 2 (`describe`). Without them the claim about the
+    whole figure is tested at ζ = 0.90 only.
     """
     return [
         _first_cycles(cases),
@@ -54,10 +54,9 @@ def _verdict(undamped: bool, damped: bool | None = None) -> str:
 
 
 def _gap(case: Case, run: Run, first: int, last: int, period: int) -> float:
-    """Greatest |Y - closed form| over some cycles of the run from rest.
+    """Return the greatest |Y - closed form| over the cycles `first` to `last` - 1 of a run.
 
-    **Arguments:** cycles `first` to `last`, without the last; `period` of the closed form in
-    cycles.
+    `period` is that of the closed form, in cycles.
     """
     cycles = run.impacts.shape[0]
     difference = sampled(run)[0] - closed_form(case, cycles, period)
@@ -109,12 +108,12 @@ def _growth(case: Case) -> float:
 
 
 def _deviation(run: Run, orbit: Run) -> np.ndarray:
-    """Distance of the states at φ = π from the 2π orbit."""
+    """Return the distances of the states at φ = π from the 2π orbit."""
     return np.linalg.norm(half_turn_states(run) - half_turn_states(orbit)[0], axis=1)
 
 
 def _rate(deviation: np.ndarray) -> float:
-    """Factor per cycle, from a straight line through the logarithms."""
+    """Return the factor per cycle, from a straight line through the logarithms."""
     return float(np.exp(np.polyfit(np.arange(deviation.size), np.log(deviation), 1)[0]))
 
 
@@ -125,7 +124,7 @@ def nudged_rate(case: Case, *, nudge: float = 1e-8) -> float:
     samples = sampled(case.from_rest)[2]
     run = run_of(case.scene, start, cycles, samples)
     deviation = _deviation(run, case.on_short)
-    # The other multiplier's share has died out after 12 cycles; the rest is still small.
+    # After 12 cycles the other multiplier's component has decayed, and the deviation is still small.
     return _rate(deviation[12:36])
 
 
@@ -181,7 +180,7 @@ def _rounding(cases) -> Claim:
 
 
 def _settling(run: Run, orbit: Run, period: int, shift: int) -> int | None:
-    """The first cycle after which the run stays on an orbit, or `None`."""
+    """Return the first cycle after which the run stays on an orbit, or `None`."""
     states, closed = half_turn_states(run), half_turn_states(orbit)[:period]
     wanted = closed[(np.arange(len(states)) - shift) % period]
     away = np.nonzero(np.linalg.norm(states - wanted, axis=1) > _SETTLED)[0]

@@ -1,4 +1,4 @@
-"""What the sweeps of Figure 2 keep to where the paper sees a discrepancy, between BB' and CC'."""
+"""The motions of Figure 2's sweeps between BB' and CC', the range of the paper's discrepancy."""
 
 from typing import Any, NamedTuple
 
@@ -10,30 +10,30 @@ from .response import LONGEST, WALL, Response, System
 
 # A motion without a period counts as chaotic beyond this exponent (per drive cycle): a choice.
 _CHAOS = 0.01
-# From where on the minimum counts as apart from the 2π analysis (unit: a).
+# A minimum farther than this from that of the 2π analysis counts as apart (unit: a).
 _APART = 1e-3
 
 
 def _stable(closed: ClosedFormOrbits) -> np.ndarray:
-    """Where the first closed form is a motion and stable."""
+    """Return the mask of the ζ at which the first closed form is admissible and stable."""
     return closed.admissible[:, 0] & (np.abs(closed.multipliers[:, 0]).max(axis=-1) < 1)
 
 
 class Row(NamedTuple):
-    """One motion that a sweep keeps to over neighbouring ζ."""
+    """One motion that a sweep follows over neighbouring ζ."""
 
     part: np.ndarray
     """Indices into the values of ζ."""
     cycles: int
     """Period in drive cycles, or a code of `REGIMES` below zero if none was found."""
     impacts: float
-    """In a period; without one, per cycle on average."""
+    """Impacts in a period; without a period, the mean per cycle."""
     exponent: float
-    """Median of the largest Lyapunov exponents where there is no period, else NaN."""
+    """Median of the largest Lyapunov exponents if there is no period, else NaN."""
 
     @property
     def motion(self) -> str:
-        """Its period and impacts in words, or what it is without a period."""
+        """The period and the number of impacts in words, or the kind of motion without a period."""
         if self.cycles <= 0:
             if self.exponent > _CHAOS:
                 return "chaotic"
@@ -43,7 +43,7 @@ class Row(NamedTuple):
 
 
 def rows(system: System, direction: str, inside: np.ndarray) -> list[Row]:
-    """Return the motions that a sweep keeps to, over the indices `inside` of ζ."""
+    """Return the motions that a sweep follows over the indices `inside` of ζ."""
     at, exponent = system.sweeps[direction], system.exponents[direction]
     period, impacts = np.asarray(at.period), np.asarray(at.impacts)
     kind = np.stack([period, np.where(period > 0, np.round(impacts), exponent > _CHAOS)])[:, inside]
@@ -61,11 +61,11 @@ def between(system: System, ratios: np.ndarray) -> np.ndarray:
 
 
 def describe(found: Response) -> dict[str, Any]:
-    """Describe where numerical minimum and 2π analysis differ in each panel, and the motions there.
+    """Describe the differences between numerical minimum and 2π analysis, and the motions there.
 
-    Floats, integers, strings, lists and `None` only. "apart" is where |min Y - min Y of the 2π
-    closed form| > 1e-3; "on_the_4pi_curve" compares all values at which the one-impact 4π motion
-    is admissible and stable.
+    The result has only floats, integers, strings, lists and `None`. "apart" counts the values with
+    |min Y - min Y of the 2π closed form| > 1e-3. "on_the_4pi_curve" compares all values at which
+    the one-impact 4π motion is admissible and stable.
     """
     return {
         "printed": "The text sees a discrepancy between BB' and CC', in the minimum only, and puts "
@@ -118,7 +118,7 @@ def _panel(found: Response, system: System) -> dict[str, Any]:
 
 
 def shares(sweep: dict[str, Any]) -> tuple[float, float]:
-    """Return the shares of a sweep on the 4π motion with one impact, and on any of period 4π."""
+    """Return the shares of a sweep on the 4π motion with one impact, and on all 4π motions."""
     one, four = (
         sum(m["values"] for m in sweep["motions"] if fits(m["motion"])) / sweep["values"]
         for fits in (lambda x: x == "4π, 1 impact", lambda x: x.startswith("4π"))

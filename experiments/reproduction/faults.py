@@ -1,4 +1,4 @@
-"""The faults of the paper's printed text, each with the number that shows it."""
+"""The errors in the paper's printed text, each with the number that shows it."""
 
 from typing import Any, NamedTuple
 
@@ -168,7 +168,7 @@ def period_doubling_damping() -> float:
 
 
 def _multipliers(c: Any) -> Any:
-    """Those of the 2π motion of Figure 3 with the damping c (N·s/m)."""
+    """Return the multipliers of the 2π motion of Figure 3 with the damping c (N·s/m)."""
     ratio = Parameters(damping=c).scene(drive="ideal").damping_ratio
     return closed_form_orbits(figure_scene(ratio), cycles=1).multipliers[0]
 

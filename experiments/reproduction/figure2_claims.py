@@ -1,4 +1,4 @@
-"""What the paper says with Figure 2, and what the sweeps, branches and closed forms say."""
+"""The paper's claims about Figure 2, tested by sweeps, branches and closed forms."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from .response import WALL, Response
 def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
     """Measure each claim about the whole of Figure 2.
 
-    **Arguments:** what was computed for the figure, and its panels as `describe` gives them.
+    **Arguments:** the computed response of the figure; its panels as returned by `describe`.
     """
     return [_free(found), _everywhere(panels), _reason(panels), _wall(panels)]
 
 
 def _sweeps(panels: list[dict]) -> dict[str, dict]:
-    """The sweeps of all panels, by their panel and direction in words."""
+    """Return the sweeps of all panels, by their panel and direction in words."""
     return {
         f"k = {panel['restitution']:g}, {'' if panel['damping_ratio'] else 'un'}damped, {name}": at
         for panel in panels

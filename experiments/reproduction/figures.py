@@ -1,4 +1,4 @@
-"""Draws Figures 3 and 4: three panels each, the undamped system above the damped one."""
+"""Drawing of Figures 3 and 4: three panels each, the undamped system above the damped one."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from .motions import Case
 
 # Dots per inch: a choice.
 _DPI = 110
-# Colour of a simulated motion: neutral, as its regime is what the picture is to show.
+# The colour of a simulated motion is neutral, because the picture is to show its regime.
 _INK = "0.2"
 
 
@@ -72,9 +72,9 @@ def _draw_row(number: int, case: Case, axes: list[Axes]) -> None:
 
 
 def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int]) -> None:
-    """A few cycles of the run with the closed forms on top.
+    """Draw a few cycles of the run with the closed forms on top.
 
-    **Arguments:** `number`, the figure's; `window`, the first and the last cycle.
+    **Arguments:** `number` of the figure; `window`, the first and the last cycle.
     """
     plot_history(
         run, machine=case.scene, ax=ax, window=window, stops=False, lw=3.2,
@@ -84,7 +84,7 @@ def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int])
         color = color_of(period, 1)
         if period == 2 and not case.long_exists:
             continue
-        # In Figure 4 the run starts on the closed form's own section.
+        # In Figure 4 the run starts on the section of the closed form.
         shift = case.long_shift if number == 3 and period == 2 else 0
         place, Y = _tiled(case, period, shift, window)
         ax.plot(2 * place, Y, color=color, lw=1.8, dashes=dash, label=f"{2 * period}π closed form")
@@ -96,7 +96,7 @@ def _panel(ax: Axes, number: int, case: Case, run: Run, window: tuple[int, int])
 def _tiled(
     case: Case, period: int, shift: int, window: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A closed form over the cycles of a window, corners at the impacts included."""
+    """Return a closed form over the cycles of a window, with the corners at the impacts."""
     run = case.on_short if period == 1 else case.from_long
     one = motion_path(run, machine=case.scene, window=(0, period))
     starts = range(window[0] - 2 * period + shift % period, window[1] + period)
@@ -108,7 +108,7 @@ def _tiled(
 
 
 def _whole(ax: Axes, case: Case, run: Run) -> None:
-    """The smallest Y of each cycle of the run, with those of the closed forms as levels."""
+    """Draw the smallest Y of each cycle of the run, with those of the closed forms as levels."""
     assert run.y_min is not None
     cycle = np.arange(run.impacts.shape[0]) + 0.5
     dots = {"ls": "none", "ms": 4.5, "mew": 0, "color": _INK, "alpha": 0.55}

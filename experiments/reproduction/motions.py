@@ -12,7 +12,7 @@ from .orbits import fit_long
 
 # ζ, k and d of both figures.
 FREQUENCY_RATIO, RESTITUTION, GAP = 0.9, 0.5, 2.0
-# Cycles of the runs and samples of each, and those of a quick reproduction: choices.
+# Cycles of the runs, samples per cycle, and those of a quick reproduction: choices.
 CYCLES, QUICK_CYCLES = 200, 60
 SAMPLES, QUICK_SAMPLES = 96, 64
 
@@ -30,17 +30,17 @@ class Case(NamedTuple):
     from_rest: Run
     """Figure 3: from Y = V = 0."""
     from_long: Run
-    """From the 4π closed-form state (of the undamped scene where there is none)."""
+    """From the 4π closed-form state; if not admissible, from that of the undamped scene."""
     from_fit: Run
     """Figure 4: from the 4π initial conditions that optax fits to the undamped scene."""
     on_short: Run
     """From the 2π closed-form state; its first cycle is the 2π closed form."""
     long_shift: int
-    """Cycles by which the 4π closed form lies later in Figure 3 than the section it starts on."""
+    """Shift of the 4π closed form in Figure 3, in cycles: 0 or 1."""
 
     @property
     def long_exists(self) -> bool:
-        """Whether the 4π closed form is a motion: inside the gap between impacts."""
+        """True if the 4π closed form is a motion: it stays inside the gap between impacts."""
         return bool(self.long.admissible[0])
 
 
@@ -52,7 +52,7 @@ def figure_scene(damping_ratio: Any, *, restitution: Any = RESTITUTION, gap: Any
         gap=gap,
         damping_ratio=damping_ratio,
     )
-    # A number, so that a run from another crank angle is the same program.
+    # The section is a number, so that runs from other crank angles share one program.
     return scene.at_section(0.0)
 
 
@@ -95,7 +95,8 @@ def run_of(scene: Scene, start: Any, cycles: int, samples: int) -> Run:
 
 
 def _alignment(from_rest: Run, orbit: Run) -> int:
-    """Which of the two sections of a 4π motion the run from rest is on after an even count."""
+    """Return 1 if, after an even number of cycles, the run from rest is on the second section of a
+    4π motion, else 0."""
     settled = np.asarray(from_rest.sections.Y)
     even = (settled.size - 1) // 2 * 2
     first, second = np.asarray(orbit.sections.Y)[:2]
@@ -119,7 +120,7 @@ def last_minima(run: Run) -> list[float]:
 
 
 def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
-    """Return Y of the 2π (`period` 1) or 4π (2) closed form, over cycles of Figure 3."""
+    """Return Y of the 2π (`period` 1) or 4π (2) closed form over the cycles of Figure 3."""
     run, shift = (case.on_short, 0) if period == 1 else (case.from_long, case.long_shift)
     one = sampled(run)[0][:period]
     return one[(np.arange(cycles) - shift) % period]
@@ -128,8 +129,8 @@ def closed_form(case: Case, cycles: int, period: int) -> np.ndarray:
 def half_turn_states(run: Run) -> np.ndarray:
     """Return (Y, V) at φ = π of each cycle, shape (cycles, 2).
 
-    The impacts of these motions lie near φ = 0, where a section would see them now before, now
-    after the jump.
+    The impacts of these motions lie near φ = 0. States on a section there would be before the jump
+    in some cycles and after it in others.
     """
     Y, V, size = sampled(run)
     return np.stack([Y[:, size // 2], V[:, size // 2]], axis=1)

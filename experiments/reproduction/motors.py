@@ -1,4 +1,4 @@
-"""Figures 3 and 4 with the motor of Table 1 in the ideal drive's place, tuned to ζ = 0.90."""
+"""Figures 3 and 4 with the motor of Table 1 instead of the ideal drive, tuned to ζ = 0.90."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,19 +14,19 @@ from .figures import common_legend
 from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
 from .orbits import TableRow, mean_ratio
 
-# T0 in N·m: a choice about Table 1's 10.
+# T0 in N·m: a choice around Table 1's 10.
 TORQUES = (2.0, 10.0, 100.0)
-# (k, c in N·s/m, words): the figures, and the case in which Table 1's machine has a 4π motion.
+# (k, c in N·s/m, label): the figures, and the case in which Table 1's machine has a 4π motion.
 _MACHINES = (
     (RESTITUTION, 0.0, "k = 0.5, undamped"),
     (0.8, float(Parameters().damping), "k = 0.8, Table 1's damping"),
 )
-# ζ is tuned to this: a choice.
+# Tolerance of the tuned ζ: a choice.
 _TUNED = 1e-9
 
 
 class MotorRun(NamedTuple):
-    """What the machine of Figures 3 and 4 does with one motor; lengths in units of a."""
+    """The motions of the machine of Figures 3 and 4 with one motor; lengths in units of a."""
 
     torque: float
     """T0, the stall torque at κ = 1 (N·m)."""
@@ -48,7 +48,7 @@ class MotorRun(NamedTuple):
 
 
 class Motors(NamedTuple):
-    """All that is measured with the motors of Table 1."""
+    """All results for the motors of Table 1."""
 
     rows: list[TableRow]
     runs: list[MotorRun]
@@ -139,7 +139,7 @@ def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
 
 
 def _in_step(ideal: np.ndarray, motor: np.ndarray) -> np.ndarray:
-    """The ideal run, a cycle later where its 4π motion lies so beside the motor's."""
+    """Return the ideal run, a cycle later if its 4π motion then agrees with the motor's."""
     later = np.roll(ideal, SAMPLES)
     tail = slice(-2 * SAMPLES, None)
     near = [np.abs(x[tail] - motor[tail]).max() for x in (ideal, later)]

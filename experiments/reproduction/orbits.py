@@ -1,4 +1,4 @@
-"""The periodic motions behind the figures, found by gradient and by Newton's method."""
+"""The periodic motions of the figures, found by gradient descent and by Newton's method."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import optax
 from vi_jax.machine import Scene
 from vi_jax.orbit import Gradient, Orbit, closed_form_orbits, find_orbit
 
-# How wrong the fit's guess is, and how well it must do: no transient is to be seen afterwards.
+# Relative error of the fit's guess, and tolerance of the fit, at which no transient is visible.
 _WRONG, _FITTED = 0.05, 1e-10
 
 
@@ -28,7 +28,7 @@ def mean_ratio(orbit: Orbit) -> float:
 def fit_long(scene: Scene) -> Orbit:
     """Fit the 4π motion by optax' Adam from a state 5 % off the closed form.
 
-    This is what the paper asks for with Figure 4: initial conditions accurate enough to skip the
+    The paper's Figure 4 needs such initial conditions, which are accurate enough to skip the
     transient.
     """
     closed = closed_form_orbits(scene, cycles=2)
@@ -41,10 +41,8 @@ def fit_long(scene: Scene) -> Orbit:
 
 
 def orbit_table(scenes: dict[str, Scene]) -> list[TableRow]:
-    """Find the 2π and 4π motions of ideal scenes by name, stable and unstable ones alike.
-
-    Found by Newton's method from their closed forms.
-    """
+    """Find the 2π and 4π motions of named ideal scenes, stable or not, by Newton's method from
+    their closed forms."""
     rows = []
     for name, scene in scenes.items():
         for cycles in (1, 2):

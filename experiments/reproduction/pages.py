@@ -1,4 +1,4 @@
-"""The report of a reproduction: as JSON, and as a page to read."""
+"""The report of a reproduction, as JSON and as a Markdown page."""
 
 import json
 from typing import Any, NamedTuple
@@ -48,7 +48,7 @@ def as_json(found: Findings) -> str:
 
 
 def _orbit(orbits) -> dict:
-    """The first motion of its kind, admissible or not."""
+    """Return the first motion of its kind, admissible or not."""
     if not bool(orbits.exists[0]):
         return {"exists": False}
     names = ("Y", "V", "impact_phase", "impact_speed", "y_min", "y_max")
@@ -61,7 +61,7 @@ def _orbit(orbits) -> dict:
 
 
 def _pairs(numbers) -> list[list[float]]:
-    """Real and imaginary part of each."""
+    """Return the real and imaginary part of each number."""
     return [[float(x.real), float(x.imag)] for x in numbers]
 
 
@@ -107,7 +107,7 @@ def _orbits(orbits: list[TableRow]) -> str:
 
 
 def _response(panels: dict[str, Any]) -> list[str]:
-    """Figure 2, panel by panel."""
+    """Return the lines on Figure 2, panel by panel."""
     numbers, motions, explained = [], [], []
     for panel in panels["panels"]:
         k, xi = panel["restitution"], panel["damping_ratio"]
@@ -154,7 +154,7 @@ def _response(panels: dict[str, Any]) -> list[str]:
 
 
 def _branches(panels: dict[str, Any]) -> list[str]:
-    """The special points of the branches behind Figure 2, and how they hang together."""
+    """Return the special points of the branches of Figure 2, and their connections."""
     rows = []
     for panel in panels["panels"]:
         motions: dict[str, list[str]] = {}
@@ -176,7 +176,7 @@ def _branches(panels: dict[str, Any]) -> list[str]:
 
 
 def as_markdown(found: Findings) -> str:
-    """Return the report as a page to read, with the figures in it."""
+    """Return the report as a Markdown page with its figures."""
     undamped, damped = found.cases
     cycles = undamped.from_rest.impacts.shape[0]
     ratio = float(damped.scene.damping_ratio)

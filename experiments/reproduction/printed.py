@@ -1,4 +1,4 @@
-"""The paper's equations as they are printed, to measure what is wrong with them."""
+"""The paper's equations as they are printed, to measure their errors."""
 
 from math import pi
 from typing import Any
@@ -13,8 +13,8 @@ from vi_jax.machine import AbstractMachine, RigidStop, TimedMotorState
 class CoastingMachine(AbstractMachine):
     """The machine without motor, damping and loss at the stop (T0 = 0, c = 0, k = 1), in time τ.
 
-    Its drive equation is Eq. 1 for u = cos φ with two switches, so that the right form and the
-    printed ones are one compiled program.
+    Its drive equation is Eq. 1 for u = cos φ with two switches, so that the correct form and the
+    printed forms share one compiled program.
     """
 
     contacts: tuple[RigidStop, ...]  # pyright: ignore
@@ -23,15 +23,15 @@ class CoastingMachine(AbstractMachine):
     slider_inertia: Float[Array, "..."]
     """μ, the inertia of the slider over that of the shaft (dimensionless)."""
     printed_inertia: Float[Array, "..."]
-    """Coefficient of φ'² u''(φ) in place of μ u'(φ) u''(φ); 0 for the right equation."""
+    """Coefficient of φ'² u''(φ) in place of μ u'(φ) u''(φ); 0 for the correct equation."""
 
     @property
     def cycle(self) -> float:
-        """2π of time τ: the body's natural period."""
+        """The body's natural period, 2π in time τ."""
         return 2 * pi
 
     def field(self, s: Float[Array, ""], state: TimedMotorState) -> TimedMotorState:
-        """d(state)/dτ of the state (Y, V, W, φ)."""
+        """Return d(state)/dτ of the state (Y, V, W, φ)."""
         sine, cosine = jnp.sin(state.phase), jnp.cos(state.phase)
         right = self.slider_inertia * sine * cosine
         factor = jnp.where(self.printed_inertia > 0, -self.printed_inertia * cosine, right)
@@ -53,8 +53,8 @@ def energy_drift(
 ) -> float:  # fmt: skip
     """Return the greatest |E/E(0) - 1| of a coasting run over 20 natural periods (k = 1, d = 2).
 
-    **Arguments:** ε and μ of the machine, which make the energy; the coefficients that the drive
-    equation is integrated with, if they are others.
+    **Arguments:** ε and μ of the machine, which define the energy; other coefficients for the drive
+    equation, if it is to be integrated as printed.
     """
     coefficient = coupling if printed_coupling is None else printed_coupling
     machine = CoastingMachine(
@@ -74,17 +74,17 @@ def energy_drift(
 
 
 def eq21_misses(zeta: float, k: float, d: float, n: int, *, printed: bool) -> dict[str, float]:
-    """Return by how much Eq. 14 with Eq. 20 and 21 misses the boundary conditions (16) to (18).
+    """Return the residuals of Eq. 14 with Eq. 20 and 21 in the boundary conditions (16) to (18).
 
     **Arguments:** ζ ≠ 1, k, d = Δ/a, the period 2πn; Eq. 21 as `printed`, or with its factor ζ.
 
-    **Returns:** v0 (dY/dφ before the impact), φ0 (rad), and the misses: of (16) in units of a, of
-    (17) and (18) in units of a per radian.
+    **Returns:** v0 (dY/dφ before the impact), φ0 (rad), and the residuals: of (16) in units of a,
+    of (17) and (18) in units of a per radian.
     """
     A = 1 / (1 - zeta**2)
     half = np.pi * n / zeta
     slope = (1.0 if printed else zeta) * (1 + k) / (2 * A) / np.tan(half)
-    # sin² + cos² = 1 for v0; the faster of the two impacts.
+    # sin² + cos² = 1 determines v0; the faster of the two impacts is taken.
     quadratic = [((1 - k) / (2 * A)) ** 2 + slope**2, 2 * d / A * slope, (d / A) ** 2 - 1]
     v0 = float(np.max(np.roots(quadratic).real))
     phase = float(np.arctan2(-(1 - k) / (2 * A) * v0, d / A + slope * v0))

@@ -1,4 +1,4 @@
-"""The reproduction in one go: figures, measured claims and faults, and a report of them."""
+"""The whole reproduction: figures, measured claims and errors, and a report."""
 
 import json
 import signal
@@ -36,9 +36,9 @@ from .response import response
 from .response_figure import LOOK, draw_response
 
 KEPT = Path(__file__).parent / "report" / "report.json"
-"""The report of an earlier run, beside which each run is set."""
+"""The report of an earlier run, with which each run is compared."""
 LONG_CURVES = tuple(name for name in CURVES if name not in SHORT_CURVES)
-# Located points agree to rounding; splines through curves were kept to 1e-5.
+# Located points agree to rounding, splines through curves to 1e-5.
 _AGREE = 1e-5
 
 STEPS = (
@@ -54,10 +54,10 @@ STEPS = (
 
 
 class Figure2(NamedTuple):
-    """What is found with Figure 2."""
+    """The results of Figure 2."""
 
     panels: dict[str, Any]
-    """As `describe` returns them."""
+    """The panels as returned by `describe`."""
     claims: list[Claim]
     curves: dict[str, Boundary]
     """The curves of `LONG_CURVES`, which begin on its branches."""
@@ -66,11 +66,11 @@ class Figure2(NamedTuple):
 def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
     """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
 
-    Figure 2 is computed in a second process: most of the time is tracing, which holds Python's
-    lock, so that threads would keep one core busy only.
+    Figure 2 is computed in a second process. Most of the time is tracing, which holds Python's
+    global lock, so threads would use only one core.
 
-    **Arguments:** the folder to write into, which is made if it is missing; a function that is
-    called with each of `STEPS` as it begins. Double precision is needed.
+    **Arguments:** the folder to write into, which is created if it is missing; a function that is
+    called with each of `STEPS` at its beginning. Double precision is needed.
     """
     out.mkdir(parents=True, exist_ok=True)
     # Ctrl-C ends the other process too, without a traceback.
@@ -84,7 +84,7 @@ def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
 
 
 def _each(tell: Callable[[str], None]) -> Callable[[], None]:
-    """Return a function that tells of the next step."""
+    """Return a function that reports the next step."""
     steps = iter(STEPS)
     return lambda: tell(next(steps))
 
@@ -145,9 +145,9 @@ def summary(claims: Sequence[Claim]) -> str:
 
 
 def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
-    """Return in words how a report differs from another in verdicts and in special points.
+    """Return the differences of two reports in verdicts and special points, in words.
 
-    **Arguments:** both, as `report.json` holds them.
+    **Arguments:** both reports as in `report.json`.
     """
     verdicts, others = ({x["name"]: x["verdict"] for x in of["claims"]} for of in (new, kept))
     found = [

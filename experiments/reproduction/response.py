@@ -14,48 +14,48 @@ from vi_jax.scans import REGIMES, Sweep, lyapunov, sweep
 
 from .motions import GAP, table_damping_ratio
 
-# The k that Figure 2 is computed for, and Table 1's range of ζ.
+# The values of k in Figure 2, and Table 1's range of ζ.
 RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
 # The longest step along its branches, in the units of `continue_orbit`: a choice.
 MAX_STEP = 0.2
 RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
 
-# The paper draws a second stop below without a number. Here the 2π motion is clear of it, and most
-# of the motions that the sweeps settle on are not.
+# The paper draws a second stop below without a number. At this value the 2π motion does not reach
+# it, and most of the motions that the sweeps reach do.
 WALL = -2.5
-# Between these the motions change much, and ζ is stepped through more finely.
+# Between these values the motions change much, and the steps of ζ are finer.
 FINE = (0.695, 1.015)
-# Periods of more cycles than this are not looked for: a choice.
+# The longest period that is detected, in cycles: a choice.
 LONGEST = 12
-# Lanes of the programs that settle single values again; one number, so that there is one program.
+# Lanes of the programs that settle single values again; a fixed number needs only one program.
 _LANES = 128
 
 
 class System(NamedTuple):
-    """One k and one ξ of Figure 2. Arrays of the sweeps are in the order of rising ζ."""
+    """The results of Figure 2 for one k and one ξ. Arrays of the sweeps are sorted by ζ."""
 
     restitution: float
     damping_ratio: float
     closed: dict[int, ClosedFormOrbits]
     """Motions with one impact per 1 and per 2 drive cycles at each ζ (2π and 4π)."""
     branches: list[Branch]
-    """The 2π branch, what springs from its period doubling, and so on, grazing by grazing."""
+    """The 2π branch, the branch from its period doubling, and those from further grazings."""
     stretch: tuple[float, float]
-    """ζ of BB' and CC': birth and period doubling of the 2π impact motion."""
+    """ζ of BB' and CC': first grazing and period doubling of the 2π impact motion."""
     sweeps: dict[str, Sweep]
     """The sweeps of rising and of falling ζ, by the names "run-up" and "close-down"."""
     exponents: dict[str, np.ndarray]
-    """Largest Lyapunov exponent per drive cycle where a sweep has no period, else NaN."""
+    """Largest Lyapunov exponent per drive cycle if a sweep has no period, else NaN."""
 
 
 class Response(NamedTuple):
     """All curves and marks of Figure 2."""
 
     ratios: np.ndarray
-    """The values of ζ that were swept through, in rising order."""
+    """The values of ζ of the sweeps, sorted."""
     systems: list[System]
-    """For each k of `RESTITUTIONS` the undamped one and the one with Table 1's damping."""
+    """For each k of `RESTITUTIONS`, the undamped system and that with Table 1's damping."""
 
 
 def response() -> Response:
@@ -90,7 +90,7 @@ def with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
     return scene
 
 
-# Unoptimised it compiles in half of the time, and it runs for milliseconds.
+# Without optimisation it compiles in half of the time, and it still runs within milliseconds.
 @partial(jit, static_argnames="cycles", compiler_options={"xla_backend_optimization_level": 0})
 def _closed_forms(scene: Scene, grid, ratios, *, cycles: int) -> ClosedFormOrbits:
     def one(numbers, ratio):
@@ -102,7 +102,7 @@ def _closed_forms(scene: Scene, grid, ratios, *, cycles: int) -> ClosedFormOrbit
 def _branches(
     scene: Scene, ratios: np.ndarray, closed: ClosedFormOrbits
 ) -> tuple[list[Branch], tuple[float, float]]:
-    """The 2π branch and what springs from it; ζ of BB' and CC'."""
+    """Return the 2π branch with those that begin on it, and ζ of BB' and CC'."""
     near = int(np.argmin(abs(ratios - 0.9)))
     orbit = find_orbit(scene, scene.start(Y=closed.Y[near, 0], V=closed.V[near, 0]), throw=True)
     follow = partial(continue_orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
@@ -111,7 +111,7 @@ def _branches(
     waiting = [p for p in branches[0].special if p.kind == "period-doubling"]
     doubling = max(p.parameter for p in waiting)
     seen: set[float] = set()
-    # Each grazing of a doubled motion leads to the next motion; below 1/√2 nothing is of interest.
+    # Each grazing of a doubled motion leads to the next motion; those at or below BB' are skipped.
     while waiting and len(branches) < 4:
         at = waiting.pop()
         try:
@@ -130,7 +130,7 @@ def _branches(
 
 @partial(jit, static_argnames="settle")
 def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
-    """One sweep for each row of values, all in one program.
+    """Sweep each row of values, all in one program.
 
     **Arguments:** `numbers`, k and ξ of each row, (rows, 2); `values` of ζ, (rows, values);
     `starts`, a state with one leading axis; `settle` in cycles.
@@ -147,7 +147,7 @@ def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
 
 @jit
 def _exponents(scene: Scene, numbers, values, starts):
-    """Largest Lyapunov exponents per drive cycle."""
+    """Return the largest Lyapunov exponents per drive cycle."""
 
     def one(numbers, value, start):
         here = with_numbers(scene, numbers[0], numbers[1], value)
@@ -161,14 +161,14 @@ def _sweeps(
     numbers: list[tuple[float, float]],
     ratios: np.ndarray,
 ) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
-    """Run-up and close-down of each system, all in one program.
+    """Return run-up and close-down of each system, all computed in one program.
 
-    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the values of ζ, rising.
+    **Arguments:** `numbers`, k and ξ of each system; `ratios`, the sorted values of ζ.
     """
     lanes = [(k, xi, up) for k, xi in numbers for up in (True, False)]
     pairs = np.array([lane[:2] for lane in lanes])
     values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
-    # On the motion without impacts: undamped, a start at rest would never be forgotten.
+    # Starts on the motion without impacts: without damping, the transient from rest never decays.
     gain = 1 / (1 - values[:, 0] ** 2 + 2j * pairs[:, 1] * values[:, 0])
     begin_Y, begin_V = gain.real, (1j * values[:, 0] * gain).real
     starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(begin_Y, begin_V)
@@ -182,7 +182,7 @@ def _sweeps(
     for some in _chunks(np.flatnonzero(flat.period == REGIMES.unsettled)):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
         exponents[some] = _exponents(scene, pairs[some], values[some], ends)
-    for _ in range(6):  # near a bifurcation motions come to rest slowly
+    for _ in range(6):  # near a bifurcation motions settle slowly
         quiet = (flat.period == REGIMES.unsettled) & (exponents < 0.002)
         _again(scene, flat, pairs, values, np.flatnonzero(quiet))
     exponents[flat.period > 0] = np.nan
@@ -199,10 +199,10 @@ def _sweeps(
 
 
 def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:
-    """Settle some values for another 1,000 cycles, and put the results in place.
+    """Settle some values for another 1,000 cycles, and store the results in `flat`.
 
-    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs` and `values`, k and ξ,
-    and ζ, of each; `which`, the indices to settle.
+    **Arguments:** `flat`, the sweeps as one row, changed in place; `pairs`, k and ξ of each value;
+    `values` of ζ; `which`, the indices to settle.
     """
     for some in _chunks(which):
         ends = jtu.tree_map(lambda x, some=some: x[some, -1], flat.sections)
@@ -215,7 +215,7 @@ def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, whi
 
 
 def _chunks(indices: np.ndarray) -> list[np.ndarray]:
-    """Indices in rows of equal length; the last row repeats its last one."""
+    """Return indices in rows of equal length; the last row repeats its last index."""
     if not indices.size:
         return []
     padded = np.append(indices, np.repeat(indices[-1:], -len(indices) % _LANES))

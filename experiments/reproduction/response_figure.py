@@ -1,4 +1,4 @@
-"""The picture of Figure 2: closed forms, branches, sweeps, and what the sweeps settle on."""
+"""The picture of Figure 2: closed forms, branches, sweeps, and the motions of the sweeps."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ from .discrepancy import between, rows
 from .motions import GAP
 from .response import RANGE, RESTITUTIONS, WALL, Response, System
 
-# Arguments with which `save_picture` makes a small file of it.
+# Arguments of `save_picture` for a small file.
 LOOK = {"dpi": 72, "colors": 250}
 
-# Width of a closed form, which is seen on both sides of what lies on it.
+# Line width of a closed form, which stays visible on both sides of lines on top of it.
 _BAND = 7.0
 # Circles for the run-up and dots for the close-down, as in the paper.
 _UP: dict[str, Any] = {
@@ -30,7 +30,7 @@ _DOWN: dict[str, Any] = {
 
 
 def draw_response(found: Response) -> Figure:
-    """Draw Figure 2: the range of ζ above, undamped and damped; from BB' to CC' below."""
+    """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'."""
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
     figure = Figure(figsize=(15, 17.2))
     figure.set_layout_engine("constrained", w_pad=0.08)
@@ -72,7 +72,7 @@ def draw_response(found: Response) -> Figure:
 
 
 def _colors(found: Response) -> dict[str, str]:
-    """A colour for each kind of motion in the strips; rare ones share one."""
+    """Return a colour for each kind of motion in the strips; rare kinds share one."""
     fixed = {
         "2π, 1 impact": color_of(1, 1),
         "4π, 1 impact": color_of(2, 1),
@@ -91,7 +91,7 @@ def _colors(found: Response) -> dict[str, str]:
             names |= {r.motion for r in rows(system, name, between(system, found.ratios))}
     if names - set(fixed):
         names.add("other period")
-    names |= {"2π, 1 impact", "4π, 1 impact", "4π, 2 impacts"}  # the lines'
+    names |= {"2π, 1 impact", "4π, 1 impact", "4π, 2 impacts"}  # of the lines
     return {name: color for name, color in fixed.items() if name in names}
 
 
@@ -107,14 +107,14 @@ def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
 
 
 def _sweep_marks(ax: Axes, ratios: np.ndarray, system: System, name: str = "y_min") -> None:
-    """Circles for the run-up and dots for the close-down, as in the paper."""
+    """Draw circles for the run-up and dots for the close-down, as in the paper."""
     up, down = (np.asarray(getattr(system.sweeps[s], name)) for s in ("run-up", "close-down"))
     ax.plot(ratios, up, **_UP)
     ax.plot(ratios, down, **_DOWN)
 
 
 def _free(ax: Axes, system: System) -> None:
-    """The motion without impacts, with and without its reaching the stop."""
+    """Draw the motion without impacts, also for ζ at which it would pass the stop."""
     zeta = np.linspace(*RANGE, 1401)
     free = 1 / np.abs(1 - zeta**2 + 2j * system.damping_ratio * zeta + 1e-300)
     for sign in (-1, 1):
@@ -152,7 +152,7 @@ def _zoom(
     system: System,
     colors: dict[str, str],
 ) -> None:
-    """From BB' to CC', with a strip for each sweep that names its motions by colour.
+    """Draw the range from BB' to CC', with a strip of the motions' colours for each sweep.
 
     **Arguments:** `ratios`, the values of ζ; `colors` of the motions by name.
     """
@@ -176,9 +176,9 @@ def _zoom(
 
 
 def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -> None:
-    """A strip's motion, or where it is too narrow only its period.
+    """Write a strip's motion, or only its period if the strip is too narrow.
 
-    **Arguments:** `x` and `y`, the strip's middle; `width` of it; `color` behind the text.
+    **Arguments:** `x` and `y`, the strip's middle; its `width`; `color` behind the text.
     """
     dark = np.dot(to_rgb(color), (0.3, 0.59, 0.11)) < 0.55
     for name in (motion, motion.partition(",")[0]):
@@ -189,7 +189,7 @@ def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -
 
 
 def _edges(ratios: np.ndarray, part: np.ndarray) -> tuple[float, float]:
-    """Where a row's strip begins and ends: half a step beyond its values."""
+    """Return the ends of a row's strip, half a step beyond its values."""
     half = np.gradient(ratios) / 2
     first, last = part[0], part[-1]
     return float(ratios[first] - half[first]), float(ratios[last] + half[last])

@@ -89,7 +89,7 @@ class Bench:
         return self._whole
 
     def jobs(self, listed: list[Entry], task: Task, *, all_cores: bool) -> list[Job]:
-        """Build entries. Those for one core are on different cores, to compile in parallel."""
+        """Build entries; those for one core are on different cores, to compile in parallel."""
         jobs = []
         for i, entry in enumerate(listed):
             shares = task.dealt(
