@@ -70,7 +70,7 @@ class BoundaryCurves(NamedTuple):
     """Period doubling of the 4π motion, which is unstable between the curve's two arms."""
 
 
-# The start of each curve: the period in cycles and the k of a branch, the kind of its point, and the
+# The start of each curve: period in cycles and k of a branch, the kind of its point, and the
 # second parameter. At k = 0.5 the 4π motion is stable in its whole range, at k = 0.8 it is not.
 _BEGINNINGS: dict[str, tuple[int, float, str, str]] = {
     "doubling_k": (1, RESTITUTION, "period-doubling", K),

@@ -124,7 +124,7 @@ def nudged_rate(case: Case, *, nudge: float = 1e-8) -> float:
     samples = sampled(case.from_rest)[2]
     run = run_of(case.scene, start, cycles, samples)
     deviation = _deviation(run, case.on_short)
-    # After 12 cycles the other multiplier's component has decayed, and the deviation is still small.
+    # After 12 cycles the other multiplier's part has decayed, and the deviation is still small.
     return _rate(deviation[12:36])
 
 
