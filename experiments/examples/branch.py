@@ -1,5 +1,5 @@
 # %% [markdown]
-"""# Follow a motion and switch where it bifurcates
+"""# Continue a motion and switch branches where it bifurcates
 
 The 2π motion is continued in the frequency ratio ζ. At its period doubling a 4π motion with two
 impacts begins. At a grazing this motion loses an impact and becomes the paper's 4π motion.

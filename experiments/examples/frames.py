@@ -1,7 +1,7 @@
 # %% [markdown]
 """# Two frames pound each other, shaken by an unbalanced motor
 
-Run up (△), the motor stays at its frame's resonance, then jumps: sooner if frames collide (blue).
+The motor's speed stays at the resonance (△: run-up), then jumps, sooner if frames collide (blue).
 """
 
 # %%

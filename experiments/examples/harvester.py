@@ -1,5 +1,5 @@
 # %% [markdown]
-"""# What stops do to a vibration harvester
+"""# Stops widen the band of a vibration harvester
 
 A 10 g magnet on a spring (30 Hz) moves in a coil. Its base has a random acceleration w of 20 m/s²
 (rms) in a band 3 Hz wide. Stops cost power at resonance but widen the band (gap 1 m: no stops).

@@ -1,5 +1,5 @@
 # %% [markdown]
-"""# Simulate a machine and look at its motion
+"""# Simulate a machine and plot its motion
 
 The machine of the paper's Table 1: a motor turns a crank, the crank shakes a body on a spring, and
 the body hits a stop. The motion settles for 200 drive cycles, and the next two are drawn.

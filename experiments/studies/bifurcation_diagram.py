@@ -126,7 +126,7 @@ DRAWN = [
 ]  # fmt: skip
 
 # %% [markdown]
-# ## What was found
+# ## Results
 #
 # The closed form's multipliers are independent of the continuation: at -1 the period doubles.
 

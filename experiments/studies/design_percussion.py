@@ -220,7 +220,7 @@ listed = table(heads, rows)
 print(listed)
 
 # %% [markdown]
-# ## What was found
+# ## Results
 
 # %%
 end_a, end_b, end_c = (ascents[name].end for name in DESIGNS)

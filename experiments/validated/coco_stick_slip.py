@@ -1,5 +1,5 @@
 # %% [markdown]
-"""# An impactor that makes what it hits slide
+"""# An impactor that makes its base slide
 
 A voltage attracts a body on a spring to a base at q = 0.5. An impact makes the base slide until
 friction stops it.

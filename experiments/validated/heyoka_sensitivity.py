@@ -1,5 +1,5 @@
 # %% [markdown]
-"""# How the time of an event changes
+"""# Derivatives of the time of an event
 
 A mass on a spring of stiffness k starts with speed 1. The derivatives of the time of its first
 turning point and of the misfit (x - 10.123)² there are compared.

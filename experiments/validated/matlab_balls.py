@@ -2,7 +2,7 @@
 """# Two bouncing balls
 
 `ballode` throws a ball up at 20 m/s (e = 0.9). Simulink's ball (15 m/s from 10 m, e = 0.8) has
-infinitely many impacts in finite time, where its solver may stop; here it comes to rest.
+infinitely many impacts in finite time. Its solver may stop there; here the ball comes to rest.
 """
 
 # %%

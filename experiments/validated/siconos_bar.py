@@ -1,8 +1,8 @@
 # %% [markdown]
 """# An elastic bar that hits a wall
 
-A steel bar of 100 nodes flies at a wall at 0.1 m/s. Its end stays there until the wave in it comes
-back. The end rests on a stop without restitution; the bar is followed in its natural modes.
+A steel bar of 100 nodes hits a wall at 0.1 m/s. Its end stays in contact until the wave in the bar
+returns. The wall is a stop without restitution, and the bar is simulated in its natural modes.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
-"""# A block that rubs and stops
+"""# A block that slides and stops
 
-x'' = -x with Coulomb friction of level 1, from x = 12 with x' = 6. The block turns eight times,
-each time 2 nearer, and sticks.
+x'' = -x with Coulomb friction of level 1, from x = 12 with x' = 6. The block turns, each time 2
+nearer to zero, and sticks at the eighth turn.
 """
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 """# The simplest walking model
 
-Two rigid legs with a mass at the hip walk down a slope of 0.009 rad. There are two gaits; that with
-long steps is stable.
+Two rigid legs with a mass at the hip walk down a slope of 0.009 rad. There are two gaits, and the
+one with long steps is stable.
 """
 
 # %%
