@@ -201,7 +201,7 @@ class Spare(Machine):
         (lambda: Unlisted(), "must list its contacts as `contacts`"),
         (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),
         (lambda: basins_of(resolutions=9), "`basins` has no argument `resolutions`; near names: r"),
-        (lambda: basins_of(cycles=9), "`cycles` must not be given to `basins`"),
+        (lambda: basins_of(noise=9), "`noise` must not be given to `basins`"),
         (
             lambda: instance_of("machine", Machine, vi.AbstractMachine, "one"),
             "`Machine(…)`, for one",

@@ -252,8 +252,8 @@ def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> n
     return np.array([float(given.get(name, 1.0)) for name in names])
 
 
-# Options of `scan` that the functions of this file set themselves.
-_SET = {"measure", "paired", "cycles", "derivatives", "axes"}
+# Options of `scan` that the functions of this file set themselves, or that leave no period to find.
+_SET = {"measure", "paired", "cycles", "derivatives", "axes", "noise", "key"}
 
 
 class _Mark(Sections):
