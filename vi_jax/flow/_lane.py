@@ -233,11 +233,11 @@ class Plan(eqx.Module):
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
 
     sizes: State | None = None
-    """The size of each number of the state, at most 1 (see `loop.sizes_of`)."""
+    """The size of each number of the state (see `loop.sizes_of`), at most 1."""
     extents: tuple[Any, ...] | None = None
-    """The size, at most 1, of each coordinate, then of the guard of each of `others`; `None` for a
-    machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of mode 0
-    and in it, since its guard is another quantity there."""
+    """The size, at most 1, of each coordinate, then that of the guard of each of `others`; `None`
+    for a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
+    mode 0 and in it, since its guard is another quantity there."""
 
     def extent(self, k: int) -> Scalar | float:
         """Return the length scale of coordinate number k."""

@@ -56,8 +56,8 @@ _REST = 1e-15
 
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """Return the expected size of each number of the state if that is less than 1; else 1. `None`
-    for a machine whose numbers are about 1 by definition.
+    """Return the expected size of each number of the state. `None` for a machine whose numbers are
+    about 1 by definition.
 
     The size is the greater of the value at the start and its change at the rates there, in 1/2π of
     a cycle or of a shorter natural period. If both are tiny, it is the change that the sizes of the
@@ -66,7 +66,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     if scales_known(machine):
         return None
     known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
-    return stop_gradient(jtu.tree_map(_small, known))
+    return stop_gradient(jtu.tree_map(lambda x: jnp.where(x > 0, x, 1.0), known))
 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
@@ -103,7 +103,7 @@ def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> n
 def _known_sizes(
     machine: AbstractMachine, s: Scalar, start: State, modes: Scalars, values: State
 ) -> State:
-    """Return `sizes_of` without its limit of 1, and 0 if unknown; `values`: moduli in `start`."""
+    """Return `sizes_of`, but 0 if unknown; `values`: moduli in `start`."""
     holding = [x for x in events_of(machine) if x.holds_mode]
     # While something sticks or slides along a surface, its rate does not show its size.
     sticks = [getattr(x, "blends", False) or x.is_dry for x in holding] + [False] * len(modes)
@@ -134,8 +134,8 @@ def _known_sizes(
 def extents_of(
     plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
 ) -> tuple[Any, ...]:
-    """Return `Plan.extents`: the size, at most 1, of each coordinate, then of the guard of each
-    event other than a stop. `sizes` are from `sizes_of`."""
+    """Return `Plan.extents`: the size, at most 1, of each coordinate, then the size of the guard of
+    each event other than a stop. `sizes` are from `sizes_of`."""
     machine, unit = plan.machine, plan.unit
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
     s, start = stop_gradient((s, start))
@@ -146,9 +146,11 @@ def extents_of(
 
         value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
         own = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        return _small(jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes)))
+        size = jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes))
+        return jnp.where(size > 0, size, 1.0)
 
-    found: list[Any] = [_small(size_of(x.position, start, sizes)) for x in machine.coordinates]
+    places = (size_of(x.position, start, sizes) for x in machine.coordinates)
+    found: list[Any] = [_small(jnp.where(size > 0, size, 1.0)) for size in places]
     for number in plan.others(start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
@@ -164,8 +166,8 @@ def extents_of(
 
 
 def _small(size: Array) -> Array:
-    """Return a size; 1 if it is unknown, or larger, since the motion may become smaller."""
-    return jnp.where((size > 0) & (size < 1), size, 1.0)
+    """Return a size; 1 if it is larger, since the motion may become smaller."""
+    return jnp.minimum(size, 1.0)
 
 
 def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -285,6 +287,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     sizes = sizes_of(plan.machine, s, start, modes)
     if sizes is not None:
         extents = extents_of(plan, s, start, modes, sizes)
+        sizes = jtu.tree_map(_small, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
     numbers, rest = eqx.partition(plan, eqx.is_array)

@@ -14,7 +14,15 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars
 from ...lanes import pin
-from ...machine import RigidStop, clock_of, events_of, horner, section_number, stops_of
+from ...machine import (
+    RigidStop,
+    clock_of,
+    events_of,
+    horner,
+    section_number,
+    stops_of,
+    switches_of,
+)
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
 from ..events import Rates, highest, quintic, rising_root, slope, to_turn
 from ..methods import Foreseen
@@ -546,7 +554,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             below.append(~path.leaves.left & asked)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
-        if not exactly:
+        if not exactly or any(x.blends for x in switches_of(plan.machine)):
             # A turn that is closer than the clock resolves, as of a body that a rounded difference
             # has almost stopped, has nothing before it to step to. Nor does it count if all that
             # moves is rounding, as between bodies that move together.
