@@ -1,4 +1,4 @@
-"""The same machine in other units of length and time has the same special points."""
+"""The same machine in other units of length and time has the same orbits and special points."""
 
 import functools
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-UNITS = ((1.0, 1.0), (1e-6, 1e-3), (1e6, 1e3), (1e-6, 1e6))
+pytestmark = pytest.mark.slow
+UNITS = ((1.0, 1.0), (1e-6, 1e-3), (1e3, 1.0), (1e-6, 1e6), (1.0, 1e6))
 
 
 class Struck(vi.AbstractMachine):
@@ -47,6 +48,29 @@ class Rubbed(Struck):
         return (vi.DryFriction(on=("x", "v"), level=self.length / self.time**2 / 3),)
 
 
+class Sliding(Struck):
+    """The same friction as a switch."""
+
+    contacts, events = (), vi.Switch(lambda m, s, x: x.v, slides=True)
+
+    def field(self, s, state, side):
+        drag = side * self.length / self.time**2 / 3
+        return {"x": state.v, "v": super().field(s, state)["v"] - drag}
+
+
+class Heated(Struck):
+    """The impact is a reset, which warms the body; heat has a unit of its own."""
+
+    reset = lambda m, s, x: {"v": -0.6 * x.v, "heat": x.heat + (x.v * m.time / m.length**2) ** 2}
+    contacts, events = (), vi.Reset(lambda m, s, x: x.x - m.gap * m.length, reset)
+
+    def field(self, s, state):
+        return super().field(s, state) | {"heat": -0.2 * state.heat / self.time}
+
+    def start(self):
+        return vi.State(x=0.0, v=0.0, heat=0.0)
+
+
 class Swinging(vi.AbstractMachine):
     """The van der Pol oscillator."""
 
@@ -70,39 +94,43 @@ CASES = {
     "impacts": (Struck, {"frequency": 0.6, "gap": 0.5}, "frequency", (0.5, 1.2)),
     "bends": (Struck, {"cubic": 1.0, "gap": 9.0, "force": 0.4}, "frequency", (0.6, 3.0)),
     "rubs": (Rubbed, {"frequency": 0.5}, "frequency", (0.2, 0.9)),
+    "slides": (Sliding, {"frequency": 0.5}, "frequency", (0.2, 0.9)),
+    "heats": (Heated, {"frequency": 0.6}, "gap", (0.1, 2.0)),
     "swings": (Swinging, {}, "growth", (-0.5, 0.6)),
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_branch_is_the_same_in_all_units(case):
     kind, numbers, parameter, bounds = CASES[case]
-    found = []
-    # In the fourth units the body that rubs is slower than what counts as sticking.
-    units = [at for at in UNITS if (kind, at) != (Rubbed, UNITS[3])]
-    for length, time in units:
+    found, forecasts = [], []
+    for length, time in UNITS:
         machine = kind(length=length, time=time, **numbers)
         settled = vi.simulate(machine, machine.start(), 1, settle=60).last
         orbit = vi.find_orbit(machine, settled, throw=True)
         branch = vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
-        # At its ends the body that rubs is only just held: a force, which no length is a scale for.
-        assert branch.admissible[1:-1].all()
-        found.append((branch.ends, [(p.kind, p.parameter) for p in branch.special], branch))
-    assert found[0][1], found[0][2]
-    if case == "impacts":  # the parameter changes how long a cycle takes
-        touch = next(p for p in found[0][2].special if p.kind == "grazing")
-        assert vi.grazing(touch, progress=False).agreement == 1
-    for ends, special, branch in found[1:]:
-        assert ends == found[0][0] and [k for k, _ in special] == [k for k, _ in found[0][1]], (
-            str(found[0][2]), str(branch),
-        )  # fmt: skip
-        np.testing.assert_allclose(
-            [at for _, at in special], [at for _, at in found[0][1]], rtol=1e-9, atol=1e-9
-        )
+        assert branch.admissible.all()
+        points = {p.kind: p for p in branch.special}
+        kinds = branch.ends, [p.kind for p in branch.special]
+        found.append((kinds, [p.parameter for p in branch.special]))
+        if case == "heats" and length == 1:  # the curve is a line: motions grow with gap and force
+            at = points["period-doubling"]
+            curve = vi.boundary(at, parameter="force", bounds=(bounds, (0.5, 2.0)), max_points=20)
+            gap, force = curve.parameters.T
+            np.testing.assert_allclose(gap / force, at.parameter, rtol=1e-9)
+            assert not curve.special, str(curve)
+        if case == "impacts" and len(found) < 4:  # the parameter changes how long a cycle takes
+            ahead = vi.grazing(points["grazing"], progress=False)
+            assert ahead.agreement == 1
+            forecasts.append((ahead.entries / ahead.entries[0], ahead.forecast.period))
+    assert found[0][1]
+    for other in forecasts:
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, forecasts[0])
+    for kinds, places in found:
+        assert kinds == found[0][0]
+        np.testing.assert_allclose(places, found[0][1], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_manifolds_and_exponents_are_the_same_in_all_units():
     curves = []
     for length, time in UNITS[:3]:
@@ -115,3 +143,54 @@ def test_manifolds_and_exponents_are_the_same_in_all_units():
         curves.append((curve, exponents))
     for other in curves[1:]:
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, curves[0])
+
+
+def test_all_orbits_are_told_apart():
+    """Those of one period were one motion."""
+    found = []
+    numbers = {"frequency": 0.9, "damping": 0.04, "stiffness": 1.0, "cubic": 0.0}
+    for size in (1.0, 1e-6):
+        machine = vi.machines.Duffing(
+            amplitude=size, gap=2.0 * size, restitution=0.5, two_sided=False, **numbers
+        )
+        region = {"start.Y": (-3 * size, 2 * size), "start.V": (-3 * size, 3 * size)}
+        all_of_them = vi.all_orbits(machine, 2, region=region, starts=64)
+        rows = zip(all_of_them.orbits, all_of_them.found.tolist(), strict=True)
+        found.append([[int(orbit.impacts), *row] for orbit, row in rows])
+    assert found[0] == found[1] and len(found[0]) == 4
+
+
+class Tool(vi.Mechanical):
+    """A motor's crank shakes a body against a stop. The angle has no unit of length."""
+
+    size: float = 1.0
+    control: float = 0.9
+    q = ("y", "phi")
+    cycle = vi.turn_of("phi", usual=0.45)
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.08 * self.size, 0.5, on="y")
+
+    def mass(self, q):
+        return 0.35, self.size**2 * (0.06 + 0.2 * (0.04 * jnp.sin(q.phi)) ** 2)
+
+    def force(self, t, q, v):
+        spring = 88.8 * (q.y - 0.04 * self.size * jnp.cos(q.phi))
+        torque = 10.0 * self.size**2 * (self.control - v.phi / 15.93)
+        return dict(y=-spring - 0.5 * v.y, phi=torque - 0.04 * self.size * spring * jnp.sin(q.phi))
+
+
+def test_lengths_are_compared_with_lengths_only():
+    """Motions of a machine of millimetres had a period, since lengths were compared with a speed in
+    radians per second."""
+    found, errors = [], []
+    for size in (1.0, 1e-3, 1e3):
+        tool = Tool(size=size)
+        options = {"start": tool.at(v={"phi": 14.0}), "settle": 100}
+        sweep = vi.sweep(tool, "control", np.linspace(0.7, 0.9, 5), **options)
+        found.append(sweep.period.tolist())
+        tried = vi.suggest_method(tool, start=options["start"], cycles=4, lanes=2).tried
+        errors.append(max(x.error for x in tried if x.name.startswith("FixedStep")))
+    assert found == [[1, 2, -2, -2, 1]] * 3
+    np.testing.assert_allclose(errors, errors[0], rtol=1e-3)

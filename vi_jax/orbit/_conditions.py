@@ -219,12 +219,11 @@ class Exchange(eqx.Module):
 def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
     """Return the exchange at a crossing of branches, from the singular vectors of the motion's
     Jacobian without the parameters' columns; `None` if the second parameter separates them."""
-    scale = problem.scale
-    jacobian = jacobian_at(problem, x) * scale
+    jacobian = jacobian_at(problem, x)[0]
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
     if abs(left[:, -1] @ jacobian[:, -2]) > _APART * sizes[0]:
         return None
-    return Exchange(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * scale[:-2]))
+    return Exchange(jnp.asarray(left[:, -1]), jnp.asarray(right[-1] * problem.scale[:-2]))
 
 
 class FixedComponent(AbstractCondition):

@@ -454,8 +454,8 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
 
 
 def room(step: Step) -> float:
-    """Return the clearance as a share of the motion's extent; 1 for motions without a turn."""
-    return float(np.clip(step.seen.nearest.room / step.seen.length, -1.0, 1.0))
+    """Return the clearance as a share of its size; 1 for motions without a turn."""
+    return float(np.clip(step.seen.nearest.room / step.seen.nearest.unit, -1.0, 1.0))
 
 
 def least_hold_force(step: Step) -> float:

@@ -138,9 +138,9 @@ COARSE = 1e-10
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 
-# A component of the state below the first share of the largest one at events, or below the second
-# along the whole motion, gets the size of the largest. Both are choices; the second is above the
-# remainder of a component that decays to zero. If all are below the third, at rest, the size is 1.
+# A component of the state below the first share of its expected size at events, or below the second
+# along the whole motion, gets that size. Both are choices; the second is above the remainder of a
+# component that decays to zero. If all are below the third, at rest, the size is 1.
 _SMALL, _NOTHING, _REST = 1e-3, 1e-10, 1e-9
 
 
@@ -202,7 +202,7 @@ def problem_of(
         before = states
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
         states, modes = _followed(blank, orbit.state, found, period)
-        if np.max(np.abs(states - before) / _sizes(states)) < _SETTLED:
+        if np.max(np.abs(states - before) / _sizes(blank, states)) < _SETTLED:
             break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
@@ -214,9 +214,9 @@ def problem_of(
 def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
     """Set the sizes of the clock (a cycle is 2π) and of the components of the state."""
     _, states, period = problem.values(x)
-    sizes = _sizes(states)
+    sizes = _sizes(problem, states)
     if largest is not None and np.isfinite(largest).all():
-        sizes = _sizes(largest, _NOTHING)
+        sizes = _sizes(problem, largest, _NOTHING)
     turn = period / problem.cycles / (2 * np.pi)
     return dataclasses.replace(problem, sizes=jnp.append(turn, sizes))
 
@@ -230,12 +230,17 @@ def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
     return dataclasses.replace(problem, sizes=sizes)
 
 
-def _sizes(states: np.ndarray, small: float = _SMALL) -> np.ndarray:
+def _sizes(problem: Shooting, states: np.ndarray, small: float = _SMALL) -> np.ndarray:
     """Return half the largest modulus of each component of some states, (…, states). A component
-    that is a small share of the others gets the largest of all: it may be larger elsewhere."""
+    that is a small share of the others gets the size that its rates give it, else that of the
+    largest of all, at most 1: it may be larger elsewhere."""
     most = np.abs(np.atleast_2d(states)).max(axis=0)
     largest = most.max() if most.max() > _REST else 1.0
-    return 0.5 * np.where(most > small * largest, most, largest)
+    if (most > small * largest).all():
+        return 0.5 * most
+    usual = sizes_on_host(problem.machine, problem.like, states)
+    usual = np.where(usual == 1, min(largest, 1.0), usual)
+    return 0.5 * np.where(most > small * usual, most, usual)
 
 
 def _check_instants(

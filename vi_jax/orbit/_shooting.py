@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.lax import stop_gradient
 from jaxtyping import Array, Complex, Float, Int
 
 from .._types import Scalar, State, Vector
@@ -57,6 +58,8 @@ class Observed(NamedTuple):
     approach: Float[Array, " events"]
     """V⁻ at each impact, the rate of the guard at other events; negative beyond the event's loss.
     """
+    units: Float[Array, " events"]
+    """The sizes of these along the motion."""
     y_min: Scalar
     """Smallest position of the first coordinate over the period."""
     y_max: Scalar
@@ -87,9 +90,9 @@ class Observed(NamedTuple):
 
     def admissible(self, events: Sequence[int]) -> bool:
         """Return whether it stays inside the stops and approaches these events; host-side."""
-        inside = float(self.nearest.room) >= -ROUNDING * self.length
-        slowest = np.asarray(self.approach)[list(events)].min(initial=0.0)
-        return bool(inside and slowest >= -ROUNDING * self.fastest)
+        inside = self.nearest.room >= -ROUNDING * self.nearest.unit
+        slowest = np.asarray(self.approach / self.units)[list(events)].min(initial=0.0)
+        return bool(inside and slowest >= -ROUNDING)
 
     @property
     def fastest(self) -> float:
@@ -428,22 +431,23 @@ class Shooting(eqx.Module):
 
             after = self.after(machine, leg, s0, u)
             carried, (passed, path, begin) = jax.jacfwd(end, has_aux=True)(after)
-            approach, order = jnp.zeros((0,), x.dtype), jnp.ones((), x.dtype)
+            approach, order = jnp.zeros((2, 0), x.dtype), jnp.ones((), x.dtype)
             if self.events:
-                saltation, rises = self.saltation(machine, leg, s0, u)
-                carried, approach = carried @ saltation, rises[None]
+                saltation, *rises = self.saltation(machine, leg, s0, u)
+                carried, approach = carried @ saltation, jnp.stack(rises)[:, None]
                 order = self._order(machine, leg, s0, u)
             places = [machine.position(self.unravel(x)) for x in (u, after)]
             h = (s1 - begin.s) / self.steps
             flight = self.flight(machine, leg)
             turns = turns_of(Path(flight, path[0], path[1], h, not self.events))
+            sizes = self._guard_sizes(flight, s0, after)
             largest = jnp.max(jnp.abs(path[1]), axis=0)
-            return carried, passed, approach, order, turns, places, largest, begin
+            return carried, passed, approach, order, turns, places, largest, begin, sizes
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
         found = jax.vmap(follow)(legs, clock, ends, states)
-        carried, passed, approach, order, turns, places, largest, begin = found
+        carried, passed, approach, order, turns, places, largest, begin, sizes = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
             monodromy = carried[leg] @ monodromy
@@ -454,17 +458,19 @@ class Shooting(eqx.Module):
         Y = jnp.concatenate(places)
         low, high, nearest, pull = turns
         i, j = jnp.argmin(nearest.room), jnp.argmin(pull.room)
-        order_of_events = self._order_margin(machine, clock, ends - clock, states)
+        nearest = jax.tree.map(lambda x: x[i], nearest)
+        order_of_events = self._order_margin(machine, clock, ends - clock, states, sizes)
         integrals = jax.tree.map(jnp.sum, passed)
         time = integrals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
             monodromy=monodromy,
-            approach=approach.ravel(),
+            approach=approach[:, 0].ravel(),
+            units=approach[:, 1].ravel(),
             y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
-            nearest=jax.tree.map(lambda x: x[i], nearest),
+            nearest=nearest._replace(unit=sizes[i, nearest.event.astype(int)]),
             pull=jax.tree.map(lambda x: x[j], pull),
             order=jnp.min(order),
             order_margin=reduce(jnp.minimum, left, order_of_events),
@@ -474,8 +480,21 @@ class Shooting(eqx.Module):
             escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
 
+    def _guard_sizes(self, flight: Flight, s: Scalar, u: Vector) -> Vector:
+        """Return the size of the guard of each of the machine's events, or 1: what the sizes of the
+        state's components and of the clock change it by. One more entry is of no event."""
+
+        def guards(s, u):
+            at = s, self.unravel(u), flight.modes, flight.contact
+            numbers = range(len(events_of(flight.machine)))
+            return jnp.stack([*(guard_of(flight.machine, n, *at) for n in numbers), u[0]])
+
+        gained, slopes = jax.jacrev(guards, argnums=(0, 1))(s, u)
+        sizes = jnp.abs(slopes) @ self.sizes[1:] + jnp.abs(gained) * self.sizes[0]
+        return stop_gradient(jnp.where((sizes > 0) & jnp.isfinite(sizes), sizes, 1.0))
+
     def _order_margin(
-        self, machine: AbstractMachine, clock: Array, lengths: Array, states: Array
+        self, machine: AbstractMachine, clock: Array, lengths: Array, states: Array, sizes: Array
     ) -> Scalar:
         least = jnp.asarray(jnp.inf, clock.dtype)
         for i, event in enumerate(self.events):
@@ -489,6 +508,7 @@ class Shooting(eqx.Module):
                 if met or 1.0 + number in self.contacts[i - 1]:
                     continue
                 room = -guard_of(machine, number, clock[i], state, before, contact)
+                room = room / sizes[i - 1, number] * self.sizes[0]
                 if other.from_below:  # if it is beyond zero, it must come from below again first
                     room = jnp.where(room > 0, room, jnp.inf)
                 least = jnp.minimum(least, room)
@@ -533,8 +553,9 @@ class Shooting(eqx.Module):
 
     def saltation(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector
-    ) -> tuple[Float[Array, "states states"], Scalar]:
-        """Return the saltation matrix of the event that begins a leg, and the speed of approach.
+    ) -> tuple[Float[Array, "states states"], Scalar, Scalar]:
+        """Return the saltation matrix of the event that begins a leg, the speed of approach and the
+        size of such a speed.
 
         The matrix DR + (f⁺ - DR f⁻) ∇g / ġ, with ġ = ∇g·f⁻ + ∂g/∂s, maps perturbations across the
         event. The jump is differentiated where the body is, without moving it onto its stop
@@ -572,7 +593,8 @@ class Shooting(eqx.Module):
             return event.of(machine).speed(machine, self.unravel(u), rate)
 
         approach = self._each(leg, met, u, rate)
-        return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach
+        unit = (jnp.abs(slope) @ self.sizes[1:]) / self.sizes[0] + jnp.abs(gained)
+        return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach, unit
 
     def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return 1 if the event that begins a leg puts its switch into the leg's mode, else -1."""

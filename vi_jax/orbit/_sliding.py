@@ -119,11 +119,6 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     return change if length < brief * period else None
 
 
-def _unit(problem: Shooting, at: Step, *, held: bool) -> float:
-    """Return the unit of a switch's guard: that of a velocity, or while `held` of a force."""
-    return at.seen.length / problem.radian ** (2 if held else 1)
-
-
 def _touching(problem: Shooting, at: Step) -> Change | None:
     """Return a flight's touch of a switch's surface, or a body at the limit of being held."""
     nearest, number = at.seen.nearest, int(at.seen.nearest.event)
@@ -131,13 +126,13 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
         return None
     leg, place = map(float, problem.leg_at(at.x, float(nearest.clock)))
     leg, mode = int(leg), _mode(problem, int(leg), number)
-    if abs(float(nearest.room)) > _ZERO * _unit(problem, at, held=not mode):
+    if abs(float(nearest.room)) > _ZERO * nearest.unit:
         return None
     force, _, away = holding_force(problem, at, leg, number, place)
     if not mode:
         return Change(number, place, (0.0, away, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
-    is_held = force < _ZERO * _unit(problem, at, held=True)
+    is_held = force < _ZERO * nearest.unit / problem.radian
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
@@ -150,11 +145,12 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
         before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
         if before:
             force, rate, _ = holding_force(problem, at, i, event.number, float(clock[i]))
-            found.append((abs(force), rate, event.number, float(clock[i]), before, after))
+            share = abs(force) / at.seen.units[i]
+            found.append((share, rate, event.number, float(clock[i]), before, after))
     if not found:
         return None
-    force, rate, number, place, before, after = min(found)
-    if force > _ZERO * _unit(problem, at, held=True):
+    share, rate, number, place, before, after = min(found)
+    if share > _ZERO:
         return None
     if rate > 0:  # at the limit of release
         return Change(number, place, (before, 0.0, after or -before), False)

@@ -71,14 +71,17 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
     return called
 
 
-def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array]:
-    """Return derivative and value; with loops `jax.jacfwd` gives no common value of its columns."""
+def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Array]:
+    """Return derivative and value, both divided by the largest derivative in each row, and those.
+    With loops `jax.jacfwd` gives no common value of its columns."""
 
     def along(direction):
         return jax.jvp(function, (x,), (direction,))
 
     values, columns = jax.vmap(along)(jnp.eye(x.size, dtype=x.dtype))
-    return columns.T, values[0]
+    rows = jnp.max(jnp.abs(columns), axis=0)
+    rows = jnp.where(rows > 0, rows, 1.0)
+    return columns.T / rows[:, None], values[0] / rows, rows
 
 
 @on_host
@@ -91,7 +94,7 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
     def newton(carry):
         y, before, count, *_ = carry
-        jacobian, missing = _jacobian(equations, y)
+        jacobian, missing, _ = _jacobian(equations, y)
         both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
         if problem.is_double:
             move, along = smallest_solution(jacobian, both, _DOUBLE).T
@@ -138,7 +141,7 @@ def step_error(problem: Shooting, x: Unknowns) -> float:
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
     """Return the scaled unit tangent of the solutions through `x`, last component positive."""
-    null = np.linalg.svd(jacobian_at(problem, x) * problem.scale)[2]
+    null = np.linalg.svd(jacobian_at(problem, x)[0])[2]
     tangent = null[-1]
     if problem.is_double:  # one direction of the plane moves the parameters
         tangent = np.linalg.svd(null[-2:, -2:])[0][:, 0] @ null[-2:]
@@ -152,9 +155,15 @@ def state_at(problem: Shooting, x, leg, s):
 
 
 @on_host
-def jacobian_at(problem: Shooting, x):
-    """Return the derivatives of the equations with respect to all unknowns."""
-    return _jacobian(problem.residual, x)[0]
+def _jacobian_at(problem: Shooting, x, scale):
+    jacobian, _, rows = _jacobian(lambda y: problem.residual(y * scale), x / scale)
+    return jacobian, rows
+
+
+def jacobian_at(problem: Shooting, x: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of the equations with respect to all unknowns, in the unknowns' sizes
+    and relative to the largest of each equation, so that no unit matters, and those largest."""
+    return _jacobian_at(problem, x, problem.scale)
 
 
 # Distances, as shares of the step, to retry before a place without a solution: choices.

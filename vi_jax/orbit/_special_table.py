@@ -119,12 +119,11 @@ class SpecialTable(Table):
             if kind != REST or event != grazes:
                 lost = lambda step, i=i: -float(step.seen.escape[i])
                 yield Event(lost, lambda at: Ending(at, REST), noise=ROUNDING)
-        fastest = here.seen.fastest
         for i in range(len(here.seen.approach)):
             # In a symmetric motion another impact grazes as well, to rounding.
             if i == grazes and kind == GRAZING:
                 continue
-            test = lambda step, i=i: float(step.seen.approach[i]) / fastest
+            test = lambda step, i=i: float(step.seen.approach[i] / step.seen.units[i])
             lost = partial(self._singular, here, test)
             yield Event(test, lost, noise=ROUNDING)
 
@@ -236,11 +235,11 @@ def _symmetric(problem: Shooting, step: Step) -> bool:
 
 def _grazes(step: Step) -> int | None:
     """Return the impact that grazes at the end of a curve; `None` at a touch."""
-    approach = np.asarray(step.seen.approach)
+    approach = np.asarray(step.seen.approach / step.seen.units)
     # A lost impact comes with a turn near the stop: at a distance of about v² for a speed v. At a
     # touched stop the impacts keep their speed.
     touches = max(_SAME_TURN * np.sqrt(abs(room(step))), _ZERO)
-    if approach.size and approach.min() < touches * step.seen.fastest:
+    if approach.size and approach.min() < touches:
         return int(np.argmin(approach))
     return None
 
@@ -288,7 +287,7 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     fold, doubling = (
         plain(lambda s, kind=kind: tests_of(s)[kind]) for kind in (CROSSING, DOUBLING)
     )
-    without_modes = dataclasses.replace(problem, conditions=())
+    motion = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
         return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
     # The product of all eigenvalues of M ± I but one, if that one is zero.
@@ -296,14 +295,14 @@ def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     shifted = lambda s: s.seen.monodromy + sign * np.eye(len(s.seen.monodromy))
     double = plain(lambda s: float(minors(shifted(s))))
     if condition.kind == FOLD:
-        tests = {CUSP: _cusp(without_modes, 2 if condition.double else 1), FLIP: doubling}
+        tests = {CUSP: _cusp(motion, 2 if condition.double else 1), FLIP: doubling}
         return tests if condition.double else tests | {RESONANCE_1: double}
     if condition.kind == DOUBLING:
-        return {DEGENERATE: _cubic(without_modes, twice=True), FLIP: fold, RESONANCE_2: double}
+        return {DEGENERATE: _cubic(motion, twice=True), FLIP: fold, RESONANCE_2: double}
     if condition.kind == CROSSING:
         return {RESONANCE_1: double}
     if condition.kind == SYMMETRY:
-        return {DEGENERATE_SYMMETRY: _cubic(without_modes, twice=False), RESONANCE_1: double}
+        return {DEGENERATE_SYMMETRY: _cubic(motion, twice=False), RESONANCE_1: double}
     # M has a pole at a grazing impact, but not at a touched stop.
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
 
@@ -322,7 +321,7 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp(without_modes: Shooting, many: int) -> Test:
+def _cusp(motion: Shooting, many: int) -> Test:
     """Return a test for cusps: the signed rate of the parameters along a curve of folds.
 
     With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
@@ -331,8 +330,7 @@ def _cusp(without_modes: Shooting, many: int) -> Test:
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
-        jacobian = np.array(jacobian_at(without_modes, step.x))
-        jacobian[:, -2:] *= without_modes.scale[-2:]
+        jacobian = jacobian_at(motion, step.x)[0]
         nulls = _nulls(jacobian[:, :-2], like)
         if many > 1:
             lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
@@ -361,7 +359,7 @@ def _bent(problem: Shooting, x, right, bend):
     return jax.jvp(second, (zero,), (jnp.ones_like(zero),))
 
 
-def _cubic(without_modes: Shooting, *, twice: bool) -> Test:
+def _cubic(motion: Shooting, *, twice: bool) -> Test:
     """Return the cubic coefficient of the motions that begin at a doubling or a symmetry breaking.
 
     Let F be the equations of the motion gone through twice, or of the symmetric motion, with null
@@ -369,17 +367,18 @@ def _cubic(without_modes: Shooting, *, twice: bool) -> Test:
     B(r, w))/6, F_x w = -B(r, r) (Kuznetsov, Elements of Applied Bifurcation Theory, 2004, section
     5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
     """
-    whole = several(without_modes, 2) if twice else without_modes
+    whole = several(motion, 2) if twice else motion
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
-        x = repeated(without_modes, step.x, whole) if twice else np.asarray(step.x)
-        matrix = jacobian_at(whole, x)[:, :-2]
+        x = repeated(motion, step.x, whole) if twice else np.asarray(step.x)
+        (jacobian, rows), scale = jacobian_at(whole, x), whole.scale
+        matrix = jacobian[:, :-2]
         nulls = _nulls(matrix)
-        right = np.append(nulls.right, [0.0, 0.0])
+        right = scale * np.append(nulls.right, [0.0, 0.0])
         second, _ = _bent(whole, x, right, np.zeros_like(x))
-        bend = np.linalg.lstsq(matrix, -second)[0]
-        _, third = _bent(whole, x, right, np.append(bend, [0.0, 0.0]))
-        return float(nulls.left @ third) / 6, None
+        bend = np.linalg.lstsq(matrix, -second / rows)[0]
+        _, third = _bent(whole, x, right, scale * np.append(bend, [0.0, 0.0]))
+        return float(nulls.left @ (third / rows)) / 6, None
 
     return test
 

@@ -5,7 +5,7 @@ turn may grow until it touches: the branch ends there in a grazing.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,6 +50,8 @@ class Nearest(NamedTuple):
     """Clock of the turn."""
     event: Scalar
     """The number of the event."""
+    unit: Any = 1.0
+    """The size of that distance along the motion (see `Shooting.observe`)."""
 
 
 class _Found(NamedTuple):

@@ -88,10 +88,7 @@ class Point(InWords):
         bifurcation, if the motion without the vanishing part touches a surface."""
         lost = self.kind == REST or (self.impact is not None and self.kind not in SLIDING)
         seen = self.step.seen
-        # A stop's room is a length; that of a switch a velocity or, while it is held, a force.
-        orders = (0,) if self.kind == GRAZING else (1, 2)
-        unit = max(seen.length / self.problem.radian**order for order in orders)
-        return lost or abs(float(seen.nearest.room)) <= _TOUCHES * unit
+        return lost or bool(abs(seen.nearest.room) <= _TOUCHES * seen.nearest.unit)
 
     @property
     def lost(self) -> list[int]:
@@ -99,9 +96,8 @@ class Point(InWords):
         stop is touched that the motion did not hit before."""
         if self.impact is None:
             return []
-        speed = np.abs(np.asarray(self.step.seen.approach))
-        slow = ROUNDING * self.step.seen.fastest
-        others = (i for i in self.problem.impacts if speed[i] < slow)
+        speed = np.abs(np.asarray(self.step.seen.approach / self.step.seen.units))
+        others = (i for i in self.problem.impacts if speed[i] < ROUNDING)
         return sorted({self.impact, *others})
 
     def switch(self, to: str | None = None, *, distance: float = 0.01) -> Any:
