@@ -17,17 +17,16 @@ def main() -> None:
     parser.add_argument("--devices", type=int, default=1)
     parser.add_argument("--cluster", action="store_true")
     options = parser.parse_args()
-    settle = 1500 if options.cluster else 800
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", options.devices)
     import vi_jax as vi
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
     block = {**AXES, "drive.frequency_ratio": AXES["drive.frequency_ratio"][:8]}
-    vi.scan(scene, block, settle=settle, lanes=512, workers=2)  # compiles
+    vi.scan(scene, block, settle=1500, lanes=512, workers=2)  # compiles
     print("begins", flush=True)
     if not options.cluster:
-        vi.scan(scene, AXES, settle=settle, lanes=512, workers=2, store=options.store)
+        vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)
         print("ends", flush=True)
         return
     from dask.distributed import Client, LocalCluster
@@ -36,7 +35,7 @@ def main() -> None:
         with Client(cluster) as client:
             first = next(iter(client.run(os.getpid).values()))
             threading.Timer(8.0, os.kill, (first, 9)).start()
-            vi.scan(scene, AXES, settle=settle, lanes=512, cluster=client, store=options.store)
+            vi.scan(scene, AXES, settle=1500, lanes=512, cluster=client, store=options.store)
             print("ends", flush=True)
             os._exit(0)  # Dask may wait for ever for a worker that it just started again
 
