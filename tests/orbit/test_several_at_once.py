@@ -39,14 +39,12 @@ class Twins(vi.AbstractMachine):
 
 
 @functools.cache
-def branch_of(coupling, excess=0.0, **options):
+def branch_of(coupling, excess=0.0):
     """The branch of the motion in one well that both oscillators share."""
     machine = Twins(coupling=coupling, excess=excess)
     start = {"y1": 0.9, "v1": 0.2, "y2": 0.9, "v2": 0.2}
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 200).last, 1, throw=True)
-    return vi.continue_orbit(
-        orbit, parameter="force", bounds=(0.05, 0.25), progress=False, **options
-    )
+    return vi.continue_orbit(orbit, parameter="force", bounds=(0.05, 0.25), progress=False)
 
 
 def places(branch, kind):

@@ -59,7 +59,7 @@ class Sliding(Struck):
 
 
 class Heated(Struck):
-    """The impact is a reset, which warms the body; heat has a unit of its own."""
+    """The impact is a reset, which warms the body; heat has a third unit."""
 
     reset = lambda m, s, x: {"v": -0.6 * x.v, "heat": x.heat + (x.v * m.time / m.length**2) ** 2}
     contacts, events = (), vi.Reset(lambda m, s, x: x.x - m.gap * m.length, reset)

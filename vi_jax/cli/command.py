@@ -61,7 +61,7 @@ class Found(NamedTuple):
     table: Callable[[], Any] | None = None
     draw: Callable[[Figure], object] | None = None
     good: bool = True
-    """True if anything succeeded."""
+    """True if at least one of its computations succeeded; else the command fails."""
     interrupted: bool = False
     """True if Ctrl-C ended it early."""
     result: Any = None

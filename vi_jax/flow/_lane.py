@@ -268,7 +268,7 @@ class Plan(eqx.Module):
 
     @property
     def kept(self) -> int:
-        """Number of recorded intervals."""
+        """The number of intervals that are recorded, without those of `settle`."""
         return self.cycles * self.parts
 
     @property

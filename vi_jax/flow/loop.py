@@ -66,7 +66,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     if scales_known(machine):
         return None
     known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
-    return stop_gradient(jtu.tree_map(lambda x: jnp.where(x > 0, x, 1.0), known))
+    return stop_gradient(jtu.tree_map(_or_one, known))
 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
@@ -146,11 +146,10 @@ def extents_of(
 
         value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
         own = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        size = jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes))
-        return jnp.where(size > 0, size, 1.0)
+        return _or_one(jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes)))
 
     places = (size_of(x.position, start, sizes) for x in machine.coordinates)
-    found: list[Any] = [_small(jnp.where(size > 0, size, 1.0)) for size in places]
+    found: list[Any] = [_small(_or_one(size)) for size in places]
     for number in plan.others(start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
@@ -163,6 +162,11 @@ def extents_of(
         each = ((*modes[:own], jnp.full_like(s, x), *modes[own + 1 :]) for x in (1.0, 0.0))
         found.append(tuple(of_guard(number, x, rest) for x in each))
     return stop_gradient(tuple(found))
+
+
+def _or_one(size: Array) -> Array:
+    """Return a size; 1 if it is 0 or NaN, which is unknown."""
+    return jnp.where(size > 0, size, 1.0)
 
 
 def _small(size: Array) -> Array:

@@ -466,13 +466,13 @@ class Run(Summarized):
     frequency_ratio: Float[Array, " cycles"] | None
     """ζ: mean speed of the drive over each cycle."""
     samples: Samples | None
-    """Dense samples, if requested."""
+    """States within cycles, if `samples` is given."""
     impact_log: ImpactLog | None
-    """The impacts, if requested."""
+    """Impacts one by one, if `impact_log` is given."""
     event_log: EventLog | None
-    """Events of all kinds, if requested."""
+    """Events of all kinds, if `event_log` is given."""
     errors: Errors | None
-    """Estimated errors, if requested."""
+    """Estimated errors, if `estimate` is set."""
     result: RESULTS
     """The reason why the run ended: `RESULTS.successful`, or a failure."""
     steps: Int[Array, ""]

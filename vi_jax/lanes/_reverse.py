@@ -195,7 +195,7 @@ def reverse(
 
 
 def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
-    """Return the flags `ReverseProgram.carried`."""
+    """Return for each part of the carry whether it has a cotangent (see `ReverseProgram`)."""
     n, inputs = len(program.carry_avals), [False] * len(program.in_avals)
     depend = dependent_parts(program, varied, smooth=True)
     outs = given[: len(program.out_avals)]

@@ -24,7 +24,6 @@ class Recent(Generic[K, V]):
         return len(self._values)
 
     def clear(self) -> None:
-        """Remove all values."""
         with self._lock:
             self._values.clear()
 

@@ -133,8 +133,8 @@ class AbstractSwitch(AbstractEvent):
     friction_stop: ClassVar[int | None] = None
     """The index of the stop on which this is friction, also in impacts (see `ContactFriction`)."""
     blends: ClassVar[bool] = False
-    """True if the field of mode 0 is the mean of those of modes -1 and +1 with which the motion
-    stays on the surface between them (see `Switch`)."""
+    """True if the motion may slide along the surface in mode 0. Its field there is a weighted mean
+    of the fields of modes -1 and +1 (see `Switch`)."""
 
     @abc.abstractmethod
     def begin(self, machine: Machine, s: Scalar, state: State) -> Scalar:

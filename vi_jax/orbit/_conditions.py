@@ -219,7 +219,7 @@ class Exchange(eqx.Module):
 def exchange_at(problem: Shooting, x: np.ndarray) -> Exchange | None:
     """Return the exchange at a crossing of branches, from the singular vectors of the motion's
     Jacobian without the parameters' columns; `None` if the second parameter separates them."""
-    jacobian = jacobian_at(problem, x)[0]
+    jacobian = jacobian_at(problem, x)
     left, sizes, right = np.linalg.svd(jacobian[:, :-2])
     if abs(left[:, -1] @ jacobian[:, -2]) > _APART * sizes[0]:
         return None

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
 from .. import lanes
 from .._types import Scalar, Scalars, State, Vector
@@ -25,6 +26,9 @@ from ..machine import (
 )
 
 LANDS, LEAVES = "lands", "leaves"
+
+# Clocks (rows,) and states (rows, states) before steps of a flight.
+Rows = tuple[Float[Array, " rows"], Float[Array, "rows states"]]
 
 
 class Event(NamedTuple):
@@ -129,7 +133,7 @@ class Flight(eqx.Module):
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int | Scalar,
         averages: tuple[str, ...] = (), *, rows: int = 0,
-    ) -> tuple[Vector, Integrals, tuple[Any, Any]]:  # fmt: skip
+    ) -> tuple[Vector, Integrals, Rows]:  # fmt: skip
         """Integrate from `u` at clock `s0` to clock `s1` in equal steps. Return the final state;
         time and integrals of `averages`; clock and state before each of the first `rows` steps.
         Without rows one program serves any number of steps."""

@@ -135,13 +135,14 @@ def _residual(problem: Shooting, x, steps):
 
 def step_error(problem: Shooting, x: Unknowns) -> float:
     """Return the relative change of the ends of the flights by doubling the steps."""
+    # With `steps` as an argument, equations that differ in their number share one program.
     shared, steps = dataclasses.replace(problem, steps=1), float(problem.steps)
     return float(np.max(np.abs(_residual(shared, x, 2 * steps) - _residual(shared, x, steps))))
 
 
 def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
     """Return the scaled unit tangent of the solutions through `x`, last component positive."""
-    null = np.linalg.svd(jacobian_at(problem, x)[0])[2]
+    null = np.linalg.svd(jacobian_at(problem, x))[2]
     tangent = null[-1]
     if problem.is_double:  # one direction of the plane moves the parameters
         tangent = np.linalg.svd(null[-2:, -2:])[0][:, 0] @ null[-2:]
@@ -160,10 +161,15 @@ def _jacobian_at(problem: Shooting, x, scale):
     return jacobian, rows
 
 
-def jacobian_at(problem: Shooting, x: Unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the equations with respect to all unknowns, in the unknowns' sizes
-    and relative to the largest of each equation, so that no unit matters, and those largest."""
+def jacobian_and_rows(problem: Shooting, x: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Return `jacobian_at`, and the largest derivative of each equation, by which it is divided."""
     return _jacobian_at(problem, x, problem.scale)
+
+
+def jacobian_at(problem: Shooting, x: Unknowns) -> np.ndarray:
+    """Return the derivatives of the equations with respect to all unknowns, in the unknowns' sizes
+    and relative to the largest of each equation, so that no unit matters."""
+    return jacobian_and_rows(problem, x)[0]
 
 
 # Distances, as shares of the step, to retry before a place without a solution: choices.

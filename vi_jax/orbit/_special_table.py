@@ -36,6 +36,7 @@ from ._solution import (
     advance,
     crossing,
     distance_along,
+    jacobian_and_rows,
     jacobian_at,
     located,
     on_host,
@@ -330,7 +331,7 @@ def _cusp(motion: Shooting, many: int) -> Test:
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
-        jacobian = jacobian_at(motion, step.x)[0]
+        jacobian = jacobian_at(motion, step.x)
         nulls = _nulls(jacobian[:, :-2], like)
         if many > 1:
             lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
@@ -371,7 +372,7 @@ def _cubic(motion: Shooting, *, twice: bool) -> Test:
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
         x = repeated(motion, step.x, whole) if twice else np.asarray(step.x)
-        (jacobian, rows), scale = jacobian_at(whole, x), whole.scale
+        (jacobian, rows), scale = jacobian_and_rows(whole, x), whole.scale
         matrix = jacobian[:, :-2]
         nulls = _nulls(matrix)
         right = scale * np.append(nulls.right, [0.0, 0.0])

@@ -69,7 +69,7 @@ def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
     """Return the motion gone through n times, and right singular vectors of its Jacobian in x."""
     new = several(point.problem, n)
     x = repeated(point.problem, point.step.x, new)
-    return new, x, np.linalg.svd(jacobian_at(new, x)[0][:, :-1])[2]
+    return new, x, np.linalg.svd(jacobian_at(new, x)[:, :-1])[2]
 
 
 def _doubled(point: Point, distance: float) -> Orbit:
@@ -85,7 +85,7 @@ def _doubled(point: Point, distance: float) -> Orbit:
 
 def _crossed(point: Point, distance: float) -> Orbit:
     problem, x = point.problem, point.step.x
-    jacobian = jacobian_at(problem, x)[0]
+    jacobian = jacobian_at(problem, x)
     # The equations have two null vectors here: one leads along this branch, the other off it.
     plane = np.linalg.svd(jacobian)[2][-2:]
     along = plane.T @ (plane @ point.step.tangent)

@@ -109,7 +109,7 @@ class Path(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A tried step."""
+    """A step of the method from the lane's state, before it is accepted."""
 
     h: Scalar
     """The step's length in `s`."""
