@@ -26,7 +26,6 @@ from .clocks import may_rest as may_rest
 from .clocks import phase_at as phase_at
 from .clocks import prepared as prepared
 from .clocks import scales_known as scales_known
-from .clocks import with_earlier_clock as with_earlier_clock
 from .contacts import added as added
 from .contacts import check_takes as check_takes
 from .contacts import constrained_rate as constrained_rate
@@ -51,6 +50,7 @@ from .cycles import counter_of as counter_of
 from .cycles import falling as falling
 from .cycles import rising as rising
 from .cycles import turn_of as turn_of
+from .cycles import turns as turns
 from .drives import UNITS as UNITS
 from .drives import AbstractCrank as AbstractCrank
 from .drives import AbstractDrive as AbstractDrive
@@ -142,6 +142,7 @@ from .own import outcomes_of as outcomes_of
 from .own import section_in as section_in
 from .own import stops_of as stops_of
 from .own import switches_of as switches_of
+from .own import with_earlier_clock as with_earlier_clock
 from .scene import Oscillator as Oscillator
 from .scene import Parameters as Parameters
 from .scene import Scene as Scene

@@ -23,8 +23,8 @@ except ImportError:  # JAX 0.9
 from .._checks import fields_with, number, require
 from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
-from .cycles import Passing, Turn, at_intervals, counter_of
-from .event import AbstractEvent, AbstractSwitch
+from .cycles import Turn, at_intervals, counter_of
+from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction
 from .numbers import PLAIN, Shown, unit_in
@@ -102,13 +102,12 @@ def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
 
 @once_a_trace
 def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
-    """Return the events that are not switches, then the turn that ends the cycles."""
+    """Return the events that are not switches."""
     found = []
     for event in listed(machine.events):
         if not isinstance(event, AbstractSwitch):
             found += event.one_way() if isinstance(event, Reset) else (event,)
-    counter = counter_of(machine)
-    return (*found, counter.event()) if isinstance(counter, Turn) else tuple(found)
+    return tuple(found)
 
 
 def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
@@ -409,12 +408,21 @@ class AbstractMachine(Shown):
     _switches = property(_switches_in)
     _others = property(_other_events)
 
+    @property
+    def _end(self) -> Section:
+        counter = counter_of(self)
+        return Section() if counter is None else counter.end
+
     def _section(self, state: State) -> Scalar | None:
         counter = counter_of(self)
-        return counter.section(self, state) if isinstance(counter, Passing) else None
+        return None if counter is None else counter.section(self, state)
 
     def _clock(self, state: State) -> Scalar | None:
         return None
+
+    def _with_earlier_clock(self, state: State) -> State:
+        counter = counter_of(self)
+        return state if counter is None else counter.with_earlier_angle(state)
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         """Return the coordinate that a contact names by its `on`, with this effective mass (1 if

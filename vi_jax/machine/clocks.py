@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._checks import in_range
 from .._messages import count_of
 from .._types import Flag, Machine, Number, Scalar, State
-from .cycles import Turn, counter_of
+from .cycles import turns
 from .linear import LinearMachine, Prepared
 from .own import clock_of, stops_of, switches_of
 from .scene import Scene, ShaftMachine
@@ -63,11 +63,6 @@ def in_cycle_state(machine: Machine, name: str, state: State) -> State:
     return state
 
 
-def with_earlier_clock(machine: Machine, state: State) -> State:
-    """Return the state with its clock set back by one cycle."""
-    return machine.with_earlier_clock(state) if isinstance(machine, ShaftMachine) else state
-
-
 def cycle_time(machine: Machine) -> Scalar | float:
     """Return the duration of a cycle, if it is fixed."""
     return machine.period if isinstance(machine, Scene) else machine.cycle
@@ -87,8 +82,7 @@ def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
     """Return the mean speed of the drive over cycles of these durations; `None` without a drive."""
     if isinstance(machine, Scene):
         return machine.frequency_ratio(duration)
-    turns = isinstance(machine, ShaftMachine) or isinstance(counter_of(machine), Turn)
-    return 2 * pi / duration if turns else None
+    return 2 * pi / duration if isinstance(machine, ShaftMachine) or turns(machine) else None
 
 
 def cycles_in_words(machine: Machine, cycles: int) -> str:

@@ -12,15 +12,17 @@ import jax.numpy as jnp
 
 from .._checks import concrete
 from .._types import Scalar, State
-from .coordinates import component, has_component, with_component
-from .event import AbstractEvent
-from .events import Reset
-from .own import with_static
+from .coordinates import component, has_component, with_component, wrap_angles
+from .event import AbstractEvent, Section, TurnEnd
+from .own import is_own, with_static
 
 
 class Counter:
     """The counter of a machine's cycles, its class attribute `cycle`. The `cycle` of an instance is
     the usual length of a cycle."""
+
+    end: ClassVar = Section()
+    """The event that ends a cycle."""
 
     def __init__(self, name: Any, usual: Any):
         self.name, self.usual = name, usual
@@ -37,9 +39,19 @@ class Counter:
             "how long a cycle takes."
         )
 
+    def section(self, machine: Any, state: State) -> Any:
+        """Return the function that rises through zero at the end of a cycle."""
+        raise NotImplementedError
+
+    def with_earlier_angle(self, state: State) -> State:
+        """Return the state at the beginning of the next cycle."""
+        return state
+
 
 class Turn(Counter):
     """Cycles that are full turns of an angle."""
+
+    end: ClassVar = TurnEnd()
 
     def __init__(self, name: str, start: Any = 0.0, usual: Any = None):
         super().__init__(name, usual)
@@ -71,23 +83,13 @@ class Turn(Counter):
             return usual / 5
         return 0.2 * usual / jnp.maximum(1.0, usual * jnp.abs(speed) / (2 * pi))
 
-    def event(self) -> Reset:
-        """Return the reset that subtracts a full turn from the angle and ends a cycle."""
+    def section(self, machine: Any, state: State) -> Any:
+        """Return the angle beyond the end of the turn."""
+        return component(self.name, state) - (self.start + 2 * pi)
 
-        def guard(machine: Any, s: Scalar, state: State, *modes: Any) -> Any:
-            return component(self.name, state) - (self.start + 2 * pi)
-
-        def reset(machine: Any, s: Scalar, state: State, *modes: Any) -> State:
-            return with_component(self.name, state, component(self.name, state) - 2 * pi)
-
-        return _TurnOver(guard, reset, ends_cycle=True, name="turn")  # pyright: ignore
-
-
-class _TurnOver(Reset):
-    """The end of a turn. Its guard, an angle, falls by a whole turn there."""
-
-    from_below: ClassVar = False
-    checked_within_step: ClassVar = False  # a shaft does not reverse twice in a step
+    def with_earlier_angle(self, state: State) -> State:
+        """Return the state with a full turn subtracted from the angle."""
+        return with_component(self.name, state, component(self.name, state) - 2 * pi)
 
 
 class Passing(Counter):
@@ -98,7 +100,7 @@ class Passing(Counter):
         self.sign = sign
 
     def section(self, machine: Any, state: State) -> Any:
-        """Return the function that rises through zero at the end of a cycle."""
+        """Return the component or function, with the sign with which it rises at the section."""
         where: Any = self.name
         value: Any = where(machine, state) if callable(where) else component(where, state)
         return value if self.sign > 0 else -value
@@ -137,6 +139,11 @@ def counter_of(machine: Any) -> Counter | None:
     """Return the counter of a machine's cycles, or `None` without a counter."""
     found = getattr(type(machine), "cycle", None)
     return found if isinstance(found, Counter) else None
+
+
+def turns(machine: Any) -> bool:
+    """Return whether the cycles of a machine are counted by `turn_of`."""
+    return isinstance(counter_of(machine), Turn)
 
 
 def at_intervals(machine: Any, interval: Any) -> Any:
@@ -179,6 +186,9 @@ def _observed_kind(kind: type) -> type:
         "observed_every": lambda self, interval: original(self).observed_every(interval),
         **{name: parts(name) for name in ("_stops", "_switches", "_others")},
     }
+    counter: Any = getattr(kind, "cycle", None)
+    if isinstance(counter, Turn) and not is_own(kind.renewed):
+        body["renewed"] = wrap_angles(counter.name)
     if "cycle" not in _fields(kind):
         body["cycle"] = property(lambda self: self.observed_interval)
     return type(kind)(kind.__name__, (kind,), body)

@@ -168,4 +168,11 @@ class Section(AbstractEvent):
 
     def after(self, machine, s, state, *modes):
         """Return the state at the beginning of the next cycle."""
-        return machine.renewed(state), modes
+        return machine.renewed(machine._with_earlier_clock(state)), modes
+
+
+class TurnEnd(Section):
+    """The end of a turn, after which the angle is a whole turn less."""
+
+    from_below: ClassVar = False
+    checked_within_step: ClassVar = False  # a shaft does not reverse twice in a step

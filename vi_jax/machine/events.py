@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import called, field_in, rate_of, shown_modes, with_friction_impulse
-from .event import AbstractEvent, AbstractSwitch, EventContext, Modes, Section
+from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import chosen_together, frictions_in
 from .numbers import Shown, size_of
 from .own import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
@@ -28,7 +28,7 @@ from .state import changed
 
 def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
     """Return all events by number: stops, switches, other events, and the section."""
-    return (*stops_of(machine), *switches_of(machine), *others_of(machine), Section())
+    return (*stops_of(machine), *switches_of(machine), *others_of(machine), machine._end)
 
 
 def is_autonomous(machine: Machine, state: State) -> bool:

@@ -7,7 +7,8 @@ vᵀ(∂M/∂q_i) v. The force of a contact with gap g(q), J = ∇g, acts along 
 
 import abc
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import pi
 from typing import Any, ClassVar
 
@@ -200,22 +201,34 @@ class Mechanical(AbstractMachine):
         return matrix_of(given(q) if callable(given) else given, shapes, type(self).__name__)
 
     def _inertial(self, q: Named, v: Named) -> list[Any]:
-        """Return h of Lagrange's equations; 0 with constant masses."""
+        """Return h = dM/dt v - ½ ∂(vᵀMv)/∂q of Lagrange's equations; 0 with constant masses."""
         names = self.free_names
-        speeds = [getattr(v, name) for name in names]
+        speeds, found = [getattr(v, name) for name in names], dict.fromkeys(names, 0.0)
         if not callable(_mass_of(self)):
-            return [0.0 for _ in names]
+            return list(found.values())
 
         def momenta(q: Named) -> list[Any]:
             rows = (zip(row, speeds, strict=True) for row in self.masses(q))
-            return [sum(_times(m, x) for m, x in row if not _is_zero(m)) for row in rows]
+            return [_sum(_times(m, x) for m, x in row if not _is_zero(m)) for row in rows]
 
         def twice_energy(q: Named) -> Any:
             return _dot(momenta(q), speeds)
 
-        _, moves = jax.jvp(momenta, (q,), (v,))
-        pulls = [_slope(twice_energy, q, name) for name in names]
-        return [x - 0.5 * y for x, y in zip(moves, pulls, strict=True)]
+        for name in self.q_names:
+            acts = _depend_on(momenta, q, name)
+            if not any(acts):
+                continue
+            speed = getattr(v, name)
+            is_array = jnp.ndim(speed) > 0
+            slopes = _change(momenta, q, name, speed if is_array else jnp.ones_like(speed))
+            slopes = [x if y else 0.0 for x, y in zip(slopes, acts, strict=True)]
+            pull = _slope(twice_energy, q, name) if is_array else _dot(slopes, speeds)
+            for x, slope in zip(names, slopes, strict=True):
+                if not _is_zero(slope):
+                    found[x] = _sum((found[x], slope if is_array else slope * speed))
+            if name in found:
+                found[name] = found[name] - 0.5 * pull
+        return list(found.values())
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         return Coordinate(
@@ -271,20 +284,26 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
         base, place = split_place(name)
         one = jnp.zeros_like(getattr(q, base)).at[place].set(1.0) if place else 1.0
         return [one if x == base else 0.0 for x in names]
-    gap = jax.make_jaxpr(on)(q).jaxpr
-    acts = [any(dependent_results(gap, [x == y for y in names], smooth=False)) for x in names]
-    return [_slope(on, q, x) if y else 0.0 for x, y in zip(names, acts, strict=True)]
+    return [_slope(on, q, x) if any(_depend_on(on, q, x)) else 0.0 for x in names]
+
+
+def _depend_on(function: Callable[[Named], Any], q: Named, name: str) -> list[bool]:
+    """Return whether each result of a function may depend on one of the coordinates."""
+    traced = jax.make_jaxpr(function)(q).jaxpr
+    return dependent_results(traced, [x == name for x in vars(q)], smooth=False)
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
+    """Return the derivative of a number with respect to a coordinate."""
     here = getattr(q, name)
-
-    def of_one(x: Any) -> Any:
-        return function(q.replace(**{name: x}))
-
     if jnp.ndim(here):
-        return jax.grad(of_one)(here)
-    return jax.jvp(of_one, (here,), (jnp.ones_like(here),))[1]
+        return jax.grad(lambda x: function(q.replace(**{name: x})))(here)
+    return _change(function, q, name, jnp.ones_like(here))
+
+
+def _change(function: Callable[[Named], Any], q: Named, name: str, speed: Any) -> Any:
+    """Return the rate of change of a function if one coordinate moves at this speed."""
+    return jax.jvp(lambda x: function(q.replace(**{name: x})), (getattr(q, name),), (speed,))[1]
 
 
 def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
@@ -406,8 +425,13 @@ def _less(x: Any, factor: Any, y: Any) -> Any:
 
 def _dot(xs: Sequence[Any], ys: Sequence[Any]) -> Any:
     """Return the sum of the products of numbers and arrays, without known zeros."""
-    both = zip(xs, ys, strict=True)
-    return sum(jnp.sum(x * y) if jnp.ndim(x) else x * y for x, y in both if not _is_zero(x))
+    both = [(x, y) for x, y in zip(xs, ys, strict=True) if not _is_zero(x)]
+    return _sum(jnp.sum(x * y) if jnp.ndim(x) else x * y for x, y in both)
+
+
+def _sum(xs: Iterable[Any]) -> Any:
+    """Return a sum without known zeros: the compiler must not omit an addition of 0."""
+    return functools.reduce(operator.add, [x for x in xs if not _is_zero(x)] or [0.0])
 
 
 def _times(factor: Any, y: Any) -> Any:

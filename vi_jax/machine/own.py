@@ -103,9 +103,14 @@ def clock_of(machine: Machine, state: State) -> Scalar | None:
     return machine._clock(state)
 
 
+def with_earlier_clock(machine: Machine, state: State) -> State:
+    """Return the state with its clock, or the angle of `turn_of`, set back by one cycle."""
+    return machine._with_earlier_clock(state)
+
+
 def section_in(machine: Machine, state: State) -> Scalar | None:
-    """Return the function that rises through zero at the end of a cycle (see `rising`); `None` if
-    `s`, a clock or an event ends cycles."""
+    """Return the function that rises through zero at the end of a cycle (see `rising` and
+    `turn_of`); `None` if `s`, a clock or an event ends cycles."""
     return machine._section(state)
 
 

@@ -119,8 +119,9 @@ class ShaftMachine(AbstractMachine):
     def _clock(self, state: State) -> Scalar | None:
         return state.phase if self.is_timed(state) else None
 
-    def with_earlier_clock(self, state: State) -> State:
-        """Return the state with a full turn subtracted from the angle."""
+    def _with_earlier_clock(self, state: State) -> State:
+        if not self.is_timed(state):
+            return state
         return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
 
     def alive(self, state: State) -> jax.Array | None:

@@ -33,7 +33,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._types import Scalar, Vector
-from ..machine import AbstractMachine, renews, section_in
+from ..machine import AbstractMachine, renews, section_in, turns
 from ._conditions import HeldMultiplier, alone, rates_at
 from ._flight import LANDS, LEAVES, section_of
 from ._flight import Event as MotionEvent
@@ -569,7 +569,8 @@ def _size_of(problem: Shooting, x: Unknowns) -> float:
 def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     """Return a tiny motion about the equilibrium with eigenvalues ±iω onto which the cycle shrinks
     between two points; `None` unless it has a multiplier 1."""
-    if problem.events != (section_of(problem.machine, 0),) or renews(problem.machine):
+    machine = problem.machine
+    if problem.events != (section_of(machine, 0),) or renews(machine) or turns(machine):
         return None
     rates = [_leaving(problem, step.x)[0] for step in (here, new)]
     if np.dot(*rates) >= 0:

@@ -47,6 +47,7 @@ from ..machine import (
     size_of,
     stops_of,
     switches_of,
+    turns,
     with_leaf,
     with_modes,
     without_modes,
@@ -306,7 +307,7 @@ def _followed(
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(_carry(blank, modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
-    if first is not None and (renews(machine) or first != section_of(machine, 0)):
+    if first is not None and (renews(machine) or turns(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
     return np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),)
 
