@@ -117,7 +117,7 @@ class Flight(eqx.Module):
         """Return the state, and the time and integrals passed, after one step of the method."""
         smooth, state = self.smooth, self.unravel(u)
         beside = carried(smooth, s0, state, passed)
-        new, after, _ = self.method.step(smooth, s0, s1, state, beside)
+        new, after = _stepped_once(self.method, smooth, s0, s1, state, beside)
         for number, stop in enumerate(stops_of(self.machine) if self.contact else ()):
             # A closed form of the flight leaves out the force that holds the body.
             rests = self.contact[stop.coordinate] == 1.0 + number
@@ -154,6 +154,15 @@ class Flight(eqx.Module):
             (numbers, s0, (s1 - s0) / steps, u, jnp.asarray(steps, s0.dtype)), rows=rows,
         )  # fmt: skip
         return u, passed, path
+
+
+@eqx.filter_jit
+def _stepped_once(
+    method: AbstractMethod, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State,
+    beside: Integrals,
+) -> tuple[State, Integrals]:  # fmt: skip
+    # Six programs of an orbit's equations take such steps: one trace saves a sixth of their time.
+    return method.step(smooth, s0, s1, state, beside)[:2]
 
 
 def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:

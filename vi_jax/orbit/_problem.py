@@ -3,6 +3,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from math import ceil
 from typing import Any
 
@@ -54,7 +55,7 @@ from ..machine import (
 )
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from ._shooting import Shooting, Unknowns
-from ._solution import step_error
+from ._solution import on_host, step_error
 from .results import Orbit
 
 
@@ -296,16 +297,18 @@ def _followed(
     modes = begin_modes(machine, jnp.zeros(()), state, own)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
+    # With clocks and steps as arguments, all flights share one program.
+    carried = partial(_carry, dataclasses.replace(blank, steps=1), float(blank.steps))
     for place, event in found:
         if place > s:
-            u = _carry(blank, modes, s, place, u)
+            u = carried(modes, s, place, u)
         states.append(np.asarray(u))
-        here = blank.unravel(u)
+        here = blank.unravel(jnp.asarray(u))
         if (place, event.cycle) != (0.0, 0):  # the orbit's state is after that one
             here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(here)[0], place
-    states.append(np.asarray(_carry(blank, modes, s, period, u)))
+    states.append(np.asarray(carried(modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
     if first is not None and (renews(machine) or turns(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
@@ -368,11 +371,10 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
     return [(int(n), float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
 
 
-@compiled
-def _carry(blank: Shooting, modes, s0, s1, u):
+@on_host
+def _carry(blank: Shooting, steps, modes, s0, s1, u):
     """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
-    flight = Flight(blank.machine, modes, blank.method, blank.like)
-    return flight.fly(jnp.asarray(s0), jnp.asarray(s1), u, blank.steps)[0]
+    return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
 
 
 # Most events of a cycle that are logged, and of a period that are followed: choices.
