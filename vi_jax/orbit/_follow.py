@@ -64,6 +64,10 @@ _BEGINS = 1e-7
 # the rest that its shortest steps leave.
 _STALLED_AT = 1e-6
 
+# A parameter this close to its bound (in its scale) is at it, to rounding: a choice, below the
+# corrector's tolerance.
+_ROUNDED = 1e-12
+
 
 class Ending(NamedTuple):
     """The end of a curve."""
@@ -274,7 +278,7 @@ class _Walk:
                 if abs(length) < _STALLED_AT:
                     at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
-                        return Ending(at, BOUNDS)
+                        return _end_at_bound(at, i, bound)
         return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
@@ -321,6 +325,14 @@ def _falls(row: Event, begin: float, new: Step) -> bool:
     return abs(begin) <= _BEGINS * abs(end) and end < -row.noise
 
 
+def _end_at_bound(at: Step, i: int, bound: float) -> Ending:
+    """Return the end of a curve at the bound of parameter number i, which `at` differs from by
+    rounding only: beyond it, a number may be out of its range."""
+    x = np.array(at.x)
+    x[i] = bound
+    return Ending(at._replace(x=x), BOUNDS)
+
+
 def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
     def tangent(step: Step) -> np.ndarray:
         along = np.asarray(step.tangent) * before / after
@@ -339,7 +351,9 @@ def bounds_of(table: Table) -> list[Event]:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
         def ending(at: Step) -> Ending:
-            return Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER)
+            if abs(left(at)) >= _STALLED_AT:
+                return Ending(at, SHORTER)
+            return _end_at_bound(at, i, bound) if abs(left(at)) < _ROUNDED else Ending(at, BOUNDS)
 
         return Event(left, ending)
 

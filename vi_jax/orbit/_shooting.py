@@ -7,6 +7,7 @@ pass smoothly through V⁻ = 0 and through a touch of the stop. On the far side 
 motion; the sign of V⁻ or of the clearance shows this. (`hspo` of COCO has the same idea.)
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, reduce
@@ -212,6 +213,16 @@ class Shooting(eqx.Module):
         for i, name in enumerate(self.parameters, x.shape[0] - len(self.parameters)):
             machine = with_leaf(machine, name, x[i])
         return machine
+
+    def motion_at(self, x: Unknowns) -> tuple["Shooting", Unknowns]:
+        """Return the equations of the motion alone, without parameters among the unknowns, and a
+        solution of them, from a solution `x`; host-side."""
+        x, n = np.asarray(x), len(self.parameters)
+        machine = self.machine
+        for name, value in zip(self.parameters, x[x.size - n :], strict=True):
+            machine = with_leaf(machine, name, np.asarray(value))
+        alone: Any = {"parameters": (), "conditions": (), "widths": ()}
+        return dataclasses.replace(self, machine=machine, **alone), x[: x.size - n]
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
         """Return the machines at the ends of these intervals of the parameters."""

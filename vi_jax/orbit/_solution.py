@@ -65,7 +65,7 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def called(*args: Any) -> Any:
         numbers = (float, np.ndarray, np.generic)
-        args = tuple(jnp.asarray(np.asarray(a)) if isinstance(a, numbers) else a for a in args)
+        args = tuple(np.asarray(a) if isinstance(a, numbers) else a for a in args)
         return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program(*args))
 
     return called
@@ -85,9 +85,11 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Arr
 
 
 @on_host
-def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
-    """Advance as `advance` does, by Newton's method on the equations and the plane. The parameter
-    is one of the unknowns, so the Jacobian is not close to singular at a fold."""
+def _advanced(
+    problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar
+) -> tuple[Any, ...]:
+    """Return a `Step` but for its observations, by Newton's method on the equations and the plane.
+    The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold."""
 
     def equations(y):
         return jnp.concatenate([problem.residual(y * scale), jnp.dot(tangent, y - y0)[None]])
@@ -113,30 +115,40 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
     along = along / jnp.linalg.norm(along)
     # Rounding may keep the last correction above the tolerance where the curve is steep.
     good = (size <= 1e3 * _TOLERANCE) & jnp.all(jnp.isfinite(along))
-    return Step(y * scale, along, size, count, good, problem.observe(y * scale))
+    return y * scale, along, size, count, good
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
     """Return the solution on the plane across a unit tangent, at `length` from `x` (scaled)."""
-    return _advanced(problem, x, tangent, problem.scale, float(length))
+    found = _advanced(problem, x, tangent, problem.scale, float(length))
+    return Step(*found, observe(problem, found[0]))
+
+
+# These programs take the equations of the motion alone, so that a branch and all its curves share
+# them.
 
 
 @on_host
-def observe(problem: Shooting, x):
-    """Compute the multipliers, extremes, clearance and speeds of approach of a solution."""
-    return problem.observe(x)
+def _observed(motion: Shooting, x):
+    return motion.observe(x)
+
+
+def observe(problem: Shooting, x: Unknowns) -> Any:
+    """Return the observations of a solution (`Observed`), host-side."""
+    return _observed(*problem.motion_at(x))
 
 
 @on_host
-def _residual(problem: Shooting, x, steps):
-    ends = problem.motion_residual(x, steps)[: problem.legs * problem.states]
-    return ends.reshape(-1, problem.states) / problem.sizes[1:]
+def _residual(motion: Shooting, x, steps):
+    ends = motion.motion_residual(x, steps)[: motion.legs * motion.states]
+    return ends.reshape(-1, motion.states) / motion.sizes[1:]
 
 
 def step_error(problem: Shooting, x: Unknowns) -> float:
     """Return the relative change of the ends of the flights by doubling the steps."""
     # With `steps` as an argument, equations that differ in their number share one program.
-    shared, steps = dataclasses.replace(problem, steps=1), float(problem.steps)
+    motion, x = problem.motion_at(x)
+    shared, steps = dataclasses.replace(motion, steps=1), float(motion.steps)
     return float(np.max(np.abs(_residual(shared, x, 2 * steps) - _residual(shared, x, steps))))
 
 
@@ -350,14 +362,15 @@ class Hits(NamedTuple):
 
 
 @compiled
-def _sections(problem: Shooting, x: Array):
-    states = jax.vmap(lambda leg, s: problem.state_at(x, leg, s))(*problem.sections(x))
-    return states, jnp.max(jnp.abs(problem.motion_residual(x)))
+def _sections(motion: Shooting, x: Array):
+    states = jax.vmap(lambda leg, s: motion.state_at(x, leg, s))(*motion.sections(x))
+    return states, jnp.max(jnp.abs(motion.motion_residual(x)))
 
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
     """Return the states on the sections, leaves (cycles,), and the largest residual component."""
-    return _sections(problem, jnp.asarray(x))
+    motion, x = problem.motion_at(x)
+    return _sections(motion, jnp.asarray(x))
 
 
 def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
