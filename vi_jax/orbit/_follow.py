@@ -102,6 +102,7 @@ class Table(abc.ABC):
     def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
         self.problem, self.bounds = problem, bounds
         self.closing = Closing(self)
+        self._way: tuple[tuple[Any, ...], dict[float, Step]] = ((None,) * 3, {})
 
     @property
     def scale(self) -> np.ndarray:
@@ -119,7 +120,12 @@ class Table(abc.ABC):
         return new._replace(good=np.asarray(False)) if aside else new
 
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
-        return located(self.problem, here, new, test)
+        """Return the point between two at which a test is zero; points found for another test
+        between the same two are used again."""
+        way = self.problem, here, new
+        if any(a is not b for a, b in zip(way, self._way[0], strict=True)):
+            self._way = way, {}
+        return located(*way, test, self._way[1])
 
     def images(self, step: Step) -> np.ndarray:
         """Return the difference of a motion from its own image; empty if it cannot be symmetric."""

@@ -27,8 +27,8 @@ from .root_finders import smallest_solution
 
 Vector = Float[Array, " n"]
 
-# The largest component of the last correction, in scaled unknowns.
-_TOLERANCE = 1e-11
+# The largest component of the last correction, in scaled unknowns: usually, and if it is rounding.
+_TOLERANCE, _ROUNDED = 1e-11, 1e-8
 
 # On a curve of double folds the equations do not change to first order in one direction: singular
 # values below this share of the greatest are zero. A choice.
@@ -102,7 +102,11 @@ def _advanced(
             move, along = smallest_solution(jacobian, both, _DOUBLE).T
         else:
             move, along = jnp.linalg.solve(jacobian, both).T
-        return y - move, jnp.max(jnp.abs(move)), count + 1, along, before <= _TOLERANCE
+        size = jnp.max(jnp.abs(move))
+        # One correction more than needed: the tangent is then that of the solution. Where the curve
+        # is steep, rounding may keep all corrections above the tolerance.
+        done = (before <= _TOLERANCE) | ((before <= _ROUNDED) & (size >= before))
+        return y - move, size, count + 1, along, done
 
     def going(carry):
         _, size, count, _, done = carry
@@ -110,11 +114,9 @@ def _advanced(
 
     y0 = x / scale + length * tangent
     start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
-    # One correction more than needed: the tangent is then that of the solution.
     y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
     along = along / jnp.linalg.norm(along)
-    # Rounding may keep the last correction above the tolerance where the curve is steep.
-    good = (size <= 1e3 * _TOLERANCE) & jnp.all(jnp.isfinite(along))
+    good = (size <= _ROUNDED) & jnp.all(jnp.isfinite(along))
     return y * scale, along, size, count, good
 
 
@@ -187,6 +189,10 @@ def jacobian_at(problem: Shooting, x: Unknowns) -> np.ndarray:
 # Distances, as shares of the step, to retry before a place without a solution: choices.
 _SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
 
+# A test is zero below this share of its largest value, and a place is known to this distance in
+# scaled unknowns, or to that of the last correction. Choices: closer, rounding would be resolved.
+_ZERO, _PLACED = 1e-13, 1e-13
+
 # Search no closer after this number of places without a solution: around a singularity of the
 # equations only the corrector's rounding would be resolved. A choice.
 _TRIALS = 5
@@ -213,12 +219,19 @@ class _CloseError(ArithmeticError):
     """The corrector has failed so often that no closer place can be reached."""
 
 
-def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+def located(
+    problem: Shooting, here: Step, new: Step, test: Callable[[Step], float],
+    known: dict[float, Step] | None = None,
+) -> Step | None:  # fmt: skip
     """Return the point between two, along the first one's tangent, at which a test that changes its
-    sign between them is zero, or `None`. `new` may lie on either side of `here`."""
+    sign between them is zero, or `None`. `new` may lie on either side of `here`. Points between
+    them, by their distance from `here`, are taken from `known` and added to it."""
     length = distance_along(problem, here, new)
-    at: dict[float, Step] = {0.0: here, length: new}
+    at = {} if known is None else known
+    at |= {0.0: here, length: new}
     silent: list[float] = []
+    tested: dict[float, float] = {}
+    bracket: dict[bool, float] = {}
 
     def reached(s: float) -> Step:
         """Return the solution there; if none, as at crossing branches, the one just before it."""
@@ -236,19 +249,23 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
             if len(silent) >= _TRIALS:
                 raise _CloseError
             at[s] = reached(s)
-        found = test(at[s])
+        found = tested[s] = test(at[s]) if s not in tested else tested[s]
         if np.isnan(found):
             raise NoValueError
-        return found
+        bracket[found > 0] = s
+        unsure = max(float(at[end].size) for end in bracket.values())
+        close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= unsure
+        return 0.0 if close or abs(found) <= _ZERO * max(map(abs, tested.values())) else found
 
     from scipy.optimize import brentq  # slow to load
 
     # If the test jumps or has no value, use the closest point.
-    options: Any = {"xtol": 1e-14, "rtol": 1e-14, "maxiter": 80}
+    options: Any = {"xtol": _PLACED, "rtol": 1e-14, "maxiter": 80}
     try:
         if not value(0.0) * value(length) <= 0:
             return None
-        root = float(brentq(value, 0.0, length, full_output=True, disp=False, **options)[0])
+        ends = _known_bracket([s for s, step in at.items() if bool(step.good)], length, value)
+        root = float(brentq(value, *ends, full_output=True, disp=False, **options)[0])
         value(root)
     except NoValueError:
         return None
@@ -256,18 +273,29 @@ def located(problem: Shooting, here: Step, new: Step, test: Callable[[Step], flo
         root = silent[-1]
     # At crossing branches, or if a motion shrinks to rest, use a point just before it.
     for short in _SHORT_OF:
-        if any(bool(at[s].good) for s in at if abs(s - root) <= short * abs(length)):
+        if any(bool(at[s].good) for s in tested if abs(s - root) <= short * abs(length)):
             break
         with contextlib.suppress(NoValueError, _CloseError):
             value(root - short * length)
-    begin, good = test(here), [(s, step) for s, step in at.items() if bool(step.good)]
 
-    def off(place: tuple[float, Step]) -> tuple[float, bool, float]:
+    def off(s: float) -> tuple[float, bool, float]:
         """Rank a point by its distance from zero; if the test jumps, prefer the last one before."""
-        left = test(place[1])
-        return abs(left), bool(left * begin < 0), abs(place[0] - root)
+        return abs(tested[s]), bool(tested[s] * tested[0.0] < 0), abs(s - root)
 
-    return min(good, key=off)[1] if good else None
+    good = [s for s in tested if bool(at[s].good)]
+    return at[min(good, key=off)] if good else None
+
+
+def _known_bracket(
+    places: list[float], length: float, value: Callable[[float], float]
+) -> tuple[float, float]:
+    """Return two neighbours among known places between which a test changes its sign."""
+    places = sorted({0.0, *places, length}, key=abs)
+    low, high = 0, len(places) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if value(places[middle]) * value(0.0) > 0 else (low, middle)
+    return places[low], places[high]
 
 
 def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
