@@ -87,7 +87,7 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Arr
 @on_host
 def _advanced(
     problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar
-) -> tuple[Any, ...]:
+) -> tuple[Any, Any, Any, Any, Any]:
     """Return a `Step` but for its observations, by Newton's method on the equations and the plane.
     The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold."""
 
@@ -122,6 +122,7 @@ def _advanced(
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
     """Return the solution on the plane across a unit tangent, at `length` from `x` (scaled)."""
+    found: tuple[Any, Any, Any, Any, Any]
     found = _advanced(problem, x, tangent, problem.scale, float(length))
     return Step(*found, observe(problem, found[0]))
 
