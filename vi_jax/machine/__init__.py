@@ -47,10 +47,10 @@ from .coordinates import without_turns as without_turns
 from .coordinates import wrap_angles as wrap_angles
 from .cycles import Turn as Turn
 from .cycles import counter_of as counter_of
+from .cycles import counts_turns as counts_turns
 from .cycles import falling as falling
 from .cycles import rising as rising
 from .cycles import turn_of as turn_of
-from .cycles import turns as turns
 from .drives import UNITS as UNITS
 from .drives import AbstractCrank as AbstractCrank
 from .drives import AbstractDrive as AbstractDrive

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._checks import in_range
 from .._messages import count_of
 from .._types import Flag, Machine, Number, Scalar, State
-from .cycles import turns
+from .cycles import counts_turns
 from .linear import LinearMachine, Prepared
 from .own import clock_of, stops_of, switches_of
 from .scene import Scene, ShaftMachine
@@ -82,7 +82,8 @@ def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
     """Return the mean speed of the drive over cycles of these durations; `None` without a drive."""
     if isinstance(machine, Scene):
         return machine.frequency_ratio(duration)
-    return 2 * pi / duration if isinstance(machine, ShaftMachine) or turns(machine) else None
+    has_shaft = isinstance(machine, ShaftMachine) or counts_turns(machine)
+    return 2 * pi / duration if has_shaft else None
 
 
 def cycles_in_words(machine: Machine, cycles: int) -> str:

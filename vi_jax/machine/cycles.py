@@ -141,7 +141,7 @@ def counter_of(machine: Any) -> Counter | None:
     return found if isinstance(found, Counter) else None
 
 
-def turns(machine: Any) -> bool:
+def counts_turns(machine: Any) -> bool:
     """Return whether the cycles of a machine are counted by `turn_of`."""
     return isinstance(counter_of(machine), Turn)
 

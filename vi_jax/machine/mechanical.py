@@ -214,8 +214,7 @@ class Mechanical(AbstractMachine):
         def twice_energy(q: Named) -> Any:
             return _dot(momenta(q), speeds)
 
-        for name in self.q_names:
-            acts = _depend_on(momenta, q, name)
+        for name, acts in _dependence(momenta, q).items():
             if not any(acts):
                 continue
             speed = getattr(v, name)
@@ -284,13 +283,14 @@ def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
         base, place = split_place(name)
         one = jnp.zeros_like(getattr(q, base)).at[place].set(1.0) if place else 1.0
         return [one if x == base else 0.0 for x in names]
-    return [_slope(on, q, x) if any(_depend_on(on, q, x)) else 0.0 for x in names]
+    return [_slope(on, q, x) if any(acts) else 0.0 for x, acts in _dependence(on, q).items()]
 
 
-def _depend_on(function: Callable[[Named], Any], q: Named, name: str) -> list[bool]:
-    """Return whether each result of a function may depend on one of the coordinates."""
-    traced = jax.make_jaxpr(function)(q).jaxpr
-    return dependent_results(traced, [x == name for x in vars(q)], smooth=False)
+def _dependence(function: Callable[[Named], Any], q: Named) -> dict[str, list[bool]]:
+    """Return for each coordinate whether each result of a function may depend on it."""
+    traced, names = jax.make_jaxpr(function)(q).jaxpr, tuple(vars(q))
+    marks = {name: [name == x for x in names] for name in names}
+    return {name: dependent_results(traced, x, smooth=False) for name, x in marks.items()}
 
 
 def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:

@@ -33,6 +33,7 @@ from ..machine import (
     after_event,
     begin_modes,
     check_again,
+    counts_turns,
     events_of,
     has_contact_friction,
     in_rows,
@@ -48,7 +49,6 @@ from ..machine import (
     size_of,
     stops_of,
     switches_of,
-    turns,
     with_leaf,
     with_modes,
     without_modes,
@@ -310,7 +310,8 @@ def _followed(
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(carried(modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
-    if first is not None and (renews(machine) or turns(machine) or first != section_of(machine, 0)):
+    jumps = renews(machine) or counts_turns(machine) or first != section_of(machine, 0)
+    if first is not None and jumps:
         states[0] = states[-1]
     return np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),)
 

@@ -254,7 +254,7 @@ def located(
         if np.isnan(found):
             raise NoValueError
         bracket[found > 0] = s
-        unsure = max(float(at[end].size) for end in bracket.values())
+        unsure = max(min(_ROUNDED, float(at[end].size)) for end in bracket.values())
         close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= unsure
         return 0.0 if close or abs(found) <= _ZERO * max(map(abs, tested.values())) else found
 

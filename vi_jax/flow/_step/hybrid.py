@@ -23,6 +23,7 @@ from ...lanes import pin_flag
 from ...machine import (
     DryFriction,
     SoftStop,
+    counts_turns,
     is_alive,
     others_of,
     section_in,
@@ -30,7 +31,6 @@ from ...machine import (
     stops_of,
     struck_modes,
     switches_of,
-    turns,
     with_earlier_clock,
 )
 from .._lane import FREE, Lane, Plan, Record, select, to_event, total
@@ -73,7 +73,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     rejected = active & ~trial.good
     length = _resized(plan, lane, trial, taken, rejected)
     arrived, completed = arrive(plan, lane, trial, taken)
-    if section_in(plan.machine, lane.state) is not None and not turns(plan.machine):
+    if section_in(plan.machine, lane.state) is not None and not counts_turns(plan.machine):
         completed = completed | taken & _is_equilibrium_on_section(plan, lane, arrived)
     reached = completed = pin_flag(completed, lane.s)
     if plan.noise is not None:
