@@ -138,7 +138,7 @@ def plane_points(curve: Boundary) -> np.ndarray:
     """Return points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
     points = curve.parameters.copy()
     if curve.names[1] == XI:
-        points[:, 1] = np.maximum(points[:, 1], 0.0) / xi_per_c()  # may be -1e-17 at its end
+        points[:, 1] /= xi_per_c()
     return points
 
 

@@ -127,6 +127,15 @@ class Table(abc.ABC):
             self._way = way, {}
         return located(*way, test, self._way[1])
 
+    def on_bounds(self, step: Step) -> Step:
+        """Return a point with its parameters on their bounds if they are there to rounding: beyond
+        a bound, a number may be out of its range."""
+        x = np.array(step.x)
+        for i, ends in enumerate(self.bounds, -len(self.bounds)):
+            for bound in ends:
+                x[i] = bound if abs(x[i] - bound) < _ROUNDED * self.scale[i] else x[i]
+        return step._replace(x=x)
+
     def images(self, step: Step) -> np.ndarray:
         """Return the difference of a motion from its own image; empty if it cannot be symmetric."""
         return halves_apart(self.problem, step, mirrored=True) if self.symmetric else np.zeros(0)
@@ -165,7 +174,10 @@ def both_ways(
 
     **Raises:** on Ctrl-C `Interrupted`, with the result so far.
     """
-    ahead, back = _Walk(table(), start), _Walk(table(), start._replace(tangent=-start.tangent))
+    tables = table(), table()
+    start = tables[0].on_bounds(start)
+    ahead = _Walk(tables[0], start)
+    back = _Walk(tables[1], start._replace(tangent=-start.tangent))
 
     def found() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
@@ -220,7 +232,8 @@ class _Walk:
                 for point, at in self.table.passed(here, last):
                     self._note(at, point)
             if ending is not None:
-                self._note(None if ending.last is here else ending.last, ending.point)
+                last = None if ending.last is here else self.table.on_bounds(ending.last)
+                self._note(last, ending.point)
                 end = ending.reason
                 break
             self._note(new)
@@ -284,7 +297,7 @@ class _Walk:
                 if abs(length) < _STALLED_AT:
                     at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
-                        return _end_at_bound(at, i, bound)
+                        return Ending(at, BOUNDS)
         return table.stalled(self.steps)
 
     def _made_finer(self, new: Step) -> bool:
@@ -331,14 +344,6 @@ def _falls(row: Event, begin: float, new: Step) -> bool:
     return abs(begin) <= _BEGINS * abs(end) and end < -row.noise
 
 
-def _end_at_bound(at: Step, i: int, bound: float) -> Ending:
-    """Return the end of a curve at the bound of parameter number i, which `at` differs from by
-    rounding only: beyond it, a number may be out of its range."""
-    x = np.array(at.x)
-    x[i] = bound
-    return Ending(at._replace(x=x), BOUNDS)
-
-
 def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
     def tangent(step: Step) -> np.ndarray:
         along = np.asarray(step.tangent) * before / after
@@ -357,9 +362,7 @@ def bounds_of(table: Table) -> list[Event]:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
         def ending(at: Step) -> Ending:
-            if abs(left(at)) >= _STALLED_AT:
-                return Ending(at, SHORTER)
-            return _end_at_bound(at, i, bound) if abs(left(at)) < _ROUNDED else Ending(at, BOUNDS)
+            return Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER)
 
         return Event(left, ending)
 
