@@ -23,7 +23,7 @@ except ImportError:  # JAX 0.9
 from .._checks import fields_with, number, require
 from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
-from .cycles import Turn, at_intervals, counter_of
+from .cycles import Turn, at_intervals, counter_of, counts_turns
 from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction
@@ -465,3 +465,8 @@ def names_coordinates(machine: AbstractMachine) -> bool:
 def renews(machine: AbstractMachine) -> bool:
     """Return whether a machine defines `renewed`."""
     return is_own(type(machine).renewed)
+
+
+def jumps_on_section(machine: AbstractMachine) -> bool:
+    """Return whether the state jumps at the end of a cycle: by `renewed`, or by a whole turn."""
+    return renews(machine) or counts_turns(machine)

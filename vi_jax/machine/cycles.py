@@ -1,6 +1,7 @@
 """Cycles that end with a turn of an angle or a zero of a function, not with time; and machines
 observed at equal intervals instead."""
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from .event import AbstractEvent, Section, TurnEnd
 from .own import is_own, with_static
 
 
-class Counter:
+class Counter(abc.ABC):
     """The counter of a machine's cycles, its class attribute `cycle`. The `cycle` of an instance is
     the usual length of a cycle."""
 
@@ -39,9 +40,9 @@ class Counter:
             "how long a cycle takes."
         )
 
+    @abc.abstractmethod
     def section(self, machine: Any, state: State) -> Any:
         """Return the function that rises through zero at the end of a cycle."""
-        raise NotImplementedError
 
     def with_earlier_angle(self, state: State) -> State:
         """Return the state at the beginning of the next cycle."""

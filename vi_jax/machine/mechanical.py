@@ -203,9 +203,9 @@ class Mechanical(AbstractMachine):
     def _inertial(self, q: Named, v: Named) -> list[Any]:
         """Return h = dM/dt v - ½ ∂(vᵀMv)/∂q of Lagrange's equations; 0 with constant masses."""
         names = self.free_names
-        speeds, found = [getattr(v, name) for name in names], dict.fromkeys(names, 0.0)
         if not callable(_mass_of(self)):
-            return list(found.values())
+            return [0.0 for _ in names]
+        speeds, found = [getattr(v, name) for name in names], dict.fromkeys(names, 0.0)
 
         def momenta(q: Named) -> list[Any]:
             rows = (zip(row, speeds, strict=True) for row in self.masses(q))

@@ -66,7 +66,7 @@ _STALLED_AT = 1e-6
 
 # A parameter this close to its bound (in its scale) is at it, to rounding: a choice, below the
 # corrector's tolerance.
-_ROUNDED = 1e-12
+_ON_BOUND = 1e-12
 
 
 class Ending(NamedTuple):
@@ -102,7 +102,9 @@ class Table(abc.ABC):
     def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
         self.problem, self.bounds = problem, bounds
         self.closing = Closing(self)
-        self._way: tuple[tuple[Any, ...], dict[float, Step]] = ((None,) * 3, {})
+        # The equations and ends of the last search by `where`, and the points that it found.
+        self._searched: tuple[Any, ...] = (None, None, None)
+        self._found: dict[float, Step] = {}
 
     @property
     def scale(self) -> np.ndarray:
@@ -122,10 +124,10 @@ class Table(abc.ABC):
     def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """Return the point between two at which a test is zero; points found for another test
         between the same two are used again."""
-        way = self.problem, here, new
-        if any(a is not b for a, b in zip(way, self._way[0], strict=True)):
-            self._way = way, {}
-        return located(*way, test, self._way[1])
+        ends = self.problem, here, new
+        if any(a is not b for a, b in zip(ends, self._searched, strict=True)):
+            self._searched, self._found = ends, {}
+        return located(*ends, test, self._found)
 
     def on_bounds(self, step: Step) -> Step:
         """Return a point with its parameters on their bounds if they are there to rounding: beyond
@@ -133,7 +135,7 @@ class Table(abc.ABC):
         x = np.array(step.x)
         for i, ends in enumerate(self.bounds, -len(self.bounds)):
             for bound in ends:
-                x[i] = bound if abs(x[i] - bound) < _ROUNDED * self.scale[i] else x[i]
+                x[i] = bound if abs(x[i] - bound) < _ON_BOUND * self.scale[i] else x[i]
         return step._replace(x=x)
 
     def images(self, step: Step) -> np.ndarray:

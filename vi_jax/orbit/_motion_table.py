@@ -33,7 +33,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._types import Scalar, Vector
-from ..machine import AbstractMachine, counts_turns, renews, section_in
+from ..machine import AbstractMachine, jumps_on_section, section_in
 from ._conditions import HeldMultiplier, alone, rates_at
 from ._flight import LANDS, LEAVES, section_of
 from ._flight import Event as MotionEvent
@@ -570,8 +570,7 @@ def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     """Return a tiny motion about the equilibrium with eigenvalues ±iω onto which the cycle shrinks
     between two points; `None` unless it has a multiplier 1."""
     machine = problem.machine
-    returns = not (renews(machine) or counts_turns(machine))
-    if not returns or problem.events != (section_of(machine, 0),):
+    if problem.events != (section_of(machine, 0),) or jumps_on_section(machine):
         return None
     rates = [_leaving(problem, step.x)[0] for step in (here, new)]
     if np.dot(*rates) >= 0:

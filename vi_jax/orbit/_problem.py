@@ -33,11 +33,11 @@ from ..machine import (
     after_event,
     begin_modes,
     check_again,
-    counts_turns,
     events_of,
     has_contact_friction,
     in_rows,
     is_autonomous,
+    jumps_on_section,
     leaf,
     modes_of,
     others_of,
@@ -310,8 +310,7 @@ def _followed(
         u, s = ravel_pytree(here)[0], place
     states.append(np.asarray(carried(modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
-    jumps = renews(machine) or counts_turns(machine) or first != section_of(machine, 0)
-    if first is not None and jumps:
+    if first is not None and (jumps_on_section(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
     return np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),)
 

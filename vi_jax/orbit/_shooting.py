@@ -209,20 +209,24 @@ class Shooting(eqx.Module):
 
     def at(self, x: Unknowns) -> AbstractMachine:
         """Return the machine with the parameters in `x`."""
-        machine, x = self.machine, jnp.asarray(x)
-        for i, name in enumerate(self.parameters, x.shape[0] - len(self.parameters)):
-            machine = with_leaf(machine, name, x[i])
+        x = jnp.asarray(x)
+        n = x.shape[0]
+        return self._with_parameters([x[i] for i in range(n - len(self.parameters), n)])
+
+    def _with_parameters(self, values: Sequence[Any]) -> AbstractMachine:
+        machine = self.machine
+        for name, value in zip(self.parameters, values, strict=True):
+            machine = with_leaf(machine, name, value)
         return machine
 
     def motion_at(self, x: Unknowns) -> tuple["Shooting", Unknowns]:
         """Return the equations of the motion alone, without parameters among the unknowns, and a
         solution of them, from a solution `x`; host-side."""
-        x, n = np.asarray(x), len(self.parameters)
-        machine = self.machine
-        for name, value in zip(self.parameters, x[x.size - n :], strict=True):
-            machine = with_leaf(machine, name, np.asarray(value))
+        x = np.asarray(x)
+        end = x.size - len(self.parameters)
+        machine = self._with_parameters([np.asarray(value) for value in x[end:]])
         alone: Any = {"parameters": (), "conditions": (), "widths": ()}
-        return dataclasses.replace(self, machine=machine, **alone), x[: x.size - n]
+        return dataclasses.replace(self, machine=machine, **alone), x[:end]
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
         """Return the machines at the ends of these intervals of the parameters."""

@@ -85,11 +85,10 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Arr
 
 
 @on_host
-def _advanced(
-    problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar
-) -> tuple[Any, Any, Any, Any, Any]:
-    """Return a `Step` but for its observations, by Newton's method on the equations and the plane.
-    The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold."""
+def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
+    """Advance as `advance` does, without observations, by Newton's method on the equations and the
+    plane. The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold.
+    """
 
     def equations(y):
         return jnp.concatenate([problem.residual(y * scale), jnp.dot(tangent, y - y0)[None]])
@@ -117,14 +116,13 @@ def _advanced(
     y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
     along = along / jnp.linalg.norm(along)
     good = (size <= _ROUNDED) & jnp.all(jnp.isfinite(along))
-    return y * scale, along, size, count, good
+    return Step(y * scale, along, size, count, good, None)
 
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
     """Return the solution on the plane across a unit tangent, at `length` from `x` (scaled)."""
-    found: tuple[Any, Any, Any, Any, Any]
-    found = _advanced(problem, x, tangent, problem.scale, float(length))
-    return Step(*found, observe(problem, found[0]))
+    step = _advanced(problem, x, tangent, problem.scale, float(length))
+    return step._replace(seen=observe(problem, step.x))
 
 
 # These programs take the equations of the motion alone, so that a branch and all its curves share
@@ -177,7 +175,7 @@ def _jacobian_at(problem: Shooting, x, scale):
 
 
 def jacobian_and_rows(problem: Shooting, x: Unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Return `jacobian_at`, and the largest derivative of each equation, by which it is divided."""
+    """Return the Jacobian of `jacobian_at`, and the numbers by which its rows are divided."""
     return _jacobian_at(problem, x, problem.scale)
 
 
@@ -250,7 +248,9 @@ def located(
             if len(silent) >= _TRIALS:
                 raise _CloseError
             at[s] = reached(s)
-        found = tested[s] = test(at[s]) if s not in tested else tested[s]
+        if s not in tested:
+            tested[s] = test(at[s])
+        found = tested[s]
         if np.isnan(found):
             raise NoValueError
         bracket[found > 0] = s
@@ -292,10 +292,10 @@ def _known_bracket(
 ) -> tuple[float, float]:
     """Return two neighbours among known places between which a test changes its sign."""
     places = sorted({0.0, *places, length}, key=abs)
-    low, high = 0, len(places) - 1
+    low, high, begin = 0, len(places) - 1, value(0.0)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if value(places[middle]) * value(0.0) > 0 else (low, middle)
+        low, high = (middle, high) if value(places[middle]) * begin > 0 else (low, middle)
     return places[low], places[high]
 
 
