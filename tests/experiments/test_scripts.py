@@ -18,7 +18,7 @@ WITHOUT_FIGURE = {"gpu"}
 RUN_ELSEWHERE = {"peers", "chains"}
 # These run with the slow tests; the others, whose calls pyright has checked, before
 # a release. Headline numbers are tests of their own (`test_headlines.py`).
-SLOW = {"motors"}
+SLOW = {"basins_map"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)

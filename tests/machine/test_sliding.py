@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from rubbing import Rubbing
-
 
 def speed(machine, s, z):
     return z.V
@@ -93,41 +91,3 @@ def test_it_leaves_where_one_side_points_away():
     np.testing.assert_allclose(leaves, [np.arcsin(1 / a)], atol=1e-8)
     leaves = phases[kinds == 3][modes == -1.0]
     np.testing.assert_allclose(leaves, [np.pi + np.arcsin(1 / a)], atol=1e-8)
-
-
-def drive(machine, s, z):
-    return jnp.cos(s) - z.Y
-
-
-class Driven(Rubbing):
-    """A body on a spring and on a rough floor, driven slowly, which slides twice a cycle: by a
-    switch's mode or by that of its friction."""
-
-    dry: bool = eqx.field(static=True, default=False)
-
-    @property
-    def contacts(self):
-        return vi.DryFriction(self.level, on="V", mass=0.3) if self.dry else ()
-
-    @property
-    def events(self):
-        return () if self.dry else vi.Switch(speed, slides=True)
-
-    def field(self, s, z, mode=0.0):
-        pull = drive(self, s, z) - self.level * mode
-        return vi.OscillatorState(z.V / 0.3, pull / 0.3)
-
-
-@pytest.mark.slow
-def test_sticking_is_sliding_along_the_surface_of_no_speed():
-    """Orbit, multipliers and branch beside those of `DryFriction`, whose mode says the same."""
-    found = []
-    for machine in (Driven(drive, 0.4), Driven(drive, 0.4, dry=True)):
-        start = vi.OscillatorState(jnp.array(0.1), jnp.array(0.0))
-        orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=20).last)
-        branch = vi.continue_orbit(orbit, parameter="level", bounds=(0.1, 0.6))
-        (graze,) = branch.special
-        assert graze.kind == "adding-sliding"
-        multiplier = float(jnp.abs(orbit.multipliers).max())
-        found.append((float(orbit.state.Y), multiplier, graze.parameter))
-    np.testing.assert_allclose(*found, atol=1e-8)

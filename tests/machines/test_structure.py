@@ -126,6 +126,7 @@ def test_derivatives_by_matrices():
     slopes = np.stack([(last(p + e) - last(p - e)) / 2e-6 for e in h], axis=-1)
     np.testing.assert_allclose(found / size, slopes / size, rtol=0, atol=1e-6)
 
+    @jax.jit
     def energy(stiff):
         return jax.grad(lambda x: jnp.sum(last(p.at[jnp.array([0, 4])].set(x)) ** 2))(stiff)
 

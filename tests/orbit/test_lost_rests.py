@@ -7,8 +7,6 @@ import vi_jax as vi
 
 from two_coupled import Coupled, settled
 
-pytestmark = pytest.mark.slow
-
 ZETA = "drive.frequency_ratio"
 
 
@@ -17,6 +15,7 @@ def found(machine, start, cycles=40):
     return vi.find_orbit(machine, last, impact_log=64, throw=True)
 
 
+@pytest.mark.slow
 def test_a_lost_rest_of_one_body():
     """Beside flights in 60 digits at the place and at the ends of both curves, and beside
     simulations in between. The steps are so long that the corrector begins far off."""
@@ -51,6 +50,7 @@ def rest_beside(machine_at, value, by=1e-6):
     return [rests(machine_at(value + x)) for x in (-by, by)]
 
 
+@pytest.mark.slow
 def test_a_rest_that_is_divided():
     """Two bodies. The place, the curve and the multipliers are those of a shooting code with exact
     hops; on both sides of the curve simulations count the rests."""
@@ -78,6 +78,7 @@ def test_a_rest_that_is_divided():
     assert rests == [2, 1]
 
 
+@pytest.mark.exhaustive
 def test_a_ball_on_its_table():
     """Beside simulations on both sides of the curve."""
     machine, bounds = vi.machines.BouncingBall(acceleration=1.3, restitution=0.4), (1.2, 2.0)
@@ -115,6 +116,7 @@ class Switched(vi.AbstractMachine):
         return vi.OscillatorState(jnp.asarray(-0.5), jnp.asarray(0.0))
 
 
+@pytest.mark.slow
 def test_an_event_before_a_chatter_is_over():
     """The body rests for 1.1788045220098, by hops in 60 digits, until the drive changes its sign:
     the switch cannot come before that rest begins."""

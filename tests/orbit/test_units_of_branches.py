@@ -1,6 +1,7 @@
 """The same machine in other units of length and time has the same orbits and special points."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -93,8 +94,7 @@ class Swinging(vi.AbstractMachine):
 CASES = {
     "impacts": (Struck, {"frequency": 0.6, "gap": 0.5}, "frequency", (0.5, 1.2)),
     "bends": (Struck, {"cubic": 1.0, "gap": 9.0, "force": 0.4}, "frequency", (0.6, 3.0)),
-    "rubs": (Rubbed, {"frequency": 0.5}, "frequency", (0.2, 0.9)),
-    "slides": (Sliding, {"frequency": 0.5}, "frequency", (0.2, 0.9)),
+    "rubs": ((Rubbed, Sliding), {"frequency": 0.5}, "frequency", (0.2, 0.9)),
     "heats": (Heated, {"frequency": 0.6}, "gap", (0.1, 2.0)),
     "swings": (Swinging, {}, "growth", (-0.5, 0.6)),
 }
@@ -102,14 +102,22 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_branch_is_the_same_in_all_units(case):
-    kind, numbers, parameter, bounds = CASES[case]
-    found, forecasts = [], []
-    for length, time in UNITS:
+    """And the same with friction as a contact and as a switch that slides; a branch, from event to
+    event, passes through the orbit that was searched by the cycle map."""
+    kinds, numbers, parameter, bounds = CASES[case]
+    kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+    found, forecasts, searched = [], [], []
+    for kind, (length, time) in itertools.product(kinds, UNITS):
         machine = kind(length=length, time=time, **numbers)
         settled = vi.simulate(machine, machine.start(), 1, settle=60).last
         orbit = vi.find_orbit(machine, settled, throw=True)
+        sizes = np.abs(orbit.multipliers)
+        searched.append([orbit.state.x / length, orbit.state.v * time / length, *sizes[:2]])
         branch = vi.continue_orbit(orbit, parameter=parameter, bounds=bounds, progress=False)
         assert branch.admissible.all()
+        i = np.abs(branch.parameter - getattr(machine, parameter)).argmin()
+        np.testing.assert_allclose(np.abs(branch.multipliers[i]), sizes, rtol=0, atol=1e-6)
+        assert branch.y_max[i] / length == pytest.approx(float(orbit.y_max) / length, abs=1e-8)
         points = {p.kind: p for p in branch.special}
         kinds = branch.ends, [p.kind for p in branch.special]
         found.append((kinds, [p.parameter for p in branch.special]))
@@ -126,6 +134,7 @@ def test_a_branch_is_the_same_in_all_units(case):
     assert found[0][1]
     for other in forecasts:
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, forecasts[0])
+    np.testing.assert_allclose(searched, [searched[0]] * len(searched), rtol=0, atol=1e-8)
     for kinds, places in found:
         assert kinds == found[0][0]
         np.testing.assert_allclose(places, found[0][1], rtol=1e-9, atol=1e-9)

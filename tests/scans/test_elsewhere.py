@@ -52,24 +52,17 @@ def _same(found, whole):
 
 
 @pytest.mark.slow
-def test_killed_twice_the_store_ends_the_same(tmp_path, whole):
-    """Each run goes on with what the killed ones left."""
-    path, rng, before = tmp_path / "store", np.random.default_rng(3), 0
-    for _ in range(2):
-        process = _run(path)
-        assert process.stdout.readline() == "begins\n"
-        while _done(path) == before:
-            time.sleep(0.02 * rng.uniform())
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert before < _done(path) < whole["result"].size
-        before = _done(path)
-    _same(_finished(path), whole)
-
-
-@pytest.mark.slow
-def test_two_devices_give_the_same_numbers(tmp_path, whole):
-    _same(_finished(tmp_path / "two", "--devices", "2"), whole)
+def test_killed_and_resumed_on_two_devices_the_store_ends_the_same(tmp_path, whole):
+    """The second run goes on with what the killed one left."""
+    path = tmp_path / "store"
+    process = _run(path)
+    assert process.stdout.readline() == "begins\n"
+    while not _done(path):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert 0 < _done(path) < whole["result"].size
+    _same(_finished(path, "--devices", "2"), whole)
 
 
 @pytest.mark.slow
