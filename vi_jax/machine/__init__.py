@@ -44,6 +44,7 @@ from .coordinates import component as component
 from .coordinates import has_component as has_component
 from .coordinates import is_angle as is_angle
 from .coordinates import nearest_images as nearest_images
+from .coordinates import with_component as with_component
 from .coordinates import without_turns as without_turns
 from .coordinates import wrap_angles as wrap_angles
 from .cycles import Turn as Turn

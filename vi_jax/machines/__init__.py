@@ -13,8 +13,6 @@ from .impact_pair import PairState as PairState
 from .relief_valve import ReliefValve as ReliefValve
 from .relief_valve import ValveState as ValveState
 from .structure import Structure as Structure
-from .unbalanced_rotor import RotorState as RotorState
-from .unbalanced_rotor import TimedRotorState as TimedRotorState
 from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor
 from .woodpecker import Woodpecker as Woodpecker
 from .woodpecker import WoodpeckerState as WoodpeckerState

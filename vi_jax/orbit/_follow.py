@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from .._checks import count, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
-from ..machine import angles_in, nearest_images
+from ..machine import nearest_images
 from ._problem import COARSE, finer, grown, sized_by_motion
 from ._shooting import Shooting
 from ._solution import Step, advance, distance_along, located, on_host, step_error
@@ -466,7 +466,7 @@ class Closing:
     def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
         """Shift the angles of motions by the turns that bring them nearest to another one."""
         problem, xs = self.table.problem, xs.copy()
-        angles = angles_in(problem.machine, problem.like)
+        angles = problem.angles
         if angles is not None:
             first, angles = len(problem.events), np.tile(angles, problem.legs)
             states = slice(first, first + angles.size)
@@ -482,7 +482,7 @@ def _others_with_rates(problem: Shooting, x, along):
 
 def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
     """Return the same motion from other events, or without events from its other sections."""
-    if problem.autonomous:
+    if problem.autonomous and not problem.omits_sections:
         return []
     clock, states = problem.parts(x)
     if not problem.events:
@@ -493,5 +493,5 @@ def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
     for first in range(1, problem.legs):
         if problem.events[first:] + problem.events[:first] == problem.events:
             later = jnp.concatenate([clock[first:], clock[:first] + period])
-            found.append(problem.pack(later, jnp.roll(states, -first, axis=0), x))
+            found.append(problem.pack(later, jnp.roll(states, -first, axis=0), x, period))
     return found

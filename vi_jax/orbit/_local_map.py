@@ -19,8 +19,8 @@ from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from ._flight import Event, Flight
 from ._shooting import Shooting
-from ._solution import on_host, tangent_at
-from ._surgery import of_least_period, without_events
+from ._solution import on_host, since_section, tangent_at
+from ._surgery import of_least_period, with_sections, without_events
 from ._turns import Path, turning
 from ._words import one
 from .special import Point
@@ -429,7 +429,8 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
     old, x, i = point.problem, np.asarray(point.step.x), point.impact
     if i is None:
         nearest = point.step.seen.nearest
-        return old, x, int(nearest.event), float(nearest.clock)
+        clock = since_section(old, x, float(nearest.clock))
+        return *with_sections(old, x), int(nearest.event), clock
     if old.events[i].cycle is not None:
         raise ValueError(
             "Argument `point` must be a grazing of a stop, but there the section of the machine "
@@ -440,8 +441,8 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
         beside = [j % old.legs for j in (i - 1, i + 1)]
         which += [j for j in beside if old.events[j].number == old.events[i].number][:1]
     which += [j for j in point.lost if j not in which]
-    clock = float(old.values(x)[0][i])
-    return *without_events(old, x, sorted(which)), old.events[i].number, clock
+    clock = since_section(old, x, float(old.values(x)[0][i]))
+    return *with_sections(*without_events(old, x, sorted(which))), old.events[i].number, clock
 
 
 @on_host

@@ -22,6 +22,7 @@ from ..flow import (
     MethodLike,
     Run,
     RunOptions,
+    SmoothMachine,
     check_parts,
     chosen,
     simulate,
@@ -33,7 +34,11 @@ from ..machine import (
     after_event,
     begin_modes,
     check_again,
+    component,
+    counter_of,
+    counts_turns,
     events_of,
+    guard_of,
     has_contact_friction,
     in_rows,
     is_autonomous,
@@ -46,9 +51,11 @@ from ..machine import (
     renews,
     scales_known,
     section_in,
+    section_number,
     size_of,
     stops_of,
     switches_of,
+    with_component,
     with_leaf,
     with_modes,
     without_modes,
@@ -209,7 +216,7 @@ def problem_of(
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
-    x = problem.pack(places, states, [leaf(machine, parameter)], period)
+    x = problem.pack(np.asarray(places), states, [leaf(machine, parameter)], period)
     return sized(problem, x), np.asarray(x)
 
 
@@ -328,10 +335,41 @@ def events_in(orbit: Orbit) -> list[Placed]:
     if others or (autonomous and cycles > 1):
         begins, listed = _listed_events(orbit)
         found = listed if others else found
+    if counts_turns(machine) and found and not renews(machine) and _repeats(orbit):
+        return found  # these may pass sections, at which nothing happens
     if section_in(machine, without_modes(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     # An event that coincides with a section belongs to the cycle that ends there.
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
+
+
+# Angles of a turn at which a machine is compared with itself a turn later, and the largest relative
+# difference: choices.
+_AROUND, _DIFFERS = 7, 1e-8
+
+
+def _repeats(orbit: Orbit) -> bool:
+    """Return whether a machine with turns is the same a whole turn earlier and later."""
+    around = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
+    turns = 2 * np.pi * np.array([0.0, -1.0, 1.0])[:, None]
+    machine, state = orbit.machine, without_modes(orbit.state)
+    here, *others = np.asarray(_around(machine, state, modes_of(orbit.state), around + turns))
+    return bool((np.abs(others - here) <= _DIFFERS * np.abs(here).max(axis=0)).all())
+
+
+@compiled
+def _around(machine: AbstractMachine, state: State, own: Any, turned: Any) -> Any:
+    """Return rates and guards of a machine at these angles beyond that of the state."""
+    name, s = counter_of(machine).name, jnp.zeros(())
+
+    def at(angle):
+        there = with_component(name, state, component(name, state) + angle)
+        modes = begin_modes(machine, s, there, own)
+        rates = SmoothMachine(machine, modes, ()).field(s, there)
+        guards = [guard_of(machine, n, s, there, modes) for n in range(section_number(machine))]
+        return jnp.stack([*raveled(rates)[0], *guards])
+
+    return jnp.vectorize(at, signature="()->(n)")(turned)
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:

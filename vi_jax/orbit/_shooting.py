@@ -28,6 +28,9 @@ from ..machine import (
     AbstractMachine,
     after_event,
     angles_in,
+    component,
+    components,
+    counter_of,
     cycle_time,
     events_of,
     guard_of,
@@ -37,6 +40,7 @@ from ..machine import (
     nearest_images,
     section_number,
     stops_of,
+    with_component,
     with_leaf,
 )
 from ._chatter import Hops, escape, hopped, remaining
@@ -46,6 +50,10 @@ from .results import multipliers_of
 
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
+
+# Newton steps from the begin of a step to where an angle passes within it: four reach rounding if
+# the speed changes by less than half in a step.
+_PASSING = 5
 
 
 class Observed(NamedTuple):
@@ -124,8 +132,9 @@ class Shooting(eqx.Module):
 
     and the event after the last is the first one, a period later. The unknowns, in one vector x,
     are (s₁ … sₙ, u₁ … uₙ, p). Without events there is one leg, from the state at clock zero, and x
-    = (u, p). The first event of an autonomous machine is a section, at clock zero; its period is an
-    unknown and replaces s₁.
+    = (u, p). The first event of an autonomous machine is at clock zero; its period is an unknown and
+    replaces s₁. Sections are among its events, unless turns end its cycles and there are other
+    events. These may then pass a section along a branch.
     """
 
     machine: AbstractMachine
@@ -172,6 +181,21 @@ class Shooting(eqx.Module):
     def autonomous(self) -> bool:
         """True if the period is an unknown."""
         return is_autonomous(self.machine, self.like)
+
+    @property
+    def omits_sections(self) -> bool:
+        """True if the sections of an autonomous machine are not among the events."""
+        in_flight = all(event.cycle is None for event in self.events)
+        return bool(self.events) and in_flight and self.autonomous
+
+    @property
+    def angles(self) -> np.ndarray | None:
+        """Which components of a state are angles, equal up to whole turns; `None` without any."""
+        if not self.omits_sections:
+            return angles_in(self.machine, self.like)
+        turn = counter_of(self.machine)
+        assert turn is not None
+        return np.array([name == turn.name for name in components(self.like)])
 
     @property
     def impacts(self) -> tuple[int, ...]:
@@ -263,7 +287,7 @@ class Shooting(eqx.Module):
         """Pack `parts`, the parameters of other unknowns `x` and perhaps a period into unknowns."""
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
-            clock = clock.at[0].set(period)
+            clock = (clock - clock[0]).at[0].set(period)
         parameters = jnp.asarray(x)[-len(self.parameters) :]
         return jnp.concatenate([clock, jnp.ravel(states), parameters])
 
@@ -336,7 +360,56 @@ class Shooting(eqx.Module):
         begins = [i for i, event in enumerate(self.events) if event.cycle is not None]
         if begins:
             return jnp.asarray(begins), self.parts(x)[0][jnp.asarray(begins)]
+        if self.omits_sections:
+            return self._ends_of_turns(x)
         return self.leg_at(x, self.at(x).cycle * jnp.arange(self.cycles, dtype=x.dtype))
+
+    def _ends_of_turns(self, x: Vector) -> tuple[Int[Array, " cycles"], Float[Array, " cycles"]]:
+        """Return the `sections` that are not among the events, by Newton's method from the step in
+        which the angle passes. The first is the one before an orbit's first event, along a whole
+        branch."""
+        machine, turn, (clock, states) = self.at(x), counter_of(self.machine), self.parts(x)
+        angle = lambda u: component(turn.name, self.unravel(u))
+
+        def follow(leg, s0, s1, u):
+            after = self.after(machine, leg, s0, u)
+            path = self.flight(machine, leg).fly(s0, s1, after, self.steps, rows=self.steps)
+            return angle(path[0]), *path[2]
+
+        ends = self.ends(clock, self.period(x))
+        arrived, s, path = jax.vmap(follow)(jnp.arange(self.legs), clock, ends, states)
+        begins = jax.vmap(angle)(states)
+        turns = jnp.round((arrived - jnp.roll(begins, -1)) / (2 * np.pi))  # less at the next event
+        turns = jnp.cumsum(turns) - turns
+        angles = (jax.vmap(jax.vmap(angle))(path) + 2 * np.pi * turns[:, None]).ravel()
+        first = jnp.ceil((begins[0] - turn.start) / (2 * np.pi))
+
+        def passing(number):
+            goal = turn.start + 2 * np.pi * number
+            row = jnp.maximum(jnp.sum(angles <= goal) - 1, 0)
+            leg = row // self.steps
+            flight, goal = self.flight(machine, leg), goal - 2 * np.pi * turns[leg]
+            s0, u0 = s.ravel()[row], path.reshape(-1, self.states)[row]
+
+            def nearer(_, place):
+                place = stop_gradient(place)  # only the last step has a derivative: that of a root
+                u = flight.fly(s0, place, u0, 1)[0]
+                rates = flight.smooth.field(place, self.unravel(u))
+                return place + (goal - angle(u)) / component(turn.name, rates)
+
+            return leg, jax.lax.fori_loop(0, _PASSING, nearer, s0)
+
+        numbers = jnp.arange(self.cycles, dtype=x.dtype)
+        return jax.vmap(passing)(first + jnp.mod(numbers - first, self.cycles))
+
+    def on_sections(self, x: Vector) -> State:
+        """Return the states on the sections, leaves (cycles,)."""
+        states = jax.vmap(partial(self.state_at, x))(*self.sections(x))
+        if not self.omits_sections:
+            return states
+        turn = counter_of(self.machine)
+        begins = jnp.full_like(component(turn.name, states), turn.start)
+        return with_component(turn.name, states, begins)
 
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """Return the flight of a leg; after the hops of the chatter, if the leg begins with one."""
@@ -425,7 +498,7 @@ class Shooting(eqx.Module):
         ends = self.ends(clock, self.period(x))
         arrived, away, begins = jax.vmap(arrive)(legs, clock, ends, states)
         after = jnp.roll(states, -1, axis=0)
-        arrived = nearest_images(angles_in(machine, self.like), arrived, after)
+        arrived = nearest_images(self.angles, arrived, after)
         return jnp.concatenate([(arrived - after).ravel(), away.ravel()]), begins
 
     def observe(self, x: Vector) -> Observed:
@@ -596,8 +669,10 @@ class Shooting(eqx.Module):
         jacobian = jax.jacfwd(reset)(u)
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
-            # The clock restarts at a section, so a perturbation along the motion vanishes.
-            goes_on = [float(not event.of(machine).ends_cycle) for event in self.events]
+            # The clock restarts there, so a perturbation along the motion vanishes.
+            restarts = [event.of(machine).ends_cycle for event in self.events]
+            restarts[0] = True
+            goes_on = [float(not x) for x in restarts]
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
         gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)

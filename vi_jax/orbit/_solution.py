@@ -392,8 +392,7 @@ class Hits(NamedTuple):
 
 @compiled
 def _sections(motion: Shooting, x: Array):
-    states = jax.vmap(lambda leg, s: motion.state_at(x, leg, s))(*motion.sections(x))
-    return states, jnp.max(jnp.abs(motion.motion_residual(x)))
+    return motion.on_sections(x), jnp.max(jnp.abs(motion.motion_residual(x)))
 
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
@@ -402,10 +401,31 @@ def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
     return _sections(motion, jnp.asarray(x))
 
 
+def first_section(problem: Shooting, x: Unknowns) -> tuple[int, float]:
+    """Return leg and clock of the first section of a motion."""
+    if not problem.omits_sections:
+        legs, clock = problem.sections(jnp.asarray(x))
+    else:
+        motion, x = problem.motion_at(x)
+        legs, clock = _passed(motion, jnp.asarray(x))
+    return int(legs[0]), float(clock[0])
+
+
+@compiled
+def _passed(motion: Shooting, x: Array):
+    return motion.sections(x)
+
+
+def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
+    """Return clocks counted from the first section, within the period."""
+    begin = first_section(problem, x)[1] if problem.omits_sections else 0.0
+    return np.mod(clock - begin, float(problem.period(x)))
+
+
 def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
     sections = sections_of(problem, x)[0] if sections is None else sections
-    modes = problem.modes_in(int(problem.sections(jnp.asarray(x))[0][0]))
+    modes = problem.modes_in(first_section(problem, x)[0]) if problem.modes[0] else ()
     state = jax.tree.map(lambda x: x[0], sections)
     return with_modes(state, own_modes(problem.machine, modes))
 
@@ -418,10 +438,10 @@ def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
         clock, speed, stop = (a[listed[2] >= 0] for a in listed)
         return Hits(clock, speed, stop.astype(np.int32), int(count))
     # Along a branch an impact may move past the section; an orbit's clocks lie within its period.
-    impacts, (clock, _, period) = np.asarray(problem.impacts, int), problem.values(step.x)
+    impacts, clock = np.asarray(problem.impacts, int), problem.values(step.x)[0]
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
     speed = np.asarray(step.seen.approach)[impacts]
-    return Hits(np.mod(clock[impacts], period), speed, stops, len(impacts))
+    return Hits(since_section(problem, step.x, clock[impacts]), speed, stops, len(impacts))
 
 
 @compiled

@@ -13,8 +13,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..machine import AbstractMachine, stops_of
-from ._flight import Event
+from ..machine import AbstractMachine, counter_of, in_rows, nearest_images, stops_of
+from ._flight import Event, section_of
 from ._shooting import ROUNDING, Shooting
 from ._solution import Step, advance, observe, on_host, sections_of, state_at, tangent_at, zero_near
 
@@ -29,7 +29,7 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
     A driven machine is its own image after half a drive cycle, so the number of cycles must be odd.
     """
     events, half = problem.events, len(problem.events) // 2
-    if problem.cycles % 2 == 0 or problem.autonomous or len(events) % 2:
+    if problem.cycles % 2 == 0 or len(events) % 2:
         return False
     if any(machine.mirrored(problem.like) is None for machine in machines):
         return False
@@ -70,8 +70,9 @@ def _halves(
     clock, states = problem.parts(x)
     if not half:
         return ravel_pytree(problem.state_at(x, 0, turn))[0] - image(states[0])
-    late = clock[half:] - clock[:half] - turn
-    return jnp.concatenate([late, (states[half:] - jax.vmap(image)(states[:half])).ravel()])
+    late, images = clock[half:] - clock[:half] - turn, jax.vmap(image)(states[:half])
+    apart = nearest_images(problem.angles, states[half:], images) - images
+    return jnp.concatenate([late, apart.ravel()])
 
 
 def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
@@ -116,7 +117,8 @@ def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
     )  # fmt: skip
     if legs:
         clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
-        states = 0.5 * (states[:legs] + states[legs:])
+        first = states[:legs]
+        states = 0.5 * (first + nearest_images(problem.angles, states[legs:], first))
     else:
         states = states + 0.5 * halves_apart(problem, at) * problem.half_scale()
     mean = np.asarray(half.pack(clock, states, at.x, turn))
@@ -149,10 +151,32 @@ def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step
 _SAME = 1e-7
 
 
+def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
+    """Return the equations of a motion with its sections among the events, and their unknowns."""
+    if not old.omits_sections:
+        return old, x
+    (clock, states, period), places = old.values(x), old.sections(jnp.asarray(x))
+    begin, turn = counter_of(old.machine).start, old.angles
+    ends = in_rows(old.on_sections(jnp.asarray(x))) + 2 * np.pi * turn
+    states = np.where(turn, begin + np.mod(states - begin, 2 * np.pi), states)
+    legs, place = map(np.asarray, places)
+    clock = np.mod(np.concatenate([place, clock]) - place[0], period)
+    clock[0], order = 0.0, np.argsort(clock, kind="stable")
+    events = (*(section_of(old.machine, i) for i in range(old.cycles)), *old.events)
+    modes = (*(old.modes[leg] for leg in legs), *old.modes)
+    new = dataclasses.replace(
+        old, events=tuple(events[i] for i in order), modes=tuple(modes[i] for i in order)
+    )
+    return new, np.asarray(new.pack(clock[order], np.concatenate([ends, states])[order], x, period))
+
+
 def without_events(
     old: Shooting, x: np.ndarray, which: Sequence[int]
 ) -> tuple[Shooting, np.ndarray]:
     """Return the equations and unknowns of a motion without events that only graze."""
+    if old.omits_sections and len(which) == old.legs:
+        old, x = with_sections(old, x)
+        which = [i for i, event in enumerate(old.events) if event.cycle is None]
     clock, states, period = old.values(x)
     keep = [i for i in range(old.legs) if i not in which]
     if keep:

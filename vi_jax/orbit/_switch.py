@@ -121,7 +121,9 @@ def _reordered(point: Point, distance: float) -> Orbit:
     """Return a motion with other events or another order, near where two events coincide."""
     problem, (clock, _, period) = point.problem, point.problem.values(point.step.x)
     here, begins = list(problem.events), range(len(problem.events))
-    if all(event.cycle is None for event in here):
+    if problem.omits_sections:
+        begins = range(problem.legs)
+    elif all(event.cycle is None for event in here):
         # The same motion may begin whole cycles later, but not at any other of its events.
         n = problem.cycles
         begins = [int(np.sum(clock < i * period / n)) for i in range(n)]

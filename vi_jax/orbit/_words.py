@@ -6,7 +6,7 @@ from ..machine import RigidStop, SoftStop, clock_in_words
 from ._flight import Event
 from ._shooting import Shooting
 from ._sliding import SLIDING
-from ._solution import Step
+from ._solution import Step, since_section
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
@@ -61,9 +61,9 @@ def one(kind: str) -> str:
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
-    """Return the place in its period of a motion, in words; `clock` counts from the section."""
-    period = float(problem.period(at.x))
-    return f"at {clock_in_words(problem.machine, clock % period, problem.cycles)}"
+    """Return the place in its period of a motion, in words."""
+    place = float(since_section(problem, at.x, clock))
+    return f"at {clock_in_words(problem.machine, place, problem.cycles)}"
 
 
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
