@@ -381,9 +381,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
         raise ValueError(
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
         )
-    begins = np.concatenate([[0.0], np.cumsum(np.asarray(run.duration))])
-    if not is_autonomous(machine, without_modes(orbit.state)):
-        begins = float(machine.cycle) * np.arange(cycles + 1)
+    begins = _begins(run, machine, is_autonomous(machine, without_modes(orbit.state)))
     found, events = [], events_of(machine)
     for n, s, kind, i in logged_events(machine, run):
         if kind in (EventKind.rest, EventKind.release):
@@ -440,15 +438,19 @@ def resting_problem_of(
     must chatter one at a time, and no switch may change with their hops."""
     machine, state, cycles = orbit.machine, without_modes(orbit.state), int(orbit.cycles)
     flying = fixed_step_method(method, orbit.method, machine)
-    if is_autonomous(machine, state) or renews(machine) or has_contact_friction(machine):
+    autonomous = is_autonomous(machine, state)
+    followed = not autonomous or (counts_turns(machine) and _repeats(orbit))
+    if not followed or renews(machine) or has_contact_friction(machine):
         raise ValueError(
             f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has a section, "
             f"`renewed` or friction on a stop, so that it cannot be followed. {_INSTEAD}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
-    cycle = float(machine.cycle)
-    log = [(n * cycle + s, kind, number) for n, s, kind, number in logged_events(machine, run)]
-    events = _grouped(log, cycle, cycle * cycles)
+    begins = _begins(run, machine, autonomous)
+    log = [(begins[n] + s, kind, number) for n, s, kind, number in logged_events(machine, run)]
+    events = _grouped(log, begins[-1] / cycles, begins[-1])
+    if autonomous and events == []:
+        events = [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
     if events is None or len(events) > _FOLLOWED:
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
@@ -462,10 +464,11 @@ def resting_problem_of(
         held=_contact(machine, state, order),
     )  # fmt: skip
     clock = np.array([place for place, _ in events])
-    rows = _before(orbit, run, clock - _EARLIER * cycle)
-    problem = dataclasses.replace(problem, modes=_modes(problem, orbit.state, clock, rows))
+    rows = _before(problem, orbit, run, clock - _EARLIER * begins[-1] / cycles, begins)
+    modes = _modes(problem, orbit.state, clock, rows, begins[-1])
+    problem = dataclasses.replace(problem, modes=modes)
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
-    x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)]))
+    x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
     problem = sized(problem, x)
     off = step_error(problem, x) if sized_by_motion(problem) else 0.0
     if off > COARSE:
@@ -473,18 +476,31 @@ def resting_problem_of(
     return problem, x
 
 
-def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
+def _begins(run: Run, machine: AbstractMachine, autonomous: bool) -> np.ndarray:
+    """Return the clocks at which the cycles of a run begin, and that at its end."""
+    n = len(np.asarray(run.impacts))
+    if not autonomous:
+        return float(machine.cycle) * np.arange(n + 1)
+    assert run.duration is not None
+    return np.concatenate([[0.0], np.cumsum(np.asarray(run.duration))])
+
+
+def _before(
+    problem: Shooting, orbit: Orbit, run: Run, clocks: np.ndarray, begins: np.ndarray
+) -> np.ndarray:
     """Return the states of a motion at some clocks since its section, (clocks, states)."""
-    cycle, found = float(orbit.machine.cycle), []
-    sections = np.asarray(in_rows(orbit.sections, 1))
-    for clock in clocks:
-        whole = int(np.floor(clock / cycle))
-        n = whole % len(sections)
+    sections, found = np.asarray(in_rows(orbit.sections, 1)), []
+    for clock in clocks % begins[-1]:
+        n = int(np.searchsorted(begins, clock, side="right")) - 1
         row, own = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
-        place = jnp.asarray(clock - whole * cycle)
-        found.append(
+        place = jnp.asarray(clock - begins[n])
+        u = np.asarray(
             _state_at(orbit.machine, orbit.method, without_modes(orbit.state), row, own, place)
         )
+        if problem.omits_sections:
+            begin, turns = counter_of(orbit.machine).start, 2 * np.pi * n
+            u = np.where(problem.angles, begin + turns + np.mod(u - begin, 2 * np.pi), u)
+        found.append(u)
     return np.reshape(found, (len(clocks), sections.shape[1]))
 
 
@@ -492,17 +508,23 @@ def _before(orbit: Orbit, run: Run, clocks: np.ndarray) -> np.ndarray:
 def _state_at(machine, method, like, row, own, clock):
     """Return the state at a clock in the cycle that begins with these components and modes."""
     unravel = ravel_pytree(like)[1]
-    options = RunOptions(method=method, record="sections", rests=True, until=clock)
+    options = RunOptions(method=method, record="sections", rests=True)
+    if counts_turns(machine):
+        machine = machine.observed_every(clock)
+    else:
+        options = dataclasses.replace(options, until=clock)
     start = lambda u: (machine, with_modes(unravel(u), own))
     return in_rows(simulate_pool(start, row[None], 1, options).sections, 2)[0, -1]
 
 
-def _modes(problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray) -> Modes:
+def _modes(
+    problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray, period: float
+) -> Modes:
     """Return the machine's modes in each leg, from the first state and each event's."""
     machine, start = problem.machine, jnp.zeros(())
     modes = begin_modes(machine, start, without_modes(state), modes_of(state))
     found = [modes] * problem.legs
-    first = int(np.searchsorted(clocks, float(problem.cycles * machine.cycle)))
+    first = int(np.searchsorted(clocks, period))
     for i in [*range(first, len(clocks)), *range(first)]:
         event, before = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
         if event.use != LEAVES:

@@ -372,32 +372,29 @@ class Shooting(eqx.Module):
         angle = lambda u: component(turn.name, self.unravel(u))
 
         def follow(leg, s0, s1, u):
-            after = self.after(machine, leg, s0, u)
-            path = self.flight(machine, leg).fly(s0, s1, after, self.steps, rows=self.steps)
-            return angle(path[0]), *path[2]
+            begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
+            end, _, (s, path) = self.fly_leg(machine, leg, begin, s1, rows=self.steps)
+            return angle(end), jnp.append(s0, s), jax.vmap(angle)(jnp.concatenate([u[None], path]))
 
         ends = self.ends(clock, self.period(x))
-        arrived, s, path = jax.vmap(follow)(jnp.arange(self.legs), clock, ends, states)
-        begins = jax.vmap(angle)(states)
-        turns = jnp.round((arrived - jnp.roll(begins, -1)) / (2 * np.pi))  # less at the next event
+        arrived, s, angles = jax.vmap(follow)(jnp.arange(self.legs), clock, ends, states)
+        turns = jnp.round((arrived - jnp.roll(angles[:, 0], -1)) / (2 * np.pi))  # less at the next
         turns = jnp.cumsum(turns) - turns
-        angles = (jax.vmap(jax.vmap(angle))(path) + 2 * np.pi * turns[:, None]).ravel()
-        first = jnp.ceil((begins[0] - turn.start) / (2 * np.pi))
+        passed = (angles + 2 * np.pi * turns[:, None]).ravel()
+        first = jnp.ceil((angles[0, 0] - turn.start) / (2 * np.pi))
 
         def passing(number):
             goal = turn.start + 2 * np.pi * number
-            row = jnp.maximum(jnp.sum(angles <= goal) - 1, 0)
-            leg = row // self.steps
-            flight, goal = self.flight(machine, leg), goal - 2 * np.pi * turns[leg]
-            s0, u0 = s.ravel()[row], path.reshape(-1, self.states)[row]
+            row = jnp.maximum(jnp.sum(passed <= goal) - 1, 0)
+            leg = row // s.shape[1]
 
             def nearer(_, place):
                 place = stop_gradient(place)  # only the last step has a derivative: that of a root
-                u = flight.fly(s0, place, u0, 1)[0]
-                rates = flight.smooth.field(place, self.unravel(u))
-                return place + (goal - angle(u)) / component(turn.name, rates)
+                state = self.state_at(x, leg, place)
+                rate = component(turn.name, self.flight(machine, leg).smooth.field(place, state))
+                return place + (goal - 2 * np.pi * turns[leg] - component(turn.name, state)) / rate
 
-            return leg, jax.lax.fori_loop(0, _PASSING, nearer, s0)
+            return leg, jax.lax.fori_loop(0, _PASSING, nearer, s.ravel()[row])
 
         numbers = jnp.arange(self.cycles, dtype=x.dtype)
         return jax.vmap(passing)(first + jnp.mod(numbers - first, self.cycles))

@@ -452,6 +452,8 @@ def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
     log = run.impact_log
     assert log is not None
     begins = jnp.asarray(machine.cycle, x.dtype) * jnp.arange(cycles)
+    if problem.autonomous:
+        begins = jnp.cumsum(run.duration) - run.duration
     clock = (log.phase + begins[:, None]).ravel()
     return jnp.sum(run.impacts), clock, log.speed.ravel(), log.stop.ravel()
 
