@@ -538,6 +538,8 @@ def _reached(at: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
         for stop in stops_of(plan.machine):
             k = stop.coordinate
             short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
+            if lane.contact is not None:
+                short = short & (lane.contact[k] == 0)
             room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
             clearance = jnp.minimum(clearance, room)
     for place in (*places[1:], reached):
