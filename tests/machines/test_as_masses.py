@@ -93,32 +93,6 @@ class Spring(Masses):
         return z.x, z.v.x
 
 
-class Rotor(Masses):
-    """The inertia of the shaft is 1/ε."""
-
-    q: ClassVar = ("Y", "phi")
-    cycle: ClassVar = vi.turn_of("phi", usual=2 * np.pi)
-
-    def mass(self, q):
-        across = -jnp.sin(q.phi)
-        return [[1.0, across], [across, 1 / self.of.coupling]]
-
-    def force(self, t, q, v):
-        n = self.of
-        motor = n.strength * (n.control - v.phi / n.no_load_speed)
-        return dict(Y=-q.Y - 2 * n.damping_ratio * v.Y, phi=motor / n.coupling)
-
-    @property
-    def contacts(self):
-        return self.walls(self.of.gap, "Y")
-
-    def begun(self, x):
-        return self.at(Y=x.Y, v=dict(Y=x.V, phi=x.P))
-
-    def seen(self, z):
-        return z.Y, z.v.Y, z.v.phi
-
-
 # The ranges of its numbers and of its start.
 HITS = {"restitution": (0.3, 0.9)}
 CASES = {
@@ -135,12 +109,6 @@ CASES = {
         {**HITS, "amplitude": (0.2, 1), "frequency": (0.6, 1.5), "damping": (0, 0.3),
          "stiffness": (-0.5, 1), "cubic": (0, 1), "gap": (0.5, 1)},
         {"Y": (-0.5, 0.5), "V": (-1, 1)},
-    ),
-    "rotor": (
-        M.UnbalancedRotor(gap=1.0, two_sided=True), Rotor,
-        {**HITS, "strength": (0.05, 1), "control": (0.6, 1.8), "no_load_speed": (0.8, 1.2),
-         "coupling": (0.01, 0.3), "damping_ratio": (0.01, 0.2), "gap": (1, 2.5)},
-        {"Y": (-0.8, 0.8), "V": (-0.5, 0.5), "W": (0.7, 1.3)},
     ),
 }  # fmt: skip
 

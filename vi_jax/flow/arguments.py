@@ -34,7 +34,6 @@ from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
     Scene,
-    ShaftMachine,
     begin_modes,
     convert_start,
     field_in,
@@ -328,7 +327,7 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         numbers = concrete(x)
         if numbers is not None and not np.isfinite(numbers).all():
             raise ValueError(f"Argument `start` must be finite, but its {part} is {numbers}.")
-    if isinstance(machine, ShaftMachine):
+    if isinstance(machine, Scene):
         machine.check_start(start)
     if isinstance(start, eqx.Module):
         require_ranges(start)

@@ -148,7 +148,6 @@ from .own import with_earlier_clock as with_earlier_clock
 from .scene import Oscillator as Oscillator
 from .scene import Parameters as Parameters
 from .scene import Scene as Scene
-from .scene import ShaftMachine as ShaftMachine
 from .state import State as State
 from .state import like as like
 from .stop import AbstractContactLaw as AbstractContactLaw

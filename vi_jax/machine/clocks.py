@@ -12,13 +12,13 @@ from .._types import Flag, Machine, Number, Scalar, State
 from .cycles import counts_turns
 from .linear import LinearMachine, Prepared
 from .own import clock_of, stops_of, switches_of
-from .scene import Scene, ShaftMachine
+from .scene import Scene
 
 
 def in_clock(machine: Machine, clock: str) -> Machine:
     """Return the same machine with another independent variable. **Raises:** `ValueError` for a
     machine with one clock."""
-    if isinstance(machine, ShaftMachine):
+    if isinstance(machine, Scene):
         return machine.in_clock(clock)
     raise ValueError(
         f"Argument `clock` must be left out for a {type(machine).__name__}, which has its own "
@@ -29,7 +29,7 @@ def in_clock(machine: Machine, clock: str) -> Machine:
 def in_cycle_clock(machine: Machine) -> Machine:
     """Return a machine with a shaft in its phase clock, and any other as it is. In the time clock
     the section would be an event, and the angle of the shaft one more component of the state."""
-    return machine.in_clock("phase") if isinstance(machine, ShaftMachine) else machine
+    return machine.in_clock("phase") if isinstance(machine, Scene) else machine
 
 
 def at_section(machine: Machine, phase: Number) -> Machine:
@@ -50,15 +50,13 @@ def phase_at(machine: Machine, since_section: Number) -> Any:
 
 def convert_start(machine: Machine, start: State) -> State:
     """Return a start in the form that a machine needs. **Raises:** `TypeError` for others."""
-    return (
-        machine.convert_start(start) if isinstance(machine, ShaftMachine | LinearMachine) else start
-    )
+    return machine.convert_start(start) if isinstance(machine, Scene | LinearMachine) else start
 
 
 def in_cycle_state(machine: Machine, name: str, state: State) -> State:
     """Return a section state of any clock in the form for `in_cycle_clock`; `name` is the
     argument's name in error messages."""
-    if isinstance(machine, ShaftMachine | LinearMachine):
+    if isinstance(machine, Scene | LinearMachine):
         return machine.in_cycle_state(name, state)
     return state
 
@@ -82,8 +80,7 @@ def frequency_ratio(machine: Machine, duration: Float[Array, "..."]) -> Any:
     """Return the mean speed of the drive over cycles of these durations; `None` without a drive."""
     if isinstance(machine, Scene):
         return machine.frequency_ratio(duration)
-    has_shaft = isinstance(machine, ShaftMachine) or counts_turns(machine)
-    return 2 * pi / duration if has_shaft else None
+    return 2 * pi / duration if counts_turns(machine) else None
 
 
 def cycles_in_words(machine: Machine, cycles: int) -> str:
@@ -109,7 +106,7 @@ def scales_known(machine: Machine) -> bool:
 def is_alive(machine: Machine, state: State) -> Flag | None:
     """Return whether the motion can continue: false if a crank stops in the phase clock; `None` if
     the clock cannot fail."""
-    return machine.alive(state) if isinstance(machine, ShaftMachine) else None
+    return machine.alive(state) if isinstance(machine, Scene) else None
 
 
 def may_rest(machine: Machine) -> bool:

@@ -1,7 +1,6 @@
-"""Machines whose cycle is a turn of a shaft, in the phase or the time clock; the paper's scene; and
-Table 1 of the paper in SI units, with conversions to a scene and back."""
+"""The paper's scene, in the phase or the time clock of its shaft; and Table 1 of the paper in SI
+units, with conversions to a scene and back."""
 
-import abc
 import dataclasses
 from collections.abc import Iterable
 from math import cos, pi, sin
@@ -54,102 +53,6 @@ from .stop import RigidStop, SoftStop
 _ON_SECTION = 1e-5
 
 
-class ShaftMachine(AbstractMachine):
-    """A machine driven by a shaft that turns once in a cycle.
-
-    Its clock is `"phase"`, with the shaft's angle as independent variable, or `"time"`. If its
-    speed W is part of the state, the shaft must turn forward in the phase clock. In the time clock
-    it need not, and its angle is the component `phase` of the state.
-    """
-
-    clock_name: eqx.AbstractVar[str]
-
-    def __check_init__(self):
-        one_of("clock_name", self.clock_name, ("phase", "time"))
-
-    @property
-    @abc.abstractmethod
-    def state_type(self) -> type:
-        """The class of a state in the phase clock."""
-
-    @property
-    @abc.abstractmethod
-    def timed_type(self) -> type | None:
-        """The class of a state in the time clock, with `phase` as last component; `None` if the
-        speed of the shaft is not part of the state."""
-
-    def is_timed(self, state: State) -> bool:
-        """Return whether the angle of the shaft is part of the state."""
-        return type(state) is self.timed_type
-
-    def is_paced(self, state: State) -> bool:
-        """Return whether the angle is the independent variable, and dτ/dφ depends on the state."""
-        return self.timed_type is not None and type(state) is self.state_type
-
-    def in_clock(self, clock: str) -> Any:
-        """Return the same machine in the `"phase"` or the `"time"` clock."""
-        one_of("clock", clock, ("phase", "time"))
-        return dataclasses.replace(self, clock_name=clock)
-
-    def convert_start(self, start: State) -> State:
-        """Return a start made for either clock in the form of this machine's clock."""
-        wanted = self.state_type
-        if self.clock_name == "time" and self.timed_type is not None:
-            if type(start) is wanted:
-                return self.timed_type(*vars(start).values(), jnp.zeros_like(start.Y))
-            wanted = self.timed_type
-        _require_state("start", start, wanted)
-        return state_of_numbers("start", start)
-
-    def in_cycle_state(self, name: str, state: State) -> State:
-        """Return a section state without the shaft's angle, if it is of the time clock. **Raises:**
-        `ValueError` with the argument's name if the angle is known and not 0, `TypeError` for
-        another object than a state of this machine."""
-        if not self.is_timed(state):
-            _require_state(name, state, self.state_type)
-            return state
-        phase = concrete(state.phase)
-        if phase is not None and not (abs(phase) <= _ON_SECTION).all():
-            raise ValueError(
-                f"Argument `{name}` must lie on the section, where its phase is 0, but has "
-                f"{abs(phase).max():g}."
-            )
-        return self.state_type(*list(vars(state).values())[:-1])
-
-    def _clock(self, state: State) -> Scalar | None:
-        return state.phase if self.is_timed(state) else None
-
-    def _with_earlier_clock(self, state: State) -> State:
-        if not self.is_timed(state):
-            return state
-        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
-
-    def alive(self, state: State) -> jax.Array | None:
-        """Return whether the shaft turns forward, in the phase clock; `None` in another."""
-        return state.W > 0 if self.is_paced(state) else None
-
-    def check_start(self, start: State) -> None:
-        """Raise `ValueError` for a start beyond the section, or with W ≤ 0 in the phase clock."""
-        if self.is_paced(start):
-            speed = concrete(self.section_speed(start))
-            if speed is not None and not (speed > 0).all():
-                raise ValueError(
-                    "Argument `start` must have W > 0 in the phase clock, but has "
-                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
-                )
-        if self.is_timed(start):
-            phase = concrete(start.phase)
-            if phase is not None and not (phase < 2 * pi).all():
-                raise ValueError(
-                    "Argument `start` must have its phase, counted from the last section, below "
-                    f"2π, but has {phase.max():g}."
-                )
-
-    def section_speed(self, state: State) -> Any:
-        """Return W of a state on the section."""
-        return state.W
-
-
 def _require_state(name: str, state: object, wanted: type) -> None:
     if type(state) is wanted:
         return
@@ -172,7 +75,7 @@ class Oscillator(Shown):
         require_ranges(self)
 
 
-class Scene(ShaftMachine):
+class Scene(AbstractMachine):
     """A body on a spring, driven by a crank, with stops: Y'' + 2ξY' + Y = U(φ).
 
     Every number is a leaf, and may be a `vmap` axis or be differentiated. Absent parts (a stop, the
@@ -204,6 +107,7 @@ class Scene(ShaftMachine):
     labels: ClassVar = ("Y = y/a", "V = dY/dτ")  # pyright: ignore
 
     def __check_init__(self):
+        one_of("clock_name", self.clock_name, ("phase", "time"))
         instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         instance_of("drive", self.drive, AbstractDrive, "an `IdealDrive` or a `Motor`")
@@ -300,14 +204,82 @@ class Scene(ShaftMachine):
         own = self.drive.begin(M=M, W=W, **others)
         return self.convert_start(self.state_type(Y, V, *own.values()))
 
+    def is_timed(self, state: State) -> bool:
+        """Return whether the angle of the shaft is part of the state."""
+        return type(state) is self.timed_type
+
+    def is_paced(self, state: State) -> bool:
+        """Return whether the angle is the independent variable, and dτ/dφ depends on the state."""
+        return self.timed_type is not None and type(state) is self.state_type
+
+    def in_clock(self, clock: str) -> Any:
+        """Return the same machine in the `"phase"` or the `"time"` clock."""
+        one_of("clock", clock, ("phase", "time"))
+        return dataclasses.replace(self, clock_name=clock)
+
+    def convert_start(self, start: State) -> State:
+        """Return a start made for either clock in the form of this machine's clock."""
+        wanted = self.state_type
+        if self.clock_name == "time" and self.timed_type is not None:
+            if type(start) is wanted:
+                return self.timed_type(*vars(start).values(), jnp.zeros_like(start.Y))
+            wanted = self.timed_type
+        _require_state("start", start, wanted)
+        return state_of_numbers("start", start)
+
+    def in_cycle_state(self, name: str, state: State) -> State:
+        """Return a section state without the shaft's angle, if it is of the time clock. **Raises:**
+        `ValueError` with the argument's name if the angle is known and not 0, `TypeError` for
+        another object than a state of this machine."""
+        if not self.is_timed(state):
+            _require_state(name, state, self.state_type)
+            return state
+        phase = concrete(state.phase)
+        if phase is not None and not (abs(phase) <= _ON_SECTION).all():
+            raise ValueError(
+                f"Argument `{name}` must lie on the section, where its phase is 0, but has "
+                f"{abs(phase).max():g}."
+            )
+        return self.state_type(*list(vars(state).values())[:-1])
+
+    def _clock(self, state: State) -> Scalar | None:
+        return state.phase if self.is_timed(state) else None
+
+    def _with_earlier_clock(self, state: State) -> State:
+        if not self.is_timed(state):
+            return state
+        return eqx.tree_at(lambda x: x.phase, state, state.phase - 2 * pi)
+
+    def alive(self, state: State) -> jax.Array | None:
+        """Return whether the shaft turns forward, in the phase clock; `None` in another."""
+        return state.W > 0 if self.is_paced(state) else None
+
+    def check_start(self, start: State) -> None:
+        """Raise `ValueError` for a start beyond the section, or with W ≤ 0 in the phase clock."""
+        if self.is_paced(start):
+            speed = concrete(start.W)
+            if speed is not None and not (speed > 0).all():
+                raise ValueError(
+                    "Argument `start` must have W > 0 in the phase clock, but has "
+                    f'W = {speed.min():g}. Pass `clock="time"` to start from rest.'
+                )
+        if self.is_timed(start):
+            phase = concrete(start.phase)
+            if phase is not None and not (phase < 2 * pi).all():
+                raise ValueError(
+                    "Argument `start` must have its phase, counted from the last section, below "
+                    f"2π, but has {phase.max():g}."
+                )
+
     @property
     def state_type(self) -> type:
-        """The class of the drive's states."""
+        """The class of a state in the phase clock, that of the drive."""
         return self.drive.state
 
     @property
     def timed_type(self) -> type | None:
-        """The class of the drive's states in the time clock."""
+        """The class of a state in the time clock, with `phase` as last component; `None` if the
+        speed of the shaft is not part of the state."""
         return self.drive.timed_state
 
     @property

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .numbers import in_words, known, number_in_words, split_place, table
+from .numbers import by_name, in_words, known, number_in_words, split_place, table
 
 
 class State:
@@ -48,7 +48,7 @@ class State:
         return in_words(self) if known(self) else f"State({', '.join(vars(self))})"
 
     def _repr_html_(self) -> str:
-        rows = [(name, number_in_words(x)) for name, x in vars(self).items() if known(x)]
+        rows = [(name, number_in_words(x)) for name, x in by_name(self).items() if known(x)]
         return table("State", rows)
 
 

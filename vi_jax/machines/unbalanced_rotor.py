@@ -65,7 +65,7 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
     }  # fmt: skip
     labels: ClassVar = ("Y (m r/M)", "dY/dτ (m r ω/M)")  # pyright: ignore
 
-    def mass(self, q: Any) -> list[list[Any]]:
+    def mass(self, q: Any) -> list[list[Any]]:  # pyright: ignore
         """Return the mass matrix of body and shaft (units: M; m r; (m r)²/M)."""
         across = -jnp.sin(q.phi)
         return [[1.0, across], [across, 1 / self.coupling]]

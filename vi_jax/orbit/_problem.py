@@ -31,6 +31,7 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    Turn,
     after_event,
     begin_modes,
     check_again,
@@ -360,10 +361,11 @@ def _repeats(orbit: Orbit) -> bool:
 @compiled
 def _around(machine: AbstractMachine, state: State, own: Any, turned: Any) -> Any:
     """Return rates and guards of a machine at these angles beyond that of the state."""
-    name, s = counter_of(machine).name, jnp.zeros(())
+    turn, s = counter_of(machine), jnp.zeros(())
+    assert isinstance(turn, Turn)
 
     def at(angle):
-        there = with_component(name, state, component(name, state) + angle)
+        there = with_component(turn.name, state, component(turn.name, state) + angle)
         modes = begin_modes(machine, s, there, own)
         rates = SmoothMachine(machine, modes, ()).field(s, there)
         guards = [guard_of(machine, n, s, there, modes) for n in range(section_number(machine))]
@@ -498,8 +500,7 @@ def _before(
             _state_at(orbit.machine, orbit.method, without_modes(orbit.state), row, own, place)
         )
         if problem.omits_sections:
-            begin, turns = counter_of(orbit.machine).start, 2 * np.pi * n
-            u = np.where(problem.angles, begin + turns + np.mod(u - begin, 2 * np.pi), u)
+            u = problem.in_turn(n, u)
         found.append(u)
     return np.reshape(found, (len(clocks), sections.shape[1]))
 

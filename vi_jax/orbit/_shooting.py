@@ -26,6 +26,7 @@ from .._types import Scalar, State, Vector
 from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
+    Turn,
     after_event,
     angles_in,
     component,
@@ -132,8 +133,8 @@ class Shooting(eqx.Module):
 
     and the event after the last is the first one, a period later. The unknowns, in one vector x,
     are (s₁ … sₙ, u₁ … uₙ, p). Without events there is one leg, from the state at clock zero, and x
-    = (u, p). The first event of an autonomous machine is at clock zero; its period is an unknown and
-    replaces s₁. Sections are among its events, unless turns end its cycles and there are other
+    = (u, p). The first event of an autonomous machine is at clock zero; its period is an unknown
+    and replaces s₁. Sections are among its events, unless turns end its cycles and there are other
     events. These may then pass a section along a branch.
     """
 
@@ -193,9 +194,20 @@ class Shooting(eqx.Module):
         """Which components of a state are angles, equal up to whole turns; `None` without any."""
         if not self.omits_sections:
             return angles_in(self.machine, self.like)
-        turn = counter_of(self.machine)
-        assert turn is not None
-        return np.array([name == turn.name for name in components(self.like)])
+        return np.array([name == self.turn.name for name in components(self.like)])
+
+    @property
+    def turn(self) -> Turn:
+        """The counter of turns of a machine whose sections are omitted."""
+        counter = counter_of(self.machine)
+        assert isinstance(counter, Turn)
+        return counter
+
+    def in_turn(self, number: int, states: np.ndarray) -> np.ndarray:
+        """Return states, the last axis, with the angle that turns within turn number `number`."""
+        begin, turns = float(self.turn.start), 2 * np.pi * number
+        inside = begin + turns + np.mod(states - begin, 2 * np.pi)
+        return np.where(np.asarray(self.angles), inside, states)
 
     @property
     def impacts(self) -> tuple[int, ...]:
@@ -368,7 +380,7 @@ class Shooting(eqx.Module):
         """Return the `sections` that are not among the events, by Newton's method from the step in
         which the angle passes. The first is the one before an orbit's first event, along a whole
         branch."""
-        machine, turn, (clock, states) = self.at(x), counter_of(self.machine), self.parts(x)
+        machine, turn, (clock, states) = self.at(x), self.turn, self.parts(x)
         angle = lambda u: component(turn.name, self.unravel(u))
 
         def follow(leg, s0, s1, u):
@@ -389,7 +401,7 @@ class Shooting(eqx.Module):
             leg = row // s.shape[1]
 
             def nearer(_, place):
-                place = stop_gradient(place)  # only the last step has a derivative: that of a root
+                place = stop_gradient(place)  # the last step has the derivative
                 state = self.state_at(x, leg, place)
                 rate = component(turn.name, self.flight(machine, leg).smooth.field(place, state))
                 return place + (goal - 2 * np.pi * turns[leg] - component(turn.name, state)) / rate
@@ -404,9 +416,8 @@ class Shooting(eqx.Module):
         states = jax.vmap(partial(self.state_at, x))(*self.sections(x))
         if not self.omits_sections:
             return states
-        turn = counter_of(self.machine)
-        begins = jnp.full_like(component(turn.name, states), turn.start)
-        return with_component(turn.name, states, begins)
+        name, start = self.turn.name, self.turn.start
+        return with_component(name, states, jnp.full_like(component(name, states), start))
 
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """Return the flight of a leg; after the hops of the chatter, if the leg begins with one."""

@@ -453,6 +453,7 @@ def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
     assert log is not None
     begins = jnp.asarray(machine.cycle, x.dtype) * jnp.arange(cycles)
     if problem.autonomous:
+        assert run.duration is not None
         begins = jnp.cumsum(run.duration) - run.duration
     clock = (log.phase + begins[:, None]).ravel()
     return jnp.sum(run.impacts), clock, log.speed.ravel(), log.stop.ravel()

@@ -13,7 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..machine import AbstractMachine, counter_of, in_rows, nearest_images, stops_of
+from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
 from ._flight import Event, section_of
 from ._shooting import ROUNDING, Shooting
 from ._solution import Step, advance, observe, on_host, sections_of, state_at, tangent_at, zero_near
@@ -155,11 +155,9 @@ def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     """Return the equations of a motion with its sections among the events, and their unknowns."""
     if not old.omits_sections:
         return old, x
-    (clock, states, period), places = old.values(x), old.sections(jnp.asarray(x))
-    begin, turn = counter_of(old.machine).start, old.angles
-    ends = in_rows(old.on_sections(jnp.asarray(x))) + 2 * np.pi * turn
-    states = np.where(turn, begin + np.mod(states - begin, 2 * np.pi), states)
-    legs, place = map(np.asarray, places)
+    (clock, states, period), sections = old.values(x), old.sections(jnp.asarray(x))
+    ends = old.in_turn(1, np.asarray(in_rows(old.on_sections(jnp.asarray(x)))))
+    states, (legs, place) = old.in_turn(0, states), map(np.asarray, sections)
     clock = np.mod(np.concatenate([place, clock]) - place[0], period)
     clock[0], order = 0.0, np.argsort(clock, kind="stable")
     events = (*(section_of(old.machine, i) for i in range(old.cycles)), *old.events)

@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 from .._checks import instance_of
 from .._types import State
-from ..machine import AbstractMachine, ShaftMachine, SoftStop, convert_start
+from ..machine import AbstractMachine, Scene, SoftStop, convert_start
 from .colors import BLUE, GREEN, RED
 from .motion import all_stops, new_axes
 
@@ -194,7 +194,7 @@ def plot_sketch(
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
     state = machine.start() if state is None else convert_start(machine, state)
     if phase is None:  # a crank or a rotor, turned
-        phase = 0.3 * pi if isinstance(machine, ShaftMachine) else 0.0
+        phase = 0.3 * pi if isinstance(machine, Scene) else 0.0
     ax = new_axes(ax)
     sketch(machine, pen_for(machine, ax, _positions(machine, state), labels=True), state, phase)
     ax.set_aspect("equal", adjustable="datalim")
