@@ -140,14 +140,14 @@ def test_branches_pass_the_begin_of_a_turn():
 @pytest.mark.slow
 def test_a_body_pressed_on_comes_to_rest_and_leaves():
     """The unbalance presses the body on while W² cos φ exceeds the gap, also as a turn begins."""
-    rotor = ROTOR(control=1.2, strength=2.0, gap=0.1, restitution=0.1, coupling=0.1,
+    rotor = ROTOR(control=1.2, strength=2.0, gap=0.4, restitution=0.1, coupling=0.1,
                   damping_ratio=0.6)  # fmt: skip
     one, other = both(rotor)
     assert int(one.rests) == int(other.rests) == 1
     assert float(one.clearance) == pytest.approx(float(other.clearance), abs=1e-7)
     assert float(one.duration) == pytest.approx(float(other.duration), abs=1e-8)
     ends = [
-        vi.continue_orbit(orbit, parameter=name, bounds=(0.05, 0.6))
+        vi.continue_orbit(orbit, parameter=name, bounds=(0.38, 0.5))
         for orbit, name in ((one, "gap"), (other, "of.gap"))
     ]
     assert [branch.ends for branch in ends] == 2 * [("bounds", "rest")]

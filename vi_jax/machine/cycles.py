@@ -112,7 +112,8 @@ def turn_of(name: str, *, start: Any = 0.0, usual: Any = None) -> Any:
 
     At a full turn of the angle beyond `start`, a cycle ends and 2π is subtracted from the angle.
     The machine may start from rest in time; its orbits, branches and exponents are those of its
-    turns. An angle that turns backward ends no cycle.
+    turns. Along a branch impacts may pass the begin of a turn if the machine is the same a turn
+    later. An angle that turns backward ends no cycle.
 
     **Arguments:** `name`, the angle in the state, in a `Mechanical` a coordinate; `start`, the
     angle (radians) at which a cycle begins; `usual`, the approximate duration of a turn, by default

@@ -91,8 +91,9 @@ def continue_orbit(
     **Returns:** a `Branch`.
 
     **Raises:** `ValueError` for an unknown name; for an orbit that was not found, does not list all
-    its impacts, lies outside the bounds, or rests on a stop of a machine with a section, `renewed`
-    or friction on a stop. On Ctrl-C `Interrupted`, whose `partial` is the branch so far.
+    its impacts, lies outside the bounds, or rests on a stop of a machine with `renewed`, friction
+    on a stop, or cycles that another event than a turn ends. On Ctrl-C `Interrupted`, whose
+    `partial` is the branch so far.
     """
     settings = check_walk(step=step, max_step=max_step, max_points=max_points)
     progress = flag("progress", progress)

@@ -444,8 +444,9 @@ def resting_problem_of(
     followed = not autonomous or (counts_turns(machine) and _repeats(orbit))
     if not followed or renews(machine) or has_contact_friction(machine):
         raise ValueError(
-            f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has a section, "
-            f"`renewed` or friction on a stop, so that it cannot be followed. {_INSTEAD}"
+            f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has `renewed`, "
+            "friction on a stop or cycles that another event than a turn ends, so that it cannot be "
+            f"followed. {_INSTEAD}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
     begins = _begins(run, machine, autonomous)

@@ -191,7 +191,7 @@ class Shooting(eqx.Module):
 
     @property
     def angles(self) -> np.ndarray | None:
-        """Which components of a state are angles, equal up to whole turns; `None` without any."""
+        """Flags of the components of a state that are angles; `None` without any."""
         if not self.omits_sections:
             return angles_in(self.machine, self.like)
         return np.array([name == self.turn.name for name in components(self.like)])
