@@ -344,34 +344,36 @@ def events_in(orbit: Orbit) -> list[Placed]:
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
-# Angles of a turn at which a machine is compared with itself a turn later, and the largest relative
-# difference: choices.
-_AROUND, _DIFFERS = 7, 1e-8
+# Angles of a turn at which a machine is compared with itself, a turn later and at another clock (a
+# share of the period), and the largest relative difference: choices.
+_AROUND, _LATER, _DIFFERS = 7, 0.37, 1e-8
 
 
 def _repeats(orbit: Orbit) -> bool:
-    """Return whether a machine with turns is the same a whole turn earlier and later."""
+    """Return whether a machine with turns is the same a turn earlier and later, at any time."""
     around = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
-    turns = 2 * np.pi * np.array([0.0, -1.0, 1.0])[:, None]
+    turns = 2 * np.pi * np.array([0.0, -1.0, 1.0, 0.0])[:, None]
+    clocks = np.array([0.0, 0.0, 0.0, _LATER * float(orbit.duration)])[:, None]
     machine, state = orbit.machine, without_modes(orbit.state)
-    here, *others = np.asarray(_around(machine, state, modes_of(orbit.state), around + turns))
+    found = _around(machine, state, modes_of(orbit.state), clocks + 0 * around, around + turns)
+    here, *others = np.asarray(found)
     return bool((np.abs(others - here) <= _DIFFERS * np.abs(here).max(axis=0)).all())
 
 
 @compiled
-def _around(machine: AbstractMachine, state: State, own: Any, turned: Any) -> Any:
-    """Return rates and guards of a machine at these angles beyond that of the state."""
-    turn, s = counter_of(machine), jnp.zeros(())
+def _around(machine: AbstractMachine, state: State, own: Any, clocks: Any, angles: Any) -> Any:
+    """Return rates and guards of a machine at these clocks and angles beyond the state's."""
+    turn = counter_of(machine)
     assert isinstance(turn, Turn)
 
-    def at(angle):
+    def at(s, angle):
         there = with_component(turn.name, state, component(turn.name, state) + angle)
         modes = begin_modes(machine, s, there, own)
         rates = SmoothMachine(machine, modes, ()).field(s, there)
         guards = [guard_of(machine, n, s, there, modes) for n in range(section_number(machine))]
         return jnp.stack([*raveled(rates)[0], *guards])
 
-    return jnp.vectorize(at, signature="()->(n)")(turned)
+    return jnp.vectorize(at, signature="(),()->(n)")(clocks, angles)
 
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
@@ -445,7 +447,7 @@ def resting_problem_of(
     if not followed or renews(machine) or has_contact_friction(machine):
         raise ValueError(
             f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has `renewed`, "
-            "friction on a stop or cycles that another event than a turn ends, so that it cannot be "
+            "friction on a stop or cycles that another event than a turn ends, and cannot be "
             f"followed. {_INSTEAD}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
