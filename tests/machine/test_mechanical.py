@@ -282,7 +282,7 @@ def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
         kinetic += machine.m * jnp.cos(z.a - z.b) * z.v.a * z.v.b
         return kinetic - (1 + machine.m) * jnp.cos(z.a) - machine.m * jnp.cos(z.b)
 
-    start = machine.at(a=-0.9, b=-0.4)
+    start = machine.at(a=-1, b=-0.4)  # an integer is a number
     run = vi.simulate(machine, start, 20, method=CLOSE)
     assert int(run.impacts.sum()) > 6
     np.testing.assert_allclose(jax.vmap(energy)(run.sections), energy(start), atol=1e-9)

@@ -315,6 +315,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 def check_start(machine: AbstractMachine, start: State) -> None:
     """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` for an invalid concrete
     start."""
+    check_reals("start", start)
+    start = as_floats(machine, start)  # derivatives of a coordinate need them
     shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(
