@@ -29,9 +29,8 @@ def energy(z, springs=(1.0, 1.0, 1.0)):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("rests", "samples"), [(True, 16), (False, 0)]
-)  # 16: the balls meet where an interval ends
+# With 16 samples the balls meet where an interval ends.
+@pytest.mark.parametrize(("rests", "samples"), [(True, 16), (False, 0)])
 def test_a_blow_passes_through_balls_that_touch(rests, samples):
     start = Cradle().balls((-1, 0, 0), (0, 0, 0))
     run = vi.simulate(Cradle(), start, 3, rests=rests, samples=samples, impact_log=6)
@@ -219,3 +218,14 @@ def test_a_rod_lands_flat_on_its_feet():
         assert (v + places * turn <= 1e-12).all()
         if wanted is not None:
             np.testing.assert_allclose((v, turn), wanted, atol=1e-12)
+
+
+def test_blows_that_act_on_each_other_by_friction():
+    """The faster one first: b from 2 to -1 takes .9 off a, then a from .1 to -.05 adds .045."""
+    rough = dict(restitution=0.5, friction=0.3)
+    a = vi.RigidStop(1.0, on="a", along="b", **rough)
+    b = vi.RigidStop(2.0, on="b", along="a", **rough)
+    for walls in ((a, b), (b, a)):
+        machine = type("Corner", (Chain,), {"contacts": walls})(0.5, (1.0, 1.0), length=3.0)
+        v = vi.simulate(machine, machine.balls((0, 0), (1, 2)), 1).last.v
+        np.testing.assert_allclose((v.a, v.b), (-0.05, -0.955), atol=1e-12)

@@ -212,7 +212,8 @@ def _before_impacts(
 ) -> _Instant:
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
     each = list(bodies.values())
-    gains = shares(each, at_event, [push_of(body, at_event) for body in each])
+    pushes = [push_of(body, at_event) for body in each]
+    gains = shares(each, at_event, pushes)
     met = jnp.zeros_like(taken)
     coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
@@ -224,7 +225,8 @@ def _before_impacts(
         if lane.contact is not None:
             closed = closed | (lane.contact[k] == to_event(number))
         touches[number] = closed
-    coupled = _coupled(plan, gains, touches, coupled)
+    acts = _acting(plan.machine, bodies, gains, pushes, at_event)
+    coupled = _coupled(plan, acts, touches, coupled)
     before = {k: body.velocity(at_event) for k, body in bodies.items()}
     slow = {k: plan.rounding(k, at_event)[1] for k in bodies}
     return _Instant(
@@ -232,11 +234,30 @@ def _before_impacts(
     )
 
 
+def _acting(
+    machine: AbstractMachine, bodies: dict[int, Coordinate], gains: list[list[Scalar]],
+    pushes: list[State], state: State,
+) -> list[list[Flag]]:  # fmt: skip
+    """Return for each pair of coordinates whether blows change each other's velocity, also by
+    friction. Products of both changes do not depend on units."""
+    size = range(len(gains))
+    both = [[jnp.abs(gains[i][j] * gains[j][i]) for j in size] for i in size]
+    for number, stop in enumerate(stops_of(machine)):
+        friction = friction_on(machine, number)
+        if friction is not None:
+            along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
+            felt = shares([*bodies.values()], state, [push_of(along, state)])
+            for i, change in enumerate(shares([along], state, pushes)[0]):
+                dragged = jnp.abs(change * felt[i][0])
+                both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
+    return [[stop_gradient(x) > _APART**2 for x in row] for row in both]
+
+
 def _coupled(
-    plan: Plan, gains: list[list[Scalar]], touches: dict[int, Flag], landed: dict[int, Flag]
+    plan: Plan, acts: list[list[Flag]], touches: dict[int, Flag], landed: dict[int, Flag]
 ) -> dict[int, Flag]:
     """Return for each coordinate whether a blow on one of those `landed` acts on it through closed
-    contacts. `gains` are from `shares`; `touches`: for each stop, whether its contact is closed."""
+    contacts. `touches`: for each stop, whether its contact is closed."""
     closes = dict.fromkeys(landed, jnp.zeros((), bool))
     for number, stop in enumerate(stops_of(plan.machine)):
         closes[stop.coordinate] = closes[stop.coordinate] | touches[number]
@@ -246,8 +267,7 @@ def _coupled(
         for i in (*range(size), *reversed(range(size - 1))):
             for j in range(size):
                 if j != i:
-                    acts = jnp.abs(stop_gradient(gains[i][j])) > _APART
-                    coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts)
+                    coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts[i][j])
     return dict(zip(landed, coupled, strict=True))
 
 
