@@ -188,6 +188,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
     assert run.outcomes == ("right", "left")
     np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
     assert bool((run.result == vi.RESULTS.ended).all())
+    assert bool(jnp.isnan(run.duration[:, -1]).all())  # no cycle that was not reached took time
 
     class Walled(Toppling):
         """The same where the right side is a wall."""

@@ -214,7 +214,9 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
     duration = None
     if plan.motion:
-        duration = period if times is None else per_cycle(times, jnp.sum)
+        reached = jnp.isfinite(records.impacts).reshape(plan.cycles, parts).all(axis=1)
+        fixed = jnp.where(reached, period, jnp.nan)
+        duration = fixed if times is None else per_cycle(times, jnp.sum)
     averages = {}
     if integrals:
         # If s is proportional to time but does not measure it, the integrals are over s.
