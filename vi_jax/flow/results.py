@@ -257,8 +257,8 @@ class RESULTS(NamedEnumeration):
         '`clock="time"`.'
     )
     chatter = (
-        "The impacts within one cycle exceeded `max_impacts`, as where no event ends it, or "
-        "followed each other too fast to be told apart (chatter)."
+        "The impacts within one cycle exceeded `max_impacts` (perhaps no event ends the cycle), "
+        "or followed each other too fast to be told apart (chatter)."
     )
     underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
     not_finite = "The state ceased to be finite."
