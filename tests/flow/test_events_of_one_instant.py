@@ -301,11 +301,11 @@ def test_a_blow_is_felt_along_any_path_of_contacts():
 
     def reached(order):
         ones = jnp.zeros((6, 6)).at[order[:-1], order[1:]].set(1.0)
-        gains = [list(row) for row in ones + ones.T]
+        acts = [list(row) for row in ones + ones.T > 0]
         plan = type("Plan", (), {"machine": Row()})
         struck = {i: jnp.equal(order[0], i) for i in range(6)}
         closed = dict.fromkeys(range(6), jnp.ones((), bool))
-        return jnp.stack([*inspect.unwrap(_coupled)(plan, gains, closed, struck).values()]).all()
+        return jnp.stack([*inspect.unwrap(_coupled)(plan, acts, closed, struck).values()]).all()
 
     class Row:
         _stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
