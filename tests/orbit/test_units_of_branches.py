@@ -119,8 +119,8 @@ def test_a_branch_is_the_same_in_all_units(case):
         np.testing.assert_allclose(np.abs(branch.multipliers[i]), sizes, rtol=0, atol=1e-6)
         assert branch.y_max[i] / length == pytest.approx(float(orbit.y_max) / length, abs=1e-8)
         points = {p.kind: p for p in branch.special}
-        kinds = branch.ends, [p.kind for p in branch.special]
-        found.append((kinds, [p.parameter for p in branch.special]))
+        names = branch.ends, [p.kind for p in branch.special]
+        found.append((names, [p.parameter for p in branch.special]))
         if case == "heats" and length == 1:  # the curve is a line: motions grow with gap and force
             at = points["period-doubling"]
             curve = vi.boundary(at, parameter="force", bounds=(bounds, (0.5, 2.0)), max_points=20)
@@ -135,8 +135,8 @@ def test_a_branch_is_the_same_in_all_units(case):
     for other in forecasts:
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, forecasts[0])
     np.testing.assert_allclose(searched, [searched[0]] * len(searched), rtol=0, atol=1e-8)
-    for kinds, places in found:
-        assert kinds == found[0][0]
+    for names, places in found:
+        assert names == found[0][0]
         np.testing.assert_allclose(places, found[0][1], rtol=1e-9, atol=1e-9)
 
 

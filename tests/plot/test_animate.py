@@ -33,7 +33,7 @@ MACHINES = {
         soft_stops=(vi.SoftStop(1.2, 50.0, restitution=0.5),),
     ),
     "ball": M.BouncingBall(), "pair": M.ImpactPair(), "free pair": M.ImpactPair(mass_ratio=0.2),
-    "duffing": M.Duffing(), 
+    "duffing": M.Duffing(),
     "rotor": M.UnbalancedRotor(gap=1.5).observed_every(6.5),
 }  # fmt: skip
 

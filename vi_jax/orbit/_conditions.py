@@ -62,7 +62,7 @@ def quantity_of(problem: Shooting, x: Vector, seen: Observed, name: str) -> Scal
         speeds = seen.approach[np.asarray(problem.impacts, int)]
         return jnp.nanmax(speeds) if name == "fastest_impact" else jnp.nanmin(speeds)
     if problem.events:
-        state = jax.tree.map(lambda a: a[0], problem.on_sections(x))
+        state = jax.tree.map(lambda a: a[0], problem.on_sections(x, problem.sections(x)))
     else:
         state = problem.unravel(problem.parts(x)[1][0])
     inner = name.removeprefix(_SECTION)

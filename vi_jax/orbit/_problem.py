@@ -355,7 +355,7 @@ def _repeats(orbit: Orbit) -> bool:
     turns = 2 * np.pi * np.array([0.0, -1.0, 1.0, 0.0])[:, None]
     clocks = np.array([0.0, 0.0, 0.0, _LATER * float(orbit.duration)])[:, None]
     machine, state = orbit.machine, without_modes(orbit.state)
-    found = _around(machine, state, modes_of(orbit.state), clocks + 0 * around, around + turns)
+    found = _around(machine, state, modes_of(orbit.state), clocks, around + turns)
     here, *others = np.asarray(found)
     return bool((np.abs(others - here) <= _DIFFERS * np.abs(here).max(axis=0)).all())
 

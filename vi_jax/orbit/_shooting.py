@@ -411,9 +411,9 @@ class Shooting(eqx.Module):
         numbers = jnp.arange(self.cycles, dtype=x.dtype)
         return jax.vmap(passing)(first + jnp.mod(numbers - first, self.cycles))
 
-    def on_sections(self, x: Vector) -> State:
-        """Return the states on the sections, leaves (cycles,)."""
-        states = jax.vmap(partial(self.state_at, x))(*self.sections(x))
+    def on_sections(self, x: Vector, sections: tuple[Array, Array]) -> State:
+        """Return the states on the `sections`, leaves (cycles,)."""
+        states = jax.vmap(partial(self.state_at, x))(*sections)
         if not self.omits_sections:
             return states
         name, start = self.turn.name, self.turn.start
@@ -678,9 +678,8 @@ class Shooting(eqx.Module):
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
             # The clock restarts there, so a perturbation along the motion vanishes.
-            restarts = [event.of(machine).ends_cycle for event in self.events]
-            restarts[0] = True
-            goes_on = [float(not x) for x in restarts]
+            goes_on = [float(i > 0 and not event.of(machine).ends_cycle)
+                       for i, event in enumerate(self.events)]  # fmt: skip
             after = jnp.asarray(goes_on, u.dtype)[leg] * after
         gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
         rate = gained + jnp.dot(slope, before)

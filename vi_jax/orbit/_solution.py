@@ -392,40 +392,34 @@ class Hits(NamedTuple):
 
 @compiled
 def _sections(motion: Shooting, x: Array):
-    return motion.on_sections(x), jnp.max(jnp.abs(motion.motion_residual(x)))
+    sections = motion.sections(x)
+    off = jnp.max(jnp.abs(motion.motion_residual(x)))
+    return motion.on_sections(x, sections), sections, off
 
 
-def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
-    """Return the states on the sections, leaves (cycles,), and the largest residual component."""
+def sections_at(problem: Shooting, x: Unknowns) -> tuple[State, tuple[Array, Array], Scalar]:
+    """Return the states on the sections, leaves (cycles,); the leg and the clock of each; and the
+    largest residual component."""
     motion, x = problem.motion_at(x)
     return _sections(motion, jnp.asarray(x))
 
 
-def first_section(problem: Shooting, x: Unknowns) -> tuple[int, float]:
-    """Return leg and clock of the first section of a motion."""
-    if not problem.omits_sections:
-        legs, clock = problem.sections(jnp.asarray(x))
-    else:
-        motion, x = problem.motion_at(x)
-        legs, clock = _passed(motion, jnp.asarray(x))
-    return int(legs[0]), float(clock[0])
-
-
-@compiled
-def _passed(motion: Shooting, x: Array):
-    return motion.sections(x)
+def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
+    """Return the states on the sections, leaves (cycles,), and the largest residual component."""
+    states, _, off = sections_at(problem, x)
+    return states, off
 
 
 def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     """Return clocks counted from the first section, within the period."""
-    begin = first_section(problem, x)[1] if problem.omits_sections else 0.0
+    begin = float(sections_at(problem, x)[1][1][0]) if problem.omits_sections else 0.0
     return np.mod(clock - begin, float(problem.period(x)))
 
 
 def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
     sections = sections_of(problem, x)[0] if sections is None else sections
-    modes = problem.modes_in(first_section(problem, x)[0]) if problem.modes[0] else ()
+    modes = problem.modes_in(int(sections_at(problem, x)[1][0][0])) if problem.modes[0] else ()
     state = jax.tree.map(lambda x: x[0], sections)
     return with_modes(state, own_modes(problem.machine, modes))
 

@@ -16,7 +16,17 @@ from jaxtyping import Array, Float
 from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
 from ._flight import Event, section_of
 from ._shooting import ROUNDING, Shooting
-from ._solution import Step, advance, observe, on_host, sections_of, state_at, tangent_at, zero_near
+from ._solution import (
+    Step,
+    advance,
+    observe,
+    on_host,
+    sections_at,
+    sections_of,
+    state_at,
+    tangent_at,
+    zero_near,
+)
 
 # Halves of a period that differ by less than the first are equal, or images of each other; by less
 # than the second up to rounding. Both are choices.
@@ -155,8 +165,8 @@ def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     """Return the equations of a motion with its sections among the events, and their unknowns."""
     if not old.omits_sections:
         return old, x
-    (clock, states, period), sections = old.values(x), old.sections(jnp.asarray(x))
-    ends = old.in_turn(1, np.asarray(in_rows(old.on_sections(jnp.asarray(x)))))
+    (clock, states, period), (there, sections, _) = old.values(x), sections_at(old, x)
+    ends = old.in_turn(1, np.asarray(in_rows(there)))
     states, (legs, place) = old.in_turn(0, states), map(np.asarray, sections)
     clock = np.mod(np.concatenate([place, clock]) - place[0], period)
     clock[0], order = 0.0, np.argsort(clock, kind="stable")
