@@ -111,9 +111,6 @@ class SpecialTable(Table):
     def _grazings(self, here: Step) -> Iterator[Event]:
         """Yield the rows of lost impacts other than the grazing one, and of touched stops."""
         kind, grazes = self.condition.kind, self.condition.impact
-        # At a grazing the body turns on the stop, to rounding.
-        if kind not in TOUCHING or kind == REST or grazes is not None:
-            yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
         if self.problem.rests and (kind != REST or grazes is not None):
             yield Event(least_hold_force, lambda at: Ending(at, REST), noise=ROUNDING)
         for i, event in enumerate(self.problem.landings):
@@ -127,15 +124,17 @@ class SpecialTable(Table):
             test = lambda step, i=i: float(step.seen.approach[i] / step.seen.units[i])
             lost = partial(self._singular, here, test)
             yield Event(test, lost, noise=ROUNDING)
+        # At a grazing the body turns on the stop, to rounding. Before an impact is lost, the turn
+        # beside it is at v² from the stop: by that, the end is known to the root of rounding only.
+        if kind not in TOUCHING or kind == REST or grazes is not None:
+            yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
 
     def _singular(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
         """Return the end at a grazing impact, where the monodromy matrix has a pole."""
-        found = None
-        if self.condition.kind not in TOUCHING and at is not here:
-            root = distance_along(self.problem, here, at)
-            found = crossing(self.problem, self.advance, here, root, test)
-        if found is None:
+        if self.condition.kind in TOUCHING or at is here:
             return Ending(at, GRAZING)
+        root = distance_along(self.problem, here, at)
+        found = crossing(self.problem, self.advance, here, root, test) or at
         gone = {"monodromy": found.seen.monodromy, "multipliers": found.seen.multipliers}
         gone = {name: np.nan * numbers for name, numbers in gone.items()}
         return Ending(found._replace(seen=found.seen._replace(**gone)), GRAZING)
