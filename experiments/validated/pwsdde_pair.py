@@ -38,7 +38,8 @@ class Pair(vi.AbstractMachine):
         return tuple(-x for x in z)
 
 
-orbit = vi.find_orbit(Pair(), tuple(map(jnp.array, (-0.69, -1.5, 0.13, -1.2))))
+guess = tuple(map(jnp.array, (-0.69, -1.5, 0.13, -1.2)))
+orbit = vi.find_orbit(Pair(), guess, method="reference")  # 1e-10 by default
 lost = vi.continue_orbit(orbit, parameter="omega", bounds=(1.25, 2.12)).special
 WHERE = "1.298963194", "1.439080000", "1.976551861", "2.094953736"
 comparison = Comparison(
