@@ -55,9 +55,7 @@ class Chain(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(self.gap, 0.7),)
 
-    @property
-    def cycle(self):
-        return 2 * PI / 0.8
+    cycle = 2 * PI / 0.8
 
     def field(self, s, state):
         x, y, u, w = self.parts(state)
@@ -216,9 +214,7 @@ class Row(vi.AbstractMachine):
     def contacts(self):
         return vi.RigidStop(0.5, 0.8, on=("x[-1]", "v[-1]"))
 
-    @property
-    def cycle(self):
-        return 2 * jnp.pi / 0.4
+    cycle = 2 * jnp.pi / 0.4
 
     def field(self, s, state):
         x, v = state.x, state.v

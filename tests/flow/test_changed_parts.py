@@ -28,9 +28,7 @@ class Pulled(vi.Scene):
 class Named(vi.Scene):
     """With other words only, and a mean."""
 
-    @property
-    def labels(self):
-        return "x", "v"
+    labels = "x", "v"
 
     def averages(self, s, state):
         return {"speed": state.V}

@@ -15,7 +15,7 @@ MACHINES = [
     vi.Scene.ideal(frequency_ratio=0.9, gap=1.25, damping_ratio=0.0625),
     vi.Parameters(electrical_time=0.01).scene(crank="slider"),
     M.BouncingBall(), M.ImpactPair(mass_ratio=0.2), M.Duffing(), M.ReliefValve(), M.Capsule(),
-    M.UnbalancedRotor(gap=1.0), vi.SoftStop(1.5, stiffness=30.0), vi.Parameters(),
+    M.UnbalancedRotor(gap=1.0), M.Woodpecker(), vi.SoftStop(1.5, stiffness=30.0), vi.Parameters(),
 ]  # fmt: skip
 SCENE = MACHINES[0]
 

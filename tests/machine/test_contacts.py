@@ -184,10 +184,18 @@ def test_an_event_ends_the_motion_with_an_outcome():
     t = np.linspace(0, 8, 4001)
     swing = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t)
     places = swing + np.outer(speeds, np.sinh(t))
-    first = [x[np.argmax(abs(x) > 1)] for x in places]
+    when = np.argmax(abs(places) > 1, axis=1)
+    first = np.take_along_axis(places, when[:, None], 1)[:, 0]
     assert run.outcomes == ("right", "left")
     np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
     assert bool((run.result == vi.RESULTS.ended).all())
+    at = run.outcome_cycle * machine.cycle + run.outcome_phase
+    np.testing.assert_allclose(at, t[when], atol=2e-3)  # the next of these instants
+    np.testing.assert_allclose(run.outcome_state.x, np.sign(first), atol=1e-12)
+    speed = 0.05 * np.sinh(at) + 0.15 * np.sin(3 * at) + speeds * np.cosh(at)
+    np.testing.assert_allclose(run.outcome_state.u, speed, atol=1e-7)
+    assert "ended: right, in cycle" in str(jax.tree.map(lambda x: x[0], run))
+    assert str(run.to_xarray().outcome.values[1]) == "left"
     assert bool(jnp.isnan(run.duration[:, -1]).all())  # no cycle that was not reached took time
 
     class Walled(Toppling):
@@ -202,6 +210,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
     axes = {"start.u": speeds, "amplitude": [0.5]}
     data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)
     np.testing.assert_array_equal(data["outcome"].values[:, 0], run.outcome)
+    np.testing.assert_array_equal(data["outcome_cycle"].values[:, 0], run.outcome_cycle)
 
 
 def test_an_event_in_both_directions():

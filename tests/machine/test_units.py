@@ -52,10 +52,7 @@ def test_a_machine_that_states_nothing_is_told_without_units():
             return (vi.RigidStop(self.gap, 0.6),)
 
         cycle = 2 * np.pi
-
-        @property
-        def labels(self):
-            return "lift (mm)", "speed (mm/s)"
+        labels = "lift (mm)", "speed (mm/s)"
 
         def field(self, s, x):
             return vi.OscillatorState(x.V, jnp.cos(s) - x.Y)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax.machine import stops_of
-from vi_jax.machine.numbers import with_leaf
+from vi_jax.machine.numbers import with_leaves
 
 from differences import quick
 
@@ -28,11 +28,11 @@ KINDS = {
     "ball": (M.BouncingBall(), {"acceleration": (0.1, 5.0), "restitution": (0.0, 1.0)},
              {"height": (0.0, 5.0), "speed": (-3.0, 3.0)}),
     "pair": (M.ImpactPair(), {"half_gap": (0.2, 6.0), "restitution": (0.0, 1.0)},
-             {"place": (-0.2, 0.2), "speed": (-3.0, 3.0)}),
+             {"place": (-0.2, 0.2), "v.place": (-3.0, 3.0)}),
     "free pair": (M.ImpactPair(mass_ratio=0.2),
                   {"half_gap": (0.2, 6.0), "restitution": (0.0, 1.0), "mass_ratio": (0.01, 2.0),
-                   "damping_ratio": (0.0, 0.5), "force": (0.0, 2.0), "frequency": (0.3, 3.0)},
-                  {"place": (-0.2, 0.2), "speed": (-3.0, 3.0)}),
+                   "damping_ratio": (0.0, 0.5), "amplitude": (0.0, 2.0), "frequency": (0.3, 3.0)},
+                  {"place": (-0.2, 0.2), "v.place": (-3.0, 3.0)}),
     "duffing": (M.Duffing(), {"cubic": (0.0, 3.0), "amplitude": (0.0, 3.0), "gap": (0.1, 2.0),
                               "restitution": (0.0, 1.0), "damping": (0.0, 0.5)},
                 {"Y": (-0.1, 0.1), "V": (-3.0, 3.0)}),
@@ -42,11 +42,11 @@ KINDS = {
     "capsule": (M.Capsule(), {"amplitude": (0.0, 4.0), "frequency": (0.3, 3.0), "gap": (0.0, 1.0),
                               "mass_ratio": (0.5, 10.0), "restitution": (0.0, 1.0),
                               "friction": (0.0, 4.0), "static_ratio": (1.0, 2.0)},
-                {"place": (-1.0, 0.0), "speed": (-2.0, 2.0)}),
+                {"place": (-1.0, 0.0), "v.place": (-2.0, 2.0)}),
     "rotor": (M.UnbalancedRotor(gap=1.0), {"strength": (0.05, 3.0), "control": (0.3, 3.0),
                                            "coupling": (0.0, 0.2), "damping_ratio": (0.0, 0.5),
                                            "gap": (0.2, 3.0), "restitution": (0.0, 1.0)},
-              {"Y": (-0.2, 0.2), "V": (-2.0, 2.0)}),
+              {"Y": (-0.2, 0.2), "v.Y": (-2.0, 2.0)}),
 }  # fmt: skip
 
 
@@ -60,19 +60,13 @@ def crowd(name, lanes):
     )
 
 
-def changed(machine, numbers):
-    for name, value in numbers.items():
-        machine = with_leaf(machine, name, value)
-    return machine
-
-
 @pytest.mark.parametrize("name", quick(KINDS, "motor"))
 def test_a_crowd(name):
     machine, drawn, starts = crowd(name, LANES)
 
     def one(drawn, starts):
-        scene = changed(machine, drawn)
-        run = vi.simulate(scene, scene.start(**starts), CYCLES)
+        scene = with_leaves(machine, drawn)
+        run = vi.simulate(scene, with_leaves(scene.start(), starts), CYCLES)
         stops = [stop for stop in stops_of(scene) if stop.coordinate == 0]
         depth = [
             jnp.where(stop.sign > 0, run.y_max - stop.gap, -run.y_min - stop.gap).max()

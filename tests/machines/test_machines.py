@@ -68,7 +68,7 @@ def symmetric(restitution):
     place, speed = -half + np.sin(at) + w * (2 * PI - at), w
     if at < PI:  # by the section it is on its way back
         place, speed = half - np.sin(at) - w * (PI - at), -w
-    orbit = vi.find_orbit(pair, pair.start(place=place, speed=speed - 1), throw=True)
+    orbit = vi.find_orbit(pair, pair.at(place=place, v={"place": speed - 1}), throw=True)
     np.testing.assert_allclose(orbit.impact_speed, 2 * w / (1 + e), atol=1e-10)
     return vi.continue_orbit(orbit, parameter="half_gap", bounds=(1.05, 20.0))
 

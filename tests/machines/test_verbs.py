@@ -22,7 +22,6 @@ class Case(NamedTuple):
     """A machine with a stable motion of one cycle, and what a parameter does to it."""
 
     machine: Any
-    start: dict[str, float]
     place: str
     speed: str
     parameter: str
@@ -37,23 +36,23 @@ class Case(NamedTuple):
 
 CASES = {
     "pair": Case(
-        M.ImpactPair(), {}, "place", "speed", "half_gap", (1.2, 3.0), ("symmetry-breaking",),
+        M.ImpactPair(), "place", "v.place", "half_gap", (1.2, 3.0), ("symmetry-breaking",),
         "symmetry-breaking", "restitution", (0.4, 0.6),
     ),
     "valve": Case(
-        M.ReliefValve(flow_rate=5.0), {}, "lift", "pressure", "flow_rate", (4.0, 8.0),
+        M.ReliefValve(flow_rate=5.0), "lift", "pressure", "flow_rate", (4.0, 8.0),
         ("period-doubling", "grazing"), "period-doubling", "restitution", (0.75, 0.85),
     ),
     "capsule": Case(
-        M.Capsule(), {}, "place", "speed", "amplitude", (0.8, 3.0), ("grazing", "grazing"),
+        M.Capsule(), "place", "v.place", "amplitude", (0.8, 3.0), ("grazing", "grazing"),
         "grazing", "friction", (0.9, 1.1),
     ),
     "rotor": Case(
-        M.UnbalancedRotor(gap=1.0), {}, "Y", "v.Y", "control", (0.6, 1.2),
+        M.UnbalancedRotor(gap=1.0), "Y", "v.Y", "control", (0.6, 1.2),
         ("grazing", "period-doubling"), "period-doubling", "gap", (0.95, 1.05),
     ),
     "two bodies": Case(
-        TwoBodies(), {}, "x", "y", "drive", (0.3, 1.0), ("grazing", "period-doubling"),
+        TwoBodies(), "x", "y", "drive", (0.3, 1.0), ("grazing", "period-doubling"),
         "period-doubling", "gap", (0.55, 0.65),
     ),
 }  # fmt: skip
@@ -67,7 +66,7 @@ def case(request):
 
 @pytest.fixture(scope="module")
 def orbit(case):
-    settled = vi.simulate(case.machine, case.machine.start(**case.start), 1, settle=500)
+    settled = vi.simulate(case.machine, case.machine.start(), 1, settle=500)
     return vi.find_orbit(case.machine, settled.last, throw=True)
 
 

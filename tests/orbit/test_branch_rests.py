@@ -224,11 +224,11 @@ def test_chatter_and_rest_pass_over_the_section():
     first; as the gap gets smaller its first impact comes upon the section, where the state jumps
     and the motion goes on."""
     pair = Pair(half_gap=0.1, since=1.0)
-    last = vi.simulate(pair, pair.start(place=0.0, speed=0.5), 60).last
+    last = vi.simulate(pair, pair.start(), 60).last
     orbit = vi.find_orbit(pair, last, impact_log=64, throw=True)
     branch = vi.continue_orbit(orbit, parameter="half_gap", bounds=(0.05, 0.3))
     assert set(branch.rests) == {2} and branch.ends == ("bounds", "rest")
-    places, speeds = branch.column("section_place"), branch.column("section_speed")
+    places, speeds = branch.column("section_place"), branch.column("section_v.place")
     for i in (0, 1, -2):
         (hit, speed), *_ = carried(float(branch.parameter[i]))
         # At phase 1 the ball flies from the left wall, or back from its first impact.

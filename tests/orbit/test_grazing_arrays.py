@@ -19,9 +19,7 @@ class Shaken(vi.AbstractMachine):
     def contacts(self):
         return (vi.RigidStop(self.gap, 0.76),)
 
-    @property
-    def cycle(self):
-        return 2 * np.pi / 0.31
+    cycle = 2 * np.pi / 0.31
 
     def position(self, state):
         return state.z[0]

@@ -97,9 +97,7 @@ class Switched(vi.AbstractMachine):
 
     phase: float = 1.2
 
-    @property
-    def cycle(self):
-        return 2 * np.pi / 0.6
+    cycle = 2 * np.pi / 0.6
 
     @property
     def contacts(self):

@@ -253,9 +253,23 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         labels=machine.labels,
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
-        outcome=outcome_of(lane.fault) if outcomes_of(machine) else None,
         outcomes=outcomes_of(machine),
+        **_outcome(machine, lane),
     )
+
+
+def _outcome(machine: AbstractMachine, lane: Ends) -> dict[str, Any]:
+    """Return the outcome of a run, and where an event ended it."""
+    if lane.at is None:
+        return {}
+    number, (cycle, clock, state) = outcome_of(lane.fault), lane.at
+    clock, state = jtu.tree_map(
+        lambda x: jnp.where(number < 0, jnp.nan, x), (as_logged(machine, clock), state)
+    )
+    cycle = jnp.where(number < 0, -1, cycle).astype(jnp.int32)
+    return {
+        "outcome": number, "outcome_cycle": cycle, "outcome_phase": clock, "outcome_state": state,
+    }  # fmt: skip
 
 
 def _quantities(plan: Plan, points: State) -> dict[str, Array]:

@@ -31,6 +31,7 @@ from ..machine import (
     is_in_range,
     mode_number,
     modes_of,
+    outcomes_of,
     prepared,
     replaced,
     scales_known,
@@ -265,6 +266,8 @@ class Ends(NamedTuple):
     fault: Scalar
     steps: Scalar
     rejected: Scalar
+    at: tuple[Scalar, Scalar, State] | None
+    """The cycle, the clock and the state at the end; `None` for a machine without outcomes."""
 
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
@@ -296,11 +299,13 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
-        partial(_begin, rest), partial(_step, rest), _end, (numbers, start, jnp.asarray(wanted)),
-        rows=plan.kept + 1, backend=plan.backend,
+        partial(_begin, rest), partial(_step, rest), partial(_end, rest),
+        (numbers, start, jnp.asarray(wanted)), rows=plan.kept + 1, backend=plan.backend,
     )  # fmt: skip
     if not own:
         states = replaced(states, jax.vmap(form.outward)(without_modes(states)))
+        if ends.at is not None:
+            ends = ends._replace(at=(*ends.at[:2], form.outward(ends.at[2])))
     return ends, states, records
 
 
@@ -325,5 +330,8 @@ def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]
     return lane, lanes.Emitted(active, complete, (here, record))
 
 
-def _end(inputs: _Inputs, lane: Lane) -> Ends:
-    return Ends(lane.fault, lane.steps, lane.rejected)
+def _end(rest: Plan, inputs: _Inputs, lane: Lane) -> Ends:
+    plan, at = eqx.combine(inputs[0], rest), None
+    if outcomes_of(plan.machine):
+        at = plan.cycle_of(lane.done), plan.clock(lane.s, lane.state), lane.state
+    return Ends(lane.fault, lane.steps, lane.rejected, at)

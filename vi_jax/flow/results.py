@@ -239,6 +239,10 @@ def run_dataset(
         kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
         variables |= present(kept, cycle)
     variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
+    if run.outcome is not None:
+        kept = {name: getattr(run, name) for name in ("outcome_cycle", "outcome_phase")}
+        kept["outcome"] = np.asarray([*run.outcomes, ""])[np.asarray(run.outcome)]
+        variables |= present(kept, batch) | states("outcome_state", run.outcome_state, batch)
     own = {name: name for name in run.averages}
     data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units), own), along)
     return _met(data, _LISTED[along]) if along in _LISTED else data
@@ -493,6 +497,12 @@ class Run(Summarized):
     outcome: Int[Array, ""] | None = None
     """The outcome with which an event ended the motion, as an index into `outcomes`; -1 without,
     and `None` for a machine without outcomes."""
+    outcome_cycle: Int[Array, ""] | None = None
+    """The cycle in which the event ended the motion, from the start and from 0; -1 without."""
+    outcome_phase: Float[Array, ""] | None = None
+    """The clock of that cycle at the event, as in `ImpactLog`; NaN without."""
+    outcome_state: State | None = None
+    """The state after the event, a pytree like the start; NaN without."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the outcomes with which events and stops of the machine end a motion."""
 
@@ -525,10 +535,10 @@ class Run(Summarized):
         States become a variable for each component: `section_Y` (cycles + 1), `sample_Y`. An array
         in the state keeps its axes, as `q_0`, and a state that is one array is `section_state`. The
         impact log becomes `log_phase`, `log_speed` and `log_stop`; the log of all events
-        `event_phase`, `event_kind` (in words), `event_number` and `event_value`. The machine's own
-        quantities are `section_lift` and `sample_lift`. All other variables, averages included,
-        keep their names, and `result` is the name of the reason. It runs on the host and cannot be
-        traced.
+        `event_phase`, `event_kind` (in words), `event_number` and `event_value`. An `outcome` is in
+        words, the state there `outcome_state_Y`. The machine's own quantities are `section_lift`
+        and `sample_lift`. All other variables, averages included, keep their names, and `result` is
+        the name of the reason. It runs on the host and cannot be traced.
 
         As a table, everything together would have a row for each combination of a cycle, a section,
         a sample and an impact. `to_xarray(along="cycle").to_dataframe()` has one for each cycle.
@@ -545,6 +555,12 @@ class Run(Summarized):
         """Return the numbers of the picture: the smallest position in each cycle."""
         return None if self.steps.ndim else self.y_min
 
+    def _outcome_in_words(self) -> str | None:
+        if self.outcome is None or self.outcome_cycle is None or self.outcome < 0:
+            return None
+        name = self.outcomes[int(self.outcome)]
+        return f"{name}, in cycle {self.outcome_cycle + 1} at {self.outcome_phase:.6g}"
+
     def summary(self) -> str:
         """Return the last section and cycle, and the reason why the run ended, as text."""
         if self.steps.ndim:
@@ -554,8 +570,10 @@ class Run(Summarized):
         lines = [
             f"Run of {count_of(cycles, 'cycle')}, {count_of(int(jnp.sum(self.impacts)), 'impact')}"
         ]
-        units = dict(self.units)
-        lines.append(f"  last section: {state_in_words(without_modes(self.last), 9, units)}")
+        units, name = dict(self.units), self._outcome_in_words()
+        last = without_modes(self.last) if name is None else self.outcome_state
+        where = "section" if name is None else "state"
+        lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
         if self.y_min is not None and self.y_max is not None:
             span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
             span = in_unit(span, units, "position")
@@ -566,5 +584,5 @@ class Run(Summarized):
             worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")
         lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
-        ended = "completed" if bool(self.successful) else RESULTS[self.result]
+        ended = name or ("completed" if bool(self.successful) else RESULTS[self.result])
         return "\n".join([*lines, f"  ended: {ended}"])

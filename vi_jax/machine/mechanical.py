@@ -22,7 +22,6 @@ from ..lanes import dependent_results
 from .base import AbstractMachine, once_a_trace
 from .coordinates import Coordinate, component
 from .numbers import split_place
-from .own import with_static
 from .state import State as Named
 from .state import like
 
@@ -58,17 +57,11 @@ class Mechanical(AbstractMachine):
 
     q: ClassVar[tuple[str, ...]]
     mass: ClassVar[Any]
-    # The components with the velocities of the coordinates, in a state without `v`.
-    _velocity_names: ClassVar[Mapping[str, str]] = {}
 
     @abc.abstractmethod
     def force(self, *args: Any, **kwargs: Any) -> Any:
         """Return the applied force on each coordinate, by name: `force(t, q, v)`. Discrete modes of
         the machine are further arguments."""
-
-    def _applied(self, t: Scalar, q: Named, v: Named, *modes: Scalar) -> Any:
-        """Return `force`; a subclass with a field of that name overrides this."""
-        return self.force(t, q, v, *modes)
 
     def prescribed(self, t: Scalar) -> dict[str, Any]:
         """Return the positions of the coordinates with given motion, as functions of time."""
@@ -89,8 +82,6 @@ class Mechanical(AbstractMachine):
         if len(names) < len(zeros):
             given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
             at, rate = at | given[0], rate | given[1]
-        if self._velocity_names:
-            return self._in_state(self.start(), Named(**at), Named(**rate))
         return Named(**at, v=Named(**rate))
 
     def start(self) -> Any:
@@ -128,10 +119,10 @@ class Mechanical(AbstractMachine):
 
     def field(self, t: Scalar, state: State, *modes: Scalar) -> Any:
         """Return the rate of the state: velocities, and accelerations by Lagrange's equations."""
-        q, v, names = self.places(state), self._velocities(state), self.free_names
+        q, v, names = self.places(state), state.v, self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
-        given = self._applied(t, q, v, *modes)
+        given = self.force(t, q, v, *modes)
         applied = like(free, given, whose)
         if not isinstance(applied, Named):
             by_name = ", ".join(f"{name}=..." for name in names)
@@ -144,7 +135,7 @@ class Mechanical(AbstractMachine):
         if len(names) < len(self.q_names):
             rates |= self._guided(t, q, v)
         zero, v_rates = jax.tree.map(jnp.zeros_like, state), {x: rates[x] for x in self.q_names}
-        return self._in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
+        return _in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
 
     def _by_s(self, s: Scalar, state: State, *rates: Named) -> Sequence[Named]:
         """Return rates with respect to `s`, which need not be time."""
@@ -177,17 +168,6 @@ class Mechanical(AbstractMachine):
     def places(self, state: State) -> Named:
         """Return the coordinates in a state, without velocities."""
         return Named(**{name: getattr(state, name) for name in self.q_names})
-
-    def _velocities(self, state: State) -> Named:
-        if not self._velocity_names:
-            return state.v
-        return Named(**{q: getattr(state, self._velocity_names[q]) for q in self.q_names})
-
-    def _in_state(self, state: Any, q: Named, v: Named) -> Any:
-        if isinstance(state, Named):
-            return state.replace(**vars(q), v=v)
-        speeds = {self._velocity_names[name]: x for name, x in vars(v).items()}
-        return with_static(state, **vars(q), **speeds)
 
     def masses(self, q: Named) -> Matrix:
         """Return the mass matrix at these coordinates, as rows of numbers."""
@@ -240,7 +220,7 @@ class Mechanical(AbstractMachine):
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
         name = _named(self, on)
-        return None if name is None else (name, self._velocity_names.get(name, f"v.{name}"))
+        return None if name is None else (name, f"v.{name}")
 
 
 @once_a_trace
@@ -269,8 +249,7 @@ def _place(machine: Mechanical, on: Any, state: State) -> Any:
 
 
 def _speed(machine: Mechanical, on: Any, state: State) -> Any:
-    name = _named(machine, on)
-    v = machine._velocities(state)
+    name, v = _named(machine, on), state.v
     if name is not None:
         return component(name, v)
     return jax.jvp(on, (machine.places(state),), (v,))[1]
@@ -336,7 +315,7 @@ def _pushed(machine: Mechanical, on: Any, state: State) -> Any:
     q = machine.places(zero)
     v = {x: (jnp if isinstance(push[x], jax.Array) else np).full_like(y, push[x])
          for x, y in vars(q).items()}  # fmt: skip
-    return machine._in_state(zero, q, Named(**v))
+    return _in_state(zero, q, Named(**v))
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
@@ -344,11 +323,15 @@ def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
     of the masses. A coordinate by name is set exactly."""
     name, q = _named(machine, on), machine.places(state)
     q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
-    push, v = _push(machine, on, q)[0], machine._velocities(state)
-    v = _moved(v, push, V - _speed(machine, on, machine._in_state(state, q, v)))
+    push, v = _push(machine, on, q)[0], state.v
+    v = _moved(v, push, V - _speed(machine, on, _in_state(state, q, v)))
     if name is not None:
         v = _with(v, name, V)
-    return machine._in_state(state, q, v)
+    return _in_state(state, q, v)
+
+
+def _in_state(state: State, q: Named, v: Named) -> State:
+    return state.replace(**vars(q), v=v)
 
 
 def _with(x: Named, name: str, value: Any) -> Named:

@@ -2,17 +2,12 @@
 
 from ..machine import StructureState as StructureState
 from .beam import Beam as Beam
-from .bouncing_ball import BallState as BallState
 from .bouncing_ball import BouncingBall as BouncingBall
 from .capsule import Capsule as Capsule
-from .capsule import CapsuleState as CapsuleState
 from .duffing import Duffing as Duffing
-from .impact_pair import FreePairState as FreePairState
 from .impact_pair import ImpactPair as ImpactPair
-from .impact_pair import PairState as PairState
 from .relief_valve import ReliefValve as ReliefValve
 from .relief_valve import ValveState as ValveState
 from .structure import Structure as Structure
 from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor
 from .woodpecker import Woodpecker as Woodpecker
-from .woodpecker import WoodpeckerState as WoodpeckerState

@@ -7,25 +7,15 @@ import jax.numpy as jnp
 
 from .._checks import NOT_NEGATIVE, SHARE, number
 from .._types import Number, Scalar
-from ..machine import RigidStop, Shown
+from ..machine import RigidStop, State
 from ._base import PhaseMachine, number_field
-
-
-class BallState(Shown):
-    """The position and velocity of a ball relative to the table."""
-
-    units: ClassVar = {"height": "g/ω²", "speed": "g/ω"}
-
-    height: Scalar
-    """Height above the table (unit: g/ω²)."""
-    speed: Scalar
-    """Upward speed relative to the table (unit: g/ω)."""
 
 
 class BouncingBall(PhaseMachine):
     """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
 
-    The independent variable is ωt, a cycle 2π. The motion with one bounce in n cycles begins at Γ =
+    The independent variable is ωt, a cycle 2π. The state is `height` and upward `speed`, relative
+    to the table. The motion with one bounce in n cycles begins at Γ =
     nπ (1 - e)/(1 + e). Its period doubles at Γ² = [nπ (1 - e)/(1 + e)]² + [2 (1 + e²)/(1 + e)²]²
     (Holmes, Journal of Sound and Vibration 84, 1982; Luo and Han, Nonlinear Dynamics 10, 1996).
 
@@ -36,7 +26,8 @@ class BouncingBall(PhaseMachine):
     acceleration: Any = number_field("acceleration", 1.2, NOT_NEGATIVE, "g")
     restitution: Any = number_field("restitution", 0.5, SHARE)
     quantity_units: ClassVar = {
-        **BallState.units, "rate": "ω", "time": "1/ω", "energy": "m g²/ω²", "power": "m g²/ω",
+        "height": "g/ω²", "speed": "g/ω", "rate": "ω", "time": "1/ω", "energy": "m g²/ω²",
+        "power": "m g²/ω",
     }  # fmt: skip
     labels: ClassVar = ("height (g/ω²)", "speed from the table (g/ω)")  # pyright: ignore
 
@@ -45,15 +36,15 @@ class BouncingBall(PhaseMachine):
         """The table, below the ball."""
         return (RigidStop(0.0, self.restitution, "left", on=("height", "speed")),)
 
-    def field(self, s: Scalar, state: BallState) -> BallState:
+    def field(self, s: Scalar, state: Any) -> dict[str, Scalar]:
         """Return d(state)/d(ωt): free fall minus the table's acceleration."""
-        return BallState(state.speed, -1 - self.acceleration * jnp.cos(s))
+        return {"height": state.speed, "speed": -1 - self.acceleration * jnp.cos(s)}
 
-    def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> BallState:
+    def start(self, *, height: Number = 1.0, speed: Number = 0.0) -> State:
         """Return a ball above the table at ωt = 0, when the table is lowest."""
-        return BallState(number("height", height), number("speed", speed))
+        return State(height=number("height", height), speed=number("speed", speed))
 
-    def sketch(self, pen: Any, state: BallState, phase: float) -> None:
+    def sketch(self, pen: Any, state: Any, phase: float) -> None:
         """Draw a ball above its table."""
         radius, table = 0.3 * pen.size, -float(self.acceleration) * cos(phase)
         wide = 2.4 * pen.size

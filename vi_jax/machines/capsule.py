@@ -1,35 +1,14 @@
 """A capsule that moves along the ground by internal impacts: dry friction, sticking, drift."""
 
-import dataclasses
 from math import pi
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range, number
-from .._types import Number, Scalar, State
-from ..machine import DryFriction, Mechanical, RigidStop, Shown
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, Range
+from .._types import Scalar, State
+from ..machine import DryFriction, Mechanical, RigidStop
 from ._base import ForcedMachine, number_field
-
-
-class CapsuleState(Shown):
-    """The mass inside relative to the capsule, and the capsule relative to the ground."""
-
-    units: ClassVar = {
-        **dict.fromkeys(("place", "travel", "progress"), "F/k"),
-        **dict.fromkeys(("speed", "capsule_speed"), "F/√(k m)"),
-    }
-
-    place: Scalar
-    """Position of the mass, from where its spring is relaxed (unit: F/k)."""
-    speed: Scalar
-    """Speed of the mass relative to the capsule (unit: F/√(k m))."""
-    capsule_speed: Scalar
-    """Speed of the capsule on the ground (unit: F/√(k m))."""
-    travel: Scalar
-    """Distance that the capsule has moved since the cycle began (unit: F/k)."""
-    progress: Scalar
-    """Distance that the capsule moved in the previous cycle (unit: F/k)."""
 
 
 class Capsule(ForcedMachine, Mechanical):
@@ -42,8 +21,9 @@ class Capsule(ForcedMachine, Mechanical):
         x1'' = α cos ωt - p - 2 ξ p',   γ x2'' = p + 2 ξ p' - friction,   p = x1 - x2 ≤ δ
 
     for the mass x1 and the capsule x2. At p = δ the relative speed is reversed and scaled by e, and
-    the momentum of both is conserved. The independent variable is ωt, a cycle 2π. The component
-    `progress` of the state is the distance that the capsule moved in the last cycle.
+    the momentum of both is conserved. The independent variable is ωt, a cycle 2π. The coordinates
+    are `place` p, from where the spring is relaxed, and `travel`, the distance that the capsule has
+    moved since the cycle began. Its mean speed over a cycle is the average `progress`.
 
     **Arguments:** `amplitude` α of the force on the mass, any number; `frequency` ω, positive;
     `damping_ratio` ξ, not negative; `mass_ratio` γ = M/m, positive; `gap` δ, any number;
@@ -60,10 +40,10 @@ class Capsule(ForcedMachine, Mechanical):
     friction: Any = number_field("friction", 1.0, NOT_NEGATIVE, "F")
     static_ratio: Any = number_field("static_ratio", 1.0, Range(1.0))
     q: ClassVar = ("place", "travel")
-    _velocity_names: ClassVar = {"place": "speed", "travel": "capsule_speed"}
     quantity_units: ClassVar = {
-        **CapsuleState.units, "rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k",
-        "power": "F²/√(k m)",
+        **dict.fromkeys(("place", "travel"), "F/k"),
+        **dict.fromkeys(("v.place", "v.travel", "progress"), "F/√(k m)"),
+        "rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)",
     }  # fmt: skip
     labels: ClassVar = (  # pyright: ignore
         "place in the capsule (F/k)",
@@ -93,15 +73,10 @@ class Capsule(ForcedMachine, Mechanical):
         stiffness = jnp.sqrt(1 + 1 / self.mass_ratio)
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
 
-    def renewed(self, state: CapsuleState) -> CapsuleState:
-        """Return the state with the travel of the cycle as its progress."""
-        at = state.travel
-        return dataclasses.replace(state, travel=jnp.zeros_like(at), progress=at)
+    def averages(self, s: Scalar, state: State, *modes: Scalar) -> dict[str, Scalar]:
+        """Return the speed of the capsule."""
+        return {"progress": state.v.travel}
 
-    def start(
-        self, *, place: Number = 0.0, speed: Number = 0.0, capsule_speed: Number = 0.0
-    ) -> Any:
-        """Return a state; by default at rest with the spring relaxed."""
-        given = number("place", place), number("speed", speed)
-        capsule = number("capsule_speed", capsule_speed)
-        return CapsuleState(*given, capsule, jnp.zeros_like(capsule), jnp.zeros_like(capsule))
+    def renewed(self, state: State) -> State:
+        """Return the state with the capsule's travel set back to zero."""
+        return state.replace(travel=jnp.zeros_like(state.travel))

@@ -4,34 +4,13 @@ from collections.abc import Mapping
 from math import sin
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, number
-from .._types import Number, Scalar, State
-from ..machine import Mechanical, RigidStop, Shown
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
+from .._types import Scalar, State
+from ..machine import Mechanical, RigidStop
 from ._base import PhaseMachine, number_field, stops_at
-
-
-class PairState(Shown):
-    """The state of the ball in its box."""
-
-    units: ClassVar = {"place": "a", "speed": "a ω"}
-
-    place: Scalar
-    """Position of the ball, from the middle of the box (unit: a)."""
-    speed: Scalar
-    """Speed of the ball relative to the box (unit: a ω)."""
-
-
-class FreePairState(PairState):
-    """The states of the ball in its box, and of the box."""
-
-    units: ClassVar = {**PairState.units, "box": "a", "box_speed": "a ω"}
-
-    box: Scalar
-    """Position of the box (unit: a)."""
-    box_speed: Scalar
-    """Speed of the box (unit: a ω)."""
 
 
 class ImpactPair(PhaseMachine, Mechanical):
@@ -40,7 +19,8 @@ class ImpactPair(PhaseMachine, Mechanical):
     The box moves as a sin ωt. If `mass_ratio` is given, it is a body on a spring and a damper,
     driven by a force: X'' + 2 ξ Ω X' + Ω² X = F sin s between impacts. An impact reverses the
     relative speed, scales it by e, and conserves momentum. The independent variable is s = ωt, a
-    cycle 2π.
+    cycle 2π. The coordinates are `place`, the position of the ball from the middle of the box,
+    and `box`, the position of a free box.
 
     Let the motion of the box be prescribed and σ = (1 - e)/(1 + e). The symmetric motion with one
     impact at each wall in a cycle has the flight speed w of (π w/2 - λ)² + σ² w² = 1 and the speed
@@ -54,7 +34,7 @@ class ImpactPair(PhaseMachine, Mechanical):
     - `restitution` e in [0, 1].
     - `mass_ratio`: the ball's mass over the box's, positive; without it the box's motion is given.
     - `damping_ratio` ξ, `frequency` Ω (of the box on its spring, unit: ω; 0 leaves out the spring)
-      and `force` F (unit: M a ω²), of a free box.
+      and `amplitude` F of the force (unit: M a ω²), of a free box.
     """
 
     half_gap: Any = number_field("half_gap", 1.6, POSITIVE, "a")
@@ -62,8 +42,7 @@ class ImpactPair(PhaseMachine, Mechanical):
     mass_ratio: Any = number_field("mass_ratio", None, POSITIVE)
     damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
     frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
-    force: Any = number_field("force", 0.5, REAL, "M a ω²")  # pyright: ignore
-    _velocity_names: ClassVar = {"place": "speed", "box": "box_speed"}
+    amplitude: Any = number_field("amplitude", 0.5, REAL, "M a ω²")
     labels: ClassVar = ("place in the box (a)", "speed in the box (a ω)")  # pyright: ignore
 
     @property
@@ -77,12 +56,12 @@ class ImpactPair(PhaseMachine, Mechanical):
         ball = self.mass_ratio
         return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
 
-    def _applied(self, t: Scalar, q: Any, v: Any, *modes: Scalar) -> dict[str, Any]:
+    def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
         """Return the forces on the ball relative to a prescribed box, or on ball and box."""
         if self.mass_ratio is None:
             return {"place": jnp.sin(t)}
         pull = -self.frequency * (self.frequency * q.box + 2 * self.damping_ratio * v.box)
-        return {"place": 0.0, "box": pull + self.force * jnp.sin(t)}
+        return {"place": 0.0, "box": pull + self.amplitude * jnp.sin(t)}
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
@@ -93,26 +72,16 @@ class ImpactPair(PhaseMachine, Mechanical):
     def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
         """The units, with the mass of the ball as unit of mass, or that of a free box."""
         mass = "m" if self.mass_ratio is None else "M"
-        rates = {"rate": "ω", "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
-        return {**FreePairState.units, **rates}
+        own = {"place": "a", "box": "a", "v.place": "a ω", "v.box": "a ω", "rate": "ω"}
+        return {**own, "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
 
-    def start(
-        self,
-        *,
-        place: Number = 0.0,
-        speed: Number = 0.5,
-        box: Number = 0.0,
-        box_speed: Number = 0.0,
-    ) -> Any:
-        """Return a state, by default with the ball in the middle and a free box at rest."""
-        ball = number("place", place), number("speed", speed)
-        if self.mass_ratio is None:
-            return PairState(*ball)
-        return FreePairState(*ball, number("box", box), number("box_speed", box_speed))
+    def start(self) -> Any:
+        """Return a state with the ball in flight from the middle, and a free box at rest."""
+        return self.at(v={"place": 0.5})
 
-    def mirrored(self, state: State) -> Any:
+    def mirrored(self, state: State) -> State:
         """Return the state with left and right exchanged, half a cycle later."""
-        return type(state)(*(-x for x in vars(state).values()))
+        return jax.tree.map(jnp.negative, state)
 
     def sketch(self, pen: Any, state: Any, phase: float) -> None:
         """Draw a box with a ball in it."""

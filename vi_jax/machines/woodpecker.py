@@ -3,18 +3,16 @@
 from math import pi
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete, number
-from .._types import Number, Scalar, State
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete
+from .._types import Scalar, State
 from ..machine import (
     ContactFriction,
     Coordinate,
     Mechanical,
     RigidStop,
-    Shown,
     counter_of,
     rising,
     solved,
@@ -24,37 +22,14 @@ from ._base import ReadyMachine, number_field
 WOOD, SLEEVE, BIRD, BEAK = "#c9a36b", "#6f6f6f", "#4c5b66", "#e0b83f"
 
 
-class WoodpeckerState(Shown):
-    """The state of sleeve and bird; angles counterclockwise, the bird on the right of the pole."""
-
-    units: ClassVar = {
-        **dict.fromkeys(("height", "drop"), "m"), "speed": "m/s",
-        **dict.fromkeys(("sleeve_angle", "bird_angle"), "rad"),
-        **dict.fromkeys(("sleeve_rate", "bird_rate"), "rad/s"),
-    }  # fmt: skip
-
-    height: Scalar
-    """Height of the sleeve's middle above its height when the cycle began (m)."""
-    sleeve_angle: Scalar
-    """φM, the angle between the sleeve and the pole (rad)."""
-    bird_angle: Scalar
-    """φS, the angle of the bird (rad)."""
-    speed: Scalar
-    """Upward speed of the sleeve's middle (m/s)."""
-    sleeve_rate: Scalar
-    """dφM/dt of the sleeve (rad/s)."""
-    bird_rate: Scalar
-    """dφS/dt of the bird (rad/s)."""
-    drop: Scalar
-    """Distance that the sleeve moved down in the previous cycle (m)."""
-
-
 class Woodpecker(ReadyMachine, Mechanical):
     """A sleeve with some play on a pole, and a bird on a spring at it that pecks the pole.
 
     The sleeve tilts until its edge jams on the pole by friction. The bird swings on and lifts the
     edge off. The sleeve slides down and jams the other way; the beak hits the pole, and the bird
-    swings back. The coordinates are height y and small angles φM of the sleeve and φS of the bird:
+    swings back. The coordinates are the height y of the sleeve above that where the cycle began,
+    `height`, and small angles φM of the sleeve and φS of the bird, `sleeve_angle` and `bird_angle`,
+    counterclockwise with the bird on the right of the pole:
 
         T = ½ m_M y'² + ½ J_M φM'² + ½ J_S φS'² + ½ m_S (y' + l_M φM' + l_G φS')²
         U = ½ c (φM - φS)² + m_M g y + m_S g (y + l_M φM + l_G φS)
@@ -67,8 +42,8 @@ class Woodpecker(ReadyMachine, Mechanical):
     of the Siconos software. A slipping contact may stick after an impact by the cone of friction.
 
     Only its weight drives it. A cycle ends when φS falls through `section_angle`, after a varying
-    time. The component `drop` of the state is the descent in the last cycle. Time is the
-    independent variable, and units are SI units. The stops are, in this order, `LOWER` and `UPPER`
+    time. Its mean speed of descent is the average `descent`. Time is the independent variable, and
+    units are SI units. The stops are, in this order, `LOWER` and `UPPER`
     edge of the sleeve and `BEAK`; the switches are the friction on each.
 
     **Arguments:**
@@ -101,12 +76,11 @@ class Woodpecker(ReadyMachine, Mechanical):
     pole_radius: Any = number_field("pole_radius", 0.0025, POSITIVE, "m")
     section_angle: Any = number_field("section_angle", -0.2788, REAL, "rad")
     q: ClassVar = ("height", "sleeve_angle", "bird_angle")
-    _velocity_names: ClassVar = {
-        "height": "speed", "sleeve_angle": "sleeve_rate", "bird_angle": "bird_rate",
-    }  # fmt: skip
     quantity_units: ClassVar = {
-        **WoodpeckerState.units, **dict.fromkeys(("play", "reach", "gap"), "m"), "phase": "s",
-        "rate": "1/s", "time": "s", "energy": "J", "power": "W",
+        **dict.fromkeys(("height", "play", "reach", "gap"), "m"), "phase": "s",
+        **dict.fromkeys(("v.height", "descent"), "m/s"), "sleeve_angle": "rad", "bird_angle": "rad",
+        "v.sleeve_angle": "rad/s", "v.bird_angle": "rad/s", "rate": "1/s", "time": "s",
+        "energy": "J", "power": "W",
     }  # fmt: skip
     labels: ClassVar = ("beak towards the pole (m)", "its speed (m/s)")  # pyright: ignore
     ranges: ClassVar = {"play": POSITIVE}
@@ -189,34 +163,25 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
 
-    def renewed(self, state: WoodpeckerState) -> WoodpeckerState:
-        """Return the state with the descent as `drop`; unchanged if observed at equal intervals."""
+    def averages(self, s: Scalar, state: State, *modes: Scalar) -> dict[str, Scalar]:
+        """Return the downward speed of the sleeve."""
+        return {"descent": -state.v.height}
+
+    def renewed(self, state: State) -> State:
+        """Return the state with the height set to zero; unchanged if observed at equal
+        intervals."""
         if counter_of(self) is None:
             return state
-        at = jnp.zeros_like(state.height)
-        return eqx.tree_at(lambda x: (x.height, x.drop), state, (at, -state.height))
+        return state.replace(height=jnp.zeros_like(state.height))
 
-    def start(
-        self, *, height: Number = 0.0, sleeve_angle: Number | None = None,
-        bird_angle: Number | None = None, speed: Number = -0.34, sleeve_rate: Number = 0.0,
-        bird_rate: Number = -7.5,
-    ) -> WoodpeckerState:  # fmt: skip
+    def start(self) -> Any:
         """Return a state near the cycle of the default numbers: on the section, the sleeve on its
-        lower edge and sliding down, the bird swinging away.
-
-        **Arguments:** one for each component, in SI units; the default angles are those of the
-        sleeve on its lower edge, and of the section.
-        """
+        lower edge and sliding down, the bird swinging away."""
         jammed = -self.play / self.sleeve_height
-        given = {
-            "height": height, "sleeve_angle": jammed if sleeve_angle is None else sleeve_angle,
-            "bird_angle": self.section_angle if bird_angle is None else bird_angle,
-            "speed": speed, "sleeve_rate": sleeve_rate, "bird_rate": bird_rate,
-        }  # fmt: skip
-        numbers = {name: number(name, value) for name, value in given.items()}
-        return WoodpeckerState(**numbers, drop=jnp.zeros_like(numbers["height"]))
+        speeds = {"height": -0.34, "bird_angle": -7.5}
+        return self.at(sleeve_angle=jammed, bird_angle=self.section_angle, v=speeds)
 
-    def sketch(self, pen: Any, state: WoodpeckerState, phase: float) -> None:
+    def sketch(self, pen: Any, state: State, phase: float) -> None:
         """Draw pole, sleeve, spring and bird to scale."""
         inside, half = float(self.sleeve_radius), float(self.sleeve_height)
         pole, arm = float(self.pole_radius), float(self.bird_arm)

@@ -497,6 +497,7 @@ def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
             "long_name": "outcome with which an event ended the motion",
             **flags({"none": -1} | outcomes),
         }
+        known["outcome_cycle"] = {"long_name": "cycle in which it ended, from the start; -1 if not"}
     for measure in program.measures:
         known |= measure.described(start)
     found, units = {}, units_of(machine)
