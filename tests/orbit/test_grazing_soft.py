@@ -9,22 +9,19 @@ from vi_jax.orbit._local_map import graze_at
 from grazings import grazing_of
 
 
-class Soft(vi.AbstractMachine):
-    """A shaken body with a soft stop, by time."""
+class Soft(vi.Mechanical):
+    """A shaken body with a soft stop."""
 
+    q, mass, cycle = ("x",), (1.0,), 2 * jnp.pi
     stop: vi.SoftStop
+    push: float = 1.0
 
     @property
     def contacts(self):
         return self.stop
 
-    cycle = 2 * jnp.pi
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, jnp.cos(s) - 0.5 * x.Y - 0.4 * x.V)
-
-    def start(self):
-        return vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
+    def force(self, t, q, v):
+        return dict(x=self.push * jnp.cos(t) - 0.5 * q.x - 0.4 * v.x)
 
 
 SWING = 1 / np.hypot(0.5, 0.4)
@@ -54,3 +51,14 @@ def test_soft_stops():
     np.testing.assert_allclose(found.kick[0], [0, kick], rtol=1e-8, atol=1e-12)
     assert found.checked is not None and found.agreement > 0.9
     assert graze_at(soft_grazing(restitution=0.6, adhesive=False)).touches[0].kick.order == 1
+
+
+@pytest.mark.slow
+def test_grazings_from_the_side_of_contact():
+    """Touch and release vanish at once. The push at a grazing is that of the linear oscillator."""
+    machine, bounds = Soft(vi.SoftStop(1.0, 20.0, restitution=0.8), 0.9), ((0.2, 1.0), (0.5, 1.5))
+    start = vi.simulate(machine, machine.start(), 1, settle=200).last
+    point = grazing_of(machine, "push", bounds[0], start)
+    curve = vi.boundary(point, parameter="stop.gap", bounds=bounds)
+    assert point.impact is not None and curve.ends == ("bounds", "bounds")
+    np.testing.assert_allclose(*(curve.parameters / [1.0, SWING]).T, rtol=1e-12)

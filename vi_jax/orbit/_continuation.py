@@ -25,7 +25,7 @@ from ._problem import (
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._solution import Step, advance, tangent_at
-from ._special_table import Intervals, SpecialTable
+from ._special_table import Intervals, SpecialTable, lost_at
 from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
 from .curve import Boundary, Branch
 from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
@@ -313,9 +313,15 @@ def boundary(
         tangent = tangent_at(problem, x)
         start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), 0.0)
     if not bool(start.good):
+        several = ""
+        if point.kind in TOUCHING and sum(lost_at(point.step)) > 1:
+            several = (
+                " Several of its events are lost at once, as in a motion that is the same after a "
+                "half of its cycles: begin with the motion of that half."
+            )
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "
-            f"{float(start.size):.2g})."
+            f"{float(start.size):.2g}).{several}"
         )
 
     return both_ways(

@@ -73,6 +73,10 @@ _ZERO, _ENTRY = 1e-6, 1e-4
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
 
+# Events with a lower speed of approach (in their units) are lost: a choice, 20 times the greatest
+# at the end of a contact with a soft stop that grazes, which the corrector leaves.
+_SLOW = 1e-6
+
 # Local maps of grazing motions are examined over so many periods.
 PERIODS = 3
 
@@ -117,9 +121,9 @@ class SpecialTable(Table):
             if kind != REST or event != grazes:
                 lost = lambda step, i=i: -float(step.seen.escape[i])
                 yield Event(lost, lambda at: Ending(at, REST), noise=ROUNDING)
-        for i in range(len(here.seen.approach)):
-            # In a symmetric motion another impact grazes as well, to rounding.
-            if i == grazes and kind == GRAZING:
+        for i, lost in enumerate(lost_at(here)):
+            # In a symmetric motion another impact grazes as well, on a soft stop the release.
+            if kind == GRAZING and (lost or i == grazes):
                 continue
             test = lambda step, i=i: float(step.seen.approach[i] / step.seen.units[i])
             lost = partial(self._singular, here, test)
@@ -174,6 +178,11 @@ class SpecialTable(Table):
 
         alike = lambda step: float(np.dot(begin, self.images(step)))
         return crossing(self.problem, self.advance, here, root, alike, admits)
+
+
+def lost_at(step: Step) -> np.ndarray:
+    """Return which events of a motion are lost, to rounding."""
+    return np.abs(np.asarray(step.seen.approach / step.seen.units)) < _SLOW
 
 
 def cosine_of(step: Step) -> float:
