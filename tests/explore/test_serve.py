@@ -78,7 +78,7 @@ def test_a_port_that_is_none_or_taken(monkeypatch, capsys):
 def address():
     """The page, served by the command."""
     pytest.importorskip("marimo")
-    command = [sys.executable, "-m", "vi_jax.cli", "explore", "--no-browser", "--port", "0"]
+    command = [sys.executable, "-m", "vi_jax", "explore", "--no-browser", "--port", "0"]
     served = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert served.stderr is not None
     lines = []

@@ -178,25 +178,8 @@ class Toppling(vi.AbstractMachine):
 
 
 def test_an_event_ends_the_motion_with_an_outcome():
-    """Which side it is beside the closed form, x = A (eᵗ + e⁻ᵗ)/20 - A cos 3t/10 + u sinh t."""
+    """Beside the closed form, x = A (eᵗ + e⁻ᵗ)/20 - A cos 3t/10 + u sinh t."""
     machine, speeds = Toppling(), jnp.array([0.3, -0.3, 0.03, -0.1])
-    run = jax.vmap(lambda u: vi.simulate(machine, vi.State(x=0.0, u=u), 4))(speeds)
-    t = np.linspace(0, 8, 4001)
-    swing = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t)
-    places = swing + np.outer(speeds, np.sinh(t))
-    when = np.argmax(abs(places) > 1, axis=1)
-    first = np.take_along_axis(places, when[:, None], 1)[:, 0]
-    assert run.outcomes == ("right", "left")
-    np.testing.assert_array_equal(run.outcome, np.where(np.array(first) > 0, 0, 1))
-    assert bool((run.result == vi.RESULTS.ended).all())
-    at = run.outcome_cycle * machine.cycle + run.outcome_phase
-    np.testing.assert_allclose(at, t[when], atol=2e-3)  # the next of these instants
-    np.testing.assert_allclose(run.outcome_state.x, np.sign(first), atol=1e-12)
-    speed = 0.05 * np.sinh(at) + 0.15 * np.sin(3 * at) + speeds * np.cosh(at)
-    np.testing.assert_allclose(run.outcome_state.u, speed, atol=1e-7)
-    assert "ended: right, in cycle" in str(jax.tree.map(lambda x: x[0], run))
-    assert str(run.to_xarray().outcome.values[1]) == "left"
-    assert bool(jnp.isnan(run.duration[:, -1]).all())  # no cycle that was not reached took time
 
     class Walled(Toppling):
         """The same where the right side is a wall."""
@@ -204,13 +187,36 @@ def test_an_event_ends_the_motion_with_an_outcome():
         contacts = vi.RigidStop(1.0, 0.5, on=("x", "u"), ends="right")
         events = Toppling.events[1]
 
-    walled = jax.vmap(lambda u: vi.simulate(Walled(), vi.State(x=0.0, u=u), 4))(speeds)
+    def by_speed(machine):
+        run = lambda u: vi.simulate(machine, vi.State(x=0.0, u=u), 4)
+        clock, state = (lambda u: run(u).outcome_phase), (lambda u: run(u).outcome_state.u)
+        return map(lambda f: jax.vmap(f)(speeds), (run, jax.jacrev(clock), jax.jacfwd(state)))
+
+    run, by, by_state = by_speed(machine)
+    assert run.outcomes == ("right", "left") and bool((run.result == vi.RESULTS.ended).all())
+    t, at = np.linspace(0, 8, 4001), run.outcome_cycle * machine.cycle + run.outcome_phase
+    places = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t) + np.outer(speeds, np.sinh(t))
+    when = np.argmax(abs(places) > 1, axis=1)
+    np.testing.assert_allclose(at, t[when], atol=2e-3)  # the next of these instants
+    sides = np.sign(places[np.arange(4), when])
+    np.testing.assert_array_equal(run.outcome, np.where(sides > 0, 0, 1))
+    np.testing.assert_allclose(run.outcome_state.x, sides, atol=1e-12)
+    speed = 0.05 * np.sinh(at) + 0.15 * np.sin(3 * at) + speeds * np.cosh(at)
+    np.testing.assert_allclose(run.outcome_state.u, speed, atol=1e-7)
+    bend = 0.05 * np.cosh(at) + 0.45 * np.cos(3 * at) + speeds * np.sinh(at)
+    np.testing.assert_allclose(by, -np.sinh(at) / speed, rtol=1e-6)
+    np.testing.assert_allclose(by_state, np.cosh(at) + bend * by, rtol=1e-6)
+    assert "ended: right, 0 cycles and 1.79" in str(jax.tree.map(lambda x: x[0], run))
+    assert str(run.to_xarray().outcome.values[1]) == "left"
+    assert bool(jnp.isnan(run.duration[:, -1]).all())  # no cycle that was not reached took time
+    walled, by_wall, _ = by_speed(Walled())
     assert walled.outcomes == ("left", "right")
     np.testing.assert_array_equal(walled.outcome, 1 - run.outcome)
+    np.testing.assert_allclose(by_wall, by, rtol=1e-6)
     axes = {"start.u": speeds, "amplitude": [0.5]}
     data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)
-    np.testing.assert_array_equal(data["outcome"].values[:, 0], run.outcome)
-    np.testing.assert_array_equal(data["outcome_cycle"].values[:, 0], run.outcome_cycle)
+    for name in ("outcome", "outcome_cycle", "outcome_phase"):
+        np.testing.assert_allclose(data[name].values[:, 0], getattr(run, name), rtol=1e-7)
 
 
 def test_an_event_in_both_directions():

@@ -29,24 +29,17 @@ EVENTS = (
 # Lanes: the cycle, and starts beside it, by which its map is seen.
 STEP = 1e-5
 BESIDE = ((0, 0), (STEP, 0), (-STEP, 0), (0, 30 * STEP), (0, -30 * STEP))
-STARTS = np.array([(0.3, SPEED + a, BIRD_RATE + b) for a, b in BESIDE])
-
-
-def begun(toy, speed, bird_rate):
-    v = dict(height=speed, bird_angle=bird_rate)
-    return toy.at(**vars(toy.start()) | {"v": v})
-
-
-def one(friction, speed, bird_rate, cycles=1, **options):
-    toy = WOODPECKER(friction=friction)
-    options = {"method": CLOSE, "event_log": 16} | options
-    return vi.simulate(toy, begun(toy, speed, bird_rate), cycles, **options)
 
 
 @pytest.fixture(scope="module")
 def run():
-    found = vi.jit(jax.vmap(one))(*jnp.asarray(STARTS.T))
-    assert bool(found.successful.all())
+    toy = WOODPECKER(friction=0.3)
+    one = vi.jit(jax.vmap(lambda x: vi.simulate(toy, x, method=CLOSE, event_log=16)))
+    v = [dict(height=SPEED + a, bird_angle=BIRD_RATE + b) for a, b in BESIDE]
+    starts = [toy.at(**vars(toy.start()) | {"v": x}) for x in v]
+    found = one(jax.tree.map(lambda *x: jnp.stack(x), *starts))
+    # From where its sleeve lies on the pole, with the velocity that rounding has left, it goes on.
+    assert bool(found.successful.all()) and bool(one(found.last).successful.all())
     return found
 
 

@@ -132,3 +132,6 @@ def test_impacts_of_a_machine_without_a_drive_lie_where_they_happen():
     path = vi.plot.motion_path(run, machine=valve)
     step = float(run.duration[0]) / 128
     assert np.abs(np.diff(path.Y)).max() < 1.01 * step * np.abs(path.V).max()
+    ax = plot_history(run, machine=valve, ax=_axes())
+    assert ax.get_xlabel() == "time since the start"
+    assert ax.lines[0].get_xdata().max() == pytest.approx(float(run.duration[0]))

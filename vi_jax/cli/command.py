@@ -36,9 +36,11 @@ from ..machine import (
     AbstractMachine,
     State,
     check_leaf,
+    components,
     cycles_in_words,
     is_autonomous,
-    with_leaf,
+    leaf_names,
+    with_leaves,
 )
 from ..machines.named import InputError, check_keys, machine_of, value_of
 from ..orbit import continue_orbit, find_orbit
@@ -182,10 +184,11 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
             if is_autonomous(machine, first):
                 shown = machine.observed_every(machine.cycle)
             seen = simulate(shown, first, run.impacts.size, samples=64, impact_log=8)
-        plot.plot_history(seen, machine=shown, ax=left, unit="cycles")
+        unit = "cycles" if shown is machine else "time"
+        plot.plot_history(seen, machine=shown, ax=left, unit=unit)
         plot.plot_phase_portrait(seen, shown, ax=right)
 
-    return Found([str(run)], table, draw, bool(run.successful), cut)
+    return Found([str(run)], table, draw, not bool(run.failed), cut)
 
 
 def run_in_parts(
@@ -194,15 +197,19 @@ def run_in_parts(
     """Return a run of one motion, as `simulate`, and whether Ctrl-C ended it. The run then has the
     cycles recorded so far."""
     length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
+    before = options.get("settle", 0)
     planned(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
     if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
         return simulate(machine, start, cycles, samples=samples, **options), False
     try:
         for done in range(0, cycles, length):
             now = min(length, cycles - done)
-            runs.append(simulate(machine, start, now, samples=samples, **options))
-            start, options["settle"] = runs[-1].last, 0
-            if not bool(runs[-1].successful):
+            run = simulate(machine, start, now, samples=samples, **options)
+            if done and run.outcome_cycle is not None and not bool(run.successful | run.failed):
+                run = dataclasses.replace(run, outcome_cycle=run.outcome_cycle + before + done)
+            runs.append(run)
+            start, options["settle"] = run.last, 0
+            if not bool(run.successful):
                 break
     except KeyboardInterrupt:
         if not runs:
@@ -358,9 +365,8 @@ def start_of(machine: AbstractMachine, table: Any) -> Any:
                 check_keys(table, parameters, "[start]")
             return machine.start(**table)
         state = machine.start()
-        for name, number in table.items():
-            state = with_leaf(state, check_leaf(state, name, argument="start"), number)
-        return state
+        check_keys(table, dict.fromkeys((*leaf_names(state), *components(state))), "[start]")
+        return with_leaves(state, table)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -144,7 +144,7 @@ def simulate(
         tighter = dataclasses.replace(plan, method=plan.method.tighter())
         errors = _errors(run, _simulate(tighter, start, False))
         run = dataclasses.replace(run, errors=errors)
-    return eqx.error_if(run, ~run.successful, _FAILED) if throw else run
+    return eqx.error_if(run, run.failed, _FAILED) if throw else run
 
 
 @compiled
@@ -318,7 +318,11 @@ def _numbers(x: Array) -> Array:
 def failed_derivatives(run: Run) -> Run:
     """Return the same run, with derivatives that are NaN if it failed."""
     numbers, rest = eqx.partition(run, eqx.is_inexact_array)
-    return eqx.combine(_marked(run.successful, numbers), rest)
+    found = _marked(run.successful, numbers)
+    if run.outcome is not None:
+        own = {name: getattr(numbers, name) for name in ("outcome_phase", "outcome_state")}
+        found = dataclasses.replace(found, **_marked(~run.failed, own))
+    return eqx.combine(found, rest)
 
 
 @jax.custom_jvp

@@ -24,6 +24,7 @@ from ..machine import (
     by_name,
     in_unit,
     name_in,
+    plain,
     state_in_words,
     with_modes,
     with_units,
@@ -498,9 +499,9 @@ class Run(Summarized):
     """The outcome with which an event ended the motion, as an index into `outcomes`; -1 without,
     and `None` for a machine without outcomes."""
     outcome_cycle: Int[Array, ""] | None = None
-    """The cycle in which the event ended the motion, from the start and from 0; -1 without."""
+    """The number of cycles before that event, those of `settle` included; -1 without."""
     outcome_phase: Float[Array, ""] | None = None
-    """The clock of that cycle at the event, as in `ImpactLog`; NaN without."""
+    """The clock at the event, since the end of these cycles, as in `ImpactLog`; NaN without."""
     outcome_state: State | None = None
     """The state after the event, a pytree like the start; NaN without."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
@@ -510,6 +511,11 @@ class Run(Summarized):
     def successful(self) -> jax.Array:
         """True if the lane completed all its cycles."""
         return self.result == RESULTS.successful
+
+    @property
+    def failed(self) -> jax.Array:
+        """True if the lane has not completed its cycles, and no event of the machine ended it."""
+        return ~self.successful & (self.result != RESULTS.ended)
 
     @property
     def last(self) -> State:
@@ -559,30 +565,32 @@ class Run(Summarized):
         if self.outcome is None or self.outcome_cycle is None or self.outcome < 0:
             return None
         name = self.outcomes[int(self.outcome)]
-        return f"{name}, in cycle {self.outcome_cycle + 1} at {self.outcome_phase:.6g}"
+        before = count_of(int(self.outcome_cycle), "cycle")
+        return f"{name}, {before} and {self.outcome_phase:.6g} of the clock after the start"
 
     def summary(self) -> str:
         """Return the last section and cycle, and the reason why the run ended, as text."""
         if self.steps.ndim:
             good = int(jnp.sum(self.successful))
-            return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful"
+            ended = "" if self.outcome is None else f", {int(jnp.sum(self.outcome >= 0))} ended"
+            return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful{ended}"
         cycles = self.impacts.shape[-1]
         lines = [
             f"Run of {count_of(cycles, 'cycle')}, {count_of(int(jnp.sum(self.impacts)), 'impact')}"
         ]
-        units, name = dict(self.units), self._outcome_in_words()
-        last = without_modes(self.last) if name is None else self.outcome_state
-        where = "section" if name is None else "state"
+        units, outcome = dict(self.units), self._outcome_in_words()
+        last = without_modes(self.last) if outcome is None else self.outcome_state
+        where = "section" if outcome is None else "state"
         lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
-        if self.y_min is not None and self.y_max is not None:
-            span = f"[{self.y_min[-1]:.6g}, {self.y_max[-1]:.6g}]"
+        if outcome is None and self.y_min is not None and self.y_max is not None:
+            span = f"[{plain(self.y_min[-1], 6)}, {plain(self.y_max[-1], 6)}]"
             span = in_unit(span, units, "position")
             lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
-        for name, x in self.averages.items():
-            lines.append(f"    mean {name}: {in_unit(f'{x[-1]:.6g}', units, name)}")
+        for average, x in self.averages.items() if outcome is None else ():
+            lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:
             worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")
         lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
-        ended = name or ("completed" if bool(self.successful) else RESULTS[self.result])
+        ended = outcome or ("completed" if bool(self.successful) else RESULTS[self.result])
         return "\n".join([*lines, f"  ended: {ended}"])

@@ -213,6 +213,7 @@ QUANTITIES = {
     "impact_speed": "velocity", "log_speed": "velocity", "frequency_ratio": "frequency_ratio",
     "exponents": "rate", "spread": "rate", "impact_energy": "energy", "duration": "time",
     "log_phase": "phase", "impact_phase": "phase", "event_phase": "phase",
+    "outcome_phase": "phase",
     "fastest_impact": "velocity", "slowest_impact": "velocity",
 }  # fmt: skip
 """The quantities that the arrays of results contain."""

@@ -111,11 +111,11 @@ class Woodpecker(ReadyMachine, Mechanical):
     def contacts(self) -> tuple[RigidStop | ContactFriction, ...]:
         """The pole at the lower and the upper edge of the sleeve and at the beak, with friction."""
         lower, upper = (
-            RigidStop(self.play, self.sleeve_restitution, side, coordinate=1)
-            for side in ("left", "right")
+            RigidStop(self.play, self.sleeve_restitution, side, coordinate=1, name=name)
+            for side, name in (("left", "lower edge"), ("right", "upper edge"))
         )
-        beak, along = RigidStop(self.reach, self.beak_restitution, "right"), enumerate((2, 2, 3))
-        rubs = (ContactFriction(self.friction, stop=i, along=k) for i, k in along)
+        beak = RigidStop(self.reach, self.beak_restitution, "right", name="beak")
+        rubs = (ContactFriction(self.friction, stop=i, along=k) for i, k in enumerate((2, 2, 3)))
         return lower, upper, beak, *rubs
 
     @property

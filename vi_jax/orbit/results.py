@@ -261,13 +261,15 @@ class Orbit(Summarized):
     ) -> Run:
         """Return the motion over one period (or `cycles` drive cycles), sampled, for plots.
 
-        **Raises:** `ValueError` for a batch of orbits.
+        **Raises:** `ValueError` for a batch of orbits, or a guess that led to none.
         """
         if self.residual.ndim:
             raise ValueError(
                 f"`trajectory` needs one orbit, but this is a batch of shape {self.residual.shape}."
             )
         machine = self.machine
+        if not bool(self.successful):
+            raise ValueError("`trajectory` needs an orbit that was found, but this is none.")
         if cycles is None:
             cycles = int(self.cycles)
         if is_autonomous(machine, self.state):

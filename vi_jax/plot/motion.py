@@ -9,7 +9,7 @@ from matplotlib import rcParams, rcParamsDefault
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
-from .._checks import count, instance_of
+from .._checks import count, instance_of, one_of
 from .._programs import compiled
 from ..flow import Run, Samples
 from ..machine import (
@@ -223,29 +223,46 @@ def plot_history(
     - `ax`: axes to draw into; by default a new figure.
     - `window`: the first and the last cycle to draw.
     - `shift`: the number of cycles by which to move the motion along the axis.
-    - `unit`: `"angle"` (crank angle φ in units of π) or `"cycles"`; by default the clock of the
-      `machine`, which is the angle for the paper's machine or without a machine.
+    - `unit`: `"angle"` (crank angle φ in units of π), `"cycles"` or `"time"`; by default the angle
+      for the paper's machine or without a machine, time for a machine without a drive or one that
+      is observed at equal intervals, cycles for any other.
     - `stops`: whether to draw the stops.
     - `coordinate`: the coordinate to draw, by number or by name, with its own stops and impacts.
     - `style`: options of `Axes.plot`.
     """
     path = drawn_path(motion, machine=machine, window=window, coordinate=coordinate)
     turning = counts_by_angle(machine)
+    samples = motion.samples if isinstance(motion, Run) else motion
+    assert samples is not None
     if unit is None:
-        unit = "angle" if turning else "cycles"
-    if unit not in ("angle", "cycles"):
-        raise ValueError(f"Argument `unit` must be 'angle' or 'cycles', but got {unit!r}.")
-    ax = new_axes(ax)
-    factor = 2.0 if unit == "angle" else 1.0
-    ax.plot(factor * (path.cycles + shift), path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
+        unit = "angle" if turning else "time" if _without_drive(machine, samples) else "cycles"
+    one_of("unit", unit, ("angle", "cycles", "time"))
+    ax, x = new_axes(ax), path.cycles + shift
+    if unit == "angle":
+        x = 2.0 * x
+    elif unit == "time":
+        ends = np.asarray(samples.cycles)[-1], np.asarray(samples.time)[-1]
+        x = np.interp(path.cycles, samples.cycles, samples.time) + shift * ends[1] / ends[0]
+    ax.plot(x, path.Y, **{"color": BLUE, "lw": thick(1.3), **style})
     if stops and machine is not None:
         _draw_stops(machine, coordinate_of(machine, coordinate), ax, ax.axhline)
     ax.set_ylabel(_labels(motion, machine, coordinate)[0])
-    if unit == "cycles":
+    if unit == "angle":
+        angle_axis(ax)
+    elif unit == "cycles":
         ax.set_xlabel("drive cycles φ/(2π)" if turning else "cycles since the start")
     else:
-        angle_axis(ax)
+        time = unit_of({} if machine is None else units_of(machine), "time")
+        ax.set_xlabel(in_brackets("time since the start", time))
     return ax
+
+
+def _without_drive(machine: AbstractMachine | None, samples: Samples) -> bool:
+    """Return whether the cycles of a run are no cycles of a drive."""
+    if machine is None:
+        return False
+    start = jax.tree.map(lambda x: x[0], samples.state)
+    return hasattr(machine, "observed_interval") or is_autonomous(machine, start)
 
 
 def _draw_stops(

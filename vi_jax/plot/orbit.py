@@ -222,12 +222,12 @@ def axis_name(name: str, units: Mapping[str, str]) -> str:
         "restitution": "restitution k",
         "gap": "gap d",
         "damping_ratio": "damping ratio ξ",
-        "control": "motor control κ",
-        "strength": "motor strength τ0",
+        "drive.control": "motor control κ",
+        "drive.strength": "motor strength τ0",
     }
     last = name.split(".")[-1]
     unit = "" if last == "frequency_ratio" else unit_of(units, name)
-    return in_brackets(symbols.get(last, name), unit)
+    return in_brackets(symbols.get(name) or symbols.get(last, name), unit)
 
 
 def plot_multipliers(

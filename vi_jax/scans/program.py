@@ -284,7 +284,7 @@ class ScanProgram(eqx.Module):
                     found[name] = x + jnp.where(run.successful, 0.0, jnp.nan)
             if run.outcome is not None:
                 found["outcome"] = run.outcome.astype(jnp.int8)
-                found["outcome_cycle"] = run.outcome_cycle
+                found |= {"outcome_cycle": run.outcome_cycle, "outcome_phase": run.outcome_phase}
             return {**found, "result": number_of(run.result).astype(jnp.int8)}
 
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)

@@ -497,7 +497,8 @@ def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
             "long_name": "outcome with which an event ended the motion",
             **flags({"none": -1} | outcomes),
         }
-        known["outcome_cycle"] = {"long_name": "cycle in which it ended, from the start; -1 if not"}
+        known["outcome_cycle"] = {"long_name": "cycles before that event; -1 without one"}
+        known["outcome_phase"] = {"long_name": "clock at it since their end", "unit_of": "phase"}
     for measure in program.measures:
         known |= measure.described(start)
     found, units = {}, units_of(machine)

@@ -380,8 +380,11 @@ def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.
-    fixed = plan.ticks(lane.state) and not switches_of(plan.machine)
-    return (_at_fixed_clock(at, lane) if fixed else lane), places
+    if not plan.ticks(lane.state) or switches_of(plan.machine):
+        return lane, places
+    fixed = _at_fixed_clock(at, lane)
+    # Without later steps, those of an outcome are along with the event.
+    return (select(lane.fault > 0, lane, fixed) if outcomes_of(plan.machine) else fixed), places
 
 
 def _landed(at: AppliedStep, lane: Lane, at_event: State) -> Lane:

@@ -1,5 +1,0 @@
-"""`python -m vi_jax.cli`."""
-
-from .command import main
-
-raise SystemExit(main())
