@@ -115,6 +115,7 @@ from .numbers import check_again as check_again
 from .numbers import check_leaf as check_leaf
 from .numbers import check_name as check_name
 from .numbers import components as components
+from .numbers import drive_speed as drive_speed
 from .numbers import first_few as first_few
 from .numbers import in_brackets as in_brackets
 from .numbers import in_rows as in_rows

@@ -244,6 +244,12 @@ def in_brackets(words: str, unit: str) -> str:
     return words if unit in ("", "1") else f"{words} ({unit})"
 
 
+def drive_speed(units: Mapping[str, str]) -> str:
+    """Return the label of the mean speed of a drive; in units of ω it is a ratio."""
+    unit = unit_of(units, "frequency_ratio")
+    return "frequency ratio ζ" if unit == "ω" else in_brackets("speed of the drive", unit)
+
+
 def unit_in(label: str) -> str:
     """Return the unit at the end of a label such as "height (g/ω²)"."""
     return label.partition(" (")[2].removesuffix(")")

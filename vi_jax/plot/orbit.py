@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from .._checks import flag, instance_of, one_of, tuple_of
 from ..machine import (
     cycles_in_words,
+    drive_speed,
     in_brackets,
     is_angle,
     name_in,
@@ -103,7 +104,8 @@ def plot_branch(
         _legend(ax)
     machine = branch.problem.machine
     along = x if x in branch.free else branch.name
-    ax.set_xlabel("ζ" if x == "frequency_ratio" else axis_name(along, units_of(machine)))
+    units = units_of(machine)
+    ax.set_xlabel(drive_speed(units) if x == "frequency_ratio" else axis_name(along, units))
     ax.set_ylabel(extreme_name(y, machine.labels, units_of(machine), branch.averages))
     return ax
 
@@ -208,7 +210,7 @@ def extreme_name(
     least = {"y_min": "min", "y_max": "max"}.get(name)
     if least is None:
         if name == "frequency_ratio":
-            return "mean frequency ratio ζ"
+            return f"mean {drive_speed(units)}"
         quantity = quantity_of(name)
         name = f"{name.removeprefix('section_')} on the section" if "section_" in name else name
         return name if quantity is None else in_brackets(name, unit_of(units, quantity))

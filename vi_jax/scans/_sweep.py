@@ -165,10 +165,12 @@ class Sweep(Summarized):
     def _jumps(self) -> list[list[str]]:
         """Return the changes at each value that are far larger than at neighbours, if periodic."""
         name, units = name_in(self.labels[0]), dict(self.units)
+        unit = unit_of(units, "frequency_ratio")
+        speed = "ζ" if unit == "ω" else "speed of the drive"
         numbers = {
             f"min {name}": (self.y_min, unit_of(units, "position")),
             f"max {name}": (self.y_max, unit_of(units, "position")),
-            "ζ": (self.frequency_ratio, unit_of(units, "frequency_ratio")),
+            speed: (self.frequency_ratio, unit),
         }
         period, reach = np.asarray(self.period), np.maximum(abs(self.y_min), abs(self.y_max))
         found: list[list[str]] = [[] for _ in period]
@@ -179,7 +181,7 @@ class Sweep(Summarized):
             steps = np.abs(np.diff(x))
             beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
             usual = np.maximum(beside[:-2], beside[2:])
-            most = np.abs(x) if name == "ζ" else np.asarray(reach)
+            most = np.abs(x) if name == speed else np.asarray(reach)
             scale = np.maximum(most[1:], most[:-1])
             far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
             far &= (period[1:] > 0) | (period[:-1] > 0)
