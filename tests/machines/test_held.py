@@ -218,3 +218,32 @@ def test_derivatives_of_balls_that_rest_on_one_another():
 
     # Of the middle nothing depends on the radius. What is left is the chatter completed at once.
     np.testing.assert_allclose(jax.jacfwd(places)(0.25), [-1, 0, 1, 0], atol=1e-9)
+
+
+class Lying(vi.Mechanical):
+    """A body that lies on another, which would fall faster, on a floor that a third one tilts."""
+
+    q, mass, cycle = ("a", "b", "x"), (1.0, 0.6, 0.8), 2 * jnp.pi
+    contacts = (
+        vi.RigidStop(0.0, 0.4, "left", on=lambda q: q.a + 0.1 * q.x),
+        vi.RigidStop(0.0, 0.4, "left", on=lambda q: q.b - q.a),
+        vi.DryFriction(0.2, on="x"),
+    )
+    push: Any = 1.0
+
+    def force(self, t, q, v):
+        lift = self.push * jnp.cos(t)
+        return dict(a=lift - 1.0, b=0.3 * jnp.sin(2 * t) - 0.6, x=0.6 * jnp.sin(t) - q.x)
+
+
+@pytest.mark.slow
+def test_a_motion_with_several_rests_goes_on_from_any_section():
+    one = lambda push, z, settle: vi.simulate(Lying(push=push), z, 6, settle=settle)
+    run = vi.jit(jax.vmap(one, in_axes=(0, 0, None)))
+    push = jnp.linspace(0.5, 2.0, 24)
+    start = jax.vmap(lambda push: Lying(push=push).at(a=0.4, b=0.8))(push)
+    first, whole = run(push, start, 0), run(push, start, 6)
+    second = run(push, first.last, 0)
+    assert bool(whole.successful.all() & second.successful.all()) and int(second.rests.sum()) > 48
+    for a, b in zip(*map(jax.tree.leaves, (second.last, whole.last)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-8)

@@ -46,7 +46,7 @@ from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
-from .smooth import in_modes
+from .smooth import holding, in_modes, limited_of
 
 # A number of the state smaller than this share of what the other numbers make of it has still to
 # grow. Rates are evaluated at this many instants of a cycle. Choices.
@@ -196,8 +196,9 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     contact = None
     if plan.rests:
         growth = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
-        both = enumerate(zip(here, growth, strict=True))
-        contact = tuple(_rests_on(plan, k, *x, *plan.rounding(k, start)) for k, x in both)
+        contact = _contacts_at(plan, start, here, growth)
+        if len(limited_of(machine)) > 1:
+            contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
             for x, j, along in zip(here, growth, direction, strict=True)
@@ -232,6 +233,29 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         rejected=zero,
         last_impulse=zero if plan.noise is not None and plan.noise.timed else None,
     )
+
+
+def _contacts_at(plan: Plan, start: State, here: list[Rates], growth: list[Scalar]) -> Scalars:
+    """Return the stops on which the coordinates rest, by their rates and those of the forces."""
+    both = enumerate(zip(here, growth, strict=True))
+    return tuple(_rests_on(plan, k, *x, *plan.rounding(k, start)) for k, x in both)
+
+
+def _pressed_together(
+    plan: Plan, s: Scalar, start: State, modes: Scalars, contact: Scalars
+) -> Scalars:
+    """Return the contacts with those that press on only since others hold: a body lies on another
+    that would fall faster than it."""
+    bodies = plan.machine.coordinates
+
+    def again(contact: Scalars, _: None) -> tuple[Scalars, None]:
+        held = stop_gradient(holding(plan.machine, modes, contact))
+        here = [rates(held.field, x.position, s, start) for x in bodies]
+        growth = [force_rate(held, x.position, held, s, start) for x in bodies]
+        more = _contacts_at(plan, start, here, growth)
+        return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
+
+    return jax.lax.scan(again, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
 
 
 def _rests_on(

@@ -383,7 +383,7 @@ def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     if not plan.ticks(lane.state) or switches_of(plan.machine):
         return lane, places
     fixed = _at_fixed_clock(at, lane)
-    # Without later steps, those of an outcome are along with the event.
+    # No step follows an outcome: its derivatives stay those along with the event.
     return (select(lane.fault > 0, lane, fixed) if outcomes_of(plan.machine) else fixed), places
 
 
@@ -458,11 +458,7 @@ def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.drifted(offset, moving)
     if not exact(plan.machine, state):
-        # While held, their positions were accurate to the method's error only.
-        limited = limited_of(plan.machine)
-        walls = {i: contact[i] for i in limited}
-        put, _ = stilled(plan, lane.s, state, {i: walls[i] > 0 for i in limited}, walls)
-        state = select(walls[k] > 0, put, state)
+        state = select(contact[k] > 0, on_its_stops(plan, lane._replace(state=state)), state)
     direction = jnp.where(free, -at.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
     lane = lane.log_event(at.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
@@ -473,6 +469,14 @@ def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
         direction=in_place(lane.direction, k, direction),
         contact=in_place(contact, k, jnp.where(free, 0.0, contact[k])),
     )
+
+
+def on_its_stops(plan: Plan, lane: Lane) -> State:
+    """Return the state with the bodies that rest, at least one, exactly on their stops. While they
+    are held, their positions are accurate to the method's error only."""
+    assert lane.contact is not None
+    walls = {k: lane.contact[k] for k in limited_of(plan.machine)}
+    return stilled(plan, lane.s, lane.state, {k: x > 0 for k, x in walls.items()}, walls)[0]
 
 
 def _offset(at: AppliedStep, c: Crossing) -> Scalar:

@@ -13,6 +13,8 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 they are those at a fixed clock, so that later steps need no derivative of the clock.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -33,12 +35,12 @@ from ...machine import (
     switches_of,
     with_earlier_clock,
 )
-from .._lane import FREE, Lane, Plan, Record, select, to_event, total
+from .._lane import FREE, Lane, Plan, Record, any_of, select, to_event, total
 from ..noise import with_impulse
 from ..results import code
-from ..smooth import TIME, carried, holding
+from ..smooth import TIME, carried, exact, holding
 from .aim import aim_ahead, aim_at
-from .arrive import after_jump, arrive, contacts_after_jump, release_pulled
+from .arrive import after_jump, arrive, contacts_after_jump, on_its_stops, release_pulled
 from .trial import Trial, attempt
 
 # A lane has failed after this many attempts without landing; with this many impacts in one interval
@@ -76,6 +78,10 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     if section_in(plan.machine, lane.state) is not None and not counts_turns(plan.machine):
         completed = completed | taken & _is_equilibrium_on_section(plan, lane, arrived)
     reached = completed = pin_flag(completed, lane.s)
+    if arrived.contact is not None and not exact(plan.machine, arrived.state):
+        rests = reached & any_of(reached, (x > 0 for x in arrived.contact))
+        put, kept = partial(on_its_stops, plan), lambda x: x.state
+        arrived = arrived._replace(state=jax.lax.cond(rests, put, kept, arrived))
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)
