@@ -46,7 +46,7 @@ from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
-from .smooth import holding, in_modes, limited_of
+from .smooth import exact, holding, in_modes, limited_of
 
 # A number of the state smaller than this share of what the other numbers make of it has still to
 # grow. Rates are evaluated at this many instants of a cycle. Choices.
@@ -237,8 +237,15 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
 
 def _contacts_at(plan: Plan, start: State, here: list[Rates], growth: list[Scalar]) -> Scalars:
     """Return the stops on which the coordinates rest, by their rates and those of the forces."""
-    both = enumerate(zip(here, growth, strict=True))
-    return tuple(_rests_on(plan, k, *x, *plan.rounding(k, start)) for k, x in both)
+    found = []
+    for k, (body, rate) in enumerate(zip(here, growth, strict=True)):
+        slack, slow = plan.rounding(k, start)
+        if not exact(plan.machine, start):
+            # The rounding of a force that has held it for a cycle: 0.03 of it for a woodpecker.
+            share = 4 * float(jnp.finfo(body.x.dtype).eps)
+            slow = jnp.maximum(slow, share * plan.machine.cycle * jnp.abs(body.a))
+        found.append(_rests_on(plan, k, body, rate, slack, slow))
+    return tuple(found)
 
 
 def _pressed_together(
@@ -263,13 +270,9 @@ def _rests_on(
 ) -> Scalar:
     """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
     about to be by a force that grows. Its position is known to within `slack`, its velocity to
-    `slow` and to the rounding of the force that held it; both to that of a search that ends
-    there."""
+    `slow`, and both to the rounding of a search that ends there."""
     contact, least = jnp.zeros_like(here.x), 4 * jnp.finfo(here.x.dtype).eps * plan.extent(k)
     slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
-    # The rounding of a force that has held it for a cycle: a woodpecker's leaves 0.03 of it.
-    held = 4 * jnp.finfo(here.x.dtype).eps * plan.machine.cycle * jnp.abs(here.a)
-    slow = jnp.maximum(slow, held)
     for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
             pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
