@@ -131,7 +131,10 @@ class SpecialTable(Table):
         # At a grazing the body turns on the stop, to rounding. Before an impact is lost, the turn
         # beside it is at v² from the stop: by that, the end is known to the root of rounding only.
         if kind not in TOUCHING or kind == REST or grazes is not None:
-            yield Event(room, lambda at: Ending(at, GRAZING), noise=ROUNDING)
+            # The turn of a grazing impact itself is at a distance of rounding.
+            slack = 2 * ROUNDING if kind == GRAZING else 0.0
+            near = lambda step: room(step) + slack
+            yield Event(near, lambda at: Ending(at, GRAZING), noise=ROUNDING)
 
     def _singular(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
         """Return the end at a grazing impact, where the monodromy matrix has a pole."""
