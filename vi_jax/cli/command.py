@@ -205,7 +205,7 @@ def run_in_parts(
         for done in range(0, cycles, length):
             now = min(length, cycles - done)
             run = simulate(machine, start, now, samples=samples, **options)
-            if done and run.outcome_cycle is not None and not bool(run.successful | run.failed):
+            if done and run.outcome_cycle is not None and run.outcome_cycle >= 0:
                 run = dataclasses.replace(run, outcome_cycle=run.outcome_cycle + before + done)
             runs.append(run)
             start, options["settle"] = run.last, 0

@@ -241,7 +241,7 @@ def _contacts_at(plan: Plan, start: State, here: list[Rates], growth: list[Scala
     for k, (body, rate) in enumerate(zip(here, growth, strict=True)):
         slack, slow = plan.rounding(k, start)
         if not exact(plan.machine, start):
-            # The rounding of a force that has held it for a cycle: 0.03 of it for a woodpecker.
+            # A resting body gathers the rounding of the force on it: a woodpecker 0.03 of this.
             share = 4 * float(jnp.finfo(body.x.dtype).eps)
             slow = jnp.maximum(slow, share * plan.machine.cycle * jnp.abs(body.a))
         found.append(_rests_on(plan, k, body, rate, slack, slow))

@@ -566,7 +566,8 @@ class Run(Summarized):
             return None
         name = self.outcomes[int(self.outcome)]
         before = count_of(int(self.outcome_cycle), "cycle")
-        return f"{name}, {before} and {self.outcome_phase:.6g} of the clock after the start"
+        clock = in_unit(f"{self.outcome_phase:.6g}", dict(self.units), "phase")
+        return f"{name}, {before} and {clock} after the start"
 
     def summary(self) -> str:
         """Return the last section and cycle, and the reason why the run ended, as text."""

@@ -245,9 +245,8 @@ def in_brackets(words: str, unit: str) -> str:
 
 
 def drive_speed(units: Mapping[str, str]) -> str:
-    """Return the label of the mean speed of a drive; in units of ω it is a ratio."""
-    unit = unit_of(units, "frequency_ratio")
-    return "frequency ratio ζ" if unit == "ω" else in_brackets("speed of the drive", unit)
+    """Return the name of the mean speed of a drive. In units of ω it is the frequency ratio ζ."""
+    return "ζ" if unit_of(units, "frequency_ratio") == "ω" else "speed of the drive"
 
 
 def unit_in(label: str) -> str:

@@ -43,8 +43,8 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     Only its weight drives it. A cycle ends when φS falls through `section_angle`, after a varying
     time. Its mean speed of descent is the average `descent`. Time is the independent variable, and
-    units are SI units. The stops are, in this order, `LOWER` and `UPPER`
-    edge of the sleeve and `BEAK`; the switches are the friction on each.
+    units are SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the sleeve and
+    `BEAK`; the switches are the friction on each.
 
     **Arguments:**
 

@@ -316,8 +316,8 @@ def boundary(
         several = ""
         if point.kind in TOUCHING and sum(lost_at(point.step)) > 1:
             several = (
-                " Several of its events are lost at once, as in a motion that is the same after a "
-                "half of its cycles: begin with the motion of that half."
+                " Several of its events vanish at once, as in a motion that repeats within its "
+                "period. Begin with the motion of fewer cycles."
             )
         raise ValueError(
             "Argument `point` could not be refined in two parameters (last correction "

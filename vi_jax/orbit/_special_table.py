@@ -73,8 +73,8 @@ _ZERO, _ENTRY = 1e-6, 1e-4
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
 
-# Events with a lower speed of approach (in their units) are lost: a choice, 20 times the greatest
-# at the end of a contact with a soft stop that grazes, which the corrector leaves.
+# Events with a lower speed of approach (in their units) are lost: a choice. The corrector leaves up
+# to 5e-8 at the release from a soft stop that grazes.
 _SLOW = 1e-6
 
 # Local maps of grazing motions are examined over so many periods.
@@ -121,15 +121,15 @@ class SpecialTable(Table):
             if kind != REST or event != grazes:
                 lost = lambda step, i=i: -float(step.seen.escape[i])
                 yield Event(lost, lambda at: Ending(at, REST), noise=ROUNDING)
-        for i, lost in enumerate(lost_at(here)):
+        for i, is_lost in enumerate(lost_at(here)):
             # In a symmetric motion another impact grazes as well, on a soft stop the release.
-            if kind == GRAZING and (lost or i == grazes):
+            if kind == GRAZING and (is_lost or i == grazes):
                 continue
             test = lambda step, i=i: float(step.seen.approach[i] / step.seen.units[i])
             lost = partial(self._singular, here, test)
             yield Event(test, lost, noise=ROUNDING)
-        # At a grazing the body turns on the stop, to rounding. Before an impact is lost, the turn
-        # beside it is at v² from the stop: by that, the end is known to the root of rounding only.
+        # At a grazing the body turns on the stop, to rounding. Close to a lost impact it turns at a
+        # distance of v². This row would locate that end to the root of rounding, so it is the last.
         if kind not in TOUCHING or kind == REST or grazes is not None:
             # The turn of a grazing impact itself is at a distance of rounding.
             slack = 2 * ROUNDING if kind == GRAZING else 0.0

@@ -88,8 +88,7 @@ def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
             what = "touches a stop" if isinstance(event, RigidStop) else f"grazes the {called}"
         return f"{what} {place_in_words(problem, at, clock)}"
     clock = float(problem.values(at.x)[0][impact])
-    event = problem.events[impact]
-    lost, word = event.of(machine), event.of(machine).word
-    if isinstance(lost, SoftStop):
-        word = f"contact with the {event.called(machine)}"
+    event, lost = problem.events[impact], problem.events[impact].of(machine)
+    soft = isinstance(lost, SoftStop)
+    word = f"contact with the {event.called(machine)}" if soft else lost.word
     return f"the {lost.name or word} {place_in_words(problem, at, clock)} is lost"

@@ -269,7 +269,10 @@ class Orbit(Summarized):
             )
         machine = self.machine
         if not bool(self.successful):
-            raise ValueError("`trajectory` needs an orbit that was found, but this is none.")
+            raise ValueError(
+                "`trajectory` needs an orbit, but the search for this one failed. Its `result` is "
+                "the reason."
+            )
         if cycles is None:
             cycles = int(self.cycles)
         if is_autonomous(machine, self.state):

@@ -105,8 +105,8 @@ def plot_branch(
     machine = branch.problem.machine
     along = x if x in branch.free else branch.name
     units = units_of(machine)
-    ax.set_xlabel(drive_speed(units) if x == "frequency_ratio" else axis_name(along, units))
-    ax.set_ylabel(extreme_name(y, machine.labels, units_of(machine), branch.averages))
+    ax.set_xlabel(_speed_label(units) if x == "frequency_ratio" else axis_name(along, units))
+    ax.set_ylabel(extreme_name(y, machine.labels, units, branch.averages))
     return ax
 
 
@@ -210,11 +210,17 @@ def extreme_name(
     least = {"y_min": "min", "y_max": "max"}.get(name)
     if least is None:
         if name == "frequency_ratio":
-            return f"mean {drive_speed(units)}"
+            return f"mean {_speed_label(units)}"
         quantity = quantity_of(name)
         name = f"{name.removeprefix('section_')} on the section" if "section_" in name else name
         return name if quantity is None else in_brackets(name, unit_of(units, quantity))
     return in_brackets(f"{least} {name_in(labels[0])}", unit_of(units, "position"))
+
+
+def _speed_label(units: Mapping[str, str]) -> str:
+    name = drive_speed(units)
+    unit = unit_of(units, "frequency_ratio")
+    return f"frequency ratio {name}" if name == "ζ" else in_brackets(name, unit)
 
 
 def axis_name(name: str, units: Mapping[str, str]) -> str:

@@ -39,6 +39,7 @@ from ..machine import (
     check_leaf,
     convert_start,
     cycles_in_words,
+    drive_speed,
     frequency_ratio,
     in_clock,
     may_rest,
@@ -166,7 +167,7 @@ class Sweep(Summarized):
         """Return the changes at each value that are far larger than at neighbours, if periodic."""
         name, units = name_in(self.labels[0]), dict(self.units)
         unit = unit_of(units, "frequency_ratio")
-        speed = "ζ" if unit == "ω" else "speed of the drive"
+        speed = drive_speed(units)
         numbers = {
             f"min {name}": (self.y_min, unit_of(units, "position")),
             f"max {name}": (self.y_max, unit_of(units, "position")),
