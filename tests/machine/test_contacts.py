@@ -214,7 +214,8 @@ def test_an_event_ends_the_motion_with_an_outcome():
     np.testing.assert_array_equal(walled.outcome, 1 - run.outcome)
     np.testing.assert_allclose(by_wall, by, rtol=1e-6)
     axes = {"start.u": speeds, "amplitude": [0.5]}
-    data = vi.scan(machine, axes, measure="sections", cycles=16, progress=False)
+    data = vi.scan(machine, axes, measure=(), cycles=4, derivatives="start.u", progress=False)
+    np.testing.assert_allclose(data.d_outcome_phase.values.ravel(), by, rtol=1e-6)
     for name in ("outcome", "outcome_cycle", "outcome_phase"):
         np.testing.assert_allclose(data[name].values[:, 0], getattr(run, name), rtol=1e-7)
 

@@ -155,7 +155,6 @@ def test_failing_lanes_are_counted_and_harm_no_other():
         ({"axes": {"stops.0.restitution": [0.5, 1.5]}}, r"`restitution`.*\[0, 1\]"),
         ({"axes": {}}, "`axes` must map"),
         ({"measure": "extreme"}, "near names: extremes"),
-        ({"measure": ()}, "at least one"),
         ({"cycles": 12}, "at least 128 for the measure Regime"),
         ({"derivatives": ["stops.1.gap"]}, "near names: stops.0.gap"),
         ({"store": "/dev/null/x"}, "`store` must be a path"),

@@ -379,7 +379,7 @@ def scan(
     - `measure`: the results: names among `"extremes"`, `"regime"`, `"frequency_ratio"`, `"power"`,
       `"impact_rate"`, `"sections"`, `"exponent"`, `"steps"`, or of the machine's own `averages`,
       which replace ours of the same name; `AbstractMeasure`s; functions of a lane's machine and
-      `Run` that return named numbers.
+      `Run` that return named numbers. `()` for outcomes alone.
     - `start`: the initial state; by default the machine's own start.
     - `settle`, `cycles`: the numbers of drive cycles before observation, and observed (static; by
       default 32 or as many as the measures need).

@@ -515,15 +515,12 @@ class Custom(AbstractMeasure):
 
 
 def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
-    """Return measures by name, as objects, or functions of a machine and a run; one or several.
+    """Return measures by name, as objects, or functions of a machine and a run; any number.
     Names of the machine's own `averages` come first. **Raises:** `ValueError` for an unknown name,
     `TypeError` for anything else."""
     if isinstance(measure, str) or callable(measure) or not isinstance(measure, Iterable):
         measure = (measure,)
-    found = tuple(_measure(one, averages) for one in measure)
-    if not found:
-        raise ValueError("Argument `measure` must name at least one measure, but is empty.")
-    return found
+    return tuple(_measure(one, averages) for one in measure)
 
 
 def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
@@ -546,7 +543,7 @@ def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
 def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
     """Return the number of cycles to observe: the given one, or what these measures need.
     **Raises:** `ValueError` if it is too small for one of them."""
-    needed = max(m.cycles for m in measures)
+    needed = max((m.cycles for m in measures), default=1)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:
         who = next(type(m).__name__ for m in measures if m.cycles > cycles)
