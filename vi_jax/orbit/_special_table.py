@@ -265,14 +265,16 @@ def _resonances(
     def local(step: Step) -> LocalMap:
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
 
-    known = [local(step) for step in steps]
+    # Where another impact is lost as well, at an end, the map has a pole: its sign is rounding.
+    usual = lost_at(steps[len(steps) // 2])
+    known = [None if (lost_at(step) & ~usual).any() else local(step) for step in steps]
     both = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
         begins = AT_CODIMENSION_TWO[RESONANT] if both else begins
         what = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
         test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
-        values = [each.resonance(n, sign) for each in known]
+        values = [np.nan if each is None else each.resonance(n, sign) for each in known]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
             if not before * after < 0:
                 continue
