@@ -1,4 +1,4 @@
-"""A body on a belt whose friction falls with the speed of sliding, for several packages' tests."""
+"""A body on a belt with velocity-weakening friction."""
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,7 @@ def level(speed):
 
 
 class Belt(vi.AbstractMachine):
-    """x'' = -x - 0.1 x' + friction of a belt that runs at `speed`; a cycle ends where the body is
-    furthest back."""
+    """x'' = -x - 0.1 x' + friction of a belt at `speed`; a cycle ends at the minimum of x."""
 
     speed: jax.Array | float = 1.5
 

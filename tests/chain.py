@@ -1,4 +1,4 @@
-"""Balls in a row that touch, with or without a wall behind the last."""
+"""A row of balls, with or without a wall behind the last."""
 
 from itertools import pairwise
 from typing import Any
@@ -8,8 +8,8 @@ import vi_jax as vi
 
 
 class Chain(vi.Mechanical):
-    """Balls without size, each to be left of the next, and the last one of a wall; a constant force
-    per mass presses them to the right."""
+    """Point masses on a line, each left of the next and the last left of the wall. The acceleration
+    `pressed` pushes them to the right."""
 
     restitution: Any = 1.0
     weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -41,21 +41,20 @@ class Chain(vi.Mechanical):
         return dict(zip(self.q, (m * self.pressed for m in self.weights), strict=True))
 
     def balls(self, x, v):
-        """A state of the chain."""
         x, v = (dict(zip(self.q, map(float, each), strict=True)) for each in (x, v))
         return self.at(**x, v=v)
 
 
 def row(z):
-    """The places and the velocities in states of a chain."""
+    """Return the positions and velocities of a chain as two arrays."""
     return np.array([x for name, x in vars(z).items() if name != "v"]), np.array(
         [*vars(z.v).values()]
     )
 
 
 def passed(v, k, masses, wall=False):
-    """Velocities after all impacts of balls that touch: the fastest approach first, equal ones
-    together; and the contacts struck, in their order. Of sequences that end."""
+    """Return the velocities after all impacts of touching balls, and the contacts in impact order.
+    The fastest approach is resolved first, equal ones together."""
     v, masses, struck = np.array(v, float), np.asarray(masses, float), []
     count = len(v) - 1 + wall
     normals = np.zeros((count, len(v)))
@@ -75,11 +74,11 @@ def passed(v, k, masses, wall=False):
 
 
 def dropped(heights, k, masses, until):
-    """Impacts (time, contact) of balls above a floor at `wall` = 0, each flight in closed form; the
-    force is one per mass."""
+    """Return the impacts (time, contact) of balls above a floor, with flights in closed form. Their
+    acceleration is 1, towards the floor."""
     x, v, time, found = -np.array(heights, float), np.zeros(len(heights)), 0.0, []
     while time < until:
-        # Balls fall alike, so that neighbours come together at their difference of speeds.
+        # Accelerations are equal: neighbours approach at a constant relative speed.
         waits = []
         for i in range(len(x) - 1):
             fast = v[i] - v[i + 1]

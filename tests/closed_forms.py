@@ -1,4 +1,4 @@
-"""Motions with one impact in closed form, compiled once for the tests that ask for them."""
+"""Motions with one impact per period in closed form, compiled once for all tests."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ def ideal(**changes):
 
 
 def fold_by_eq_21(k, d, low, high):
-    """Where the quadratic of Eq. 21 (with its ζ) in the impact speed has a double root."""
+    """Return the ζ at which Eq. 21, quadratic in the impact speed, has a double root."""
 
     def discriminant(zeta):
         steep = zeta * (1 + k) / np.tan(np.pi / zeta)

@@ -1,4 +1,4 @@
-"""All tests run in double precision; what takes most of their time, compiling, is kept short."""
+"""All tests run in double precision, with short compile times."""
 
 import gc
 import signal
@@ -10,12 +10,12 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
-# These rooms run the code that users run; in the others programs are compiled without optimisation,
-# which takes a third of the time off and changes rounding only.
+# Tests in these folders run optimised code, as users do. All others compile without optimisation:
+# this saves a third of the time and changes only rounding.
 _AS_SHIPPED = {"lanes", "robust", "experiments"}
 
-# The lanes' many small functions, which write a program's text, would take three times as long with
-# checks of annotations; they have a test of their own (`lanes/test_types.py`).
+# Checked annotations would make the many small functions of `lanes`, which generate code, three
+# times slower. They have a separate test (`lanes/test_types.py`).
 _PACKAGE = Path(__file__).parents[1] / "vi_jax"
 _UNCHECKED = {"__init__", "lanes"}
 
@@ -34,15 +34,15 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """The longest file comes first, so that no worker is left with it in the end."""
+    """Start the longest file first, so that no worker runs it alone at the end."""
     items.sort(key=lambda item: item.path.name != "test_checks.py")
 
 
-# A shell lets what it runs in the background ignore Ctrl-C, which some tests press.
+# A shell makes its background processes ignore Ctrl-C, which some tests send.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What JAX traces lives long, and collecting garbage among it takes a tenth of the time.
+# JAX's traces live long; garbage collection among them takes a tenth of the time.
 gc.set_threshold(200_000, 20, 20)
 
 _MAPS = Path("/proc/self/maps")
@@ -58,8 +58,8 @@ def _optimised_as_needed(request):
 
 @pytest.fixture(scope="module", autouse=True)
 def _room_for_programs():
-    """Compiled programs go before they use up the memory maps that Linux grants a process (65,530
-    by default), beyond which the compiler dies; a file of tests needs up to 31,000."""
+    """Drop compiled programs before the process reaches Linux's limit of memory maps (65,530 by
+    default), at which the compiler crashes. A test file needs up to 31,000."""
     yield
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()
@@ -67,7 +67,7 @@ def _room_for_programs():
 
 @pytest.fixture
 def compilations():
-    """A list of the programs that are compiled meanwhile."""
+    """Return a list that grows by one entry with each compilation."""
     found = []
     note = lambda event, *_, **__: found.append(event) if "backend_compile" in event else None
     jax.monitoring.register_event_duration_secs_listener(note)

@@ -1,12 +1,11 @@
-"""A harmonically forced oscillator with dry friction that never stops, in closed form."""
+"""Non-stop motion of a harmonically forced oscillator with dry friction, in closed form."""
 
 import numpy as np
 
 
 def den_hartog(r, f):
-    """Amplitude of the motion that never stops, and the friction up to which there is one; both
-    for a force of amplitude one on a body of unit mass and spring (Den Hartog, Transactions of the
-    ASME 53, 1931)."""
+    """Return the amplitude of the non-stop motion and the largest friction at which it exists.
+    Mass, stiffness and force amplitude are 1 (Den Hartog, Transactions of the ASME 53, 1931)."""
     response = 1 / (1 - r * r)
     loss = np.sin(np.pi / r) / (r * (1 + np.cos(np.pi / r)))
     t = np.linspace(1e-4, np.pi - 1e-4, 200001)

@@ -1,4 +1,4 @@
-"""Derivatives of simulated motions beside what they must agree with."""
+"""Compare derivatives of simulated motions with finite differences."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,9 +11,8 @@ import vi_jax as vi
 
 
 def quick(cases, *names, slow=None):
-    """Of these cases only the named ones run by default; the rest with the longer studies, or only
-    those of `slow` with these and all others before a release. A case of several arguments is a
-    tuple."""
+    """Mark all cases but `names` as slow, so that only these run by default. If `slow` is given,
+    other cases are exhaustive (run before a release). A case of several arguments is a tuple."""
 
     def marks(x):
         return pytest.mark.slow if slow is None or x in slow else pytest.mark.exhaustive
@@ -25,7 +24,7 @@ def quick(cases, *names, slow=None):
 
 
 def some(cases, *names):
-    """Of these cases the named ones run with the longer studies; the rest before a release."""
+    """Mark the named cases as slow and all others as exhaustive."""
     return quick(cases, slow=names)
 
 
@@ -37,10 +36,10 @@ def check_derivatives(
     tolerance: float = 1e-6,
     impacts: int,
 ) -> None:
-    """Forward derivatives beside central differences, and reverse ones beside forward ones.
+    """Compare forward derivatives with central differences, and reverse with forward derivatives.
 
-    `last(x)` simulates by a vector of numbers, and gives the state at the end and the
-    impacts, which no step may change, and of which there are to be at least so many.
+    `last(x)` returns the final state and the impact counts. No difference step may change the
+    counts, and their sum must be at least `impacts`.
     """
     at = jnp.asarray(at)
     steps = jnp.diag(jnp.broadcast_to(jnp.asarray(step), at.shape))
@@ -50,14 +49,14 @@ def check_derivatives(
         found = jnp.stack(jax.tree.leaves(state))
         return found, (found, counts)
 
-    # One program gives the derivatives here and the motions on both sides.
+    # One program computes the derivatives and the motions on both sides.
     places = jnp.concatenate([at[None], at + steps, at - steps])
     slopes, (moved, counts) = vi.jit(jax.vmap(jax.jacfwd(numbers, has_aux=True)))(places)
     assert (counts == counts[0]).all() and int(counts[0].sum()) >= impacts
     forward, (ahead, behind) = np.asarray(slopes[0]), np.split(np.asarray(moved[1:]), 2)
     slope = (ahead - behind).T / (2 * np.diag(steps))
     np.testing.assert_allclose(forward, slope, rtol=tolerance, atol=tolerance)
-    # Another weight for each component, so that none can be left out.
+    # Weights differ, so that a missing component is noticed.
     weights = jnp.arange(1.0, forward.shape[0] + 1)
     backward = vi.jit(jax.grad(lambda x: weights @ numbers(x)[0]))(at)
     np.testing.assert_allclose(backward, weights @ forward, rtol=1e-12, atol=1e-12)

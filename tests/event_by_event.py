@@ -1,4 +1,4 @@
-"""Motions with events that SciPy follows one by one."""
+"""Follow a motion from event to event with SciPy."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,12 +14,12 @@ def followed(
     events: Sequence[tuple[Callable[..., Any], Callable[..., Any]]],
     **options: Any,
 ) -> tuple[float, np.ndarray, list[int]]:
-    """Follow a motion from the state `begin` at time 0 to `end`, by DOP853.
+    """Integrate from the state `begin` at time 0 to `end` with DOP853.
 
-    **Arguments:** `events` are pairs of a guard of time and state, which rises through zero, and of
-    a function of both that returns the state after the event, or `None` where the motion is to end.
+    **Arguments:** `events` are pairs of functions of time and state. An event happens when the
+    first rises through zero. The second returns the state after it, or `None` to end the motion.
 
-    **Returns:** the last time, the state there, and the numbers of the events met.
+    **Returns:** the last time, the state there, and the indices of the events.
     """
 
     def watched(guard: Any) -> Any:

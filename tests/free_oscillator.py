@@ -1,11 +1,11 @@
-"""A damped oscillator without stops or a drive: under noise everything is known of it."""
+"""A damped free oscillator, whose response to noise is known in closed form."""
 
 import jax.numpy as jnp
 import vi_jax as vi
 
 
 class Free(vi.AbstractMachine):
-    """x'' + 0.2 x' + x = σ dW, of temperature σ²/0.4."""
+    """x'' + 0.2 x' + x = σ dW, with stationary variance σ²/0.4."""
 
     cycle = 2 * jnp.pi
 

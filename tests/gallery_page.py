@@ -1,4 +1,4 @@
-"""The page of other codes' examples, taken apart."""
+"""Parse the page of examples from other codes."""
 
 import re
 
@@ -6,12 +6,12 @@ from validated.__main__ import PAGE
 
 
 def sections():
-    """The page's parts, one for each script, by their names."""
+    """Return the page's sections by the name of their script."""
     _, *parts = re.split(r"^## ", PAGE.read_text(encoding="utf-8"), flags=re.M)
     return {re.findall(r"validated/(\w+)\.py\), \d+ s\.", part)[0]: part for part in parts}
 
 
 def rows(part):
-    """The cells of a section's table, without its head."""
+    """Return the cells of a section's table, without its header."""
     lines = [x for x in part.splitlines() if x.startswith("|")][2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

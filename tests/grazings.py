@@ -1,4 +1,4 @@
-"""Branches that end where a stop is just touched, for the tests of what follows."""
+"""Find the grazing at which a branch ends."""
 
 import vi_jax as vi
 

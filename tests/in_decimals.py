@@ -1,6 +1,6 @@
 """A body between a shaker and a stop in 40 digits: Y'' + 2ξ Y' + Y = cos(ζ τ), Y ≤ d.
 
-Its steps are Taylor series, their roots by Newton's method, and nothing is of the library.
+Steps are Taylor series, roots are found by Newton's method. The library is not used.
 """
 
 import math
@@ -10,8 +10,8 @@ _ORDER, _STEP, _TINY = 44, Decimal("0.25"), Decimal("1e-30")
 
 
 def rests_again(zeta, k, d, xi):
-    """Whether the body, released by its stop, comes to rest there before the stop lets go once
-    more; it chatters."""
+    """Return whether the body, just released by its stop, chatters to rest on it before the force
+    on it changes sign again."""
     with localcontext(prec=45):
         return _rests_again(*(Decimal(str(x)) for x in (zeta, k, d, xi)))
 
@@ -20,11 +20,11 @@ def _rests_again(zeta, k, d, xi):
     y, v, cos, sin, on_stop = d, Decimal(0), d, (1 - d * d).sqrt(), False
     clock = Decimal(0)
     while zeta * clock < Decimal(math.tau):
-        pressed, fading = cos - d, zeta * sin  # what presses a body at rest there, and its rate
+        pressed, fading = cos - d, zeta * sin  # contact force of a body at rest, and its decay rate
         if on_stop and pressed <= 0:
             return False
         if on_stop and fading > 0 and -v * fading < Decimal("0.005") * pressed**2:
-            return True  # less than 4 % of the time that is left is needed
+            return True  # chatter needs less than 4 % of the remaining time
         Y, C, S = _series(zeta, xi, y, v, cos, sin)
         room = [Y[0] - d, *Y[1:]]
         if on_stop:
@@ -60,7 +60,7 @@ def _slope(series, x):
 
 
 def _first(series, x):
-    """The root near x, if within a step."""
+    """Return the root near x, or `None` if it is not within a step."""
     if not 0 < x < _STEP:
         return None
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Machines that stand still but for a kick in each cycle: their section map is any map."""
+"""Machines that only move at one reset per cycle, so that their section map can be any map."""
 
 import equinox as eqx
 import jax
@@ -7,7 +7,7 @@ import vi_jax as vi
 
 
 class Kicked(vi.AbstractMachine):
-    """The map is `kick`, of a state that nothing else moves."""
+    """The section map is `kick`; between resets the state is constant."""
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)
@@ -25,7 +25,7 @@ class Kicked(vi.AbstractMachine):
         )
 
     def kick(self, *x):
-        """The state after a cycle."""
+        """Return the state after a cycle."""
         raise NotImplementedError
 
     def field(self, s, x):
@@ -42,7 +42,7 @@ def at(*x):
     return tuple(jnp.asarray(y, float) for y in x)
 
 
-# Powers of x, y, a and b.
+# Exponents of x, y, a and b.
 POWERS = (
     (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (2, 0, 0, 0), (1, 1, 0, 0),
     (0, 2, 0, 0), (3, 0, 0, 0), (1, 0, 1, 0), (1, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 2),
@@ -51,8 +51,8 @@ POWERS = (
 
 
 class Polynomial(Kicked):
-    """Both numbers become polynomials of themselves and of a and b, all by the same programs.
-    Between kicks x' = -decay x³."""
+    """A polynomial map of (x, y) with parameters a and b; between kicks x' = -decay x³.
+    All such maps share one compiled program."""
 
     shares: jax.Array = eqx.field(kw_only=True)
     decay: jax.Array = eqx.field(kw_only=True, converter=jnp.asarray)
@@ -66,7 +66,7 @@ class Polynomial(Kicked):
 
 
 def polynomial(a, b, *rows, decay=0.0):
-    """The machine whose rows say by which factor each term enters."""
+    """Return a machine; each row maps exponents to the coefficient of their term."""
     shares = [[row.get(power, 0.0) for power in POWERS] for row in rows]
     assert all(power in POWERS for row in rows for power in row)
     return Polynomial(a, b, shares=jnp.asarray(shares), decay=decay)

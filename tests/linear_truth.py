@@ -1,4 +1,4 @@
-"""Linear machines with rigid stops by SciPy's matrix exponential, apart from the package."""
+"""Linear machines with rigid stops by SciPy's matrix exponential, independent of the package."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 
 class Chatters(Exception):
-    """More impacts in a cycle than can be followed one by one."""
+    """A cycle has more impacts than `most`."""
 
 
 class Contact(NamedTuple):
@@ -22,9 +22,9 @@ class Contact(NamedTuple):
 class LinearTruth:
     """M x'' + C x' + K x = f₀ + f₁ cos ωs + f₂ sin ωs between stops.
 
-    The state is (x, v, 1, cos ωs, sin ωs), which a matrix carries. Steps of a fortieth of the
-    fastest period are looked at, at both ends and at the turn between them, and events found by
-    halving. A contact without restitution rests on its stop until its force turns."""
+    The state is (x, v, 1, cos ωs, sin ωs), so that the flow is linear. Gaps are checked at both
+    ends of each step (1/40 of the fastest period) and at their extremum in it. Events are found by
+    bisection. A contact without restitution rests on its stop until its force changes sign."""
 
     def __init__(self, matrices, loads, frequency, contacts, most=60):
         mass, damping, stiffness = (np.asarray(x, float) for x in matrices)
@@ -41,7 +41,7 @@ class LinearTruth:
         self.known = {}
 
     def held(self, resting):
-        """The matrix while these contacts rest."""
+        """Return the matrix of the flow while these contacts rest."""
         if not resting:
             return self.free
         c = np.stack([self.contacts[i].row for i in resting])
@@ -71,7 +71,7 @@ class LinearTruth:
         return self.contacts[i].sign * (self.contacts[i].row @ rate[self.n : 2 * self.n])
 
     def first_zero(self, resting, z, length, function):
-        """Where a function of the state, negative here, is positive first, as far as it is seen."""
+        """Return a time at which a function of the state changes from negative to positive."""
         low, high = 0.0, length
         for _ in range(52):
             middle = 0.5 * (low + high)
@@ -82,7 +82,7 @@ class LinearTruth:
         return high
 
     def event(self, resting, z, length):
-        """Time and contact of the first event within a step, or `None`."""
+        """Return time and contact of the first event within a step, or `None`."""
         end, found = self.moved(resting, length, z), []
         for i in range(len(self.contacts)):
             if i in resting:
@@ -97,7 +97,7 @@ class LinearTruth:
                     )
                 continue
             reach = length
-            if self.speed(i, z) > 0 > self.speed(i, end):  # it turns in between
+            if self.speed(i, z) > 0 > self.speed(i, end):  # the gap has an extremum in the step
                 reach = self.first_zero(resting, z, length, lambda y, i=i: -self.speed(i, y))
             top = expm(self.held(resting) * reach) @ z
             if self.depth(i, top) > 1e-13 and self.speed(i, top) > -1e-9:
@@ -110,12 +110,12 @@ class LinearTruth:
         return min(found) if found else None
 
     def cycle(self, x, v, resting=()):
-        """State and impacts after a cycle from s = 0, and what rests then."""
+        """Return positions, velocities, number of impacts and resting contacts after a cycle."""
         z, clock, impacts = np.concatenate([x, v, [1.0, 1.0, 0.0]]), 0.0, 0
         period = 2 * np.pi / self.frequency
         step, behind = period / self.steps, 0
         while clock < period * (1 - 1e-14):
-            # Behind an impact a hop may begin and end within a step.
+            # After an impact, a hop may begin and end within a step.
             length = min(step / 16 if behind < 32 else step, period - clock)
             behind += 1
             event = self.event(resting, z, length)

@@ -1,6 +1,6 @@
-"""Calls that cannot be run, each with what must be said. Prints what was said instead, if any.
+"""Invalid calls, each with a part of its error message. The script prints all that deviate.
 
-A script of its own: its calls fill caches that other tests would share."""
+It runs in a separate process, since its calls fill caches that other tests would share."""
 
 import datetime
 import importlib
@@ -22,7 +22,7 @@ REGION = {"start.Y": (0.0, 1.0)}
 
 
 class Own(vi.AbstractMachine):
-    """A body on a spring, alone."""
+    """A free oscillator."""
 
     cycle: float = 1.0
 

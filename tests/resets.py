@@ -1,4 +1,4 @@
-"""Machines whose state jumps by rules of their own, each with numbers known otherwise."""
+"""Machines with resets, for which the tests have independent results."""
 
 import equinox as eqx
 import jax
@@ -8,15 +8,14 @@ import vi_jax as vi
 
 
 def legs(stance, turning):
-    """Just after a heel strike: angles of the leg that stands and between both, and their rates."""
+    """Return the state after a heel strike: stance angle, inter-leg angle, and rates."""
     swinging = turning * (1 - jnp.cos(2 * stance))
     return vi.State(stance=stance, turning=turning, between=2 * stance, swinging=swinging)
 
 
 class Walker(vi.AbstractMachine):
-    """The simplest walker (Garcia, Chatterjee, Ruina and Coleman, J. Biomech. Eng. 120, 1998): with
-    a heel strike, which ends a cycle, the legs change their parts. The foot that swings scuffs the
-    ground as it passes the other."""
+    """The simplest walker (Garcia, Chatterjee, Ruina and Coleman, J. Biomech. Eng. 120, 1998). At a
+    heel strike, which ends a cycle, the legs exchange roles. Foot scuffing is ignored."""
 
     slope: jax.Array = eqx.field(converter=jnp.asarray)
     cycle = 4.0
@@ -51,9 +50,9 @@ class Walker(vi.AbstractMachine):
 
 
 class StickSlip(vi.AbstractMachine):
-    """An impactor drawn by a voltage (COCO's example of impacts with stick and slip, Dankowicz and
-    Schilder, Recipes for Continuation, 2013): an impact makes the base slide until friction holds
-    it. The mode is 1 while it slides."""
+    """An electrostatic impactor (COCO's example with stick and slip, Dankowicz and Schilder,
+    Recipes for Continuation, 2013). After an impact the base slides until friction stops it. The
+    mode is 1 while it slides."""
 
     voltage: jax.Array = eqx.field(converter=jnp.asarray)
 
@@ -78,7 +77,7 @@ class StickSlip(vi.AbstractMachine):
 
     def field(self, s, x, slides):
         force = (self.voltage * jnp.sin(0.92 * s) / (1 - x.q)) ** 2 - 0.04 * x.v - x.q
-        # While it sticks u is zero: what fades there leaves no neutral component.
+        # u is zero while the base sticks; u' = -u there avoids a Floquet multiplier of 1.
         braked = jnp.where(slides > 0, -3.17 - 0.2 * force, -x.u)
         return dict(q=x.v, v=force + slides * (3.17 + 0.2 * force), u=braked)
 
@@ -94,7 +93,7 @@ A = np.column_stack([-np.poly(ROOTS).real[1:], [1, 0, 0], [0, 1, 0]])
 
 
 class ThreeStates(vi.AbstractMachine):
-    """x' = A x, and where x1 falls through 1 at the speed v: x2 -= b v, x3 -= 1.6 v."""
+    """x' = A x; when x1 falls through 1 with velocity v, x2 -= b v and x3 -= 1.6 v."""
 
     b: jax.Array = eqx.field(converter=jnp.asarray)
     cycle = 5.0
@@ -115,7 +114,7 @@ class ThreeStates(vi.AbstractMachine):
 
 
 class Excited(vi.AbstractMachine):
-    """x'' = 0.2 x' - x against a stop; a cycle ends with an impact."""
+    """x'' = 0.2 x' - x with a stop; a cycle ends at an impact."""
 
     restitution: jax.Array = eqx.field(default=0.6, converter=jnp.asarray)
 

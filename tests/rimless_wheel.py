@@ -1,4 +1,4 @@
-"""A rimless wheel that walks down a slope, for the tests of several packages."""
+"""A rimless wheel that walks down a slope."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +8,11 @@ ALPHA = 0.3
 """Half the angle between two spokes."""
 
 MULTIPLIER = np.cos(2 * ALPHA) ** 2
-"""Of its step, at any slope: what a heel strike leaves of the energy."""
+"""Multiplier of a step at any slope: the part of the energy that is left after a heel strike."""
 
 
 class Wheel(vi.AbstractMachine):
-    """An inverted pendulum; a step ends where the next spoke comes down."""
+    """An inverted pendulum; a step ends when the next spoke touches the ground."""
 
     slope: float = 0.08
 

@@ -1,5 +1,4 @@
-"""A driven body on a rough floor, its branches, and its motions as SciPy follows them from event to
-event."""
+"""A driven body with dry friction: its branches, and its motions by SciPy from event to event."""
 
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 
-SINCE = 0.3  # of the drive's phase on the section
+SINCE = 0.3  # phase of the drive on the section
 
 
 class Rough(vi.AbstractMachine):
@@ -45,14 +44,14 @@ def branch_of(parameter, bounds, *, max_step=0.1, **numbers):
 
 
 def on_both_sides(point, parameter, bounds, distance=0.01):
-    """The special point at which the motion on the other side ends, close to this one."""
+    """Return the special point nearest to `point` on the branch of the other side's motion."""
     other = point.switch(distance=distance)
     branch = vi.continue_orbit(other, parameter=parameter, bounds=bounds, step=1e-3)
     return min(branch.special, key=lambda x: abs(x.parameter - point.parameter))
 
 
 def settled(omega, level, second, damping, cycles=10):
-    """Phase, place, mode before and after each event of the last cycle, by SciPy."""
+    """Return phase, position, mode before and after each event of the last cycle, by SciPy."""
 
     def drive(phase):
         return np.cos(phase) + second * np.cos(2 * phase + 1)
@@ -69,7 +68,7 @@ def settled(omega, level, second, damping, cycles=10):
     phase, x, mode, events = SINCE, np.array([0.1, 0.0]), 0, []
     end = SINCE + 2 * np.pi * cycles
     while True:
-        # From zero velocity the guard of a slip has first to fall.
+        # At zero velocity the guard of the slip is zero, and must first become negative.
         first = min(phase + (1e-6 if mode else 0.0), end)
         options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
         x = solve_ivp(field, (phase, first), x, **options).y[:, -1] if first > phase else x

@@ -1,4 +1,4 @@
-"""A body that dry friction holds and brakes, and a block on a floor, for several files."""
+"""A body with dry friction, and a block on a floor."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,8 +10,7 @@ import vi_jax as vi
 
 
 class Rubbing(vi.AbstractMachine):
-    """x'' = force(machine, s, x) - level · load(machine, s, x) · friction, with numbers of its own
-    by name."""
+    """x'' = force(machine, s, x) - level · load(machine, s, x) · friction; `numbers` are parameters."""
 
     force: Callable = eqx.field(static=True)
     level: Any = 1.0
@@ -36,7 +35,7 @@ class Block(vi.Mechanical):
     pull: Any = 0.0
     """Amplitude of a force cos t along the floor."""
     lift: Any = 0.0
-    """Amplitude of a force sin 2t up."""
+    """Amplitude of an upward force sin 2t."""
     weight: Any = 1.0
     q = ("x", "y")
     cycle = 2 * jnp.pi

@@ -1,4 +1,4 @@
-"""An oscillator that is shaken against a stop, with averages and quantities of its own."""
+"""A driven oscillator with a stop, which defines averages and quantities."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import vi_jax as vi
 
 
 class Shaken(vi.AbstractMachine):
-    """By phase, so that time is another number than s."""
+    """The independent variable s is the phase, so that it differs from time."""
 
     amplitude: jax.Array | float = 1.0
     frequency: jax.Array | float = 0.8

@@ -1,12 +1,12 @@
-"""Shooting without this package: flights to events, fixed points of a map and its derivative."""
+"""Shooting with SciPy: integration to events, fixed points of a map and their derivatives."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 
 def flown(field, s, x, end, guards, noted=None):
-    """From the state `x` at `s` on until the first guard rises above zero: which one (`None` if
-    `end` comes first), when, the state there; and those on the way at which `noted` rises."""
+    """Integrate from the state `x` at `s` until a guard rises through zero, or to `end`. Return the
+    guard's index (or `None`), s and state there, and the states at which `noted` rises."""
 
     def watched(guard, terminal):
         def value(s, x):
@@ -24,7 +24,7 @@ def flown(field, s, x, end, guards, noted=None):
 
 
 def derivative(function, x, h):
-    """By differences of fourth order."""
+    """Differentiate by finite differences of fourth order."""
     columns = []
     for step in h * np.eye(len(x)):
         near = function(x + step) - function(x - step)
@@ -34,7 +34,7 @@ def derivative(function, x, h):
 
 
 def fixed_point(function, x, h=1e-4):
-    """The fixed point near `x`, and the derivative of the map there."""
+    """Return the fixed point near `x`, and the derivative of the map there."""
     x = np.array(x, float)
     matrix = derivative(function, x, h)
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""Random structures with stops, and what they do by matrix exponentials."""
+"""Random structures with stops, and their motions by matrix exponentials."""
 
 import numpy as np
 import vi_jax as vi
@@ -9,7 +9,7 @@ KINDS = ("undamped", "proportional", "general", "defective", "rigid")
 
 
 def matrices(random, n, kind):
-    """Random M, C, K with natural frequencies of 0.7 to 3."""
+    """Return random M, C, K with natural frequencies between 0.7 and 3."""
     root = random.normal(size=(n, n))
     mass = root @ root.T / n + 0.5 * np.eye(n)
     shapes = np.linalg.cholesky(mass) @ np.linalg.qr(random.normal(size=(n, n)))[0]
@@ -23,7 +23,7 @@ def matrices(random, n, kind):
     elif kind == "general":
         root = 0.3 * random.normal(size=(n, n))
         damping = damping + root @ root.T
-    elif kind == "defective":  # each mode critically damped: a double root without a second mode
+    elif kind == "defective":  # critically damped modes: double roots with one eigenvector
         damping = shapes * 2 * omega @ shapes.T
     return tuple(0.5 * (x + x.T) for x in (mass, damping, stiffness))
 

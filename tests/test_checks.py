@@ -1,4 +1,4 @@
-"""What is passed in is looked at before any work, and refused with a sentence that names it."""
+"""Arguments are checked before any work, and error messages name the argument."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from vi_jax import _checks
 from vi_jax._messages import warn, warning_once
 
 
-def test_calls_that_cannot_be_run_are_refused_with_a_reason():
+def test_invalid_calls_raise_with_a_reason():
     script = Path(__file__).with_name("refused_calls.py")
     root = Path(_checks.__file__).parents[1]
     process = subprocess.run(
@@ -29,9 +29,8 @@ def test_calls_that_cannot_be_run_are_refused_with_a_reason():
     assert found["wrong"] == {} and found["calls"] > 100
 
 
-def test_annotations_hold_for_one_machine_through_every_verb():
-    """The same holds for machines whose contacts act by themselves. Annotations are checked where
-    a module is imported, so this takes another process."""
+def test_annotations_hold_in_every_verb():
+    """Annotations are checked from the import of a module on, so this needs another process."""
     root = Path(__file__).parents[1]
     options = ["--annotations", "-n", "0", "-q", "-p", "no:cacheprovider", "-m", ""]
     options += ["-k", "[pair] or two_frictions or floor_that"]
@@ -44,7 +43,7 @@ def test_annotations_hold_for_one_machine_through_every_verb():
     assert "12 passed" in process.stdout
 
 
-def test_no_more_than_the_memory_is_asked_for():
+def test_requests_beyond_the_memory_raise():
     _checks.fits_memory("cycles", 1e6)
     with pytest.raises(ValueError, match=r"`cycles` must ask for results that fit into the memory"):
         _checks.fits_memory("cycles", 1e18)
@@ -57,7 +56,7 @@ def test_all_numbers_of_an_array_must_be_in_range():
         assert bool(_checks.in_range(put)) == good
 
 
-def test_a_warning_is_given_once_in_a_call():
+def test_a_warning_is_given_once_per_call():
     @warning_once
     def call():
         for words in ("one", "one", "other"):

@@ -1,4 +1,4 @@
-"""Packages import one way, nothing private of each other, and no file outgrows its subject."""
+"""Packages import in one direction and nothing private; no file is too long."""
 
 import ast
 import importlib
@@ -13,14 +13,14 @@ import vi_jax
 HOUSE = Path(__file__).parents[1] / "vi_jax"
 FILES = sorted(HOUSE.rglob("*.py"))
 
-# Each may import from those before it.
+# Each package may import from those before it.
 ORDER = "lanes machine flow machines orbit scans robust plot explore cli".split()
 LATE = [["machines", "named"], ["explore", "serve"], ["explore", "subject"]]
 TOOLS = {"_checks", "_messages", "_programs", "_types"}
 
 
 def imports(path: Path) -> Iterator[tuple[list[str], str]]:
-    """The package's own modules that a file imports from, and the names taken."""
+    """Yield the modules of the package that a file imports from, and the imported names."""
     here = list(path.relative_to(HOUSE).parts[:-1])
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if not isinstance(node, ast.ImportFrom):
@@ -36,7 +36,7 @@ def imports(path: Path) -> Iterator[tuple[list[str], str]]:
             yield words, name.name
 
 
-def test_packages_import_one_way_and_nothing_private():
+def test_packages_import_in_one_direction_and_nothing_private():
     packages = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").exists()}
     assert packages == set(ORDER)
     seen = 0
@@ -50,7 +50,7 @@ def test_packages_import_one_way_and_nothing_private():
                 continue
             seen += 1
             assert other in ORDER and ORDER.index(other) < ORDER.index(package), (path, other)
-            # By the one way in, its `__init__`; what takes long to load is loaded where it is used.
+            # Import from `__init__`, except for modules that load slowly.
             assert len(words) <= 1 or words in LATE, (path, words)
             assert not name.startswith("_"), (path, name)
     assert seen > 100
@@ -60,7 +60,7 @@ def test_no_file_has_more_than_800_lines():
     assert not [path for path in FILES if path.read_text(encoding="utf-8").count("\n") > 800]
 
 
-def test_each_name_is_listed_once_and_is_that_of_its_package():
+def test_each_name_is_listed_once_and_belongs_to_its_package():
     listed = [
         (name.name, node.module)
         for node in ast.parse((HOUSE / "__init__.pyi").read_text(encoding="utf-8")).body
@@ -84,7 +84,7 @@ def test_a_machine_has_the_members_that_a_user_writes_or_calls():
     assert not [name for name in members if f"`{name}`" not in told and f".{name}(" not in told]
 
 
-def test_what_simulates_loads_nothing_else():
+def test_simulate_loads_no_other_package():
     others = {f"vi_jax.{name}" for name in ("machines", "orbit", "scans", "robust", "plot")}
     run = f"import sys, vi_jax; vi_jax.simulate; print([x for x in sys.modules if x in {others}])"
     command = [sys.executable, "-c", run]
@@ -92,7 +92,7 @@ def test_what_simulates_loads_nothing_else():
     assert out.stdout.strip() == "[]"
 
 
-def test_what_is_listed_is_what_is_offered():
+def test_dir_lists_public_names_only():
     listed = dir(vi_jax)
     inner = {"TYPE_CHECKING", "importlib", "lanes", "flow", "orbit", "machine", "sys"}
     assert not inner & {*listed}

@@ -1,7 +1,4 @@
-"""Ten mistakes that everybody makes once, and others: each is answered by a sentence that says what
-to do.
-
-The page `docs/faq.md` lists the ten in this order."""
+"""Error messages of ten common mistakes, in the order of the page `docs/faq.md`, and others."""
 
 import math
 import warnings
@@ -17,7 +14,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 
 
 class Machine(vi.AbstractMachine):
-    """A driven oscillator with a stop, whose field is spoilt below."""
+    """A driven oscillator with a stop; subclasses make a mistake in its field."""
 
     omega: jax.Array | float = 0.9
     contacts: tuple = (vi.RigidStop(2.0, 0.5),)
@@ -71,21 +68,21 @@ def simulate(machine):
 
 
 def refused(call):
-    """What is said of a call that raises."""
+    """Return the error message of a call."""
     with pytest.raises((TypeError, ValueError)) as caught:
         call()
     return str(caught.value)
 
 
 def warned(call):
-    """What a call warns of."""
+    """Return the warnings of a call."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         call()
     return " ".join(str(x.message) for x in caught)
 
 
-def test_1_a_name_that_is_not_there():
+def test_1_an_unknown_name():
     wrong = lambda: vi.scan(SCENE, {"frequency_ratio": [0.9]})
     assert "near names: drive.frequency_ratio" in refused(wrong)
     assert "it is called `Y`" in refused(lambda: SCENE.start(y=0.5))
@@ -104,12 +101,12 @@ def test_3_single_precision():
 
 
 def test_4_arguments_in_another_order():
-    """That of machine and start is among the calls of `refused_calls.py`."""
+    """`refused_calls.py` has a call with machine and start swapped."""
     said = refused(lambda: vi.RigidStop(0.5, 2.0))
     assert "`restitution` must be finite and in [0, 1]" in said
 
 
-def test_5_a_field_of_another_period():
+def test_5_a_field_with_another_period():
     said = warned(lambda: simulate(OtherPeriod()))
     assert "`cycle` must be a period of the field" in said
     assert not warned(lambda: simulate(Machine()))
@@ -138,7 +135,7 @@ def test_9_a_field_that_returns_no_state():
     assert all("must return the components of its state" in said for said in (nothing, row))
 
 
-def test_10_a_guess_of_no_stable_motion():
+def test_10_a_guess_far_from_stable_motion():
     orbit = vi.find_orbit(
         SCENE, SCENE.start(Y=1.0, V=50.0), cycles=1, root_finder=vi.Newton(max_steps=2)
     )

@@ -1,4 +1,4 @@
-"""Programs go before they use up the memory maps that Linux grants a process."""
+"""Compiled programs are dropped before the process reaches Linux's limit of memory maps."""
 
 import warnings
 
@@ -14,24 +14,24 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
 
 
 def section(cycles):
-    with vi.backend("xla"):  # whose programs take hundreds of maps
+    with vi.backend("xla"):  # its programs take hundreds of maps
         return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
 
 
 @pytest.fixture
 def watch(monkeypatch):
-    """A watch that looks at every call."""
+    """Return a watch that checks at every call."""
     watch = _programs._Watch()
     monkeypatch.setattr(_programs, "_watch", watch)
     monkeypatch.setattr(_programs, "_SELDOM", 0)
     monkeypatch.setattr(_programs, "_PAUSE", 0)
-    # Which takes seconds where earlier tests have left much, and whose effect is given here.
+    # Collection takes seconds after other tests; `maps_used` is replaced anyway.
     monkeypatch.setattr(_programs.gc, "collect", lambda: 0)
     return watch
 
 
 @pytest.mark.slow
-def test_what_was_called_last_goes_last(watch, monkeypatch):
+def test_the_program_called_last_is_dropped_last(watch, monkeypatch):
     dropped = []
 
     def program(name):
@@ -53,7 +53,7 @@ def test_what_was_called_last_goes_last(watch, monkeypatch):
         a(jnp.zeros(3))
 
 
-def test_elsewhere_nothing_is_looked_at(watch, monkeypatch, tmp_path):
+def test_systems_without_memory_maps_give_no_warning(watch, monkeypatch, tmp_path):
     monkeypatch.setattr(_programs, "_MAPS", tmp_path / "maps")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -61,7 +61,7 @@ def test_elsewhere_nothing_is_looked_at(watch, monkeypatch, tmp_path):
 
 
 class Table(vi.AbstractMachine):
-    """A spring pushed by a table and by a little that has no vector form, or by a cosine."""
+    """An oscillator driven by a cosine, or by a table plus a small term without a vector form."""
 
     looked_up: bool
     contacts: tuple = (vi.RigidStop(1.5, 0.7),)
@@ -76,9 +76,9 @@ class Table(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
-    """A program is compiled quickly only if its loops are not XLA's."""
-    _primitive._warn.cache_clear()  # which may have been told in this process
+def test_fields_without_a_vector_form_are_compiled_in_full(monkeypatch):
+    """A program is compiled quickly only if XLA does not compile its loops."""
+    _primitive._warn.cache_clear()  # the warning may have been given in this process
     made = []
     original = _programs.CompiledFunction._quick.func
     monkeypatch.setattr(
@@ -102,17 +102,17 @@ def test_what_has_no_vector_form_is_compiled_in_full(monkeypatch):
     np.testing.assert_allclose(there.Y, last.Y, atol=1e-3)
 
 
-def test_a_part_of_another_program_is_compiled_with_it():
+def test_a_compiled_function_works_within_other_programs():
     function = _programs.CompiledFunction(lambda x: jnp.sin(x) * x)
     x = jnp.asarray(0.7)
     alone = function(x)
-    within = jax.jit(lambda y: function(x) + 0 * y)(x)  # what it is given is known there
+    within = jax.jit(lambda y: function(x) + 0 * y)(x)  # its argument is concrete there
     np.testing.assert_allclose([within, jax.jit(function)(x)], alone, rtol=1e-15)
     np.testing.assert_allclose(jax.vmap(function)(jnp.stack([x, x])), alone, rtol=1e-15)
     np.testing.assert_allclose(jax.grad(function)(x), jnp.sin(x) + x * jnp.cos(x), rtol=1e-15)
 
 
-def test_compiler_options_that_xla_does_not_know_are_left_out():
+def test_compiler_options_unknown_to_xla_are_left_out():
     known = _programs._known(_programs.PLAIN)  # none since JAX 0.12
     options = {"xla_no_such_option": 1, **_programs.PLAIN}
     assert _programs._known(options) == known
@@ -120,9 +120,8 @@ def test_compiler_options_that_xla_does_not_know_are_left_out():
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.slow)])
-def test_a_machine_may_close_over_what_is_differentiated(derivative):
-    """One written within a function of its numbers, through impacts, resets and turns; of its
-    guards some numbers are computed within them."""
+def test_a_machine_may_close_over_differentiated_numbers(derivative):
+    """The class is defined in a function of its parameters, and its guard computes with them."""
 
     def last(numbers):
         class Shaken(vi.AbstractMachine):
@@ -151,8 +150,8 @@ def test_a_machine_may_close_over_what_is_differentiated(derivative):
 
 
 @pytest.mark.slow
-def test_a_law_may_close_over_what_is_differentiated():
-    """Eagerly too, where no argument shows it."""
+def test_a_law_may_close_over_a_differentiated_number():
+    """Without `jit` too, where no argument is traced."""
 
     def speed(k):
         stop = vi.RigidStop(0.4, lambda approach: k + 0 * approach)

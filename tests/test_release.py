@@ -1,4 +1,4 @@
-"""What is released: a source archive and a wheel, installed away from the checkout."""
+"""The released source archive and wheel, installed outside the checkout."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# Where it is installed nothing of the checkout may be needed.
+# The installed wheel must not need the checkout.
 FIRST_STEPS = """
 import jax
 jax.config.update("jax_enable_x64", True)
@@ -32,7 +32,7 @@ def built(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_source_archive_holds_what_a_reader_needs(built):
+def test_the_source_archive_is_complete_and_small(built):
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.split("/", 1)[1] for name in archive.getnames() if "/" in name}
@@ -42,7 +42,7 @@ def test_the_source_archive_holds_what_a_reader_needs(built):
 
 
 @pytest.mark.slow
-def test_the_wheel_runs_away_from_the_checkout(built, tmp_path):
+def test_the_wheel_runs_outside_the_checkout(built, tmp_path):
     (path,) = built.glob("*.whl")
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()

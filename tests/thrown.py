@@ -1,4 +1,4 @@
-"""A body thrown against a compliant stop, for the tests of stops and of laws."""
+"""A body thrown against a compliant stop."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ class Body(eqx.Module):
 
 
 class Thrown(vi.AbstractMachine):
-    """A body on which nothing acts but its stop."""
+    """A body without forces except for that of its stop."""
 
     stop: vi.SoftStop
     length: jax.Array
@@ -32,7 +32,7 @@ class Thrown(vi.AbstractMachine):
 
 
 def thrown(stop, speed, length, **options):
-    """The run of a body that starts from zero."""
+    """Return the run of a body that starts at zero with this speed."""
     options = {"method": CLOSE, **options}
     start = Body(jnp.zeros_like(speed), speed)
     return vi.simulate(Thrown(stop, length), start, 1, **options)

@@ -1,12 +1,12 @@
-"""Independent truth for the tests: the motion with impacts, chatter and rest, without the package.
+"""Independent reference solutions: motions with impacts, chatter and rest, without the package.
 
-`flown` follows many ideally driven lanes at once in closed form, with NumPy; `integrated` follows
-one machine, ideal drive or motor, with SciPy's `solve_ivp` and its events. Neither looks at step
-ends only: `flown` isolates every root between the zeros of the next higher derivatives, and
-`integrated` takes short steps and looks for a contact only after the body has turned towards it.
+`flown` computes many ideally driven lanes at once in closed form, with NumPy. It finds every root
+between the zeros of the next higher derivative. `integrated` computes one machine, with ideal drive
+or motor, with SciPy's `solve_ivp`. It takes short steps, and searches for a contact only after the
+body has turned towards the stop.
 
-A body with ever smaller impacts is put to rest when what is left of them is shorter than 1e-6, is
-held while it is pressed on, and is released where the force on it falls through zero.
+Chatter is completed when its remaining time is below 1e-6. The body then rests until the force on
+it falls through zero.
 """
 
 from typing import NamedTuple
@@ -14,15 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-# What is left of a chatter when it is completed: its error is of second order. Hops lower than
-# rounding are completed too, unless that would take long.
+# Remaining time of a chatter when it is completed; the error is of second order. Hops lower than
+# rounding (FLAT) are completed too, unless they take longer than LONG.
 BRIEF, FLAT, LONG = 1e-6, 1e-13, 1e-3
 LATE, ROUNDING = 1e-12, 4e-15
 ULP = np.finfo(float).eps
 
 
 class Truth(NamedTuple):
-    """What was found; arrays have a trailing axis of lanes in `flown`, none in `integrated`."""
+    """Results; arrays have a trailing axis of lanes in `flown`, but not in `integrated`."""
 
     sections: np.ndarray
     """(cycles + 1, Y and V (and W)): the states on the sections."""
@@ -30,13 +30,13 @@ class Truth(NamedTuple):
     """(cycles,): smallest Y in each cycle."""
     y_max: np.ndarray
     impacts: np.ndarray
-    """(cycles,): impacts, those left out that were completed at once."""
+    """(cycles,): impacts, without those of completed chatters."""
     rests: np.ndarray
-    """(cycles,): times that the body came to rest."""
+    """(cycles,): how often the body came to rest."""
 
 
 class _Flight:
-    """Y(τ) = Re{c e^(pτ) + F e^(iζτ)} and its derivatives, of many lanes; needs ξ < 1."""
+    """Y(τ) = Re{c e^(pτ) + F e^(iζτ)} and its derivatives for many lanes; needs ξ < 1."""
 
     def __init__(self, zeta, xi, phase, Y, V):
         forced = np.exp(1j * phase) / (1 - zeta * zeta + 2j * xi * zeta)
@@ -47,18 +47,18 @@ class _Flight:
         self.begin = np.array([y - 1j * (v + xi * y) / p.imag, forced])
 
     def terms(self, tau, lanes=slice(None)):
-        """c e^(pτ) and F e^(iζτ) at times since the start, of all or some lanes."""
+        """Return c e^(pτ) and F e^(iζτ) at times since the start for all or some lanes."""
         return self.begin[:, lanes] * np.exp(self.rates[:, lanes] * tau)
 
     def derivative(self, order, terms, lanes=slice(None)):
-        """That of this order where the two terms are these."""
+        """Return the derivative of this order from the values of the two terms."""
         for _ in range(order):
             terms = terms * self.rates[:, lanes]
         return terms.real.sum(axis=0)
 
     def root(self, order, low, high, lanes, offset=0.0):
-        """Where a derivative, less `offset`, changes sign between two times: by Newton's steps, and
-        by bisection where these leave the bracket or do not shrink to half."""
+        """Return the times at which a derivative equals `offset`. Newton's method is replaced by
+        bisection if a step leaves the bracket or is more than half of the last step."""
         at_end = self.derivative(order, self.terms(high, lanes), lanes)
         offset = np.broadcast_to(offset, high.shape)
         sign = np.sign(at_end - offset)
@@ -86,8 +86,8 @@ class _Flight:
         return found
 
     def pieces(self, length):
-        """Times (points, lanes) between which Y is monotone, from the zeros of Y''' downwards, and
-        Y there."""
+        """Return times (points, lanes) between which Y is monotone, and Y there. They come from the
+        zeros of Y''', Y'' and Y'."""
         times, terms = [np.zeros_like(length), length], [self.begin, self.terms(length)]
         for order in (3, 2, 1):
             values = [self.derivative(order, x) for x in terms]
@@ -103,11 +103,11 @@ class _Flight:
 
 
 def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
-    """Lanes of the ideally driven oscillator (cosine crank) through `cycles` drive cycles.
+    """Compute the ideally driven oscillator (cosine crank) for `cycles` drive cycles.
 
-    **Arguments:** ζ, ξ < 1 (not both at resonance), a tuple of (sign, gap, k), the state on the
-    section at crank angle `section`; each a number or an array of lanes. `fineness`: looks in the
-    shorter of the two periods.
+    **Arguments:** ζ, ξ < 1 (not both at resonance), a tuple of (sign, gap, k), and the state on the
+    section at crank angle `section`; each is a number or an array of lanes. `fineness` is the
+    number of search intervals in the shorter of the two periods.
 
     **Returns:** a `Truth`.
     """
@@ -118,7 +118,7 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
     stops = [(sign, numbers[2 * i], numbers[2 * i + 1]) for i, (sign, *_) in enumerate(stops)]
     lanes = zeta.size
     look = 2 * np.pi / np.maximum(1.0, zeta) / fineness
-    held = np.zeros(lanes, int)  # 1 + the stop rested on, or 0
+    held = np.zeros(lanes, int)  # 1 + index of the stop on which the body rests, or 0
     for i, (sign, gap, _) in enumerate(stops):
         there = (sign * Y >= gap) & (V == 0) & (sign * np.cos(section) > gap)
         held[there] = 1 + i
@@ -136,7 +136,7 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
                 mine = on[held[on] == 1 + i]
                 until = _release(sign, gap[mine], section[mine] + zeta[mine] * t[mine])
                 later = t[mine] + until / zeta[mine]
-                # A hair late, when rounding cannot press it on again.
+                # Slightly late, so that rounding cannot make the force positive again.
                 t[mine] = np.minimum(later + LATE, whole[mine])
                 held[mine[later <= whole[mine]]] = 0
             on = on[(held[on] == 0) & (t[on] < whole[on])]
@@ -152,7 +152,7 @@ def flown(zeta, xi, stops, Y, V, cycles, *, section=0.0, fineness=32):
 
 
 def _look(on, zeta, xi, section, stops, look, whole, arrays):
-    """Free lanes `on` by one look ahead or up to their next contact, in place."""
+    """Advance free lanes `on` by one interval or to their next contact, in place."""
     t, Y, V, held, low, high, hits, comes = arrays
     if not on.size:
         return
@@ -198,9 +198,9 @@ def _look(on, zeta, xi, section, stops, look, whole, arrays):
 
 
 def chatter(k, speed, force):
-    """Whether impacts at this speed of approach and pressing force end in rest, and after how long.
+    """Return whether impacts at this speed and contact force end in rest, and after which time.
 
-    Flights of 2kⁿV/a follow each other: Σ = 2kV/(a(1 - k)).
+    Flights take 2kⁿV/a each: Σ = 2kV/(a(1 - k)).
     """
     ends = (force > 0) & (k < 1)
     safe = np.where(ends, force * (1 - k), 1.0)
@@ -210,17 +210,17 @@ def chatter(k, speed, force):
 
 
 def _release(sign, gap, phase):
-    """Crank angle until sign·cos φ falls through `gap`; infinite where it never does."""
+    """Return the crank angle until sign·cos φ falls through `gap`, or infinity."""
     falls = np.arccos(np.clip(gap, -1, 1)) + (0 if sign > 0 else np.pi)
     return np.where(gap > -1, np.mod(falls - phase, 2 * np.pi), np.inf)
 
 
 def integrated(drive, xi, stops, start, cycles, *, look=0.05, **options):
-    """One machine through `cycles` drive cycles, by SciPy in time τ.
+    """Compute one machine for `cycles` drive cycles with SciPy in time τ.
 
-    **Arguments:** `drive`, a number ζ or a motor's dict of `tau0`, `kappa`, `eps`, `mu` and, unless
-    it is 1, `w0`; ξ; a tuple of (sign, gap, k); the start (Y, V) or (Y, V, W) on the section φ = 0;
-    the longest step; what `solve_ivp` is told instead of DOP853 at 1e-12.
+    **Arguments:** `drive`, a number ζ or a motor's dict of `tau0`, `kappa`, `eps`, `mu` and `w0`
+    (default 1); ξ; a tuple of (sign, gap, k); the start (Y, V) or (Y, V, W) on the section φ = 0;
+    `look`, the longest step; options of `solve_ivp` (default: DOP853 at 1e-12).
 
     **Returns:** a `Truth`.
     """
@@ -266,7 +266,7 @@ def integrated(drive, xi, stops, start, cycles, *, look=0.05, **options):
 
 
 def _rates(drive, xi, x):
-    """d/dτ of Y, V, W and the crank angle, the cosine crank's."""
+    """Return d/dτ of Y, V, W and the crank angle for the cosine crank."""
     Y, V, W, phi = x
     turning = 0.0
     if isinstance(drive, dict):
@@ -280,10 +280,10 @@ def _rates(drive, xi, x):
 
 
 def _leg(drive, xi, stops, state, held, leaving, **options):
-    """From `state` to the next event: state, all Y on the way, and what was met.
+    """Integrate to the next event; return the state, Y at the extrema and the end, and the event.
 
-    After an impact or a release the body has to turn towards the stop before it can meet it, so
-    that no event function begins at its own zero.
+    After an impact or a release, the body must turn towards the stop before a contact is searched,
+    so that no event function is zero at its start.
     """
 
     def rates(t, x):
@@ -310,7 +310,7 @@ def _leg(drive, xi, stops, state, held, leaving, **options):
         event.terminal, event.direction = True, 1
         events.append(event)
         names.append(("release" if held else "turn" if leaving[i] else "contact", i))
-    # Extremes of the motion, which end nothing.
+    # Extrema of the motion do not end the integration.
     events.append(stationary)
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, **options}
     run = solve_ivp(rates, (0, 1e4), state, events=events, **options)
@@ -318,6 +318,6 @@ def _leg(drive, xi, stops, state, held, leaving, **options):
     seen = [run.y[0, -1], *(x[0] for x in run.y_events[-1])]
     after = run.y[:, -1].copy()
     if names[which][0] == "release":
-        # A hair late, when rounding cannot press it on again.
+        # Slightly late, so that rounding cannot make the force positive again.
         after += LATE * np.array(rates(0.0, after))
     return after, seen, names[which]

@@ -1,4 +1,4 @@
-"""Two bodies with three contacts, for the tests of several packages."""
+"""Two bodies with three contacts."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ import vi_jax as vi
 
 
 class TwoBodies(vi.Mechanical):
-    """Bodies on springs, the first shaken: it has a wall on its right, the second one on its left,
-    and they hit each other where they are 0.4 apart."""
+    """Bodies on springs; the first one is driven. It has a stop on its right, the second on its
+    left, and they hit each other at x - y = 0.4."""
 
     gap: Any = 0.6
     restitution: Any = 0.7
     drive: Any = 0.8
     ratio: Any = 1.0
-    """Mass of the second over that of the first."""
+    """Mass of the second body relative to that of the first."""
     damping: Any = 0.1
-    """Of the first; that of the second is 0.05."""
+    """Damping of the first body; that of the second is 0.05."""
     q = ("x", "y")
     cycle = 2 * jnp.pi
 

@@ -1,4 +1,4 @@
-"""Two coupled bodies, of which the first strikes a stop and rests on it."""
+"""Two coupled bodies; the first one hits a stop and rests on it."""
 
 from typing import Any, NamedTuple
 
