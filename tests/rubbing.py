@@ -10,7 +10,7 @@ import vi_jax as vi
 
 
 class Rubbing(vi.AbstractMachine):
-    """x'' = force(machine, s, x) - level · load(machine, s, x) · friction; `numbers` are parameters."""
+    """x'' = force(machine, s, x) - level · load(machine, s, x) · friction."""
 
     force: Callable = eqx.field(static=True)
     level: Any = 1.0

@@ -1,4 +1,4 @@
-"""Every file that a test of the command line writes lies in a folder of its own."""
+"""Each test of the command line writes its files into a separate folder."""
 
 from pathlib import Path
 
@@ -19,8 +19,8 @@ def here(tmp_path, monkeypatch):
 
 @pytest.fixture
 def run(here, capsys):
-    """Run a verb with a file, whose machine is the ideal scene unless it names another; the exit
-    code is checked, and what was printed is returned."""
+    """Run a verb with a file (default machine: the ideal scene), check the exit code, and return
+    the output."""
 
     def run(verb, text, code=0, *options):
         Path("file.toml").write_text(text if "machine =" in text else IDEAL + text, "utf-8")

@@ -1,4 +1,4 @@
-"""The command line: what it prints, where it writes, how it fails."""
+"""The command `vi-jax` without a verb."""
 
 import subprocess
 import sys
@@ -25,8 +25,7 @@ def test_a_command_is_needed(capsys):
 
 
 @pytest.mark.slow
-def test_a_reader_that_has_seen_enough():
-    """`vi-jax ... | head` is no failure."""
+def test_a_closed_pipe_as_in_head_is_no_failure():
     code = "import sys; from vi_jax import cli; sys.exit(cli.main(['--help']))"
     with subprocess.Popen(
         [sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -1,4 +1,4 @@
-"""What the command line refuses, and in which words: one sentence, without a traceback."""
+"""Error messages of the command line: one line, without a traceback."""
 
 import importlib
 import sys
@@ -25,7 +25,7 @@ def number(x=1):
 """
 
 
-def test_files_that_are_none(here, capsys):
+def test_unreadable_files_are_errors(here, capsys):
     Path("folder").mkdir()
     Path("binary.toml").write_bytes(b"\xff\xfe")
     Path("broken.toml").write_text("[scene\n")
@@ -37,7 +37,7 @@ def test_files_that_are_none(here, capsys):
         assert printed.err.startswith(f"vi-jax: error: {name}: cannot be read: ")
 
 
-def test_an_editors_mark_is_no_fault(here):
+def test_a_byte_order_mark_is_accepted(here):
     Path("file.toml").write_bytes(b"\xef\xbb\xbf" + (DUFFING + ONE).encode())
     assert cli.main(["simulate", "file.toml"]) == 0
 
@@ -74,7 +74,7 @@ def test_an_editors_mark_is_no_fault(here):
         ("[start]\nW = 1" + ONE, "Argument `W` must be left out: an ideal drive turns at its"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_machine_or_a_table(run, here, monkeypatch, text, words):
+def test_mistakes_in_a_machine_or_a_table_are_errors(run, here, monkeypatch, text, words):
     (here / "own.py").write_text(OWN)
     monkeypatch.delitem(sys.modules, "own", raising=False)
     said = run("simulate", text, 2)
@@ -101,7 +101,7 @@ def test_what_is_wrong_with_a_machine_or_a_table(run, here, monkeypatch, text, w
         ("orbit", "[orbit]\nguess = {W = 1}", "Argument `W` must be left out"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_done_is_said_before_any_work(run, here, monkeypatch, verb, text, words):
+def test_invalid_tables_are_errors_before_any_work(run, here, monkeypatch, verb, text, words):
     def work(*args, **options):
         raise AssertionError("work began")
 
@@ -112,7 +112,7 @@ def test_what_cannot_be_done_is_said_before_any_work(run, here, monkeypatch, ver
         ("flow._simulate", "_simulate"),
     ):
         if verb == "scan" and name == "_simulate":
-            continue  # traced for the shapes of what will be stored
+            continue  # a scan traces it for the shapes of its results
         monkeypatch.setattr(importlib.import_module(f"vi_jax.{module}"), name, work)
     Path("folder.png").mkdir()
     said = run(verb, text, 2)
@@ -120,7 +120,7 @@ def test_what_cannot_be_done_is_said_before_any_work(run, here, monkeypatch, ver
     assert {path.name for path in here.iterdir()} == {"file.toml", "folder.png"}
 
 
-def test_a_fault_of_the_library_is_not_taken_for_the_users(run, monkeypatch):
+def test_errors_within_the_library_keep_their_traceback(run, monkeypatch):
     def broken(*args, **options):
         raise TypeError("something else")
 

@@ -1,4 +1,4 @@
-"""Every verb of the command line: what it prints, writes and draws."""
+"""All verbs of the command line: output, files and pictures."""
 
 import csv
 import importlib
@@ -108,7 +108,7 @@ def test_scan(run):
     assert "the cycles is 128, and now it is 200" in said
 
 
-def test_interrupted_scans_tell_how_to_go_on(run, capsys, monkeypatch):
+def test_the_message_of_an_interrupted_scan_names_its_store(run, capsys, monkeypatch):
     def interrupt(*args, **options):
         raise KeyboardInterrupt
 
@@ -145,7 +145,7 @@ def test_sweep(run):
         for half in (table[:11], table[11:])
     )
     assert up.keys() == down.keys()
-    # The resonance bends to the right: between the jumps the way back is another.
+    # Hysteresis: between the jumps the motions up and down differ.
     assert max(abs(up[value] - down[value]) for value in up) > 0.5
 
 
@@ -203,8 +203,8 @@ HEADS = [
 
 
 @pytest.mark.parametrize("head", quick(HEADS, HEADS[2]))
-def test_machines_of_ones_own(run, here, monkeypatch, head):
-    """A start without arguments, and a machine without any; periods in the machine's words."""
+def test_user_defined_machines(run, here, monkeypatch, head):
+    """Machines with and without a method `start`; periods are counted in cycles."""
     (here / "mine.py").write_text(OWN)
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     run("simulate", head + BODY)
@@ -217,7 +217,7 @@ def test_machines_of_ones_own(run, here, monkeypatch, head):
     assert said.count("\n") == 1 and "State(Y=1)" in said
 
 
-def test_machines_with_integers_flags_and_arrays_and_without_a_drive(run):
+def test_machines_with_other_arguments_and_without_a_drive(run):
     beam = """machine = "vi_jax.machines:Beam"
         method = { class = "vi_jax:ExactFlight" }
         arguments = { modes = 4, two_sided = true, shaken = "tip", gap = 1 }
@@ -239,7 +239,7 @@ PARTS = "[simulate]\ncycles = 40\nsettle = 30\nsamples = 4\noutput = 'o.csv'\n"
 
 
 def short(monkeypatch):
-    """Runs in parts of ten cycles."""
+    """Split runs into parts of ten cycles."""
     monkeypatch.setattr(command, "_CYCLES", 10)
 
 
@@ -266,7 +266,7 @@ def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
 
 @pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
 def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
-    """Pressed while it settles and records its first part, or later; then again and again."""
+    """Send Ctrl-C in the first part or a later one, and again while results are written."""
     short(monkeypatch)
     compute, calls = command.simulate, []
 
@@ -289,7 +289,7 @@ def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pre
     assert (len(rows("o.csv")) if kept else os.path.exists("o.csv")) == (kept or False)
 
 
-def test_ctrl_c_keeps_the_way_up_of_a_sweep(run, monkeypatch):
+def test_ctrl_c_keeps_the_completed_direction_of_a_sweep(run, monkeypatch):
     compute, calls = command.sweep, []
 
     def computed(*args, **options):

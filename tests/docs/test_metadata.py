@@ -1,4 +1,4 @@
-"""Version and requirements are said the same everywhere."""
+"""All files agree on the version and the requirements."""
 
 import re
 import tomllib
@@ -16,7 +16,7 @@ def test_one_version():
     assert f"## {version}\n" in (ROOT / "CHANGELOG.md").read_text("utf-8")
 
 
-def test_the_recipe_asks_for_what_the_package_asks_for():
+def test_the_conda_recipe_has_the_requirements_of_the_package():
     run = RECIPE.partition("  run:\n")[2].partition("\n\n")[0]
     asked = {re.sub("-base$", "", name): at for name, at in re.findall(r"- (\S+) (\S+)", run)}
     wanted = dict(re.fullmatch(r"([\w-]+)(.*)", x).groups() for x in PROJECT["dependencies"])  # pyright: ignore

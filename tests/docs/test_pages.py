@@ -1,4 +1,4 @@
-"""The code of the README and of every page runs, its links resolve; public names are described."""
+"""The code of all pages runs, their links resolve, and the reference has all public names."""
 
 import os
 import re
@@ -28,12 +28,12 @@ def name_of(page: Path) -> str:
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """The blocks of code in this language."""
+    """Return the blocks of code in this language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
 
 
 def cases(language: str):
-    """Pages that have such blocks."""
+    """Return the pages that have blocks in this language."""
     return [
         pytest.param(page, id=name_of(page), marks=pytest.mark.slow)
         for page in PAGES
@@ -41,9 +41,8 @@ def cases(language: str):
     ]
 
 
-# Pages that start processes or that newcomers take first run in a process of their own, as shipped.
-# The others run in this one, each with its own names: imports and what they have in common are
-# compiled once.
+# These pages run in separate processes: the README as users run it, the other since it starts
+# processes. All others run in this process, so that shared programs are compiled once.
 APART = {"README.md", "docs/howto/cluster.md"}
 
 
@@ -59,7 +58,7 @@ def run_apart(folder: Path) -> str:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty one to work in; a page asks for double precision itself."""
+    """Work in an empty folder, with JAX's default precision; pages must enable double precision."""
     monkeypatch.chdir(tmp_path)
     jax.config.update("jax_enable_x64", False)
     yield tmp_path
@@ -68,8 +67,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def words(printed: str) -> list[Any]:
-    """The words of an output, and its numbers to what other processors give as well; a residual is
-    left out, which is rounding."""
+    """Return the words and numbers of an output, with a tolerance for other processors' rounding.
+    Lines with residuals are left out: they are rounding."""
     kept = [line for line in printed.splitlines() if "residual" not in line]
     parts = re.split(r"(-?\d+\.\d+)", " ".join(kept))
     return [pytest.approx(float(x), abs=2e-6) if i % 2 else x.strip() for i, x in enumerate(parts)]
@@ -77,7 +76,7 @@ def words(printed: str) -> list[Any]:
 
 @pytest.mark.parametrize("page", cases("python"))
 def test_code_runs(page, folder):
-    """The blocks of a page one after the other."""
+    """All blocks of a page run as one script."""
     code = "\n".join(blocks(page, "python"))
     Path("page.py").write_text(code, encoding="utf-8")
     if name_of(page) in APART:
@@ -92,7 +91,7 @@ def test_code_runs(page, folder):
 
 @pytest.mark.parametrize("page", cases("toml"))
 def test_files_run(page, folder):
-    """Each file by the verb that it has a table of."""
+    """Each file runs with the verb that its table names."""
     for text in blocks(page, "toml"):
         Path("page.toml").write_text(text, encoding="utf-8")
         verb = next(x for x in ("scan", "sweep", "basins", "simulate") if f"[{x}]" in text)

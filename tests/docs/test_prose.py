@@ -1,4 +1,4 @@
-"""Pages in plain English: sentences with a subject, the field's words, code that fits a column."""
+"""Pages and docstrings are in plain English; code on pages fits a column."""
 
 import ast
 import inspect
@@ -27,7 +27,7 @@ PHRASES = re.compile(
 
 
 def paragraphs(text: str) -> list[str]:
-    """Each paragraph, item or row in one line; without code, formulas and headings."""
+    """Return each paragraph, item or row as one line, without code, formulas and headings."""
     text = FORMULA.sub("x", CODE.sub("", text))
     parts = re.split(r"\n\s*\n|\n(?=\s*[-|#]|\s*\d+\. )", text)
     return [" ".join(part.split()) for part in parts if not part.lstrip().startswith("#")]
@@ -48,7 +48,7 @@ CLAUSES = "What Where When Which How Why".split()
 
 
 def documented():
-    """The docstrings of public functions and classes, and of the public members of these."""
+    """Yield the docstrings of public functions, classes and their public members."""
     for module in (vi, vi.machines, vi.plot):
         for name in (x for x in dir(module) if x[0] != "_"):
             public = getattr(module, name)
@@ -60,7 +60,7 @@ def documented():
 
 
 def test_docstrings_of_public_names():
-    """A function's begins with a verb, a class's not with a clause; plain English as on pages."""
+    """Docstrings of functions begin with a verb, those of classes not with a clause."""
     for name, public, told in documented():
         if "." not in name and inspect.isfunction(public):
             assert told.split()[0] in VERBS, name
@@ -70,8 +70,7 @@ def test_docstrings_of_public_names():
         assert not found, name
 
 
-def test_docstrings_within_the_package():
-    """They begin with a verb or a noun, too."""
+def test_docstrings_of_private_names_do_not_begin_with_a_clause():
     for path in sorted(Path(inspect.getfile(vi)).parent.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
@@ -79,7 +78,7 @@ def test_docstrings_within_the_package():
                 assert told.split()[0] not in [*CLAUSES, *"Of That Those Whether".split()], told
 
 
-def test_the_patterns_find_what_they_are_for():
+def test_the_patterns_find_bad_sentences_only():
     for bad in (
         "- What is there costs.",
         "It ends. Of these one stays.",

@@ -1,4 +1,4 @@
-"""The examples run, are short, and agree with their notebooks; their pictures are kept."""
+"""The examples are short, run, and agree with their notebooks and the gallery."""
 
 import os
 import re
@@ -11,12 +11,12 @@ from PIL import Image
 
 from differences import quick
 
-# These run with the slow tests; the others, whose calls pyright has checked, before a release.
+# These run with the slow tests, the others before a release; Pyright checks their calls.
 SLOW = {"paper_discrepancy", "simulate"}
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_script_notebook_and_picture_are_kept(example):
+def test_script_notebook_and_picture_agree(example):
     text = example.read_text(encoding="utf-8")
     assert text.startswith('# %% [markdown]\n"""# ')
     assert len(text.splitlines()) <= 40
@@ -31,7 +31,7 @@ def test_script_notebook_and_picture_are_kept(example):
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_the_gallery_shows_it(example):
+def test_the_gallery_shows_the_example(example):
     gallery = (HERE.parents[1] / "docs" / "gallery.md").read_text(encoding="utf-8")
     (_, told), *_ = cells(example.read_text(encoding="utf-8"))
     assert f"#{told}\n\n" in gallery
@@ -53,5 +53,5 @@ def test_runs(name, tmp_path):
 
 
 def _words(text):
-    """A text without its numbers, whose last digits another processor may round otherwise."""
+    """Replace the numbers of a text, whose last digits depend on the processor."""
     return re.sub(r"[-+]?\d[\d.,]*(e[-+]?\d+)?", "#", text)

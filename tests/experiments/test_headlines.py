@@ -1,4 +1,4 @@
-"""No table is stale: the headline numbers of each study are what the library gives now."""
+"""The headline numbers on the pages of the studies agree with those of the library now."""
 
 import inspect
 from pathlib import Path
@@ -16,7 +16,7 @@ from headline_numbers.closed_forms import Expected
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 PATHS = {p.stem: p for kind in ("studies", "benchmarks") for p in FOLDER.glob(f"{kind}/*.py")}
-# `gpu` has times only.
+# The page of `gpu` has times only.
 NAMES = ["reproduction", *sorted(set(PATHS) - {"gpu"})]
 COMPUTED = {
     name: function
@@ -32,7 +32,7 @@ def kept_of(name: str) -> dict[str, float]:
 
 
 def stale(kept: dict[str, float], computed: Expected) -> list[str]:
-    """What of the computed numbers a page lacks, or has otherwise."""
+    """Return the computed numbers that a page lacks or has with another value."""
     missing = [f"{name} is not kept" for name in computed if name not in kept]
     return missing + [
         f"{name}: kept {kept[name]}, computed {value} (± {slack:g})"
@@ -49,7 +49,7 @@ def test_headline_numbers(name):
     assert computed and not stale(kept, computed)
 
 
-def test_what_is_stale_is_told():
+def test_stale_numbers_are_found():
     page = '# A study\n\n## Headline numbers\n\n```json\n{"doubling": 0.824557221002}\n```\n'
     kept = headlines(page)
     assert kept == {"doubling": 0.824557221002}

@@ -1,4 +1,4 @@
-"""The README's moving picture is small, moves, and shows what is simulated."""
+"""The README's animation."""
 
 import jax
 import numpy as np
@@ -7,7 +7,7 @@ from moving_picture import CYCLES, FRAMES, GRID, TARGET, simulated
 from PIL import Image
 
 
-def test_it_is_small_and_moves():
+def test_the_animation_is_small_and_moves():
     assert TARGET.stat().st_size < 200_000
     with Image.open(TARGET) as picture:
         assert picture.n_frames == CYCLES * FRAMES + 1  # pyright: ignore
@@ -17,11 +17,11 @@ def test_it_is_small_and_moves():
 
 
 @pytest.mark.slow
-def test_it_shows_what_is_simulated():
+def test_the_animation_shows_both_basins():
     sections, settled, rest = simulated()
     assert sections.shape == (GRID**2, CYCLES + 1, 2)
     assert {*settled} == {0, 1}
-    # A start on the stop or inside; the machine that is drawn begins at rest.
+    # No start lies beyond the stop; the machine in the animation begins at rest.
     assert sections[..., 0].max() <= 2.0
     assert rest.samples is not None
     state = jax.tree_util.tree_map(lambda x: float(x[0]), rest.samples.state)

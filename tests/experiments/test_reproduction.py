@@ -1,6 +1,6 @@
-"""The reproduction: what it measures, beside the report that is kept.
+"""The reproduction agrees with its stored report.
 
-The README's first command runs it whole, and fails if a verdict or a special point is not as kept.
+The first command of the README runs all of it, and fails if a verdict or special point differs.
 """
 
 import copy
@@ -34,7 +34,7 @@ def faults():
 
 
 @pytest.mark.slow
-def test_verdicts_are_those_kept(claims):
+def test_verdicts_agree_with_the_stored_report(claims):
     kept = {claim["name"]: claim["verdict"] for claim in read(KEPT)["claims"]}
     assert len(kept) == 18 and len(claims) == 10
     assert {name: claim.verdict for name, claim in claims.items()}.items() <= kept.items()
@@ -42,7 +42,7 @@ def test_verdicts_are_those_kept(claims):
     assert kept["discrepancy of the minimum"] == "confirmed undamped only"
 
 
-def test_what_differs_is_told():
+def test_differences_from_the_stored_report_are_found():
     kept = read(KEPT)
     other = copy.deepcopy(kept)
     assert not differences(other, kept)
@@ -66,7 +66,7 @@ def test_crank_phase_of_the_start(assumptions):
     assert claim.verdict == "confirmed in part"
     assert apart["0"] == pytest.approx([0.197, 0.170], abs=2e-3)
     assert apart["1"] == pytest.approx([1.708, 1.708], abs=2e-3)
-    # From every phase the same 4π motion in the end.
+    # Starts at all phases end in the same 4π motion.
     assert claim.numbers["last_minima"] == pytest.approx([-3.2543] * len(apart), abs=1e-2)
 
 
@@ -85,7 +85,7 @@ def test_direct_short(claims):
 
 @pytest.mark.slow
 def test_motors_at_the_stated_speed(cases):
-    """κ and minima from an independent code (SciPy), at a mean ζ of 0.90."""
+    """κ and minima come from an independent code (SciPy), at a mean ζ of 0.90."""
     motors = simulate_motors()
     for row in motors.rows:
         assert row.kappa is not None and bool(row.orbit.successful)
@@ -124,11 +124,11 @@ def test_departure_has_the_rate_of_the_multiplier(claims):
 
 
 def test_four_pi_motion_has_no_transient(claims):
-    # The state is the one optax fitted to a residual of 1e-10.
+    # The start was fitted by optax to a residual of 1e-10.
     assert claims["no transient from the 4π state"].numbers["max_deviation_undamped"] < 1e-9
 
 
-def test_alignment_is_the_one_that_fits(cases):
+def test_only_the_chosen_alignment_fits(cases):
     case = cases[0]
     Y = sampled(case.from_rest)[0]
     right = np.abs(Y - closed_form(case, len(Y), 2))[-2:].max()
@@ -137,7 +137,7 @@ def test_alignment_is_the_one_that_fits(cases):
     assert right < 1e-5 < 1 < wrong
 
 
-def test_right_equation_keeps_energy_and_printed_ones_do_not(faults):
+def test_corrected_equation_conserves_energy_and_printed_ones_do_not(faults):
     first, second = faults[1].numbers, faults[2].numbers
     assert first["energy_drift_right"] < 1e-10
     assert first["energy_drift_printed_in_metres"] > 0.1
@@ -145,7 +145,7 @@ def test_right_equation_keeps_energy_and_printed_ones_do_not(faults):
     assert second["energy_drift_printed"] > 0.1
 
 
-def test_energy_drift_needs_both_faults_gone():
+def test_energy_is_conserved_only_without_either_fault():
     assert energy_drift(coupling=0.3, slider_inertia=0.4) < 1e-9
     assert energy_drift(coupling=0.3, slider_inertia=0.4, printed_coupling=0.31) > 1e-4
 
@@ -159,7 +159,7 @@ def test_eq21_needs_its_zeta(zeta, n):
     assert printed["miss_17_before"] > 0.01
 
 
-def test_eq21_gives_the_checked_impacts():
+def test_eq21_gives_known_impact_speeds():
     for n, speed in ((1, 1.57475), (2, 3.54674)):
         v0 = eq21_misses(0.9, 0.5, 2.0, n, printed=False)["v0"]
         assert 0.9 * v0 == pytest.approx(speed, abs=1e-5)

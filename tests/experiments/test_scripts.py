@@ -1,4 +1,4 @@
-"""Every study and benchmark runs as a plain script, and has its table and its figure."""
+"""All studies and benchmarks run as scripts, and have a table and a figure."""
 
 import os
 import subprocess
@@ -12,17 +12,16 @@ from differences import some
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
-# A table is all there is to see.
 WITHOUT_FIGURE = {"gpu"}
 # These need the extra `bench`.
 RUN_ELSEWHERE = {"peers", "chains"}
-# These run with the slow tests; the others, whose calls pyright has checked, before
-# a release. Headline numbers are tests of their own (`test_headlines.py`).
+# These run with the slow tests, the others before a release; Pyright checks their calls.
+# `test_headlines.py` tests the headline numbers.
 SLOW = {"basins_map"}
 
 
 @pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)
-def test_table_and_figure_are_kept(study):
+def test_table_and_figure_exist(study):
     assert study.with_suffix(".md").exists()
     assert study.read_text(encoding="utf-8").startswith(("# %%", '"""'))
     if study.stem in WITHOUT_FIGURE:

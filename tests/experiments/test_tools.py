@@ -1,4 +1,4 @@
-"""What the studies share."""
+"""Tools of the studies."""
 
 import pytest
 from tools.tables import table

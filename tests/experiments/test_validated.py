@@ -1,4 +1,4 @@
-"""The examples of other codes: each script gives what the page prints, beside their numbers."""
+"""Examples of other codes: each script reproduces the numbers on the page."""
 
 import re
 from math import floor, log10
@@ -11,7 +11,7 @@ from gallery_page import rows, sections
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_is_a_short_script_on_the_page(script):
+def test_the_script_is_short_and_on_the_page(script):
     text = script.read_text(encoding="utf-8")
     assert text.startswith('# %% [markdown]\n"""# ') and len(text.splitlines()) <= 60
     part = sections()[script.stem]
@@ -25,12 +25,12 @@ def test_the_page_has_every_script_once():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [path.stem for path in SCRIPTS])
-def test_gives_what_the_page_prints(name):
+def test_the_script_reproduces_the_page(name):
     (script,) = (path for path in SCRIPTS if path.stem == name)
     comparison = comparison_of(script)
     part = sections()[script.stem]
     now = section(script, comparison, 0.0)
-    # All but the table and the time, word for word.
+    # The text must agree word for word, except for the table and the time.
     prose = [re.sub(r"\), \d+ s\.", "", re.sub(r"^\|.*\n", "", x, flags=re.M)) for x in (part, now)]
     assert prose[1].strip() == f"## {prose[0].strip()}"
     printed = rows(part)
@@ -38,16 +38,16 @@ def test_gives_what_the_page_prints(name):
     for cells, number in zip(printed, comparison.numbers, strict=True):
         quantity, theirs, ours, difference = cells
         assert (quantity, theirs) == (number.quantity, number.theirs)
-        # Two units of the last digit: machines round differently. Of a zero, its bound.
+        # Rounding differs between machines: allow two units of the last digit, or a zero's bound.
         zero = float(theirs) == 0
         slack = number.allowed if zero else 2 * last_digit(ours)
         assert abs(float(ours) - float(number.ours)) <= slack, quantity
-        assert float(difference) <= number.allowed * 1.1, quantity  # of one digit
+        assert float(difference) <= number.allowed * 1.1, quantity  # printed with one digit
         size = 10.0 ** floor(log10(float(difference) or 1e-300))
         assert abs(float(difference) - number.difference) <= 0.51 * size + slack, quantity
 
 
-def test_a_number_that_is_off_is_refused():
+def test_deviating_numbers_raise():
     good = Comparison("a code", "a page", "printed", [("x", "0.488", 0.4884), ("n", "0", 0.0)])
     assert str(good).splitlines()[2:] == ["| x | 0.488 | 0.4884 | 4e-04 |", "| n | 0 | 0e+00 | 0 |"]
     assert (last_digit("0.488"), last_digit("12"), last_digit("1.25e-3")) == (1e-3, 1.0, 1e-5)

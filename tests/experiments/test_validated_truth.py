@@ -1,4 +1,4 @@
-"""What the page of others' examples says to be by SciPy, computed by SciPy from event to event."""
+"""Recompute the numbers that the page of other codes' examples attributes to SciPy."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ CLOSE = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
 
 
 def theirs(script):
-    """What the page prints as theirs, by quantity; of equal names the first."""
+    """Return the other code's numbers by quantity; the first one for equal names."""
     return {row[0]: row[1] for row in reversed(rows(sections()[script]))}
 
 
@@ -39,7 +39,7 @@ def test_balls_in_a_row():
 
 
 def lifted(flow_rate, y):
-    """The valve from a maximum of its lift to the next: state, time, impacts."""
+    """Integrate the valve between two maxima of its lift; return state, time and impacts."""
 
     def rate(t, y):
         falls = y[0] * np.sqrt(y[2])
@@ -80,7 +80,7 @@ def test_a_relief_valve(flow_rate, guess, hits, lift):
 
 
 def half(omega, z):
-    """Half a period of the two masses, mirrored."""
+    """Integrate the two masses for half a period and reverse the sign."""
 
     def rate(t, z):
         x, y, u, v = z
@@ -99,14 +99,14 @@ def half(omega, z):
 
 
 def multipliers_of_half(omega, z):
-    """By central differences."""
+    """Return the multipliers by central differences."""
     steps = 1e-5 * np.eye(4)
     slopes = [(half(omega, z + e) - half(omega, z - e)) / 2e-5 for e in steps]
     return np.linalg.eigvals(np.transpose(slopes))
 
 
-def test_where_the_two_masses_lose_their_stability():
-    """A multiplier of half a period is 1 at a fold; at a Neimark–Sacker point a pair crosses."""
+def test_stability_limits_of_the_two_masses():
+    """At a fold a multiplier is 1; at a Neimark–Sacker point a pair has modulus 1."""
     *_, fold, _, first, second = [row[1] for row in rows(sections()["pwsdde_pair"])]
 
     def lacks(x):
@@ -143,8 +143,8 @@ def test_two_masses():
         z = orbit(omega, z)
 
     def above(omega):
-        """Symmetry is lost where a multiplier of half a period is -1."""
+        """Return a function that is zero at the symmetry breaking (multiplier -1)."""
         return multipliers_of_half(omega, orbit(omega, z)).real.min() + 1
 
-    # The differences are right to 1e-9.
+    # Central differences have an error of 1e-9.
     agree(known["ω of the symmetry-breaking"], brentq(above, 1.438, 1.441, xtol=1e-11))
