@@ -1,4 +1,4 @@
-"""What the explorer computes, against closed forms and the rest of the library; no page needed."""
+"""The explorer's computations agree with closed forms and the library; no page is needed."""
 
 import re
 import time
@@ -16,14 +16,14 @@ ZETA, GAP, K = "drive.frequency_ratio", "stops.0.gap", "stops.0.restitution"
 
 @pytest.fixture(scope="module")
 def ideal():
-    """The page's first machine, compiled."""
+    """Return the first machine of the page, compiled."""
     subject = next(iter(ready().values()))()
     subject.compile(lambda step: None)
     return subject
 
 
 def read(svg):
-    """Of each panel its paths by style, in the numbers of its ticks, and a pixel's size in them."""
+    """Yield the paths of each panel by style, in units of its ticks, and a pixel's size in them."""
     lowered = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
     for panel in svg.decode().split("<g ")[1:]:
         *_, up, across, _ = re.findall(">([^<]*)</text>", panel)
@@ -41,7 +41,7 @@ def read(svg):
 
 
 def check_picture(svg, motion):
-    """The picture has the path of the motion, its sections and its multipliers."""
+    """Check that the picture has the path, the sections and the multipliers of the motion."""
     (course, portrait, sections, circle), path, mu = read(svg), motion.path, motion.multipliers
     for (found, pixel), style, true in (
         (course, "motion", (path.cycles, path.Y)),
@@ -60,7 +60,7 @@ def seen(subject, settle=1000, **numbers):
 
 
 @pytest.mark.parametrize("numbers", [{}, {"zeta": 1.1}, {"gap": 1.0, "Y": 3.0}])
-def test_a_motion_with_one_impact_is_as_in_closed_form(ideal, numbers):
+def test_motions_with_one_impact_agree_with_closed_forms(ideal, numbers):
     found = seen(ideal, **numbers)
     zeta, gap = numbers.get("zeta", 0.9), numbers.get("gap", 2.0)
     scene = vi.Scene.ideal(frequency_ratio=zeta, gap=gap, damping_ratio=0.01)
@@ -68,7 +68,6 @@ def test_a_motion_with_one_impact_is_as_in_closed_form(ideal, numbers):
     (place,) = np.flatnonzero(np.isclose(exact.y_min, found.extremes[0], atol=1e-6))
     assert exact.admissible[place] and found.impacts == 1
     expected = np.asarray(exact.multipliers[place])
-    # In the order that the page has, conjugates apart.
     assert np.sort_complex(found.multipliers) == pytest.approx(np.sort_complex(expected), abs=1e-5)
     assert "stable" in found.stability and f"{2 * found.period}π with 1 impact" in found.regime
     assert found.impact_speed == pytest.approx(float(exact.impact_speed[place]), abs=1e-5)
@@ -103,7 +102,7 @@ def test_a_motor_lags_behind_and_may_stop(ideal):
         assert MotionPicture(scene.labels).draw(found, which)
 
 
-def test_no_slider_compiles_and_redraws_are_quick(ideal, compilations):
+def test_sliders_do_not_compile_and_redraw_quickly(ideal, compilations):
     begin, picture, took = ideal.beginning(), MotionPicture(ideal.machine.labels), []
     picture.draw(ideal.seen(begin))
     ideal.diagram(begin, K)
@@ -118,7 +117,7 @@ def test_no_slider_compiles_and_redraws_are_quick(ideal, compilations):
     assert not compilations and np.median(took) < 0.1
 
 
-def test_a_diagram_is_made_of_runs(ideal):
+def test_a_diagram_agrees_with_runs(ideal):
     values = {**ideal.beginning(), "start.Y": 0.5}
     found = ideal.diagram(values, K)
     assert found.values[0] == 0.0 and found.values[-1] == 1.0
@@ -142,7 +141,7 @@ def test_pictures(ideal):
     check_picture(picture.draw(other := seen(ideal, zeta=0.902)), other)
 
 
-def test_requests_that_no_slider_makes_are_refused_in_a_sentence(ideal):
+def test_values_outside_a_sliders_range_raise(ideal):
     values = ideal.beginning()
     for wrong in (1e9, -5.0, float("nan"), None, "0.9"):
         message = f"The restitution k must be a number from 0 to 1, but is {wrong!r}."
@@ -150,14 +149,14 @@ def test_requests_that_no_slider_makes_are_refused_in_a_sentence(ideal):
             ideal.at({**values, K: wrong})
 
 
-def test_ranges_are_within_what_the_machine_allows():
+def test_slider_ranges_are_valid_for_the_machine():
     made = {name: make() for name, make in ready().items()}
     assert {"Scene, motor", "BouncingBall", "Beam"} <= set(made) and "Structure" not in made
     for subject in made.values():
         assert len({c.label for c in subject.controls.values()}) == len(subject.controls)
         for name, control in subject.controls.items():
             assert control.low <= control.value <= control.high
-            # The page opens with the machine's own numbers, not with places next to them.
+            # A slider's grid contains the default value.
             steps = (control.value - control.low) / control.step
             assert abs(steps - round(steps)) < 1e-9
             for end in (control.low, control.high):
@@ -170,7 +169,7 @@ def test_ranges_are_within_what_the_machine_allows():
 
 @pytest.mark.parametrize("name", some(["Beam", "ReliefValve"], "ReliefValve"))
 def test_machines_of_other_kinds(name):
-    """Several coordinates to a state; no drive. Pictures of each, and it moves."""
+    """A beam with several coordinates, and a valve without a drive."""
     subject: Subject = ready()[name]()
     subject.compile(lambda step: None)
     values = subject.beginning()

@@ -1,4 +1,4 @@
-"""`vi-jax explore`: what it says where it cannot serve, and its page in a browser."""
+"""`vi-jax explore`: error messages, access control, and its page in a browser."""
 
 import asyncio
 import http.client
@@ -23,7 +23,7 @@ from vi_jax.explore.subject import Subject
 ROOT = Path(__file__).parents[2]
 
 
-def test_without_marimo_it_says_what_to_install(monkeypatch, capsys):
+def test_without_marimo_the_message_names_the_extra(monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert cli.main(["explore", "--no-browser"]) == 1
     printed = capsys.readouterr().err
@@ -44,7 +44,7 @@ OWN = "import vi_jax as vi\n\nmake = vi.machines.Duffing\n"
         ("shown.py:make", ["--range", "gab", "1", "2"], "is of 'gab'"),
     ],
 )
-def test_what_is_no_machine_is_said_before_anything_starts(
+def test_invalid_machines_and_ranges_are_errors_before_serving(
     name, more, message, tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "shown.py").write_text(OWN, encoding="utf-8")
@@ -63,7 +63,7 @@ def test_what_is_no_machine_is_said_before_anything_starts(
     assert (subject.controls["gap"].low, subject.controls["gap"].high) == (0.5, 3.0)
 
 
-def test_a_port_that_is_none_or_taken(monkeypatch, capsys):
+def test_invalid_or_used_ports_are_errors(monkeypatch, capsys):
     assert cli.main(["explore", "--port", "70000"]) == 2
     assert "port must be 0-65535" in capsys.readouterr().err
     pytest.importorskip("marimo")
@@ -76,7 +76,7 @@ def test_a_port_that_is_none_or_taken(monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def address():
-    """The page, served by the command."""
+    """Start the command and yield the address of its page."""
     pytest.importorskip("marimo")
     command = [sys.executable, "-m", "vi_jax", "explore", "--no-browser", "--port", "0"]
     served = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
@@ -90,7 +90,7 @@ def address():
         pytest.fail("".join(lines))
     yield found[0]
     os.kill(served.pid, signal.SIGINT)
-    assert served.wait(timeout=30) == 0  # Ctrl-C is how it ends
+    assert served.wait(timeout=30) == 0  # Ctrl-C is the normal end
     assert "Traceback" not in served.stderr.read()
 
 
@@ -107,7 +107,7 @@ PAGE = "127.0.0.1:8417"
         ("127.0.0.5", "127.0.0.5:8417", None, True),
         ("0.0.0.0", "machine.lab:8417", "http://machine.lab:8417", True),
         ("127.0.0.1", PAGE, "http://evil.example", False),
-        ("127.0.0.1", PAGE, "http://127.0.0.1:8888", False),  # another port is another
+        ("127.0.0.1", PAGE, "http://127.0.0.1:8888", False),  # another port
         ("127.0.0.1", PAGE, "null", False),
         ("0.0.0.0", "machine.lab:8417", "http://evil.example", False),
         ("127.0.0.1", "evil.example:8417", "http://evil.example:8417", False),
@@ -115,7 +115,7 @@ PAGE = "127.0.0.1:8417"
         ("127.0.0.1", "", None, False),
     ],
 )
-def test_who_is_answered(kind, listening, host, origin, good):
+def test_only_requests_from_the_page_are_answered(kind, listening, host, origin, good):
     pytest.importorskip("starlette")
     asked, answered = [], []
 
@@ -138,7 +138,7 @@ def test_who_is_answered(kind, listening, host, origin, good):
 
 
 @pytest.mark.slow
-def test_nobody_without_the_token_is_answered(address):
+def test_requests_without_the_token_are_rejected(address):
     place = urlsplit(address)
 
     def asked(path, **headers):
@@ -167,7 +167,7 @@ def test_nobody_without_the_token_is_answered(address):
 
 @pytest.fixture
 def page(address):
-    """The page in a browser without a window."""
+    """Open the page in a headless browser."""
     playwright = pytest.importorskip("playwright.sync_api")
     own = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
     with playwright.sync_playwright() as tools:
@@ -187,7 +187,7 @@ def page(address):
 
 
 def after(page, act) -> str:
-    """The regime after the picture has changed."""
+    """Call `act`, wait for a new picture, and return the regime."""
     before = page.get_attribute("#motion", "src")
     act()
     page.wait_for_function(
@@ -210,7 +210,7 @@ def test_sliders_a_click_in_the_diagram_and_another_machine(page):
     box = canvas.bounding_box()
     middle = {"x": 0.525 * box["width"], "y": 0.5 * box["height"]}  # of the axes, 6.5 % to 98.5 %
     assert "period 2π" in after(page, lambda: canvas.click(position=middle))
-    # The sliders may follow a little after the picture; steps are of 0.0005.
+    # Sliders may lag behind the picture; their step is 0.0005.
     values = ("^='0.099'", "='0.1'", "^='0.100'")
     page.locator(",".join(f"[role=slider][aria-valuenow{x}]" for x in values)).first.wait_for()
     page.get_by_role("tab", name="Motion").click()

@@ -1,4 +1,4 @@
-"""Animations and schematics: what moves, what is written, what is refused."""
+"""Animations and schematics: frames, files and error messages."""
 
 import base64
 import dataclasses
@@ -49,7 +49,7 @@ class Own(vi.AbstractMachine):
 
 
 class Drawn(Own):
-    """The same, which says how it is drawn."""
+    """A machine that defines its sketch."""
 
     def sketch(self, pen, state, phase):
         pen.ball(float(state.Y), phase, 0.1, color=pen.red)
@@ -81,11 +81,11 @@ def test_every_machine_is_drawn(name):
     shown = vi.animate(moved(scene), scene, seconds=0.4, fps=10)
     assert len(shown) == 4
     first, third = (picture(shown.draw(i)) for i in (0, 2))
-    half = first.shape[0] // 3  # the machine itself moves, not the history alone
+    half = first.shape[0] // 3  # the machine must move, not only the history
     assert first.shape == third.shape and (first[:half] != third[:half]).any()
 
 
-def test_a_body_is_where_it_is(run):
+def test_frames_show_the_body_at_its_position(run):
     scene = MACHINES["ideal"]
     shown = vi.animate(run, scene, seconds=2.0, fps=25, window=(0, 2))
     figure = shown.draw(-1)
@@ -106,7 +106,7 @@ def test_a_body_is_where_it_is(run):
         shown.draw(i)
         places.append(body())
         assert (above.get_xlim(), above.get_ylim()) == limits
-    # As far as the motion, up to the face of the stop.
+    # The body's range is that of the motion, and ends at the stop.
     walked = float(run.y_max.max() - run.y_min.min())
     assert np.ptp(places) == pytest.approx(walked, abs=0.15)
     wall = max(line.get_xdata()[0] for line in above.lines if line.get_color() == GREEN
@@ -115,7 +115,7 @@ def test_a_body_is_where_it_is(run):
 
 
 def test_frames_are_even_in_time():
-    """A shaft that runs up from rest turns slowly at first."""
+    """A shaft that starts at rest is slow at first."""
     scene = MACHINES["motor"].in_clock("time")
     start = scene.start(W=0.0)
     shown = vi.animate(moved(scene, start), scene, seconds=1.0, fps=40)
@@ -124,7 +124,7 @@ def test_frames_are_even_in_time():
 
 
 @pytest.mark.slow
-def test_an_orbit_knows_its_machine():
+def test_an_orbit_is_animated_without_its_machine():
     scene = MACHINES["ideal"]
     orbit = vi.find_orbit(scene, scene.start(Y=1.9, V=1.4), throw=True)
     shown = vi.animate(orbit, seconds=0.2, fps=20, history=False)
@@ -136,7 +136,7 @@ def test_an_orbit_knows_its_machine():
         vi.animate(lost)
 
 
-def test_a_machine_says_how_it_is_drawn():
+def test_a_machine_may_define_its_sketch():
     own, drawn = Own(), Drawn()
     start = vi.OscillatorState(jnp.asarray(0.5), jnp.asarray(0.0))
     plain = vi.plot_sketch(own, start, ax=Figure().subplots())
@@ -169,7 +169,7 @@ def test_a_movie_is_written(run, tmp_path):
     assert (tmp_path / "motion.mp4").stat().st_size > 1000
 
 
-def test_wrong_arguments_are_named(run):
+def test_errors_name_the_argument(run):
     scene = MACHINES["ideal"]
     with pytest.raises(ValueError, match="`machine` must be given"):
         vi.animate(run)

@@ -25,7 +25,7 @@ VISIONS = {
 
 
 def seen(color, vision):
-    """Oklab coordinates, in hundredths, of a colour as seen."""
+    """Return 100 times the Oklab coordinates of a colour as seen with this vision."""
     rgb = np.array(to_rgb(color))
     light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     cones = np.array(
@@ -47,7 +47,7 @@ def least(colors):
 
 
 def test_regimes_are_distinct():
-    # A green and a red of like lightness are 1.2 apart.
+    # For comparison: green and red of equal lightness have a distance of 1.2.
     assert least([*PERIODS, MORE_IMPACTS, *IRREGULAR.values(), NOT_COMPUTED]) > 5
     assert least([*PERIODS[:4], MORE_IMPACTS, *IRREGULAR.values(), NOT_COMPUTED]) > 7
 

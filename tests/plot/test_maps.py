@@ -1,4 +1,4 @@
-"""Maps show what was computed: each cell, each motion, each entry of the legend."""
+"""Cells, motions and legends of maps agree with the data."""
 
 import matplotlib
 
@@ -33,7 +33,7 @@ def _data(period=PERIODS, x=(0.5, 0.7, 0.9, 1.1), y=(0.1, 0.2, 0.3), result=None
 
 
 def _cells(ax):
-    """Colours of the cells, by column and row."""
+    """Return the colours of the cells by column and row, and the mesh."""
     (mesh,) = ax.collections
     mesh.update_scalarmappable()
     rows, columns = mesh.get_array().shape
@@ -76,7 +76,7 @@ def test_regimes_lie_around_their_values():
     np.testing.assert_allclose(edges[:, 0, 1], [0.05, 0.15, 0.25, 0.35])
 
 
-def test_axes_by_name_single_rows_and_what_was_not_computed():
+def test_axes_by_name_single_rows_and_missing_cells():
     turned = vi.plot_regimes(_data(), ax=_axes(), x="stops.0.restitution", legend=False)
     assert turned.get_legend() is None
     straight, _ = _cells(vi.plot_regimes(_data(), ax=_axes()))
@@ -88,7 +88,7 @@ def test_axes_by_name_single_rows_and_what_was_not_computed():
 
 
 def test_outcomes_have_colours():
-    """Lanes that an event ended, beside periods and without any."""
+    """Outcomes are drawn with and without periods in the data."""
     data = _data(PERIODS[:2], x=(0.5, 0.7), result=np.zeros((2, 3)))
     ends = np.array([[-1, 0, 1], [-1, -1, 0]])
     meanings = {"flag_values": [-1, 0, 1], "flag_meanings": "none fell_left fell_right"}
@@ -143,12 +143,12 @@ def test_basins_on_a_grid():
     first, second = ax.lines
     assert first.get_xydata().tolist() == [[0.2, 1.0]]
     assert second.get_xydata().tolist() == [[0.0, 0.0], [9.0, 9.0]]
-    # The point outside of the region does not widen the picture.
+    # The point outside the region does not change the limits.
     assert ax.get_xlim() == (-2.0, 2.0) and ax.get_ylim() == (-1.5, 1.5)
     assert ax.get_xlabel().startswith("Y") and ax.get_ylabel().startswith("V")
 
 
-def test_basins_name_their_circles_and_tell_motions_of_one_period_apart():
+def test_basins_have_a_legend_and_different_colours_for_equal_periods():
     dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
     found = _basins([[0, 1], [1, 0]], dims, **starts)
     ax = vi.plot_basins(found, ax=_axes())
@@ -161,7 +161,7 @@ def test_basins_name_their_circles_and_tell_motions_of_one_period_apart():
 
 
 @pytest.mark.slow
-def test_maps_of_a_machine_speak_its_words():
+def test_maps_of_a_machine_use_its_units_and_names():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     dims, starts = ("start.Y", "start.V"), {"start.Y": [0.0, 1.0], "start.V": [0.0, 1.0]}
     found = _basins([[0, 1], [1, 0]], dims, **starts)
@@ -187,7 +187,7 @@ def test_maps_of_a_machine_speak_its_words():
     assert not any("π" in name for name in _legend(vi.plot_regimes(data, ax=_axes())))
 
 
-def test_impacts_tell_regimes_of_one_period_apart():
+def test_regimes_of_equal_period_differ_by_impacts():
     impacts = np.array([[0.0, 1.0, 4.0], [5.0, 9.0, 0.0], [0.4, 0.0, 1.0], [0.4, 0.4, 2.0]])
     data = _data().assign(impacts=(_data()["period"].dims, impacts))
     ax = vi.plot_regimes(data, ax=_axes())
@@ -207,7 +207,7 @@ def test_basins_of_random_starts():
     assert len({tuple(color) for color in dots.get_facecolors()}) == 3
 
 
-def test_an_axis_of_a_number_within_an_array_has_its_name():
+def test_an_axis_of_an_array_component_has_its_name():
     from vi_jax.plot.scan import _start_name
 
     words = _start_name(vi.machines.Beam(), "start.displacement[0]")

@@ -1,4 +1,4 @@
-"""Pictures draw what was simulated: points, impacts, stops, units."""
+"""Pictures of motions agree with the simulation: points, impacts, stops, units."""
 
 import dataclasses
 
@@ -42,9 +42,9 @@ def test_path_holds_the_samples_and_the_impacts(scene, run):
     before, after = path.V[touching[::2]], path.V[touching[1::2]]
     assert (before > 0).all()
     np.testing.assert_allclose(after, -0.5 * before)
-    # Without the corners no point reaches the stop, with them none passes it.
+    # Samples do not reach the stop; impacts, drawn if a machine is given, lie on it.
     assert motion_path(run).Y.max() < 2.0 == path.Y.max()
-    # No jump in position: a misplaced impact would make one of several tenths.
+    # Positions are continuous: a misplaced impact would cause a jump of several tenths.
     step = np.abs(np.diff(path.Y))
     assert step.max() < 1.05 * np.abs(path.V).max() * 2 * np.pi / 0.9 / 32
 
@@ -67,7 +67,7 @@ def test_history_axis_and_stop(scene, run):
     assert plot_history(run, machine=scene, ax=ax, window=(2, 4), shift=1) is ax
     line, stop = ax.lines
     x = line.get_xdata()
-    # Crank angle in units of π: two for each cycle.
+    # The x axis is the crank angle in units of π: two per cycle.
     assert x.min() == pytest.approx(6.0) and x.max() == pytest.approx(10.0)
     assert set(stop.get_ydata()) == {2.0}
     assert ax.get_ylabel() == "Y = y/a"
@@ -77,7 +77,7 @@ def test_history_axis_and_stop(scene, run):
     assert cycles.lines[0].get_xdata().max() == pytest.approx(6.0)
 
 
-def test_history_of_a_machine_counts_its_own_cycles():
+def test_history_of_a_machine_counts_cycles():
     ball = vi.machines.BouncingBall(restitution=0.5, acceleration=3.0)
     run = vi.simulate(ball, ball.start(), 3, samples=16)
     ax = plot_history(run, machine=ball, ax=_axes())
@@ -86,7 +86,7 @@ def test_history_of_a_machine_counts_its_own_cycles():
 
 
 class Stated(vi.AbstractMachine):
-    """A body on a spring between a stop and a soft one, in millimetres."""
+    """An oscillator between a rigid and a soft stop, in millimetres."""
 
     contacts = (vi.RigidStop(1.5, 0.5), vi.SoftStop(1.2, 50.0, side="left"))
     cycle: float = 6.0
@@ -99,7 +99,7 @@ class Stated(vi.AbstractMachine):
         return vi.OscillatorState(x.V, -x.Y)
 
 
-def test_pictures_say_the_units_that_a_machine_states_and_show_its_soft_stop():
+def test_pictures_show_a_machines_units_and_soft_stop():
     machine, start = Stated(), vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
     run = vi.simulate(machine, start, 1, samples=16)
     assert plot_history(run, machine=machine, ax=_axes()).get_ylabel() == "position (mm)"
@@ -124,8 +124,8 @@ def test_errors_name_the_argument(scene, run):
 
 
 @pytest.mark.slow
-def test_impacts_of_a_machine_without_a_drive_lie_where_they_happen():
-    """Its nominal cycle is not as long as the motion's, so that a place is a part of its time."""
+def test_impacts_of_a_machine_without_a_drive_are_drawn_in_place():
+    """The motion's period differs from the machine's nominal cycle."""
     valve = vi.machines.ReliefValve()
     start = valve.start(lift=2.4936, speed=0.0, pressure=1.5342)
     run = vi.find_orbit(valve, start, throw=True).trajectory()

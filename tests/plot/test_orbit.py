@@ -25,7 +25,7 @@ def branch():
     return vi.continue_orbit(orbit, parameter=NAME, bounds=(0.9, 1.0))
 
 
-def test_branch_changes_its_line_where_it_changes_stability(branch):
+def test_branch_changes_its_line_style_with_stability(branch):
     ax = vi.plot_branch(branch, label="2π")
     lines = {line.get_linestyle(): line for line in ax.lines if len(line.get_xdata()) > 1}
     assert set(lines) == {"-", "--"}
@@ -38,7 +38,7 @@ def test_branch_changes_its_line_where_it_changes_stability(branch):
     assert [line.get_label() for line in ax.lines].count("2π") == 1
 
 
-def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
+def test_legend_names_marks_and_begins_with_a_solid_line(branch):
     for turn in (slice(None), slice(None, None, -1)):  # begins stable, begins unstable
         turned = dataclasses.replace(branch, steps=branch.steps[turn])
         ax = vi.plot_branch(turned, ax=_axes(), label="2π")
@@ -51,15 +51,15 @@ def test_branch_names_its_marks_and_begins_its_legend_solid(branch):
         assert handles["2π"].get_linestyle() == "-"
         assert handles["2π"].get_color() == color_of(1)
         assert [handles[word].get_linestyle() for word in named[1:3]] == ["-", "--"]
-        # Without a label the legend says what the colour stands for, and nothing twice.
+        # Without a label the legend explains the colour, and has no entry twice.
         for _ in range(2):
             vi.plot_branch(branch, ax=ax)
             again = [t.get_text() for t in ax.get_legend().get_texts()]
             assert again == ["2π", "2π, 1 impact", *named[1:]]
 
 
-def test_a_branch_along_which_nothing_moves_is_drawn_by_its_least_position(branch):
-    """By rounding alone the other extreme varies, and a sweep would be drawn by another one."""
+def test_a_branch_with_constant_extremes_is_drawn_by_its_minimum(branch):
+    """The maximum varies by rounding only, and must not be chosen."""
     noisy = [{"y_min": -1.3, "y_max": 1.3 + i % 2 * 1e-15} for i in range(len(branch.steps))]
     steps = [
         step._replace(seen=step.seen._replace(**at))
@@ -83,7 +83,7 @@ def test_a_sweep_lies_above_branches_and_below_marks(branch):
     assert marks and max(x.zorder for x in lines) < dots.zorder < min(x.zorder for x in marks)
 
 
-def test_every_special_point_has_a_mark_of_its_own():
+def test_every_kind_of_special_point_has_a_different_mark():
     assert len({mark for mark, _ in MARKS.values()}) == len(MARKS)
     assert set(_sliding.SLIDING) <= set(MARKS)
     assert set(MARKS) - set(_sliding.SLIDING) == {
@@ -97,8 +97,8 @@ def test_every_special_point_has_a_mark_of_its_own():
     }  # fmt: skip
 
 
-def test_what_a_stop_holds_is_not_drawn(branch):
-    """Of a ball on a table the least height is the table's; and names are checked."""
+def test_an_extreme_that_a_stop_fixes_is_not_drawn(branch):
+    """The minimal height of a ball on a table is constant, so the maximum is drawn."""
     ball = vi.machines.BouncingBall(acceleration=1.2, restitution=0.6)
     swept = vi.sweep(
         ball, "acceleration", np.linspace(1.1, 1.2, 3), start=ball.start(height=6.8, speed=-0.7),

@@ -1,4 +1,4 @@
-"""The styles reach pictures and files."""
+"""The styles set the sizes of figures and the fonts of files."""
 
 import re
 
@@ -39,5 +39,5 @@ def test_a_pdf_has_its_fonts_as_truetype(run, tmp_path):
         ax.figure.savefig(tmp_path / "figure.pdf")
     text = (tmp_path / "figure.pdf").read_bytes()
     kinds = set(re.findall(rb"/Subtype /(Type3|CIDFontType2|Type42)", text))
-    assert kinds == {b"CIDFontType2"}  # how a PDF names an embedded TrueType font
+    assert kinds == {b"CIDFontType2"}  # an embedded TrueType font
     plt.close(ax.figure)

@@ -1,4 +1,4 @@
-"""Manifolds of saddles, beside closed forms and beside the basins whose boundary they are."""
+"""Manifolds of saddles, compared with closed forms and with boundaries of basins."""
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,9 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("which", ["stable", "unstable"])
 @pytest.mark.parametrize("growth", [2.0, -2.0])
-def test_bent_manifolds_of_a_map_with_closed_forms(which, growth):
-    """Of (x, y) → (g x + b y², y/2 + c x²) they are x = b y²/(1/4 - g) where c = 0, and
-    y = c x²/(g² - 1/2) where b = 0; each branch on its side, also if a multiplier is negative."""
+def test_curved_manifolds_agree_with_closed_forms(which, growth):
+    """Manifolds of (x, y) → (g x + b y², y/2 + c x²) are x = b y²/(1/4 - g) if c = 0, and
+    y = c x²/(g² - 1/2) if b = 0. A branch stays on one side, even if its multiplier is negative."""
     bent, straight = {(0, 2, 0, 0): 0.8}, {(2, 0, 0, 0): 0.8}
     bends = (bent, {}) if which == "stable" else ({}, straight)
     rows = {(1, 0, 0, 0): growth} | bends[0], {(0, 1, 0, 0): 0.5} | bends[1]
@@ -40,8 +40,8 @@ def saddle():
     return vi.find_orbit(scene, scene.start(Y=1.26, V=1.086), cycles=2)
 
 
-def test_the_stable_manifold_is_the_boundary_of_basins(saddle):
-    """On its two sides, 1e-6 away, starts settle on motions with one impact and with two."""
+def test_the_stable_manifold_is_a_basin_boundary(saddle):
+    """Starts 1e-6 from the manifold settle on one impact on one side and on two on the other."""
     machine = saddle.machine
 
     def one(row):
@@ -61,7 +61,7 @@ def test_the_stable_manifold_is_the_boundary_of_basins(saddle):
         np.testing.assert_array_equal(sides, np.repeat([[1], [2]], len(rows) - 2, axis=1))
 
 
-def test_the_unstable_manifold_leads_to_the_motions_on_both_sides(saddle):
+def test_the_unstable_manifold_ends_at_the_two_attractors(saddle):
     found = vi.manifold(saddle, which="unstable")
     ends = sorted(float(branch.Y[-1]) for branch in found.branches)
     np.testing.assert_allclose(ends, [1.28266, 1.52828], atol=1e-3)
@@ -69,7 +69,7 @@ def test_the_unstable_manifold_leads_to_the_motions_on_both_sides(saddle):
     assert len(ax.lines) == 3 and ax.get_xlabel() and ax.get_ylabel()
 
 
-def test_what_has_no_manifolds(saddle):
+def test_invalid_arguments_raise(saddle):
     with pytest.raises(ValueError, match="`which` must be one of"):
         vi.manifold(saddle, which="center")
     with pytest.raises(ValueError, match="`orbit` must be a saddle"):

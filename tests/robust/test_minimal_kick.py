@@ -1,4 +1,4 @@
-"""How hard a motion may be kicked: beside brute force, bisection and decimals by SciPy."""
+"""The minimal kick, compared with brute force, bisection and SciPy."""
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ from vi_jax.robust import _minimal_kick
 
 from belts import Belt
 
-# Between two motions of period 4π, with one impact and with two.
+# This scene has two stable motions of period 4π, with one impact and with two.
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
 
 
@@ -30,7 +30,7 @@ def result(motions):
 
 @pytest.fixture(scope="module")
 def two_impacts():
-    """Of many kicks of the first motion, whether two impacts a period come of it."""
+    """Return a function of many starts: whether they settle on the motion with two impacts."""
 
     def one(row):
         run = vi.simulate(SCENE, SCENE.start(Y=row[0], V=row[1]), 2, settle=200)
@@ -44,7 +44,7 @@ def row_of(state):
 
 
 @pytest.mark.slow
-def test_the_kick_of_the_scene_beside_a_bisection_along_it(motions, result, two_impacts):
+def test_the_minimal_kick_agrees_with_bisection_along_it(motions, result, two_impacts):
     begin, there = row_of(motions[0].state), row_of(result.start)
     size = np.linalg.norm(there - begin)
     assert float(result.norm) == pytest.approx(size, rel=1e-12)
@@ -57,12 +57,12 @@ def test_the_kick_of_the_scene_beside_a_bisection_along_it(motions, result, two_
     assert high == pytest.approx(1, abs=1e-9)
     assert result.exact and result.confirmed and float(result.residual) < 1e-9
     assert int(result.settles.impacts) == 2 and bool(result.settles.stable)
-    assert result.lanes < 42_000  # a hundredth of a picture of 2,048² starts
+    assert result.lanes < 42_000  # 1 % of a map with 2,048² starts
 
 
 @pytest.mark.slow
-def test_no_kick_as_small_leads_elsewhere(motions, result, two_impacts):
-    """All around, and close beside the kick; a little harder it does."""
+def test_no_smaller_kick_leads_elsewhere(motions, result, two_impacts):
+    """Check all directions, and many close to that of the kick. A slightly harder kick escapes."""
     begin, angle = row_of(motions[0].state), np.arctan2(result.kick["V"], result.kick["Y"])
     angles = np.concatenate(
         [np.linspace(0, 2 * np.pi, 8192), angle + np.linspace(-0.01, 0.01, 512)]
@@ -74,7 +74,7 @@ def test_no_kick_as_small_leads_elsewhere(motions, result, two_impacts):
 
 
 @pytest.mark.slow
-def test_the_edge_is_the_saddle(motions, result):
+def test_the_edge_state_is_the_saddle(motions, result):
     saddle = vi.find_orbit(SCENE, SCENE.start(Y=1.26, V=1.086), 2)
     assert saddle.successful and not saddle.stable
     tracked = vi.edge_state(SCENE, motions[1], motions[0])
@@ -85,9 +85,9 @@ def test_the_edge_is_the_saddle(motions, result):
 
 
 @pytest.mark.slow
-def test_a_weight_scales_the_norm(motions, two_impacts, monkeypatch):
-    """Of the velocity: all around, on the ellipse of the norm, no smaller kick leads elsewhere. A
-    kick that two rays lead to is listed once."""
+def test_a_weighted_norm(motions, two_impacts, monkeypatch):
+    """No kick within the ellipse of the weighted norm leads elsewhere. A kick that two rays find is
+    listed once."""
     names, best = ["V", "Y"], _minimal_kick.nearest_first
     monkeypatch.setattr(_minimal_kick, "nearest_first", lambda *arguments: 2 * best(*arguments))
     result = vi.minimal_kick(SCENE, motions[0], components=names, weights={"V": 3.0}, candidates=1)
@@ -107,7 +107,7 @@ def test_a_weight_scales_the_norm(motions, two_impacts, monkeypatch):
 
 @pytest.mark.slow
 def test_the_same_machine_in_micrometres(result):
-    """There was no kick: all starts counted as come back."""
+    """Once no kick was found, since all starts counted as returned."""
     size = 1e-6
     machine = vi.machines.Duffing(
         amplitude=size, frequency=0.9, damping=2 * 0.02, stiffness=1.0, cubic=0.0, gap=2 * size,
@@ -119,7 +119,7 @@ def test_the_same_machine_in_micrometres(result):
     assert float(kick.norm) / size == pytest.approx(float(result.norm), rel=1e-7)
 
 
-def test_what_cannot_be_asked(motions, result):
+def test_invalid_arguments_raise(motions, result):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):
         ask(SCENE, result.edge.orbit)
@@ -138,13 +138,13 @@ def test_what_cannot_be_asked(motions, result):
 
 
 @pytest.mark.slow
-def test_how_hard_steady_sliding_may_be_kicked():
-    """To sticking and slipping; over the unstable cycle of sliding between them."""
+def test_the_minimal_kick_of_steady_sliding():
+    """The kick leads to stick-slip, across the unstable cycle of sliding."""
     rest = 0.5 + 0.5 * np.exp(-3.0)
     result = vi.minimal_kick(
         Belt(), vi.OscillatorState(jnp.asarray(rest), jnp.asarray(0.0)), directions=64
     )
-    # The least distance to that cycle by SciPy, backward in time, in which motions go to it.
+    # Smallest distance to that cycle by SciPy, which finds it backward in time.
     assert float(result.norm) == pytest.approx(1.17393040, abs=1e-8)
     np.testing.assert_allclose(row_of(result.start), [-0.464548, 0.631758], atol=1e-6)
     assert result.exact and result.confirmed
@@ -158,8 +158,8 @@ class Third(eqx.Module):
 
 
 class Between(vi.AbstractMachine):
-    """x goes to 1 or -1, where an oscillator dies out; on the boundary x = 0 it is Ueda's, which is
-    pushed."""
+    """x goes to 1 or -1, where an oscillator decays to rest. On the boundary x = 0 it is Ueda's
+    driven oscillator."""
 
     push: jax.Array | float = 1.0
     cycle = 2 * np.pi
@@ -178,8 +178,8 @@ HOME = third(0.0, 0.0, 1.0)
 
 
 @pytest.mark.slow
-def test_a_chaotic_edge():
-    """On the boundary, with a push of 7.5, Ueda's oscillator is chaotic."""
+def test_a_chaotic_edge_state():
+    """Ueda's oscillator with amplitude 7.5 is chaotic."""
     edge = vi.edge_state(Between(push=7.5), HOME, third(1.0, 0.5, -0.5), rounds=24)
     assert edge.orbit is None and edge.kind == "chaotic"
     assert np.abs(np.asarray(edge.sections.x)).max() < 2e-5
@@ -187,7 +187,7 @@ def test_a_chaotic_edge():
 
 @pytest.mark.exhaustive
 def test_a_kick_in_three_components():
-    """The boundary is the plane x = 0, at the distance 1 from the motion at rest."""
+    """The boundary is the plane x = 0, at distance 1 from rest."""
     result = vi.minimal_kick(Between(), HOME, candidates=1, directions=64)
     kick = [float(result.kick[name]) for name in ("Y", "V", "x")]
     np.testing.assert_allclose(kick, [0.0, 0.0, -1.0], atol=1e-9)

@@ -19,14 +19,14 @@ def motion():
 
 
 def seen_from(motion, number, of):
-    """The motion on a section moved by so many parts of a turn of the crank."""
+    """Return the motion on a section at the crank angle 2π number/of."""
     samples = vi.simulate(SCENE, motion.state, 2, samples=of, record="sections").samples.state
     there = SCENE.at_section(number % of * 2 * np.pi / of)
     return vi.find_orbit(there, there.start(Y=samples.Y[number], V=samples.V[number]), 2)
 
 
 @pytest.mark.slow
-def test_a_kick_at_a_phase_is_that_on_a_section_there(motion):
+def test_a_kick_at_a_phase_equals_that_on_a_section_there(motion):
     for number, components in ((1, ["V"]), (6, ["Y", "V"])):
         here = seen_from(motion, number, 4)
         there = vi.minimal_kick(here.machine, here, **{**BLOW, "components": components})
@@ -39,7 +39,7 @@ def test_a_kick_at_a_phase_is_that_on_a_section_there(motion):
 
 
 class Later(vi.machines.Duffing):
-    """The same oscillator, whose cycle begins later in its drive's."""
+    """The Duffing oscillator with the drive's phase shifted by `later`."""
 
     later: jax.Array | float = 0.0
 
@@ -48,8 +48,8 @@ class Later(vi.machines.Duffing):
 
 
 @pytest.mark.exhaustive
-def test_a_machine_of_ones_own_is_kicked_at_a_phase():
-    """One that is driven, whose section cannot be moved: beside the same with another origin."""
+def test_a_driven_machine_is_kicked_at_a_phase():
+    """Compare with the same machine after a shift of the drive's phase."""
     numbers = {"amplitude": 0.2, "damping": 0.15, "stiffness": -1.0, "cubic": 1.0, "gap": 100.0}
     first, then = Later(**numbers), Later(later=jnp.asarray(2.0), **numbers)
     motion = vi.find_orbit(first, first.start(Y=1.0, V=0.2), 1)
@@ -62,9 +62,9 @@ def test_a_machine_of_ones_own_is_kicked_at_a_phase():
 
 
 @pytest.mark.exhaustive
-def test_a_moment_of_a_machine_without_a_drive():
-    """A kick that stops sticking and slipping. The least is the distance between its cycle and the
-    unstable one of sliding, by SciPy."""
+def test_an_autonomous_machine_is_kicked_at_a_phase():
+    """A kick stops stick-slip. The minimum over phases is the distance between its cycle and the
+    unstable one of sliding, computed with SciPy."""
     belt = Belt(jnp.asarray(1.5))
     motion = vi.find_orbit(belt, belt.start(Y=-1.2), 1, throw=True)
     options = {"candidates": 1, "directions": 32, "progress": False}
@@ -79,7 +79,7 @@ def test_a_moment_of_a_machine_without_a_drive():
 
 
 @pytest.mark.slow
-def test_phases_that_cannot_be_asked(motion):
+def test_invalid_phases_raise(motion):
     ask = vi.minimal_kick
     with pytest.raises(TypeError, match="`phase` must be"):
         ask(SCENE, motion, phase="best")
