@@ -1,4 +1,4 @@
-"""Two threads that come to lanes first, at once, and then run them; see `test_interrupts.py`."""
+"""Two threads use lanes for the first time at once; a script of `test_interrupts.py`."""
 
 import threading
 
@@ -15,7 +15,7 @@ engines = []
 
 def slowly(text):
     engines.append(made(text))
-    threading.Event().wait(0.2)  # so that the other comes meanwhile
+    threading.Event().wait(0.2)  # the other thread arrives during this time
     return engines[-1]
 
 

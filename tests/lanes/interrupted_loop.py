@@ -1,4 +1,4 @@
-"""A loop of simulations that is interrupted again and again: prints what became of it."""
+"""Interrupt a loop of simulations many times, and print the numbers of lost and wrong results."""
 
 import gc
 import os
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
-# A shell starts what runs in the background without it.
+# A shell makes its background processes ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# An interrupt within a function that the collector of garbage calls (JAX, as of 0.10, has one) is
-# lost by Python itself, in any loop: it prints "Exception ignored in".
+# Python drops an interrupt within a callback of the garbage collector (JAX 0.10 has one), and
+# prints "Exception ignored in".
 gc.disable()
 
 INTERRUPTS = 120
@@ -42,7 +42,7 @@ begun, ended = threading.Event(), threading.Event()
 
 def strike():
     draw = random.Random(0)
-    begun.wait()  # Python's own start of this thread is no place for an interrupt
+    begun.wait()  # no interrupt while Python starts this thread
     for _ in range(INTERRUPTS):
         time.sleep(draw.uniform(0, 2.5 * took))
         before, clock = len(heard), time.perf_counter()
@@ -67,7 +67,7 @@ def work():
 
 
 def again(depth):
-    """An interrupt may come while the one before is being noted."""
+    """Count interrupts; nested, since one may come while the last is being counted."""
     while not ended.is_set():
         try:
             again(depth - 1) if depth else work()

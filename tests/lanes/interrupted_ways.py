@@ -1,4 +1,4 @@
-"""Every way into a kernel is left at Ctrl-C; prints how long each took to end (seconds)."""
+"""Send Ctrl-C to each way of calling a kernel, and print the seconds until it ends."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
-# A shell starts what runs in the background without it.
+# A shell makes its background processes ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
@@ -48,7 +48,7 @@ WAYS = {
 
 
 def struck(way, delay):
-    np.asarray(way(1))  # compiled
+    np.asarray(way(1))  # compile
     at = []
 
     def strike():
@@ -61,11 +61,11 @@ def struck(way, delay):
         while True:
             try:
                 np.asarray(way(LONG))
-            except Exception as error:  # as a loop of a user's own may have it
+            except Exception as error:  # as a user's loop may do
                 print(f"swallowed {error!r}", file=sys.stderr)
     except KeyboardInterrupt:
         pass
-    np.asarray(jnp.sin(jnp.arange(3.0)))  # waits for what runs still
+    np.asarray(jnp.sin(jnp.arange(3.0)))  # wait for running programs
     return time.perf_counter() - at[0]
 
 

@@ -1,4 +1,4 @@
-"""What is kept: machine code in files, kernels, programs of functions that are alike."""
+"""Caches: machine code in files, kernels, and programs of equal functions."""
 
 import gc
 import weakref
@@ -20,7 +20,7 @@ def program_of(function, *args):
     return next(e.params["program"] for e in equations if e.primitive.name == "lanes")
 
 
-def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
+def test_machine_code_is_cached_in_files(monkeypatch, tmp_path):
     def fallen():
         kernel = runtime.Kernel("define void @kernel() { ret void }", None, 8)
         return kernel.function
@@ -39,7 +39,7 @@ def test_programs_are_kept_where_jax_keeps_its_own(monkeypatch, tmp_path):
     assert kept.read_bytes() == content
 
 
-def test_where_programs_are_kept(tmp_path):
+def test_the_cache_folder_is_within_that_of_jax(tmp_path):
     before = jax.config.jax_compilation_cache_dir  # pyright: ignore
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path))
@@ -50,8 +50,8 @@ def test_where_programs_are_kept(tmp_path):
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_programs_are_dropped_in_time():
-    """Many programs in one process, each used once: memory maps and kernels stay few."""
+def test_old_programs_are_dropped():
+    """Memory maps and kernels stay few after many programs in one process."""
 
     def one(number):
         begin = lambda x: (x, lanes.Emitted(True, False, None))
@@ -69,8 +69,8 @@ def test_programs_are_dropped_in_time():
     assert len(runtime._recent) <= runtime._MOST_KERNELS
 
 
-def test_arrays_in_memory_go_without_the_garbage_collector(monkeypatch):
-    """Or texts, and with them the names of files of machine code, would depend on when it runs."""
+def test_arrays_are_freed_without_the_garbage_collector(monkeypatch):
+    """Otherwise texts, and so the names of cached files, would depend on when it runs."""
     function = lambda x: (jnp.outer(x, x) @ jnp.sin(x), jnp.sort(x), jnp.cumsum(x))
     program = program_of(lambda x: lanes.once(function, x), jnp.ones(23))
     blocks, take = [], _text.Arena.take
@@ -88,7 +88,7 @@ def _sum(bound, x):
 
 @pytest.mark.slow
 def test_constants_bound_to_a_function_distinguish_programs():
-    """Equal constants make one program, and what only compares equal makes another."""
+    """Equal constants share a program, unless types or signs of zero differ."""
 
     def found(offset):
         return program_of(lambda x: lanes.once(partial(_sum, {"offset": offset}), x), 1.0)
@@ -104,7 +104,7 @@ def test_constants_bound_to_a_function_distinguish_programs():
 
 
 class Metres(float):
-    """A number that shows less than it is."""
+    """A number whose `repr` is rounded."""
 
     def __repr__(self):
         return f"{float(self):.1f} m"
@@ -118,7 +118,7 @@ def _scaled(x):
 
 
 @pytest.mark.slow
-def test_clearing_the_caches_of_jax_clears_ours(monkeypatch):
+def test_clearing_the_caches_of_jax_clears_those_of_lanes(monkeypatch):
     x = jnp.asarray(3.0)
     assert lanes.once(_scaled, x) == 6.0
     monkeypatch.setitem(globals(), "FACTOR", 5.0)
@@ -141,8 +141,8 @@ def test_decorated_functions_are_distinguished_by_their_wrapper():
     assert lanes.once(scaled, x) == 15.0
 
 
-def test_what_is_traced_is_not_kept():
-    """A function bound as a constant may close over numbers that vary."""
+def test_traced_numbers_are_not_cached():
+    """A function bound as a constant may close over traced numbers."""
 
     def along(k):
         return lanes.once(partial(_applied, Law(lambda x: k * x)), jnp.asarray(2.0))

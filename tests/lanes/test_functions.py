@@ -1,4 +1,4 @@
-"""Every operation of the vector code against XLA's, at ordinary numbers and at the corners."""
+"""Operations of the vector code agree with XLA's, also for special values."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ Y = np.random.default_rng(2).permutation(X)
 
 
 def once(function, *args, backend):
-    """`function` of every lane, by a loop of one step."""
+    """Evaluate `function` in every lane with a loop of one step."""
 
     def lane(*args):
         def begin(args):
@@ -35,7 +35,7 @@ def once(function, *args, backend):
     return jax.jit(jax.vmap(lane))(*args)
 
 
-# The functions and how many units of rounding they may differ by (of results near one).
+# Functions, and the allowed difference in units of rounding for results near one.
 FUNCTIONS = {
     "arithmetic": (lambda x, y: (x + y, x - y, x * y, x / y, -x), 1),
     "powers": (lambda x, y: (x**2, x**3, x**7, x**-1, x**-2, jnp.square(x), x**0), 2),
@@ -84,19 +84,19 @@ FUNCTIONS = {
 
 
 def _numbers(name, x, y):
-    """The numbers that a function is asked at: lanes where another one is defined stay out."""
+    """Return the arguments; those for which the backends may differ are replaced."""
     kind = x.dtype.type
     if name == "whole numbers":
         whole = (np.abs(x) < 1e9) & (np.abs(y) < 1e9)
         return tuple(np.where(whole, z, kind(1.5)) for z in (x, y))
-    if name == "circle":  # beyond a million turns the reduction loses digits
+    if name == "circle":  # argument reduction loses digits for large arguments
         return np.where(np.abs(x) > 1e6, kind(1.0), x), y
     return x, y
 
 
 @pytest.fixture(scope="module", params=[np.float64, np.float32])
 def elementwise(request):
-    """All functions by one kernel and by XLA: type, and by name what either gives."""
+    """Return the type, and the results of all functions by one kernel and by XLA."""
     dtype = request.param
     with np.errstate(over="ignore"):
         x, y = X.astype(dtype), Y.astype(dtype)
@@ -120,25 +120,25 @@ def test_elementwise(name, elementwise):
         if a.dtype.kind != "f":
             np.testing.assert_array_equal(a, b)
             continue
-        tiny = np.finfo(dtype).tiny  # XLA takes smaller numbers for zero
+        tiny = np.finfo(dtype).tiny  # XLA flushes smaller numbers to zero
         np.testing.assert_allclose(a, b, rtol=units * eps, atol=max(units * eps * 0.5, tiny))
 
 
-def test_exponential_is_right_to_rounding():
+def test_exponential_is_accurate_to_rounding():
     x = np.linspace(-700, 700, 4001)
     value = once(lambda x: jnp.exp(x), x, backend="auto")
     np.testing.assert_allclose(value, np.exp(x), rtol=4e-16)
 
 
-def test_circle_is_right_to_rounding():
+def test_sine_and_cosine_are_accurate_to_rounding():
     x = np.linspace(-40, 40, 8001)
     sine, cosine = once(lambda x: lanes.sincos(x), x, backend="auto")
     np.testing.assert_allclose(sine, np.sin(x), atol=3e-16, rtol=0)
     np.testing.assert_allclose(cosine, np.cos(x), atol=3e-16, rtol=0)
 
 
-def test_a_phase_without_digits_is_no_number():
-    """Beyond 2^52 two neighbours are a radian apart, and a turn soon."""
+def test_sine_and_cosine_of_huge_arguments_are_nan():
+    """Neighbouring numbers beyond 2^52 differ by a radian or more."""
     x = np.array([1e15, -1e15, 1e18, -1e20, 1e300, np.inf, np.nan])
     for value in once(lambda x: (jnp.sin(x), jnp.cos(x)), x, backend="auto"):
         assert np.all(np.abs(value[:2]) <= 1) and np.all(np.isnan(value[2:]))
@@ -174,7 +174,7 @@ ARRAYS = {
 
 @pytest.fixture(scope="module")
 def arrays():
-    """All of them by one kernel and by XLA."""
+    """Return the results of all functions by one kernel and by XLA."""
     x, y = np.random.default_rng(3).normal(0, 2, (2, 37))
 
     def all_of(x, y):
@@ -190,7 +190,7 @@ def test_arrays_in_a_lane(name, arrays):
 
 
 def branches(x, y):
-    """A branch in a branch in a loop whose length differs from lane to lane."""
+    """Nested branches in a loop whose length differs between lanes."""
 
     def body(state):
         i, total = state
@@ -217,7 +217,7 @@ def test_control_flow():
 
 
 def quotients(x, y):
-    """Divisions in all places where a jaxpr has them, of numbers, constants and reciprocals."""
+    """Divisions in all kinds of sub-jaxprs, by variables and constants, and reciprocals."""
     inner = jax.jit(lambda a: jnp.sin(a) / (1 + a * a))
     branch = jax.lax.cond(x > 0, lambda a: a / y, lambda a: y / (2 + a), jnp.abs(x))
     loop = jax.lax.fori_loop(0, 3, lambda i, a: a / (1 + y * y), x)
@@ -267,13 +267,13 @@ def test_directions_share_divisions(monkeypatch):
         jax.jit(lane)(one, one, jnp.ones((directions, 8)))
         return max(text.count("fdiv") for text in texts)
 
-    assert divisions(2) == divisions(6) == 2  # the ratio and the divisor's reciprocal
+    assert divisions(2) == divisions(6) == 2  # the quotient and the divisor's reciprocal
 
 
 @pytest.mark.parametrize("kind", [jnp.int32, jnp.int64, jnp.uint32])
 @pytest.mark.parametrize("count", [3, 64])
-def test_integers_divided_by_what_varies(kind, count):
-    """As XLA has it, by zero and by -1 as well; three lanes leave empty slots in their group."""
+def test_division_of_integers(kind, count):
+    """Agree with XLA, also for divisors 0 and -1. Three lanes leave empty slots in their group."""
     rng = np.random.default_rng(5)
     low = 0 if kind == jnp.uint32 else -4
     info = jnp.iinfo(kind)

@@ -1,4 +1,4 @@
-"""Ctrl-C ends lanes wherever they run, and lanes that were not run are no success."""
+"""Ctrl-C interrupts lanes, and lanes that did not run raise an error."""
 
 import functools
 import gc
@@ -18,7 +18,7 @@ from vi_jax.lanes import runtime
 SCENE = vi.Scene.ideal(frequency_ratio=0.9)
 
 
-def test_threads_are_a_number_from_one_on():
+def test_the_number_of_threads_is_checked():
     for number in (0, -1, 1025, 10**30):
         with pytest.raises(ValueError, match="`number` must be from 1 to 1024, but got"):
             vi.threads(number)
@@ -28,16 +28,16 @@ def test_threads_are_a_number_from_one_on():
 
 
 @pytest.mark.slow
-def test_two_threads_may_come_to_lanes_first():
-    """The handler that XLA has must stay, whichever thread made it."""
+def test_two_threads_may_use_lanes_first_at_once():
+    """Only one handler may be created for XLA, by either thread."""
     script = Path(__file__).with_name("first_use.py")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["1"]
 
 
-def test_lanes_that_were_not_run_are_no_success(monkeypatch):
-    """Their results would be what the memory held."""
+def test_lanes_that_did_not_run_raise(monkeypatch):
+    """Their results would be uninitialised memory."""
     lanes = jax.jit(jax.vmap(lambda V: vi.simulate(SCENE, SCENE.start(V=V), 3).impacts))
     starts = jnp.linspace(0.0, 0.5, 24)
     whole = np.asarray(lanes(starts))
@@ -56,7 +56,7 @@ def test_lanes_that_were_not_run_are_no_success(monkeypatch):
 
 
 class Collected(vi.AbstractMachine):
-    """The garbage collector runs where its field is asked."""
+    """A machine whose field runs the garbage collector when it is traced."""
 
     cycle: float = 1.0
 
@@ -70,7 +70,7 @@ class Collected(vi.AbstractMachine):
 
 @pytest.fixture
 def pressed():
-    """Ctrl-C within the next callback of the garbage collector, where Python drops it."""
+    """Return a function that sends Ctrl-C in a garbage collection, where Python drops it."""
     waiting = []
 
     def callback(phase, _):
@@ -84,8 +84,8 @@ def pressed():
 
 
 @pytest.mark.slow
-def test_no_interrupt_within_the_garbage_collector_is_lost(pressed):
-    """It ends a function before its program runs, where it tells what was done, and lanes."""
+def test_interrupts_within_the_garbage_collector_are_kept(pressed):
+    """The interrupt comes during tracing, before a progress report, or before lanes run."""
     hook = sys.unraisablehook
     motion = jax.jit(lambda settle: vi.simulate(SCENE, SCENE.start(), 1, settle=settle).last.Y)
     motion(1)
@@ -114,7 +114,7 @@ def _printed(script, *arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ways", [("jit",), ("simulate", "vi.jit", "vmap", "grad", "sweep")])
-def test_each_way_into_a_kernel_hears_an_interrupt(ways):
+def test_each_way_of_calling_a_kernel_is_interruptible(ways):
     done = _printed("interrupted_ways.py", *ways)
     assert "swallowed" not in done.stderr
     for line, way in zip(done.stdout.splitlines(), ways, strict=True):
@@ -123,8 +123,8 @@ def test_each_way_into_a_kernel_hears_an_interrupt(ways):
 
 
 @pytest.mark.slow
-def test_a_loop_hears_every_interrupt_and_keeps_its_numbers():
-    """Wherever between two instructions it comes, also as XLA calls into Python."""
+def test_a_loop_receives_every_interrupt_and_stays_correct():
+    """Interrupts come at random times, also while XLA calls Python."""
     done = _printed("interrupted_loop.py")
     words = done.stdout.split()
     assert words[2:] == ["lost", "0", "wrong", "0", "errors", "0"] and int(words[1]) >= 120, words

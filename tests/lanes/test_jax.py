@@ -1,4 +1,4 @@
-"""What lanes take from JAX and Equinox by name: a test for each that no public module promises."""
+"""Names of JAX and Equinox that lanes use, but that no public interface guarantees."""
 
 import equinox as eqx
 import jax
@@ -12,19 +12,19 @@ from vi_jax.lanes import _primitive
 from vi_jax.lanes._array_rules import STRUCTURAL
 from vi_jax.lanes._operations import ELEMENTWISE
 
-# Primitives of this package, and some that JAX has in no public module, or not in all its versions.
+# Primitives of this package, and those of JAX that are not public or not in all its versions.
 OWN = {"sincos", "pin", "quotient", "weighted", "weighted_quotient", "weighted_dot"}
 ELSEWHERE = {"copy_p", "pvary", "reshard", "expand_dims", "empty2", "stack", "unstack"}
 
 
-def test_rules_are_written_for_primitives_that_there_are():
+def test_all_rules_have_a_primitive():
     there = {x.name for m in (primitives, jax.lax) for x in vars(m).values()
              if isinstance(x, Primitive)}  # fmt: skip
     gone = {*ELEMENTWISE, *STRUCTURAL} - there - OWN - ELSEWHERE
     assert not gone, f"JAX has no primitives {gone}: rename their rules (_operations.py)"
 
 
-def test_what_a_policy_of_checkpoint_says():
+def test_the_results_of_checkpoint_policies():
     policy = jax.checkpoint_policies.save_and_offload_only_these_names(
         names_which_can_be_saved=["a"], names_which_can_be_offloaded=[],
         offload_src="device", offload_dst="pinned_host",
@@ -36,7 +36,7 @@ def test_what_a_policy_of_checkpoint_says():
     assert _primitive._saved(jax.checkpoint_policies.everything_saveable(eqn.primitive)), message
 
 
-def test_what_a_rule_for_partly_known_values_is_given(monkeypatch):
+def test_the_arguments_of_a_partial_evaluation_rule(monkeypatch):
     gone, rule = [], _primitive._partially_known
 
     def spy(trace, *tracers, **parameters):
@@ -52,19 +52,19 @@ def test_what_a_rule_for_partly_known_values_is_given(monkeypatch):
     assert hasattr(mlir.ModuleContext, "add_keepalive"), "see `_lowered` (_primitive.py)"
 
 
-def test_settings_are_known_by_their_names():
+def test_the_names_of_settings():
     for name in ("compilation_cache_dir", "enable_compilation_cache", "enable_x64"):
         assert hasattr(jax.config, f"jax_{name}"), f"no setting {name} (_code.py, loop.py)"
 
 
-def test_compiler_options_within_a_program_are_refused_in_these_words():
+def test_the_error_message_for_inner_compiler_options():
     inner = jax.jit(jnp.sin, compiler_options=_programs.PLAIN)
     with pytest.raises(ValueError) as caught:
         jax.jit(lambda x: inner(x))(1.0)
     assert "compiler_options" in str(caught.value), "see `CompiledFunction` (_programs.py)"
 
 
-def test_what_equinox_compiled_can_be_dropped():
+def test_programs_of_equinox_can_be_dropped():
     cached = getattr(eqx.filter_jit(jnp.sin), "_cached", None)
     message = "`CompiledFunction.drop` (_programs.py) would clear all of JAX's caches each time"
     assert hasattr(cached, "clear_cache"), message

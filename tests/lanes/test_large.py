@@ -1,4 +1,4 @@
-"""Arrays within a lane too large for registers, against XLA's: every operation on them."""
+"""Operations on arrays that are too large for registers agree with XLA's."""
 
 import warnings
 
@@ -62,7 +62,7 @@ def mlp(x):
     return jnp.tanh(W @ jnp.tanh(W[:, :7] @ x[:7] + x) - 1.0) @ jnp.ones(N)
 
 
-# Functions of two arrays of each lane, and of an integer of each.
+# Functions of two arrays and an integer per lane.
 FUNCTIONS = {
     "elementwise": lambda x, y, i: (x * y + jnp.sin(x) * 3, jnp.where(x > y, x, y), x > 0, -x / 2),
     "one number": lambda x, y, i: (x * 0 + 3.0, jnp.full(N, x[0]) * 2 + y, jnp.zeros(N)),
@@ -172,18 +172,18 @@ FUNCTIONS = {
 
 
 def _once(function, args):
-    """The function of every lane by vector code; what has no vector form is an error."""
+    """Evaluate the function in every lane by vector code; a fallback to XLA is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return jax.jit(jax.vmap(lambda *a: lanes.once(lambda a: function(*a), a)))(*args)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_as_xla(name):
+def test_results_agree_with_xla(name):
     function = FUNCTIONS[name]
     args = jnp.asarray(X), jnp.asarray(Y), jnp.asarray(I)
     ours, truth = _once(function, args), jax.jit(jax.vmap(function))(*args)
-    # Sums of some hundred numbers in another order.
+    # Sums of some hundred numbers have another order.
     rtol = 2e-4 if name == "single precision" else 2e-11
     for a, b in zip(*map(jax.tree_util.tree_leaves, (ours, truth)), strict=True):
         assert a.dtype == b.dtype and a.shape == b.shape

@@ -1,4 +1,4 @@
-"""The C library's functions as vector code, against extended precision."""
+"""Functions of the C library as vector code agree with extended precision."""
 
 import math
 
@@ -10,11 +10,11 @@ from vi_jax import lanes
 
 
 def as_lanes(function, numbers):
-    """`function` of every lane's numbers, by one kernel."""
+    """Evaluate `function` in every lane with one kernel."""
     return jax.jit(jax.vmap(lambda few: lanes.once(function, few)))(numbers)
 
 
-# The functions of the C library: by JAX, in extended precision, and where they are looked at.
+# Functions of the C library: in JAX, in extended precision, and ranges of their arguments.
 LIBRARY = {
     "tanh": (jnp.tanh, np.tanh, [(-1, 1), (-25, 25)]),
     "expm1": (jnp.expm1, np.expm1, [(-2, 2), (-750, 750)]),
@@ -41,12 +41,12 @@ CORNERS = [
 
 
 def _units(value, wanted):
-    """The error in units of the last place; infinite where value or its sign must be the same."""
+    """Return the error in units of the last place, or infinity for a wrong special value."""
     info = np.finfo(value.dtype)
     rounded = wanted.astype(value.dtype)
     same = (value == rounded) & (np.signbit(value) == np.signbit(rounded))
     same |= np.isnan(value) & np.isnan(rounded)
-    same |= (np.abs(rounded) < info.tiny) & (np.abs(value) < info.tiny)  # taken for zero
+    same |= (np.abs(rounded) < info.tiny) & (np.abs(value) < info.tiny)  # flushed to zero
     finite = np.isfinite(value) & np.isfinite(rounded) & (value != 0) & (rounded != 0)
     last = np.ldexp(np.longdouble(1), np.frexp(np.where(finite, wanted, 1))[1] - 1 - info.nmant)
     error = np.abs(value - wanted) / np.maximum(last, info.smallest_subnormal)
@@ -55,7 +55,7 @@ def _units(value, wanted):
 
 @pytest.fixture(scope="module", params=[np.float64, np.float32])
 def library(request):
-    """By name the numbers that a function of the C library is asked at, and what a kernel gives."""
+    """Return arguments and results of one kernel by the function's name, and the function."""
     rng = np.random.default_rng(6)
 
     def numbers(ranges):
@@ -78,7 +78,7 @@ def library(request):
 
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision")
 @pytest.mark.parametrize("name", LIBRARY)
-def test_functions_of_the_library_are_right_to_two_units(name, library):
+def test_functions_of_the_library_are_accurate_to_two_units(name, library):
     x, value = (part[name] for part in library[:2])
     with np.errstate(all="ignore"):
         wide = x.astype(np.longdouble)
@@ -88,11 +88,11 @@ def test_functions_of_the_library_are_right_to_two_units(name, library):
             wanted = LIBRARY[name][1](wide)
         units = _units(value, wanted)
     worst = np.argmax(units)
-    most = 4 if name == "cbrt" else 2  # that of the C library, which is right to so many
+    most = 4 if name == "cbrt" else 2  # the error of the C library's `cbrt`
     assert units[worst] < (most if x.dtype == np.float64 else 0.51), x[worst]
 
 
-def test_functions_of_the_library_have_the_same_bits_in_any_width(library):
+def test_functions_of_the_library_do_not_depend_on_the_batch(library):
     asked, found, all_of = library
     for few in (slice(40, 43), slice(-48, -1)):
         narrow = as_lanes(all_of, {name: x[few] for name, x in asked.items()})
@@ -103,7 +103,7 @@ def test_functions_of_the_library_have_the_same_bits_in_any_width(library):
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision")
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_angles_of_all_quadrants(kind):
-    """`atan2` beside numpy's where numbers have signs and sizes of all kinds."""
+    """Compare `atan2` with NumPy for all signs and sizes."""
     rng = np.random.default_rng(7)
     some = [0.0, 1.0, 2.0, 1e-30, 1e30, np.inf, *rng.uniform(0, 2, 40), np.nan]
     y, x = (
@@ -118,7 +118,7 @@ def test_angles_of_all_quadrants(kind):
 
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no extended precision")
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_powers_are_right_to_two_units(kind):
+def test_powers_are_accurate_to_two_units(kind):
     rng = np.random.default_rng(8)
     n, info = 20000, np.finfo(kind)
     some = [*CORNERS, 2.0, 3.0, -1.5, 0.25, 2.0**53 - 1, 2.0**53, 1e16, 1e-5]

@@ -18,7 +18,7 @@ from lanes.toys import MANY, ROWS, batch, fall, logistic
 
 
 def plain(x, r, n):
-    """The same map in numpy, one lane at a time."""
+    """Iterate the map in Python for one lane."""
     out = [x]
     for _ in range(int(n)):
         x = r * x * (1 - x)
@@ -28,7 +28,7 @@ def plain(x, r, n):
 
 
 @pytest.mark.parametrize("size", [0, 1, 9, 101])
-def test_every_batch(size):
+def test_batches_of_all_sizes(size):
     x, r, n = batch(size)
     (last, steps), rows = MANY(x, r, n)
     assert last.shape == (size,) and rows["x"].shape == (size, ROWS)
@@ -50,7 +50,7 @@ def test_backends_agree():
             np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
 
 
-def test_the_backend_of_the_context():
+def test_the_context_sets_the_backend():
     with lanes.backend("xla"):
         jaxpr = jax.make_jaxpr(lambda x: logistic(x, 3.0, 4.0))(0.5)
     assert "backend=xla" in str(jaxpr)
@@ -62,22 +62,21 @@ def test_the_backend_of_the_context():
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_lanes_do_not_depend_on_each_other(data):
-    """Their numbers are the same bits beside any other lanes, in any order, on any number of
-    threads."""
+    """Results are bitwise equal in any batch, in any order, on any number of threads."""
     size = 64 * lanes.cores() + 19  # in wide groups
     values = batch(size)
     with lanes.threads(1):
         whole = jax.tree.leaves(MANY(*values))
     chosen = data.draw(st.lists(st.integers(0, size - 1), min_size=1, max_size=40))
-    chosen = np.resize(chosen, data.draw(st.sampled_from([3, 7, 40])))  # three programs
+    chosen = np.resize(chosen, data.draw(st.sampled_from([3, 7, 40])))  # only three programs
     with lanes.threads(data.draw(st.integers(1, 4))):
         part = jax.tree.leaves(MANY(*(x[chosen] for x in values)))
     for a, b in zip(whole, part, strict=True):
         np.testing.assert_array_equal(np.asarray(a)[chosen], b)
 
 
-def test_threads_hold_on_threads_of_no_context():
-    """As XLA's own are, on which it runs larger programs."""
+def test_the_number_of_threads_holds_on_threads_without_a_context():
+    """XLA runs larger programs on its own threads, which have no context."""
 
     def found():
         with ThreadPoolExecutor(1) as pool:
@@ -101,12 +100,12 @@ def test_nested_and_shared_axes():
         np.testing.assert_array_equal(b, np.swapaxes(c, 0, 1))
 
 
-def test_no_lanes_with_a_result_that_all_share():
+def test_an_empty_batch_with_a_shared_result():
     alone = lambda x: lanes.once(lambda pair: (pair[0], pair[1] + 1.0), (jnp.asarray(2.0), x))
     assert [x.shape for x in jax.vmap(alone)(jnp.zeros(0))] == [(0,), (0,)]
 
 
-def test_a_call_by_itself_is_compiled_once():
+def test_an_eager_call_is_compiled_once():
     lanes.once(jnp.sin, jnp.asarray(0.5))
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -119,7 +118,7 @@ def test_a_call_by_itself_is_compiled_once():
     assert not [name for name in compiled if "compile" in name or "trac" in name]
 
 
-def test_a_ball_falls():
+def test_a_falling_ball_agrees_with_the_closed_form():
     height = np.linspace(0.1, 5, 50)
     (time, speed), rows = jax.vmap(fall, (0, None))(height, 9.81)
     np.testing.assert_allclose(time, np.sqrt(2 * height / 9.81), rtol=1e-13)
@@ -164,7 +163,7 @@ def test_single_precision():
 
 
 @pytest.mark.parametrize("cpu", ["x86-64-v3", "x86-64"])
-def test_lesser_processors(cpu):
+def test_code_for_older_processors(cpu):
     import platform
 
     if platform.machine() not in ("x86_64", "AMD64"):
@@ -176,7 +175,7 @@ def test_lesser_processors(cpu):
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
-def test_what_a_step_must_give():
+def test_a_wrong_carry_raises():
     def begin(x):
         return x, lanes.Emitted(True, False, None)
 
@@ -187,8 +186,7 @@ def test_what_a_step_must_give():
         lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)
 
 
-def test_the_room_stands_alone():
-    """Nothing in it comes from the rest of the package."""
+def test_lanes_import_nothing_from_the_package():
     folder = Path(vi_jax.__file__).parent / "lanes"
     for file in folder.glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):

@@ -1,4 +1,4 @@
-"""Derivatives of loops: forward, of several directions with one motion, backward by columns."""
+"""Derivatives of loops: forward, in several directions at once, and reverse by columns."""
 
 import functools
 import itertools
@@ -14,7 +14,7 @@ from lanes.toys import fall, logistic
 
 
 def test_forward_derivatives():
-    """Through the event, in one direction and in several, of first and second order."""
+    """First and second derivatives through the event, in one and several directions."""
     time = lambda height, gravity: fall(height, gravity)[0][0]
     h, g = 1.7, 9.81
     slope = jax.jacfwd(time, (0, 1))(h, g)
@@ -32,8 +32,8 @@ def test_forward_derivatives():
             np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
-def test_rules_that_cannot_be_used():
-    """A rule's own error is passed on; a `custom_vjp`, which has none forward, is refused."""
+def test_rules_that_fail_raise():
+    """An error within a rule is passed on. A `custom_vjp` has no forward rule and raises."""
     forward, backward = jax.custom_jvp(jnp.sin), jax.custom_vjp(jnp.sin)
     forward.defjvp(lambda primals, tangents: int("mine"))
     backward.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g * jnp.cos(x),))
@@ -44,8 +44,8 @@ def test_rules_that_cannot_be_used():
         jax.grad(lambda x: lanes.once(backward, x))(0.5)
 
 
-def test_directions_share_one_motion():
-    """Six directions make one program whose primal part is there once."""
+def test_directions_share_the_primal_computation():
+    """Three directions make one program with one primal computation."""
     rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, backend="xla")[1]["x"]))(
         jnp.asarray([0.3, 3.7, 6.0])
     )
@@ -53,8 +53,8 @@ def test_directions_share_one_motion():
     assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
 
 
-def test_arrays_without_a_number():
-    """Their gradients have none; whole numbers stay whole numbers beside them."""
+def test_empty_arrays():
+    """Gradients of empty arrays are empty; integers joined with them stay integers."""
     value = lambda x, y: lanes.once(lambda v: jnp.sum(v[0]) + jnp.sum(v[1] ** 2), (x, y))
     slopes = jax.vmap(jax.grad(value, (0, 1)))(jnp.zeros((3, 0)), jnp.ones((3, 2)))
     assert slopes[0].shape == (3, 0)
@@ -83,7 +83,7 @@ with_its_own_derivative.defjvps(lambda slope, out, x: 3 * x * slope)
 
 
 @pytest.mark.parametrize("name", INNER)
-def test_derivatives_of_a_step_that_holds(name):
+def test_derivatives_of_inner_control_flow(name):
     def lane(x, y):
         def begin(inputs):
             return inputs[0], lanes.Emitted(True, False, None)
@@ -103,21 +103,21 @@ def test_derivatives_of_a_step_that_holds(name):
 
 @jax.custom_jvp
 def drifted(time, place, speed):
-    """Only its derivatives have moved."""
+    """Return (place, speed), with the derivatives of (place + time · speed, speed) at time 0."""
     return place, speed
 
 
 @drifted.defjvp
 def _(primals, tangents):
     time, _, speed = primals
-    along = drifted(time, *tangents[1:])  # the derivatives are carried along too
+    along = drifted(time, *tangents[1:])  # for derivatives of higher order
     return drifted(*primals), (along[0] + tangents[0] * speed, along[1])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("most_columns", [0, 9])
-def test_derivatives_of_a_branch_whose_value_has_less_to_do_with_others(monkeypatch, most_columns):
-    """place + time * speed: forward, over a tape, and over columns, up to the third order."""
+def test_derivatives_of_a_branch_with_more_inputs_than_its_value(monkeypatch, most_columns):
+    """Derivatives up to third order, forward, by a tape, and by columns."""
     monkeypatch.setattr(_backward, "_BY_COLUMNS", most_columns)
 
     def lane(x):
@@ -141,8 +141,8 @@ def test_derivatives_of_a_branch_whose_value_has_less_to_do_with_others(monkeypa
 
 
 @pytest.mark.slow
-def test_reverse_mode_is_the_forward_one_transposed():
-    """Of results and rows, of all inputs or some, of numbers of a lane's own and of common ones."""
+def test_reverse_derivatives_agree_with_forward_ones():
+    """Derivatives of results and rows, with respect to inputs per lane and shared ones."""
 
     def sums(x, r, backend=None):
         (last, *_), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
@@ -161,7 +161,7 @@ def test_reverse_mode_is_the_forward_one_transposed():
     np.testing.assert_allclose(slope / many, slope[0] / many[0], rtol=1e-12)
 
 
-def test_values_beside_a_gradient_and_linear_parts():
+def test_linearize_and_stop_gradient():
 
     def last(x):
         return logistic(x, 3.7, 6.0)[0][0]

@@ -1,4 +1,4 @@
-"""Reverse mode by a tape: the same as by columns, to any order, whatever memory there is."""
+"""Reverse derivatives by a tape agree with those by columns, for all orders and sizes of tape."""
 
 import functools
 
@@ -18,13 +18,13 @@ P, V, W = (jnp.asarray(x) for x in ([0.2, 0.33, 0.71, 3.7], [0.3, -0.2, 0.5, 0.1
 
 @pytest.fixture
 def by_tape(monkeypatch):
-    """However few numbers there are, and however many cotangents."""
+    """Use a tape for any number of inputs and cotangents."""
     monkeypatch.setattr(_backward, "_BY_COLUMNS", 0)
     monkeypatch.setattr(_backward, "_COLUMNS_EACH", 0)
 
 
 def lost(p, backend=None):
-    """Of results and of rows, not all of which every lane comes to; `r` is one for all lanes."""
+    """A loss of results and rows; lanes share `r`, and some do not reach all rows."""
     x, r = p[:3], p[3]
     (last, _), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
     return jnp.sum(jnp.sin(last)) + jnp.sum(jnp.nan_to_num(rows["x"]) ** 2)
@@ -34,7 +34,7 @@ def primitives(function, *args):
     return {e.primitive.name for e in jax.make_jaxpr(function)(*args).eqns}
 
 
-def test_a_tape_is_used_where_it_pays():
+def test_a_tape_is_used_for_many_inputs():
     many = jnp.linspace(0.1, 0.9, 5)
     one = lambda x: logistic(x[0] * x[1], 3 + x[2] * x[3] * x[4], 6.0)[0][0]
     shared = lambda x, backend: lanes.run(
@@ -60,9 +60,9 @@ ORDERS = {
 
 
 @pytest.mark.parametrize("order", quick(ORDERS, "gradient"))
-def test_derivatives_of_any_order_are_those_by_columns(by_tape, order):
+def test_derivatives_of_any_order_agree_with_those_by_columns(by_tape, order):
     program = jax.make_jaxpr(ORDERS[order](lost))(P)
-    # Else a JAX has other names for what it leaves in a transposed derivative (see `reverse`).
+    # A failure means that JAX has renamed primitives in transposed derivatives (see `reverse`).
     assert "lanes_backward" in str(program), "no tape"
     taped = jax.jit(ORDERS[order](lost))(P)
     columns = jax.jit(ORDERS[order](lambda p: lost(p, "xla")))(P)
@@ -78,9 +78,9 @@ def gradients(x, r, n):
 
 
 @pytest.mark.slow
-def test_the_same_bits_by_any_tape_on_any_threads_in_any_batch(by_tape, monkeypatch):
-    """A tape that grows holds the same states. (These maps are chaotic: over 100 steps one rounding
-    would grow to everything.)"""
+def test_gradients_do_not_depend_on_tape_threads_or_batch(by_tape, monkeypatch):
+    """A growing tape stores the same states. The maps are chaotic: over 100 steps, a difference in
+    rounding would dominate."""
     x, r, n = batch(37)
     n = 8 * n
     with lanes.threads(1):
@@ -103,7 +103,7 @@ def test_the_same_bits_by_any_tape_on_any_threads_in_any_batch(by_tape, monkeypa
 
 
 def ring(x, mix, weights):
-    """Twenty chaotic maps in a ring, coupled through a matrix that all lanes share."""
+    """Twenty chaotic maps, coupled by a matrix that all lanes share."""
 
     def begin(inputs):
         x, _, _ = inputs
@@ -121,7 +121,7 @@ def ring(x, mix, weights):
 
 
 @pytest.mark.slow
-def test_arrays_in_memory_go_back_too(by_tape, monkeypatch):
+def test_gradients_of_arrays_in_memory(by_tape, monkeypatch):
     rng = np.random.default_rng(3)
     x, mix = rng.uniform(0.1, 0.9, (11, 20)), rng.uniform(0.1, 0.3, 11)
     weights = rng.dirichlet(np.ones(20), 20)
@@ -152,8 +152,8 @@ def test_arrays_in_memory_go_back_too(by_tape, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [5, 23])
-def test_through_what_is_written_in_jax(by_tape, size):
-    """Beside JAX's derivatives of the same steps without a loop."""
+def test_gradients_of_functions_written_in_jax(by_tape, size):
+    """Compare with JAX's derivatives of the same steps without a loop."""
     functions = (
         lambda c, p: jnp.linalg.solve(jnp.outer(p, p)[:5, :5] + jnp.eye(5), c[:5]).sum() * c,
         lambda c, p: jax.lax.cumprod(c + 0.5) * p,
@@ -177,8 +177,8 @@ def test_through_what_is_written_in_jax(by_tape, size):
     np.testing.assert_allclose(jax.jvp(loss, (p,), (p,))[1], wanted @ p, rtol=1e-9)
 
 
-def test_a_zero_cotangent_meets_an_infinite_slope(by_tape):
-    """√x at 0 is not chosen: its slope is infinite, its share of the derivative none."""
+def test_a_zero_cotangent_times_an_infinite_slope_is_zero(by_tape):
+    """√x at 0 is not selected: its slope is infinite, but does not enter the derivative."""
 
     def lane(x, y):
         def step(inputs, c):
@@ -192,15 +192,15 @@ def test_a_zero_cotangent_meets_an_infinite_slope(by_tape):
     np.testing.assert_allclose(slopes, [[0, 1.25], [2, 4]])
 
 
-def test_what_is_not_there_has_no_derivative(by_tape):
-    """A row that a lane did not come to is NaN, and so is the derivative of what uses it."""
+def test_derivatives_of_missing_rows_are_nan(by_tape):
+    """Rows that a lane did not reach are NaN, and so are derivatives of functions of them."""
     row = lambda x, k: logistic(x, 3.7, 4.0)[1]["x"][k]
     slope = jax.jit(jax.vmap(jax.grad(row), (None, 0)))(0.3, jnp.arange(7))
     np.testing.assert_array_equal(np.isnan(slope), np.arange(7) > 4)
 
 
 @pytest.mark.parametrize("size", [1, 9, 40])
-def test_through_an_event(by_tape, size):
+def test_gradients_through_an_event(by_tape, size):
     height, g = np.linspace(0.5, 2, size), 9.81
     time = lambda h, g: fall(h, g)[0][0]
     slopes = jax.jit(jax.vmap(jax.grad(time, (0, 1)), (0, None)))(height, g)
@@ -209,8 +209,8 @@ def test_through_an_event(by_tape, size):
         np.testing.assert_allclose(a, b, rtol=1e-10)
 
 
-def test_loops_of_any_number_of_turns_go_by_columns(by_tape):
-    """Loops whose turns the numbers decide, one of them in a branch and with another in it."""
+def test_inner_loops_of_variable_length_use_columns(by_tape):
+    """The numbers of iterations depend on the inputs; one loop is in a branch and has another."""
 
     def lane(x, y):
         def inside(c):
@@ -237,8 +237,8 @@ def test_loops_of_any_number_of_turns_go_by_columns(by_tape):
     np.testing.assert_allclose(jax.jit(jax.grad(whole))(p), wanted, rtol=1e-12)
 
 
-def test_without_a_transpose_by_columns(by_tape):
-    """A derivative of one's own whose loop has the tangent in it has none."""
+def test_derivatives_without_a_transpose_use_columns(by_tape):
+    """A custom derivative with the tangent in a `while_loop` has no transpose."""
 
     @jax.custom_jvp
     def cube(c):
@@ -260,7 +260,7 @@ def test_without_a_transpose_by_columns(by_tape):
 
 
 @pytest.mark.slow
-def test_without_a_kernel_by_columns(by_tape, monkeypatch):
+def test_columns_are_used_without_llvm(by_tape, monkeypatch):
     def missing():
         raise lanes.Unsupported("no llvmlite")
 
@@ -274,8 +274,8 @@ def test_without_a_kernel_by_columns(by_tape, monkeypatch):
 
 
 @pytest.mark.parametrize("room", [{"entries": 1 << 44}, {"entries": 1, "most": 300}])
-def test_no_memory_is_an_error(by_tape, monkeypatch, room):
-    """More than any machine has, or than a tape may take: no crash, no numbers."""
+def test_too_little_memory_is_an_error(by_tape, monkeypatch, room):
+    """The tape needs more memory than any machine has, or than a tape may use."""
     write = runtime.reverse_text
     monkeypatch.setattr(runtime, "reverse_text", functools.partial(write, **room))
     monkeypatch.setattr(runtime, "_keys", type(runtime._keys)())

@@ -1,4 +1,4 @@
-"""The annotations of the lanes' own functions, checked at run time in a process of their own."""
+"""The annotations of the package `lanes`, checked at run time in a separate process."""
 
 import subprocess
 import sys

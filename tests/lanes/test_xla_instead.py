@@ -1,4 +1,4 @@
-"""What runs on XLA's backend instead, with one warning; faults of LLVM's."""
+"""Programs without vector code run on XLA's backend with one warning; failures of LLVM."""
 
 import sys
 import warnings
@@ -24,8 +24,8 @@ def inverse_of_erf(x, *, backend=None):
     return lanes.run(begin, step, lambda x, carry: carry, x, rows=0, backend=backend)[0]
 
 
-def test_shards_of_a_batch_are_vector_code_too():
-    """`shard_map` marks what lanes share, zeros of derivatives included; that is no computation."""
+def test_sharded_batches_use_vector_code():
+    """`shard_map` adds primitives that mark shared values; these need no computation."""
     mesh = jax.sharding.Mesh(np.asarray(jax.devices()[:1]), ("lanes",))
     split = jax.sharding.PartitionSpec("lanes")
     heights = jnp.linspace(0.5, 2.0, 13)
@@ -45,7 +45,7 @@ def test_shards_of_a_batch_are_vector_code_too():
         np.testing.assert_array_equal(a, b)
 
 
-def test_what_has_no_vector_form_runs_on_xla_with_one_warning():
+def test_functions_without_vector_code_use_xla_with_one_warning():
 
     _primitive._warn.cache_clear()
     with pytest.warns(UserWarning, match="`erf_inv`"):
@@ -74,21 +74,21 @@ def test_without_llvm(fault, monkeypatch):
     np.testing.assert_allclose(out, np.sqrt(2 * np.linspace(1, 2, 5) / 9.8125), rtol=1e-12)
 
 
-def test_a_program_that_llvm_cannot_compile(monkeypatch):
+def test_a_compiler_error_of_llvm_is_passed_on(monkeypatch):
     def begin(x):
         return x, lanes.Emitted(True, False, None)
 
     def step(x, carry):
         return carry + 0.15625, lanes.Emitted(False, False, None)
 
-    _code.llvm()  # which it can do at first
+    _code.llvm()  # works before `object_code` is replaced
     monkeypatch.setattr(_code, "object_code", failing)
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"LLVM: no such.*backend\(.xla.\)"):
         jax.block_until_ready(lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0])
 
 
-def test_code_that_is_not_valid_is_refused():
-    """As where a value is used in a block that its own does not dominate."""
+def test_invalid_code_raises():
+    """The text uses a value in a block that its definition does not dominate."""
     text = """define void @kernel(i1 %c) {
       entry: br i1 %c, label %a, label %b
       a: %x = add i32 1, 2
@@ -101,9 +101,9 @@ def test_code_that_is_not_valid_is_refused():
 
 
 @pytest.mark.parametrize("difference", ["version", "layout"])
-def test_another_version_of_the_calls_of_xla(difference, monkeypatch):
-    """XLA does not register a handler that states a version which it does not know. Where XLA's own
-    structures have other sizes, the handler states none that is known."""
+def test_another_version_of_xlas_call_interface(difference, monkeypatch):
+    """XLA does not register a handler with an unknown version. If the sizes of XLA's structures
+    differ, the handler states an unknown version."""
     if difference == "version":
         monkeypatch.setattr(call, "_MINOR", 99)
     else:
@@ -120,8 +120,8 @@ def test_another_version_of_the_calls_of_xla(difference, monkeypatch):
     assert len(seen) == 1
 
 
-def test_one_program_on_the_slower_backend_leaves_the_others_quick():
-    """A function with a word among its arguments, by which its lanes are vector code or not."""
+def test_a_program_on_the_slower_backend_does_not_slow_others():
+    """A string argument selects a function with vector code or one without."""
     functions = {"slow": jax.scipy.special.gammaln, "quick": jnp.sin}
 
     @compiled

@@ -1,4 +1,4 @@
-"""Loops for the tests of lanes: a logistic map and a ball that falls until it hits the floor."""
+"""Loops for the tests of lanes: a logistic map and a falling ball."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ ROWS = 12
 
 
 def logistic(x, r, n, *, backend=None):
-    """n steps of x ← r x (1 - x) with a rare branch; a row for every step."""
+    """Iterate x ← r x (1 - x) n times, with a rare branch and one row per step."""
 
     def begin(inputs):
         x, _, n = inputs
@@ -22,7 +22,7 @@ def logistic(x, r, n, *, backend=None):
         x = jax.lax.cond(x > 0.9, lambda x: 0.9 + 0.1 * jnp.sin(x - 0.9), lambda x: x, x)
         done = done + 1
         row = {"x": x, "steps": done.astype(jnp.int32)}
-        # Not `done < n`, so that a lane that went on behind its end would be seen.
+        # Not `done < n`: a lane that continues after its end then runs to 99 steps.
         return (x, done), lanes.Emitted((done != n) & (done < 99), True, row)
 
     def end(inputs, carry):
@@ -32,7 +32,7 @@ def logistic(x, r, n, *, backend=None):
 
 
 def fall(height, gravity, h=0.05, *, backend=None):
-    """A ball falls in steps of h until an event: time and speed when it hits the floor."""
+    """Return time and velocity of a ball when it hits the floor; the time step is h."""
 
     def begin(inputs):
         height, _ = inputs
@@ -65,5 +65,5 @@ MANY = jax.jit(jax.vmap(logistic))
 
 
 def failing(*_):
-    """In place of a function of LLVM's."""
+    """Raise an error, in place of a function of LLVM."""
     raise RuntimeError("no such instruction")
