@@ -1,4 +1,4 @@
-"""Basins left at Ctrl-C: prints how long they took to end (seconds), and the starts they had."""
+"""Interrupt basins with Ctrl-C; print the seconds until they end, and the number of starts done."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import vi_jax as vi
 
-# A shell starts what runs in the background without it.
+# A shell makes its background processes ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SCENE = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.05)
@@ -29,7 +29,7 @@ def strike(delay, at):
     os.kill(os.getpid(), signal.SIGINT)
 
 
-basins(1)  # compiles
+basins(1)  # compile
 for settle, delay in ((20_000, 4.0), (10**8, 1.0)):  # many short blocks, and then one long one
     at = []
     threading.Thread(target=strike, args=(delay, at), daemon=True).start()
@@ -41,7 +41,7 @@ for settle, delay in ((20_000, 4.0), (10**8, 1.0)):  # many short blocks, and th
             print(repr(error))
     except vi.Interrupted as error:
         took = time.perf_counter() - at[0]
-        np.asarray(jnp.sin(jnp.arange(3.0)))  # waits for what runs still
+        np.asarray(jnp.sin(jnp.arange(3.0)))  # wait for running programs
         done = np.asarray(error.data["result"]) >= 0
         share = int(done.sum()) if done.sum() < done.size else -1
         print(took, time.perf_counter() - at[0], share)

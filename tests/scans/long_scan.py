@@ -11,7 +11,6 @@ AXES = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 128), "start.Y": np.linsp
 
 
 def main() -> None:
-    """Run it."""
     parser = argparse.ArgumentParser()
     parser.add_argument("store")
     parser.add_argument("--devices", type=int, default=1)
@@ -23,7 +22,7 @@ def main() -> None:
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
     block = {**AXES, "drive.frequency_ratio": AXES["drive.frequency_ratio"][:8]}
-    vi.scan(scene, block, settle=1500, lanes=512, workers=2)  # compiles
+    vi.scan(scene, block, settle=1500, lanes=512, workers=2)  # compile
     print("begins", flush=True)
     if not options.cluster:
         vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)
@@ -37,7 +36,7 @@ def main() -> None:
             threading.Timer(8.0, os.kill, (first, 9)).start()
             vi.scan(scene, AXES, settle=1500, lanes=512, cluster=client, store=options.store)
             print("ends", flush=True)
-            os._exit(0)  # Dask may wait for ever for a worker that it just started again
+            os._exit(0)  # Dask may wait forever for a restarted worker
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All periodic motions in a region of starts, beside closed forms."""
+"""All periodic motions in a region of starts, compared with closed forms."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,8 +23,8 @@ def found(scene):
     return vi.all_orbits(scene, 1, region=REGION, starts=128)
 
 
-def test_motions_of_one_cycle_are_the_closed_forms(found, scene):
-    """One without impact, and the two with one that Eq. 14 to 21 give."""
+def test_motions_of_one_cycle_agree_with_closed_forms(found, scene):
+    """One motion has no impact; Eqs. 14 to 21 give the two others."""
     closed = vi.closed_form_orbits(scene)
     assert bool(closed.admissible.all()) and len(found.orbits) == 3
     hits = [orbit for orbit in found.orbits if int(orbit.impacts)]
@@ -43,7 +43,7 @@ def test_motions_of_one_cycle_are_the_closed_forms(found, scene):
     assert found.stable.sum() == 2
 
 
-def test_says_what_was_searched(found, tmp_path):
+def test_the_report_of_the_search(found, tmp_path):
     (searched,) = found.searched
     assert searched.starts == 128 and searched.simulated == 128
     assert searched.converged == found.found.sum() <= 128 and searched.motions == 3
@@ -62,9 +62,9 @@ def test_says_what_was_searched(found, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_equilibrium_of_an_autonomous_machine_is_no_motion():
-    """A body on a belt slides steadily where its spring holds friction, and there every period
-    would do; about it there is the cycle that sticks and slips, and one that only slips."""
+def test_an_equilibrium_is_not_counted_as_an_orbit():
+    """A body on a belt slides steadily at an equilibrium, which has any period. Around it are two
+    cycles: stick-slip, and pure slip."""
     belt, speed = Belt(), 1.5
     standing = vi.OscillatorState(level(jnp.asarray(speed)) + 1e-2, jnp.asarray(0.0))
     orbit = vi.find_orbit(belt, standing)
@@ -78,7 +78,7 @@ def test_an_equilibrium_of_an_autonomous_machine_is_no_motion():
 
 
 def test_interrupted_after_a_period(found, scene, monkeypatch):
-    """What was searched before Ctrl-C is kept; before that there is nothing to keep."""
+    """Results of complete periods are kept after Ctrl-C."""
     from vi_jax.scans import _all_orbits
 
     plain = _all_orbits.find_orbit
@@ -106,14 +106,14 @@ def test_interrupted_after_a_period(found, scene, monkeypatch):
         ({"tolerance": -1.0}, "`tolerance` must be"),
     ],
 )
-def test_says_what_is_wrong(scene, arguments, message):
+def test_invalid_arguments_raise(scene, arguments, message):
     with pytest.raises(ValueError, match=message):
         vi.all_orbits(scene, **{"region": REGION, **arguments})
 
 
 @pytest.mark.slow
-def test_motions_of_three_cycles_close(scene):
-    """As an independent simulation says, by the closed-form flights of `flown`."""
+def test_motions_of_three_cycles_are_periodic(scene):
+    """Compare with the closed-form flights of `flown`."""
     found = vi.all_orbits(scene, 3, region=REGION, starts=256)
     assert sorted(found.periods) == [1, 1, 1, 3, 3]
     for orbit in found.orbits:

@@ -1,4 +1,4 @@
-"""Basins against motions known from elsewhere, and against the starts' own symmetry."""
+"""Basins of attraction, compared with orbits, single runs and SciPy."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import vi_jax as vi
 
 from belts import Belt
 
-# Several motions live side by side here; see `experiments/studies/basins_map.py`.
+# Several motions coexist here; see `experiments/studies/basins_map.py`.
 SCENE = vi.Scene.ideal(frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.01)
 REGION = {"start.Y": (-3.5, 1.05), "start.V": (-4.0, 4.0)}
 
@@ -27,7 +27,7 @@ def test_motions_are_orbits(found):
         assert float(orbit.state.Y) == pytest.approx(attractor.sections["Y"][0], abs=1e-4)
 
 
-def test_starts_belong_where_they_end(found):
+def test_labels_agree_with_the_ends_of_runs(found):
     rng = np.random.default_rng(0)
     labels = np.asarray(found.data.label)
     assert min(a.starts for a in found.attractors[:2]) > 20
@@ -44,9 +44,9 @@ def test_starts_belong_where_they_end(found):
         assert int(np.argmin(distance)) == labels[i, j] and min(distance) < 1e-3
 
 
-def test_one_number_stands_for_a_regime(found):
-    """In the period of a scan and of a sweep as in the labels of basins."""
-    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)  # undamped: it never repeats
+def test_regimes_have_one_code(found):
+    """Periods of scans and sweeps and labels of basins use the same codes."""
+    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)  # undamped: not periodic
     swept = vi.sweep(free, "drive.frequency_ratio", [0.77], start=free.start(Y=0.3), settle=5)
     assert int(swept.period[0]) == vi.REGIMES.unsettled
     assert str(swept).endswith("no period from 0.77")
@@ -83,7 +83,7 @@ def test_basins_as_data(found):
     assert len(found.to_xarray(along="start.V").to_dataframe()) == found.data.label.size
 
 
-def test_bad_regions():
+def test_invalid_regions_raise():
     with pytest.raises(ValueError, match="ranges"):
         vi.basins(SCENE, {"start.Y": (1.0, -1.0)})
     with pytest.raises(ValueError, match="parts of the start"):
@@ -93,12 +93,12 @@ def test_bad_regions():
 
 
 @pytest.mark.slow
-def test_the_share_of_steady_sliding_is_the_area_of_its_basin():
-    """Of starts in [-2, 2] × [0, 2]: the unstable cycle of sliding encloses 0.30712 of their area,
-    by SciPy's ∫ V² dt along it. None fails, though all that slide come to rest."""
+def test_the_share_of_steady_sliding_agrees_with_its_area():
+    """The unstable cycle of sliding encloses 0.30712 of the area of starts, by SciPy's ∫ V² dt
+    along it. No start fails, although all that slide come to rest."""
     region = {"start.Y": (-2.0, 2.0), "start.V": (0.0, 2.0)}
     found = vi.basins(Belt(1.5), region, resolution=24, settle=200, progress=False)
     assert not any(found.irregular.values())
     (share,) = (x.fraction for x in found.attractors if abs(x.sections["Y"][0] - 0.5249) < 1e-3)
-    # The boundary cuts some 55 of 24² cells, each off by 0.3 of itself: three such errors.
+    # The boundary cuts about 55 of 24² cells, with an error of 0.3 cells each; allow 3 sigma.
     assert share == pytest.approx(0.30712, abs=3 * 0.3 * 55**0.5 / 24**2)

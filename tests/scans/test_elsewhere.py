@@ -1,4 +1,4 @@
-"""Scans in other processes: killed, on several devices, on clusters."""
+"""Scans that are killed, on several devices, and on clusters."""
 
 import importlib
 import re
@@ -37,12 +37,12 @@ def _finished(path, *options, **environment):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The numbers of the scan."""
+    """Return the results of the scan."""
     return _finished(tmp_path_factory.mktemp("scan") / "whole")
 
 
 def _done(path):
-    """How many lanes are stored."""
+    """Return the number of stored lanes."""
     return (_stored(path)["result"] != -1).sum() if path.exists() else 0
 
 
@@ -52,8 +52,7 @@ def _same(found, whole):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_on_two_devices_the_store_ends_the_same(tmp_path, whole):
-    """The second run goes on with what the killed one left."""
+def test_a_killed_scan_resumes_on_two_devices(tmp_path, whole):
     path = tmp_path / "store"
     process = _run(path)
     assert process.stdout.readline() == "begins\n"
@@ -66,12 +65,12 @@ def test_killed_and_resumed_on_two_devices_the_store_ends_the_same(tmp_path, who
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path, whole):
+def test_a_cluster_may_lose_a_worker(tmp_path, whole):
     _same(_finished(tmp_path / "cluster", "--cluster"), whole)
 
 
 @pytest.mark.slow
-def test_a_cluster_without_workers_is_waited_for(monkeypatch):
+def test_a_scan_waits_for_workers(monkeypatch):
     distributed = pytest.importorskip("dask.distributed")
     computed, said = importlib.import_module("vi_jax.scans._scan"), []
     monkeypatch.setattr(computed, "_PATIENCE", 0.2)
@@ -87,7 +86,7 @@ def test_a_cluster_without_workers_is_waited_for(monkeypatch):
 
 
 class _Forgetful(ThreadPoolExecutor):
-    """Stands for a Dask client that forgets the fifth of its blocks."""
+    """A fake Dask client that loses the fifth block."""
 
     status, given = "running", 0
 
@@ -99,19 +98,19 @@ class _Forgetful(ThreadPoolExecutor):
         return Future() if self.given == 5 else super().submit(*task)
 
 
-def test_a_block_that_a_cluster_forgets_is_given_to_it_again(monkeypatch):
+def test_lost_blocks_are_submitted_again(monkeypatch):
     scene, axes = vi.Scene.ideal(frequency_ratio=0.9), {"start.Y": np.linspace(-1.0, 1.0, 2000)}
     options: dict = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
     wanted = vi.scan(scene, axes, **options)
     monkeypatch.setattr(importlib.import_module("vi_jax.scans._scan"), "_PATIENCE", 0.1)
     with _Forgetful(1) as client:
         found = vi.scan(scene, axes, **options, cluster=client)
-    assert client.given > 8  # nine, but where a machine stalls for longer than blocks take
+    assert client.given > 8  # nine, or more on a stalling computer
     xr.testing.assert_identical(found, wanted)
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_its_scheduler_says_how_to_go_on(tmp_path, monkeypatch):
+def test_a_lost_scheduler_raises_with_a_hint(tmp_path, monkeypatch):
     distributed = pytest.importorskip("dask.distributed")
     known, store = tmp_path / "scheduler.json", tmp_path / "store"
     parts = [

@@ -1,4 +1,4 @@
-"""The geometry of basins, from labels of which it is known."""
+"""The geometry of basins, for labels with known results."""
 
 import itertools
 
@@ -12,13 +12,13 @@ ONES, CLOSED = np.ones(2), np.ones((2, 2), bool)
 
 
 def square(size, low=-1.0, high=1.0):
-    """Centres of cells along an axis, and the plane of them."""
+    """Return the centres of cells along an axis, and the grid of them."""
     x = low + (high - low) * (np.arange(size) + 0.5) / size
     return x, *np.meshgrid(x, x, indexing="ij")
 
 
 def test_balls_in_a_half_plane_are_exact():
-    """x < 0.1 on the square ±1: distances to the line, or to the edges."""
+    """The basin is x < 0.1 in the square ±1; radii are distances to the line or the edges."""
     x, across, _ = square(200)
     own = across < 0.1
     cells = Cells([x, x], ONES, CLOSED)
@@ -29,12 +29,12 @@ def test_balls_in_a_half_plane_are_exact():
     largest = largest_ball(own, ~own, cells)
     assert largest.radius == pytest.approx(0.55, abs=1e-12) and largest.at_edge
     assert largest.centre[0] == pytest.approx(-0.45, abs=1e-12)
-    # With twice the scale along y, the edges above and below end nothing any more at (-0.45, ...).
+    # Twice the distance along y: upper and lower edges no longer limit the ball.
     wide = cells._replace(scales=np.array([1.0, 0.5]))
     assert largest_ball(own, ~own, wide).radius == pytest.approx(0.55, abs=1e-12)
     narrow = cells._replace(scales=np.array([1.0, 4.0]))
     assert largest_ball(own, ~own, narrow).radius == pytest.approx(0.25, abs=1e-12)
-    # Of a half plane whose left edge is a stop only the line counts, and edges up and down.
+    # The left edge is a stop, which does not limit a ball.
     stop = cells._replace(ends=np.array([[False, True], [True, True]]))
     assert largest_ball(own, ~own, stop).radius == pytest.approx(1.0, abs=1e-12)
     assert ball_around(np.array([-0.8, 0.3]), ~own, stop).radius == pytest.approx(0.7, abs=1e-12)
@@ -42,9 +42,9 @@ def test_balls_in_a_half_plane_are_exact():
 
 
 @pytest.mark.parametrize("turns", [False, True])
-def test_the_largest_ball_is_that_of_brute_force(turns):
-    """On random labels, over all centres that are looked at, some cells without a start; of an
-    angle that makes a whole turn, too, wherever that begins."""
+def test_the_largest_ball_agrees_with_brute_force(turns):
+    """Compare random labels, with missing cells, over all candidate centres. A periodic axis may
+    begin at any angle."""
     rng = np.random.default_rng(0)
     for _ in range(5):
         label = (rng.random((9, 12)) < 0.1).astype(int)
@@ -71,16 +71,16 @@ def test_entropy_of_half_planes_and_stripes():
     _, across, _ = square(100)
     aligned = entropy_of((across > 0.0).astype(int), box=5)
     assert aligned.total == 0.0 and np.isnan(aligned.boundary) and aligned.boundary_boxes == 0
-    # A line through the boxes of one column, two of their five cells on one side.
+    # The line cuts one column of boxes, with two of five cells on one side.
     cut = entropy_of((across > 0.04).astype(int), box=5)
     one = -(0.4 * np.log(0.4) + 0.6 * np.log(0.6))
     assert cut.boundary == pytest.approx(one) and cut.total == pytest.approx(one / 20)
     assert (cut.boxes, cut.boundary_boxes) == (400, 20)
-    # Three outcomes in turn, box by box all alike; a box of six holds each of them twice.
+    # Three alternating outcomes; each box of six cells has all of them twice.
     turns = np.broadcast_to(np.arange(60) % 3, (60, 60))
     found = entropy_of(turns, box=6)
     assert found.total == pytest.approx(np.log(3)) and found.boundary == pytest.approx(np.log(3))
-    # Cells without a start are no outcome.
+    # Missing cells do not count as an outcome.
     there = turns != 2
     assert entropy_of(turns, box=6, there=there).total == pytest.approx(np.log(2))
 
@@ -98,11 +98,10 @@ def test_a_smooth_boundary_has_the_exponent_one():
 
 
 @pytest.mark.parametrize(("grows", "falls"), [(3, 1.5), (3, 2.0)])
-def test_the_exponent_of_a_boundary_whose_dimension_is_known(grows, falls):
+def test_the_exponent_of_a_boundary_with_known_dimension(grows, falls):
     """x -> grows·x mod 1, y -> falls·y + cos 2πx (McDonald, Grebogi, Ott and Yorke, Physica D 17,
-    125 (1985)): y goes to ±∞, and the boundary is a curve of Weierstrass, whose dimension is
-    2 - ln(falls) / ln(grows). It is the graph of a function, so that errors in y have the exponent
-    1."""
+    125 (1985)): y goes to ±∞. The boundary is a Weierstrass curve of dimension
+    2 - ln(falls) / ln(grows). It is the graph of a function, so the exponent along y is 1."""
     size = 1024
     x = (np.arange(size) + 0.5) / size
     powers = np.arange(25)
@@ -117,8 +116,8 @@ def test_the_exponent_of_a_boundary_whose_dimension_is_known(grows, falls):
 
 
 def disc_and_rest(size=40, *, beyond=0.8):
-    """Starts in ±1 of which those in a disc of 0.6 around 0 settle on a motion of two cycles; those
-    with V > `beyond` cannot be, as beyond a stop."""
+    """Starts in ±1; those within 0.6 of 0 settle on a motion of two cycles. Starts with
+    V > `beyond` fail, as beyond a stop."""
     x, Y, V = square(size)
     label = np.where(Y**2 + V**2 < 0.6**2, 0, 1)
     result = np.where(V > beyond, 1, 0)
@@ -140,13 +139,13 @@ def test_integrity_of_motions():
     assert inside.local == inside.sections.min() and not inside.local_at_edge
     assert inside.factor == pytest.approx(0.6, abs=inside.resolution)
     assert np.isnan(outside.local) and outside.factor_at_edge
-    # With twice the distance along V, from (0, -0.3) to the circle: least of Y² + 4 (V + 0.3)².
+    # Twice the distance along V: the minimum of Y² + 4 (V + 0.3)² on the circle.
     halved = found.integrity(scales={"start.V": 0.5})[0]
     np.testing.assert_allclose(halved.sections[1], np.sqrt(0.24), atol=halved.resolution)
 
 
-def test_what_has_no_geometry_says_so():
-    """Random starts, too few of them, boxes and scales that are none."""
+def test_invalid_requests_raise():
+    """Random starts, too few starts, wrong boxes and wrong scales."""
     found = disc_and_rest(8)
     few = found._replace(data=found.data.stack(sample=("start.Y", "start.V")))
     for ask in (few.integrity, few.entropy, few.uncertainty):

@@ -1,4 +1,4 @@
-"""Functions and classes known by their source: another source or content is another identity."""
+"""The identity of a function or object changes with its source or content."""
 
 import functools
 import subprocess
@@ -11,7 +11,7 @@ import pytest
 import vi_jax as vi
 from vi_jax.scans.store import UNVERIFIABLE, identity
 
-# What a user may have written: a global number, a helper, a closure, a default, a class.
+# A user's module: a global number, a helper, a closure, a default value, classes.
 SOURCE = """
 import functools
 import equinox as eqx
@@ -100,7 +100,7 @@ MEASURES = {"measure", "compiled", "filtered", "mapped", "partial"}
         ("FACTOR = 2.0", "FACTOR = 3.0", {*MEASURES, "lambda", "module"}),
     ],
 )
-def test_what_changes_the_identity(identities, old, new, changed):
+def test_changes_of_source_change_the_identity(identities, old, new, changed):
     assert old in SOURCE
     before, after = (
         identities(SOURCE, "before"),
@@ -111,8 +111,8 @@ def test_what_changes_the_identity(identities, old, new, changed):
 
 
 @pytest.mark.slow
-def test_another_process_gives_the_same(tmp_path):
-    """Whatever order its sets have."""
+def test_the_identity_does_not_depend_on_the_process(tmp_path):
+    """The order of sets differs between the processes."""
     (tmp_path / "study.py").write_text(SOURCE + LIST)
     script = tmp_path / "tell.py"
     script.write_text(
@@ -130,7 +130,7 @@ def test_another_process_gives_the_same(tmp_path):
     assert described[0] == described[1] and described[0].count(",") == len(THINGS) - 1
 
 
-def test_what_the_library_gives_can_be_told():
+def test_identities_of_the_librarys_objects():
     scene = vi.Scene.ideal(frequency_ratio=0.9)
     other = eqx.tree_at(lambda s: s.drive.frequency_ratio, scene, 0.91)
     assert identity(scene) == identity(vi.Scene.ideal(frequency_ratio=0.9)) != identity(other)
@@ -138,7 +138,7 @@ def test_what_the_library_gives_can_be_told():
     assert len({identity(method) for method in methods}) == 4
 
 
-def test_rings_are_told_and_what_hides_is_refused():
+def test_recursive_functions_are_verifiable_and_opaque_objects_are_not():
     def ring(n):
         return ring(n - 1) if n else 0
 

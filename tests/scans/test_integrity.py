@@ -1,4 +1,4 @@
-"""Integrity of the motions of machines, over a parameter and beside published shares."""
+"""Integrity profiles: the integrity of motions over a parameter."""
 
 import matplotlib
 import numpy as np
@@ -24,7 +24,7 @@ def test_motions_are_followed_along_the_values(profile):
     names = [profile.name_of(i) for i in range(3)]
     assert names == ["2π, 1 impact", "4π, 1 impact", "2π, 0 impacts"]
     hit, long, free = profile.share
-    assert hit[0] == 0 and (np.diff(hit[1:]) < 0).all()  # ever fewer starts go to the impacts
+    assert hit[0] == 0 and (np.diff(hit[1:]) < 0).all()  # ever fewer starts lead to impacts
     assert long.tolist() == [1.0, 0.0, 0.0, 0.0]
     assert free[0] == 0 and (np.diff(free[1:]) > 0).all()
     np.testing.assert_allclose(profile.share.sum(axis=0), 1.0)
@@ -38,8 +38,8 @@ def test_motions_are_followed_along_the_values(profile):
             assert profile.factor_at_edge[motion, i] == reach.factor_at_edge
 
 
-def test_an_edge_at_a_stop_ends_no_ball(profile):
-    """The region ends at the stop, Y = 2, which the motion of one impact is near."""
+def test_an_edge_at_a_stop_does_not_limit_a_ball(profile):
+    """The region ends at the stop, Y = 2, close to the motion with one impact."""
     label = profile.basins[0].data["label"]
     assert label.attrs["at_stop"] == ["start.Y high"]
     there = profile.basins[2].attractors[0]
@@ -47,14 +47,14 @@ def test_an_edge_at_a_stop_ends_no_ball(profile):
     assert not profile.local_at_edge[0, 2]
 
 
-def test_other_numbers_compile_nothing(profile, compilations):
+def test_other_numbers_do_not_recompile(profile, compilations):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.75, gap=2.0, damping_ratio=0.04)
     region = {"start.Y": (-5.0, 2.0), "start.V": (-6.0, 5.0)}
     other = vi.integrity_profile(scene, ZETA, [0.92, 1.32, 1.42, 1.48], region, **QUICK)
     assert not compilations and other.share.shape[1] == 4
 
 
-def test_a_profile_as_data_words_and_picture(profile):
+def test_a_profile_as_data_text_and_picture(profile):
     data = profile.to_xarray()
     assert data.share.dims == ("motion", ZETA) and data.local.shape == (3, 4)
     np.testing.assert_array_equal(data.factor.sel({ZETA: 1.4}), profile.factor[:, 2])
@@ -73,7 +73,7 @@ def test_a_profile_as_data_words_and_picture(profile):
         vi.plot_integrity(profile, y="area")
 
 
-def test_refused_before_any_work():
+def test_invalid_arguments_raise():
     def ask(values=(0.9, 1.0), region=REGION, **options):
         return vi.integrity_profile(SCENE, ZETA, values, region, **{**QUICK, **options})
 

@@ -1,4 +1,4 @@
-"""Long verbs end soon after Ctrl-C, and what they have computed is not lost."""
+"""Long functions end soon after Ctrl-C, and keep their results."""
 
 import importlib
 import inspect
@@ -19,7 +19,7 @@ VALUES = jnp.linspace(0.7, 1.3, 40)
 
 
 def struck(monkeypatch, place, after):
-    """Ctrl-C at the call of a function that comes after so many others."""
+    """Raise `KeyboardInterrupt` at the call of a function after `after` calls."""
     module, name = (
         importlib.import_module("vi_jax." + place.rpartition(".")[0]),
         place.split(".")[2],
@@ -36,8 +36,8 @@ def struck(monkeypatch, place, after):
 
 
 def interrupted_by(kind, call):
-    """The error with which a call is left at Ctrl-C. A bare `KeyboardInterrupt`, which would end
-    all tests, fails one."""
+    """Return the error of an interrupted call. A bare `KeyboardInterrupt` fails the test, instead
+    of ending all tests."""
     with pytest.raises(KeyboardInterrupt) as caught:
         call()
     assert isinstance(caught.value, kind), repr(caught.value)
@@ -45,9 +45,9 @@ def interrupted_by(kind, call):
 
 
 @pytest.mark.slow
-def test_basins_end_soon():
-    """Within two seconds by themselves on two cores (0.02 to 0.1 s, most of what is more being the
-    import of xarray); here other tests run beside them, which took basins beyond two."""
+def test_interrupted_basins_end_soon():
+    """Alone on two cores, basins end within two seconds (0.02 to 0.1 s plus the import of xarray).
+    The limit is larger, since other tests run at the same time."""
     done = subprocess.run(
         [sys.executable, Path(__file__).parent / "interrupted_basins.py"],
         capture_output=True, text=True, timeout=300,
@@ -59,7 +59,7 @@ def test_basins_end_soon():
     assert int(short[2]) > 0 == int(long[2]), done.stdout
 
 
-def test_an_interrupted_sweep_gives_the_values_that_were_done(monkeypatch):
+def test_an_interrupted_sweep_keeps_completed_values(monkeypatch):
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
     struck(monkeypatch, "scans._sweep._sweep", after=2)
@@ -88,7 +88,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 
 @pytest.mark.slow
-def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
+def test_interrupted_basins_keep_completed_starts(monkeypatch):
     struck(monkeypatch, "scans._basins._sorted_out", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
@@ -98,7 +98,7 @@ def test_interrupted_basins_keep_the_starts_that_were_followed(monkeypatch):
     assert error.data["period"].shape == (4,) and error.partial is error.data
 
 
-def test_all_long_verbs_have_one_option_for_their_bar():
+def test_all_long_functions_have_the_argument_progress():
     for verb in (
         vi.scan, vi.sweep, vi.basins, vi.integrity_profile, vi.lyapunov, vi.continue_orbit,
         vi.boundary, vi.grazing, vi.minimal_kick, vi.edge_state, vi.manifold,
@@ -108,8 +108,8 @@ def test_all_long_verbs_have_one_option_for_their_bar():
 
 
 @pytest.mark.slow
-def test_interrupted_exponents_are_those_of_fewer_cycles(monkeypatch):
-    """On a periodic motion, whose exponents are ln|multiplier|/duration."""
+def test_interrupted_exponents_use_completed_cycles(monkeypatch):
+    """Compare with ln|multiplier|/duration on a periodic motion."""
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     whole = vi.lyapunov(scene, scene.start(), 1100)
     assert float(whole.exponents[0]) == pytest.approx(-0.2, rel=1e-6)
@@ -128,13 +128,12 @@ def test_interrupted_exponents_are_those_of_fewer_cycles(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
-    """Between two motions that attract, and from the saddle between them."""
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
     places = ((1.283, 1.007), (1.528, 1.314), (1.26, 1.086))
     one, two, saddle = (vi.find_orbit(scene, scene.start(Y=Y, V=V), 2) for Y, V in places)
     kicks = importlib.import_module("vi_jax.robust._minimal_kick")
     best = kicks.nearest_first
-    # A second ray to be interrupted at, whichever there are.
+    # Search a second ray, at which the interrupt comes.
     monkeypatch.setattr(kicks, "nearest_first", lambda *arguments: best(*arguments)[:1] * 2)
     struck(monkeypatch, "robust._minimal_kick._exact", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.minimal_kick(scene, one))
@@ -151,7 +150,7 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
-    amplitude = 1 / np.hypot(1 - 0.9**2, 10.1 * 0.9)  # of x'' + 10.1 x' + x = cos 0.9 t
+    amplitude = 1 / np.hypot(1 - 0.9**2, 10.1 * 0.9)  # x'' + 10.1 x' + x = cos 0.9 t
     machine = vi.machines.Duffing(
         amplitude=1.0, frequency=0.9, damping=10.1, gap=1.1 * amplitude, two_sided=False
     )

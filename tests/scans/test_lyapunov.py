@@ -1,4 +1,4 @@
-"""Exponents against the damping, the multipliers of orbits, and the growth of a disturbance."""
+"""Lyapunov exponents, compared with damping, Floquet multipliers and mean contraction."""
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ def ideal(zeta=0.9, k=0.5, xi=0.0, gap=2.0):
 
 
 def test_linear_oscillator():
-    """Both turn around each other, slowly for ξ = 0.9, which the weights average out; beyond ξ = 1
-    they part."""
+    """The directions rotate, slowly for ξ = 0.9; the weights average this out. For ξ > 1 the
+    exponents differ."""
     for xi, cycles in ((0.02, 1000), (0.9, 1000), (1.5, 400)):
         scene = ideal(xi=xi, gap=None)
         found = vi.lyapunov(scene, scene.start(Y=1.0), cycles)
@@ -24,8 +24,8 @@ def test_linear_oscillator():
         np.testing.assert_allclose(found.exponents, rates, atol=1e-9)
 
 
-def test_unstable_orbit_has_the_rates_of_its_multipliers():
-    # Started on it, the motion stays for the few cycles in which it is observed.
+def test_exponents_of_an_unstable_orbit_agree_with_multipliers():
+    # The motion starts on the orbit, and stays there for the observed cycles.
     scene = ideal()
     closed = vi.closed_form_orbits(scene, cycles=1)
     start = scene.start(Y=closed.Y[0], V=closed.V[0])
@@ -34,8 +34,8 @@ def test_unstable_orbit_has_the_rates_of_its_multipliers():
     np.testing.assert_allclose(found.exponents, rates, atol=1e-4)
 
 
-def test_the_greatest_alone_is_the_greatest_of_all():
-    """One direction is made a unit only now and then, several are after every cycle."""
+def test_the_largest_exponent_alone_agrees_with_all():
+    """A single direction is normalised only occasionally, several ones after every cycle."""
     cycles = 23
     scene = ideal(zeta=0.7, k=0.8, xi=0.003)
     alone = vi.lyapunov(scene, scene.start(), cycles, number=1)
@@ -46,14 +46,14 @@ def test_the_greatest_alone_is_the_greatest_of_all():
     np.testing.assert_allclose(alone.state.Y, whole.state.Y, rtol=1e-9)
 
 
-def test_a_long_cycle_leaves_next_to_nothing():
-    """Of a direction after one cycle e^-283, whose square is no number."""
+def test_exponents_do_not_underflow_in_a_long_cycle():
+    """A direction shrinks to e^-283 in one cycle, and its square underflows."""
     scene = ideal(zeta=0.02, xi=0.9, gap=None)
     found = vi.lyapunov(scene, scene.start(Y=1.0), 16, settle=1, number=1)
     np.testing.assert_allclose(found.exponents, -0.9, atol=2e-3)
 
 
-def test_a_direction_in_single_precision():
+def test_exponents_in_single_precision():
     with jax.enable_x64(False):
         scene = ideal(xi=0.9, gap=None)
         for number in (1, 2):
@@ -63,11 +63,11 @@ def test_a_direction_in_single_precision():
 
 
 @pytest.mark.slow
-def test_exponents_add_up_to_the_mean_contraction():
+def test_the_sum_of_exponents_is_the_mean_contraction():
     """Volumes shrink by e^{-2ξ} in unit time and by k² in an impact, whatever the motion does.
 
-    Over so few cycles that rounding does not part the motion from the one whose impacts are
-    counted, and with the weights that vanish at both ends.
+    Impacts are counted in another run with the same weights. The cycles are so few that rounding
+    does not separate the two runs.
     """
     zeta, k, xi, cycles = 0.7, 0.8, 0.003, 16
     scene = ideal(zeta=zeta, k=k, xi=xi)
@@ -75,7 +75,7 @@ def test_exponents_add_up_to_the_mean_contraction():
         scene, scene.start(Y=0.3), 200, settle=500, method=vi.ExactFlight()
     ).sections
     found = jax.vmap(lambda x: vi.lyapunov(scene, x, cycles, settle=0))(starts)
-    # One cycle goes by before the first that counts.
+    # The exponents leave out the first cycle.
     options = {"settle": 1, "method": vi.ExactFlight()}
     runs = jax.vmap(lambda x: vi.simulate(scene, x, cycles, **options))(starts)
     place = (np.arange(cycles) + 0.5) / cycles
@@ -103,21 +103,21 @@ def test_failed_runs_and_bad_arguments():
 
 
 @pytest.mark.slow
-def test_a_motion_that_rests_forgets_at_once():
-    # At the default 400 cycles, whose outermost weights are 0.
+def test_exponents_of_a_motion_with_rests_are_minus_infinity():
+    # The outermost weights of the default 400 cycles are 0.
     scene = ideal(zeta=0.17, k=0.6, xi=0.02, gap=0.5)
     start = scene.start(Y=-0.5, V=0.1)
     found = vi.lyapunov(scene, start)
     assert bool(found.successful) and (np.asarray(found.exponents) == -np.inf).all()
     assert (np.asarray(found.per_cycle) == -np.inf).all() and float(found.spread) == 0
-    # The two starts end alike to the last digit: that is what -∞ says.
+    # An exponent of -∞ means that two starts end in the same state.
     ends = [vi.simulate(scene, scene.start(Y=Y), 1, settle=40).last for Y in (-0.5, -0.4)]
     np.testing.assert_allclose(*(jnp.stack(jax.tree.leaves(end)) for end in ends), rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_one_rest_is_enough():
-    # Whatever the weight of the cycle in which a direction is forgotten: it does not come back.
+def test_one_rest_makes_an_exponent_minus_infinity():
+    # A direction lost in any cycle stays lost, even if the weight of this cycle is 0.
     rates, duration = np.full((400, 2), -0.1), np.ones(400)
     rates[-1, 1] = -np.inf
     mean, halves = _weighted(jnp.asarray(rates), jnp.asarray(duration))
@@ -125,7 +125,7 @@ def test_one_rest_is_enough():
 
 
 @pytest.mark.slow
-def test_a_body_at_rest_leaves_the_exponent_of_another():
+def test_a_body_at_rest_does_not_change_the_exponent_of_another():
     def greatest(damping, number):
         row = vi.machines.Structure(
             mass=[1, 1], damping=jnp.diag(jnp.stack([2.0, damping])), frequency=1.0,

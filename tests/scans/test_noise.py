@@ -1,4 +1,4 @@
-"""Noise in scans and sweeps: the paths of lanes, stores, and what is left without noise."""
+"""Noise in scans and sweeps: paths of lanes, stores, and programs without noise."""
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ def whole():
 
 
 @pytest.mark.slow
-def test_a_lane_is_the_run_with_the_key_of_its_number(whole):
+def test_a_lane_equals_the_run_with_its_key(whole):
     for row, path in ((0, 7), (1, 211)):
         noise = vi.WhiteNoise({"V": AXES["noise.V"][row]}, impulses=16)
         key = jax.random.fold_in(KEY, 300 * row + path)
@@ -41,14 +41,14 @@ def test_a_lane_is_the_run_with_the_key_of_its_number(whole):
     assert len(np.unique(whole.V[..., -1])) == 600
 
 
-def test_paths_depend_on_no_block_worker_or_thread(whole):
+def test_paths_do_not_depend_on_blocks_workers_or_threads(whole):
     with vi.threads(1):
         other = scanned(lanes=512, workers=2)
     xr.testing.assert_identical(other, whole)
     assert np.any(scanned(key=jax.random.key(4)).V != whole.V)
 
 
-def test_a_store_knows_its_noise(whole, tmp_path):
+def test_a_store_rejects_another_noise(whole, tmp_path):
     data = scanned(store=tmp_path / "s")
     assert np.array_equal(data.V, whole.V) and '"impulses": 16' in data.noise
     for other, word in (
@@ -60,7 +60,7 @@ def test_a_store_knows_its_noise(whole, tmp_path):
             scanned(store=tmp_path / "s", **other)
 
 
-def test_a_store_knows_the_function_of_an_amplitude(tmp_path):
+def test_a_store_rejects_another_amplitude_function(tmp_path):
     def scan(factor):
         noise = vi.WhiteNoise({"V": lambda state: factor * state.Y}, impulses=16)
         given = {"settle": 1, "cycles": 4, "noise": noise, "key": KEY, "progress": False}
@@ -75,14 +75,14 @@ def test_a_store_knows_the_function_of_an_amplitude(tmp_path):
 
 
 @pytest.mark.slow
-def test_lanes_are_verified_on_their_own_paths():
+def test_verification_uses_the_paths_of_the_lanes():
     data = scanned(verify=40, method=vi.FixedStep())
     assert data.verified_error_V < 1e-5
     assert np.std(data.V) > 1e-2
 
 
 @pytest.mark.slow
-def test_derivatives_by_an_amplitude(whole):
+def test_derivatives_with_respect_to_an_amplitude(whole):
     axes = {"noise.V": [0.05], "noise.path": [0]}
     found, step = {}, 1e-6
     given = {"measure": "sections", "settle": 3, "cycles": 16, "noise": NOISE, "key": KEY}
@@ -93,8 +93,8 @@ def test_derivatives_by_an_amplitude(whole):
     np.testing.assert_allclose(found[0.0].d_V.squeeze(), differences.squeeze(), rtol=1e-5)
 
 
-def test_without_noise_the_program_has_nothing_of_it():
-    """Neither whole numbers of 32 bits without sign, of which its numbers are made, nor a key."""
+def test_programs_without_noise_have_no_random_numbers():
+    """Random numbers are made from unsigned 32-bit integers."""
 
     def program(**noise):
         made = make_program(SCENE, ("start.Y",), RunOptions(), measure="extremes", **noise)
@@ -110,7 +110,7 @@ def test_without_noise_the_program_has_nothing_of_it():
     assert "u32[" in program(noise=NOISE, key=KEY)
 
 
-def test_a_sweep_is_shaken_by_the_number_of_each_value():
+def test_a_sweep_uses_a_key_for_each_value():
     values = np.linspace(0.8, 1.0, 5)
     options = {"cycles": 4, "settle": 4, "noise": NOISE, "key": KEY}
     sweep = vi.sweep(SCENE, "drive.frequency_ratio", values, **options)
@@ -142,7 +142,7 @@ def test_a_sweep_is_shaken_by_the_number_of_each_value():
         ({"derivatives": "noise.path"}, r"number of the noise \(noise.V\), but got 'noise.path'"),
     ],
 )
-def test_what_does_not_fit_is_refused(options, message):
+def test_invalid_arguments_raise(options, message):
     with pytest.raises((TypeError, ValueError), match=message):
         scanned(**options)
 
@@ -154,7 +154,7 @@ def test_what_does_not_fit_is_refused(options, message):
         (SCENE, vi.WhiteNoise({"Y": 0.1}), "must change velocities only"),
     ],
 )
-def test_what_does_not_fit_the_machine_is_refused(machine, noise, message):
+def test_noise_that_does_not_fit_the_machine_raises(machine, noise, message):
     given = {"noise": noise, "key": KEY, "settle": 1, "cycles": 4}
     with pytest.raises(ValueError, match=message):
         vi.scan(machine, {"noise.path": [0, 1]}, measure="extremes", progress=False, **given)

@@ -1,4 +1,4 @@
-"""A machine's own averages in scans, sweeps and reports of exponents."""
+"""User-defined averages of a machine in scans, sweeps and exponents."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ OBSERVED = {"settle": 60, "cycles": 8}
 
 @pytest.fixture(scope="module")
 def runs():
-    """Each frequency by itself."""
+    """Simulate each frequency separately."""
     found = []
     for frequency in FREQUENCIES:
         machine = Shaken(frequency=frequency)
@@ -33,7 +33,7 @@ def test_a_scan_measures_an_average_by_its_name(runs):
         vi.scan(Shaken(), {"frequency": FREQUENCIES}, measure="takes")
 
 
-def test_a_sweep_shows_it(runs):
+def test_a_sweep_has_averages(runs):
     swept = vi.sweep(Shaken(), "frequency", FREQUENCIES[:1], **OBSERVED)
     np.testing.assert_allclose(swept.averages["taken"][0], runs[0].averages["taken"].mean())
     assert swept.to_xarray().taken.attrs["units"] == "W"
@@ -44,7 +44,7 @@ def test_a_sweep_shows_it(runs):
 
 
 @pytest.mark.slow
-def test_exponents_tell_it(runs):
+def test_exponents_have_averages(runs):
     machine = Shaken(frequency=FREQUENCIES[0])
     found = vi.lyapunov(machine, runs[0].last, 8, settle=0, number=1)
     np.testing.assert_allclose(found.averages["taken"], runs[0].averages["taken"][-1], rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Regimes of a scan: periods, chaos, transients, and what does not settle."""
+"""Regimes of a scan: periodic, chaotic, transient and unsettled motions."""
 
 from functools import partial
 
@@ -24,20 +24,20 @@ def _regimes_of(lanes, settle):
 
 
 @pytest.mark.slow
-def test_regime_tells_periods_chaos_and_what_does_not_settle():
+def test_periodic_chaotic_and_unsettled_motions():
     zetas = [0.65, 0.7, 0.9, 0.97, 1.1, 1.4]
     data = _regimes_of([(zeta, 0.8, 0.0) for zeta in zetas], settle=3000)
     period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
     assert period[0.9] == 2 and period[1.1] == 1
     assert period[0.7] == period[0.97] == vi.REGIMES.chaotic
-    # A free motion without damping, off resonance, has two frequencies and repeats never.
+    # An undamped motion without impacts has two frequencies, and is not periodic.
     free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
     quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
     assert int(quiet.period[0]) == vi.REGIMES.unsettled
 
 
-def test_a_chaotic_transient_is_not_called_chaos():
-    """Off the stop the motion is linear and fades at the rate ξ: nothing grows any more."""
+def test_chaotic_transients_differ_from_chaos():
+    """After the last impact, the motion is linear and perturbations decay at the rate ξ."""
     lanes = [(0.69, 0.7, 0.001), (0.69, 0.5, 0.003), (0.7, 0.8, 0.0), (0.97, 0.8, 0.0)]
     data = _regimes_of(lanes, settle=22)
     assert np.asarray(data.period).tolist() == [-4, -4, -1, -1]
@@ -54,7 +54,7 @@ def test_a_chaotic_transient_is_not_called_chaos():
     def looked_at(zeta, k, xi):
         scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, damping_ratio=xi)
         first = vi.lyapunov(scene, scene.start(), 256, settle=150, number=1).exponents[0]
-        # Rounding says when the chaos ends; from then on the motion fades by 0.9 % a cycle.
+        # Rounding determines when the chaos ends; then the transient decays by 0.9 % per cycle.
         return first, vi.simulate(scene, scene.start(), 64, settle=12_000)
 
     first, run = looked_at(*np.array(lanes).T)
@@ -66,10 +66,10 @@ def test_a_chaotic_transient_is_not_called_chaos():
 
 
 @pytest.mark.slow
-def test_windows_of_periods_beside_a_grazing():
-    """Beyond the grazing of a motion whose multiplier is 1/2 there are windows of longer and longer
-    periods with one impact, with chaos between (Chin, Ott, Nusse and Grebogi, Phys. Rev. E 50,
-    1994); the sections of a period differ by 1e-4 to 1e-6."""
+def test_windows_of_periods_near_a_grazing():
+    """Beyond the grazing of a motion with multiplier 1/2 are windows of increasing period with
+    one impact, and chaos between them (Chin, Ott, Nusse and Grebogi, Phys. Rev. E 50, 1994). The
+    sections of a period differ by 1e-4 to 1e-6."""
     xi, ratio = 5.05, 0.2 * np.pi / np.log(2)
     amplitude = 1 / np.hypot(1 - ratio**2, 2 * xi * ratio)
     scene = vi.Scene.ideal(frequency_ratio=ratio, restitution=0.8, damping_ratio=xi)
@@ -79,14 +79,14 @@ def test_windows_of_periods_beside_a_grazing():
     assert data["period"].values[::-1].tolist() == [*beyond.values()]
     periodic = data["period"] > 0
     np.testing.assert_array_equal(data["impacts"].values[periodic], 1)
-    # The same seen value by value; short of the grazing it is the driven vibration.
+    # A sweep agrees; before the grazing the motion has no impacts and period 1.
     values = [gaps[0], amplitude / (1 - 1e-5)]
     assert vi.sweep(scene, "stops.0.gap", values, settle=400).period.tolist() == [5, 1]
 
 
 @pytest.mark.slow
-def test_what_repeats_and_what_spirals_in():
-    """Sections made by hand: how closely periods must fit, by what fits best and by the method."""
+def test_periods_of_artificial_sections():
+    """Periods of artificial sections, whose tolerance depends on the best fit and on the method."""
     n, one = jnp.arange(256), jnp.ones(256, int)
 
     judged = jax.jit(partial(least_period, longest=64))
@@ -102,13 +102,13 @@ def test_what_repeats_and_what_spirals_in():
     assert period(spiral) == 1
     assert period(0.0 * n, impacts=jnp.where(n == 200, 2, 1)) == none
     assert period(1e-4 * jnp.cos(n)) == none and period(noise) == 1 and period(100 * noise) == none
-    # Steps of a tolerance wander within it, which hides a split as small.
+    # Adaptive steps have errors of size `wander`, which hide a smaller split.
     assert period(100 * noise, wander=1e-5) == 1 and period(split, wander=1e-8) == 1
     assert period(noise, tolerance=1e-8) == none
 
 
 class Small(vi.AbstractMachine):
-    """A well, or two beside each other, in a unit of length."""
+    """A potential with one well, or with two, in a unit of length."""
 
     length: float
     steep: float = 1.0
@@ -125,9 +125,9 @@ class Small(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_motions_are_compared_by_their_own_size(monkeypatch):
-    """In any unit of length two frequencies do not repeat, and two wells are two motions, told
-    apart by few comparisons."""
+def test_the_comparison_of_motions_scales_with_their_size(monkeypatch):
+    """In any unit of length, motions with two frequencies are unsettled. Two wells are two motions,
+    found with few comparisons."""
     lengths, options = [1.0, 1e-6, 1e-9, 1e6], {"settle": 60, "progress": False}
     compared, shares, distance = [], [], _basins.distance
     monkeypatch.setattr(_basins, "distance", lambda *a: compared.append(a) or distance(*a))

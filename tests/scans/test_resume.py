@@ -1,4 +1,4 @@
-"""Scans that were interrupted go on; a store refuses another scan."""
+"""Interrupted scans resume; a store rejects another scan."""
 
 import importlib
 import threading
@@ -13,7 +13,7 @@ import xarray as xr
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
 
-def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
+def test_a_store_resumes_and_rejects_another_scan(tmp_path, monkeypatch):
     work = importlib.import_module("vi_jax.scans._scan")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}
     options = {"settle": 20, "cycles": 128, "lanes": 256, "workers": 1}
@@ -52,7 +52,7 @@ def test_a_store_is_resumed_and_guards_itself(tmp_path, monkeypatch):
         vi.scan(SCENE, axes, store=tmp_path / "full", **options)
 
 
-def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_an_interrupted_creation_leaves_no_store(tmp_path, monkeypatch):
     store = importlib.import_module("vi_jax.scans.store")
     create = store.zarr.Group.create_array
 
@@ -73,8 +73,8 @@ def test_a_store_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-def test_an_interrupted_scan_in_memory_gives_what_it_has(monkeypatch):
-    """Also a block that ends on another thread after the interrupt."""
+def test_an_interrupted_scan_in_memory_keeps_its_results(monkeypatch):
+    """A block that ends on another thread after the interrupt is included."""
     work = importlib.import_module("vi_jax.scans._scan")
     begun, compute = threading.Barrier(2), work.compute
 
@@ -98,7 +98,7 @@ def test_blocks_are_computed_by_any_executor():
     options = {"measure": "extremes", "settle": 5, "cycles": 4, "lanes": 256}
     with ThreadPoolExecutor(2) as pool:
         found = vi.scan(SCENE, axes, **options, cluster=pool)
-        assert pool.submit(int).result() == 0  # it is not shut down
+        assert pool.submit(int).result() == 0  # the pool is not shut down
     xr.testing.assert_identical(found, vi.scan(SCENE, axes, **options))
     with pytest.raises(ConnectionError, match=r"was lost, .* Nothing was stored"):
         vi.scan(SCENE, axes, **options, cluster=pool)

@@ -1,4 +1,4 @@
-"""Scans against single runs, in blocks and pairs; what is refused, and how lanes fail."""
+"""Scans agree with single runs; errors, failing lanes, and verification."""
 
 import diffrax
 import numpy as np
@@ -20,7 +20,7 @@ def data():
     return vi.scan(SCENE, AXES, measure=measure, settle=100, cycles=130)
 
 
-def test_every_lane_is_a_run(data):
+def test_lanes_agree_with_runs(data):
     assert data.sizes["drive.frequency_ratio"] == 7 and data.sizes["start.Y"] == 5
     for i, j in [(0, 0), (3, 2), (6, 4)]:
         zeta, Y = AXES["drive.frequency_ratio"][i], AXES["start.Y"][j]
@@ -36,7 +36,7 @@ def test_every_lane_is_a_run(data):
         assert int(lane.steps) == int(run.steps)
 
 
-def test_power_is_what_the_impacts_take():
+def test_power_is_the_loss_in_impacts():
     orbit = vi.closed_form_orbits(SCENE, cycles=1)
     start = SCENE.start(Y=orbit.Y[0], V=orbit.V[0])
     scene = SCENE
@@ -47,7 +47,7 @@ def test_power_is_what_the_impacts_take():
     assert float(found.power[0]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_labels_units_and_origin(data):
+def test_labels_units_and_attributes(data):
     assert data.y_min.attrs["units"] == "a" and "long_name" in data.period.attrs
     assert data["drive.frequency_ratio"].attrs["units"] == "ω"
     assert "ExactFlight" in data.attrs["method"] and data.attrs["settle"] == 100
@@ -55,7 +55,7 @@ def test_labels_units_and_origin(data):
     assert data.result.attrs["flag_meanings"].split()[1] == "successful"
 
 
-def test_blocks_do_not_change_numbers(data):
+def test_blocks_do_not_change_results(data):
     same = vi.scan(SCENE, AXES, measure=("extremes", "regime"), settle=100, cycles=130, workers=3)
     xr.testing.assert_equal(same.y_min, data.y_min)
     rows = {
@@ -71,7 +71,7 @@ def test_blocks_do_not_change_numbers(data):
 
 
 def test_paired_lanes_are_checked_one_by_one():
-    """No product of the rows: the least gap on one side stands beside a wide one on the other."""
+    """The smallest gap on one side is paired with a large one on the other."""
     scene = vi.Scene(
         oscillator=vi.Oscillator(0.05),
         drive=vi.IdealDrive(0.9),
@@ -88,7 +88,7 @@ def test_paired_lanes_are_checked_one_by_one():
             vi.scan(scene, {**rows, "stops.0.gap": bad, **start}, **options)
 
 
-def test_other_numbers_compile_nothing(data, compilations):
+def test_other_numbers_do_not_recompile(data, compilations):
     axes = {name: row[:-1] + 0.01 for name, row in AXES.items()}
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=0.7, gap=1.5, damping_ratio=0.02)
     measure = ("extremes", "regime", "frequency_ratio", "power", "impact_rate", "sections", "steps")
@@ -96,7 +96,7 @@ def test_other_numbers_compile_nothing(data, compilations):
     assert not compilations
 
 
-def test_own_measures_scenes_and_starts():
+def test_user_defined_measures_scenes_and_starts():
     def span(scene, run):
         return {"span": run.y_max[-1] - run.y_min[-1], "last": run.sections.Y[-3:]}
 
@@ -117,7 +117,7 @@ def test_own_measures_scenes_and_starts():
 
 
 @pytest.mark.slow
-def test_derivatives_are_those_of_a_run():
+def test_derivatives_agree_with_those_of_a_run():
     names = ("drive.frequency_ratio", "start.V", "stops.0.gap")
     data = vi.scan(
         SCENE, {"start.Y": [0.1, 0.4]}, measure="extremes", settle=5, cycles=1, derivatives=names
@@ -136,7 +136,7 @@ def test_derivatives_are_those_of_a_run():
         assert found == pytest.approx(float(slope), rel=1e-5, abs=1e-7)
 
 
-def test_failing_lanes_are_counted_and_harm_no_other():
+def test_failing_lanes_are_counted_and_do_not_change_others():
     Y = [0.0, 5.0, 0.5]
     with pytest.warns(UserWarning, match=r"1 of 3 lanes failed \(bad_start: 1\)"):
         data = vi.scan(SCENE, {"start.Y": Y}, settle=10, cycles=128)
@@ -162,16 +162,16 @@ def test_failing_lanes_are_counted_and_harm_no_other():
         ({"paired": True}, "rows of one length"),
     ],
 )
-def test_what_cannot_be_run_is_said_before_any_work(change, message):
+def test_invalid_arguments_raise_before_any_work(change, message):
     arguments = {"axes": AXES, **change}
     with pytest.raises((ValueError, TypeError), match=message):
         vi.scan(SCENE, **arguments)
 
 
 @pytest.mark.slow
-def test_some_lanes_are_verified_by_a_better_method():
-    """Under steps of a loose tolerance sections do not repeat closely: the regimes are told wrongly
-    where that is asked for."""
+def test_verification_uses_a_better_method():
+    """With a loose tolerance of the method, sections do not repeat closely, and a strict `Regime`
+    is wrong."""
     axes = {"drive.frequency_ratio": np.linspace(1.0, 1.4, 6), "start.Y": [0.0, 0.5]}
     measure = ("extremes", vi.Regime(longest=4, observed=8, threshold=1.0, tolerance=1e-6))
     method = vi.Adaptive(diffrax.Bosh3(), rtol=1e-3)
@@ -182,8 +182,8 @@ def test_some_lanes_are_verified_by_a_better_method():
     assert 1e-6 < data.attrs["verified_error_y_min"] < 1e-1
 
 
-def test_scenes_made_by_a_function_move_as_they_would_alone():
-    """By the same default method, and at rest on the stop where they can be."""
+def test_scenes_from_a_function_agree_with_runs():
+    """Each lane uses the default method, and rests if its gap allows it."""
 
     def machine(gap):
         return vi.Scene.ideal(frequency_ratio=0.5, gap=gap, restitution=0.3)
@@ -198,7 +198,7 @@ def test_scenes_made_by_a_function_move_as_they_would_alone():
         assert (int(run.rests.sum()) > 0) == (gap < 0.5)
 
 
-def test_only_what_measures_ask_for_is_met():
+def test_unused_extremes_are_not_computed():
     scene = vi.Scene.ideal(frequency_ratio=0.9, gap=2.0, restitution=0.5)
     axes = {"drive.frequency_ratio": [0.8, 0.9]}
     lean, full = (

@@ -1,4 +1,4 @@
-"""Means with errors, densities, escapes and spectra under noise, against what is known of them."""
+"""Means with errors, densities and escapes under noise, compared with theory."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ START = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 NOISE = vi.WhiteNoise({"V": SIGMA}, impulses=IMPULSES)
 
 
-# Of it everything is known, the impulses included: from one to the next it is a linear map.
+# Between impulses the state follows a linear map, so that its covariance is known exactly.
 FLOW = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * STEP)
 JUMP = np.diag([0.0, SIGMA**2 * STEP])
 COVARIANCE = solve_discrete_lyapunov(FLOW, JUMP)
@@ -39,7 +39,7 @@ def shaken():
 
 
 def test_the_variances_of_a_linear_oscillator(shaken):
-    assert abs(COVARIANCE[0, 0] - 0.625) < 2e-5  # that of the state between impulses has no error
+    assert abs(COVARIANCE[0, 0] - 0.625) < 2e-5  # 0.625 is the limit of continuous noise
     for i, name in enumerate("YV"):
         square = shaken[f"{name}_spread"] ** 2 + shaken[f"{name}_mean"] ** 2
         error = float(square.std(ddof=1)) / LANES**0.5
@@ -47,27 +47,27 @@ def test_the_variances_of_a_linear_oscillator(shaken):
         assert abs(float(square.mean()) - COVARIANCE[i, i]) < 3 * error
 
 
-def test_batch_means_give_the_scatter_of_lanes(shaken):
-    """Of 255 lanes a variance is known within 9 %, their scatter therefore within 4.4 %; errors
-    from 16 parts are means of squares that scatter by 37 %, over as many lanes 2.3 %. Three times
-    both, and what correlation across the ends of parts of 20 cycles leaves, is 0.2."""
+def test_batch_means_agree_with_the_scatter_of_lanes(shaken):
+    """The scatter of 256 lanes has an error of 4.4 % (9 % of the variance). Squared errors from 16
+    parts scatter by 37 %, and their mean by 2.3 %. The tolerance 0.2 is three times both, plus the
+    correlation between parts of 20 cycles."""
     for name in ("Y", "V"):
         for what, error in (("mean", "error"), ("spread", "spread_error")):
             found = float((shaken[f"{name}_{error}"] ** 2).mean() ** 0.5)
             assert abs(found / float(shaken[f"{name}_{what}"].std(ddof=1)) - 1) < 0.2
 
 
-def test_the_error_of_a_mean_is_that_of_the_means_of_parts():
+def test_the_error_of_a_mean_comes_from_the_means_of_parts():
     def given(machine, run):
         return jnp.array([9.0, 0.0, 2.0, 4.0, 10.0])
 
     found = vi.Statistics(given, batches=2)(None, None)
     assert float(found["given_mean"]) == 5.0
-    # Parts are of equal length, so that the first number is in none: their means are 1 and 7.
+    # Parts have equal lengths, so the first number is left out; their means are 1 and 7.
     assert float(found["given_error"]) == pytest.approx(3.0, rel=1e-14)
 
 
-def test_the_density_is_gauss(shaken):
+def test_the_density_is_gaussian(shaken):
     shares = np.diff(norm.cdf(EDGES / COVARIANCE[0, 0] ** 0.5))
     density = shaken.density.mean("noise.path").values
     error = shaken.density.std("noise.path", ddof=1).values / LANES**0.5
@@ -78,7 +78,7 @@ def test_the_density_is_gauss(shaken):
     assert shaken.density.attrs["Y_edges"] == EDGES.tolist()
 
 
-def test_a_density_of_two_is_numpys():
+def test_a_density_in_two_variables_agrees_with_numpy():
     names = "YV"
     edges = {"V": np.linspace(-1.0, 1.5, 6), "Y": np.linspace(-1.0, 1.0, 4)}
     edges = {name: edges[name] for name in names}
@@ -97,7 +97,7 @@ def test_a_density_of_two_is_numpys():
 
 
 def test_a_body_on_the_last_edge_is_in_the_last_bin():
-    """As NumPy counts: one that rests on a stop was in no bin."""
+    """NumPy counts alike. Once a body at rest on a stop was in no bin."""
     pressed = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.0, gap=-2.0)
     start = pressed.start(Y=-2.0)
     density = vi.Density({"Y": np.linspace(-3.0, -2.0, 3)})
@@ -107,7 +107,7 @@ def test_a_body_on_the_last_edge_is_in_the_last_bin():
 
 
 class Reflected(Free):
-    """The same with an elastic stop at 0."""
+    """The free oscillator with an elastic stop at 0."""
 
     @property
     def contacts(self):
@@ -115,9 +115,9 @@ class Reflected(Free):
 
 
 @pytest.mark.slow
-def test_impacts_on_an_elastic_stop_are_crossings_of_zero():
-    """By Rice's formula with the covariance at each time between two impulses, so that of the
-    number of impulses, 4 in a cycle, nothing is left to be extrapolated."""
+def test_impacts_on_an_elastic_stop_agree_with_rices_formula():
+    """Compare with Rice's formula, with the covariance at each time between two impulses. It is
+    exact for 4 impulses per cycle."""
     step = CYCLE / 4
     turn = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * step)
     begin = solve_discrete_lyapunov(turn, np.diag([0.0, SIGMA**2 * step]))
@@ -136,11 +136,11 @@ def test_impacts_on_an_elastic_stop_are_crossings_of_zero():
     error = float(data.impacts_mean.std(ddof=1)) / 512**0.5 / CYCLE
     assert error < 1e-3 * rate
     assert abs(mean - rate) < 3 * error
-    assert abs(rate - 1 / np.pi) > 3 * error  # what is left to impulses so far apart
+    assert abs(rate - 1 / np.pi) > 3 * error  # continuous noise would differ
 
 
 class Relaxing(vi.AbstractMachine):
-    """x' = -x + σ dW, with one impulse in a cycle of 0.5."""
+    """x' = -x + σ dW with cycle 0.5."""
 
     cycle = 0.5
 
@@ -148,9 +148,9 @@ class Relaxing(vi.AbstractMachine):
         return {"x": -x["x"]}
 
 
-def test_the_rate_of_escape_is_that_of_the_map():
-    """The share left behind each impulse is the greatest eigenvalue of the map of densities below
-    the threshold (by Gauss and Legendre's rule)."""
+def test_the_escape_rate_agrees_with_the_map_of_densities():
+    """The share that survives an impulse is the largest eigenvalue of the map of densities below
+    the threshold (by Gauss-Legendre quadrature)."""
     sigma, high = 1.0, 1.5
     nodes, weights = np.polynomial.legendre.leggauss(80)
     x, w = high + 4 * (nodes - 1), 4 * weights
@@ -166,15 +166,15 @@ def test_the_rate_of_escape_is_that_of_the_map():
     assert found.rate_high / found.rate_low < 1.2
     assert int(found.escapes) + int(found.censored) < 2048 == data.escaped.size
     assert int(found.censored) == int((data.escaped == 0).sum()) > 20
-    # A mean of the times of escape leaves the censored ones out.
+    # The mean escape time underestimates, since it stops at censored paths.
     assert 1 / float(data.escape_cycle.mean()) > float(found.rate_high)
 
 
 @pytest.mark.parametrize(
     "of, samples, settle", [("Y", 4, 2), pytest.param("y_max", 0, 2, marks=pytest.mark.slow)]
 )
-def test_a_lane_ends_once_it_has_escaped(of, samples, settle):
-    """To the same numbers as beside another measure, for which all lanes go on."""
+def test_a_lane_ends_at_its_escape(of, samples, settle):
+    """Results agree with those beside a measure for which all lanes continue."""
     given = {"settle": settle, "cycles": 32, "noise": NOISE, "key": jax.random.key(2)}
     alone = vi.Escape(of, high=2.0, samples=samples)
     other = vi.Density({"V": EDGES}, samples=samples)
@@ -190,7 +190,7 @@ def test_a_lane_ends_once_it_has_escaped(of, samples, settle):
 
 
 class Bursting(vi.AbstractMachine):
-    """x' = x², which has no x after 1/x(0)."""
+    """x' = x², which diverges at time 1/x(0)."""
 
     cycle: float = 0.25
 
@@ -198,7 +198,7 @@ class Bursting(vi.AbstractMachine):
         return {"x": x["x"] ** 2}
 
 
-def test_what_comes_after_an_escape_does_not_count():
+def test_failures_after_an_escape_do_not_count():
     found = vi.scan(
         Bursting(), {"start.x": [0.5, 0.05]}, measure=vi.Escape("x", high=1.0 + 1e-6),
         start={"x": jnp.array(0.5)}, settle=0, cycles=12, progress=False,
@@ -207,7 +207,7 @@ def test_what_comes_after_an_escape_does_not_count():
     assert found.escaped.values.tolist() == [1, 0] and not found.result.values.any()
 
 
-def test_escapes_are_counted_with_those_that_are_watched():
+def test_escapes_and_censored_paths_are_counted():
     data = xr.Dataset(
         {
             "escape_cycle": (("a", "path"), [[2.0, 10.0, 10.0, 0.0], [10.0, 10.0, np.nan, 10.0]]),
@@ -229,7 +229,7 @@ def test_escapes_are_counted_with_those_that_are_watched():
 
 
 @pytest.mark.slow
-def test_extremes_tell_of_passages_between_sections():
+def test_extremes_detect_escapes_between_sections():
     given = {"settle": 3, "cycles": 32, "noise": NOISE, "key": jax.random.key(2), "start": START}
     late, soon = (
         vi.scan(Free(), {"noise.path": np.arange(64)}, measure=m, progress=False, **given)
@@ -237,7 +237,7 @@ def test_extremes_tell_of_passages_between_sections():
     )
     both = (late.escaped & soon.escaped) == 1
     assert both.sum() > 30
-    # A cycle's greatest position counts from the first cycle's end.
+    # The maximal position of a cycle is known at its end, first after one cycle.
     assert np.all(soon.escape_cycle <= np.maximum(late.escape_cycle, 1.0))
     assert np.mean(soon.escape_cycle < late.escape_cycle) > 0.5
 
@@ -260,7 +260,7 @@ def test_extremes_tell_of_passages_between_sections():
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(make, message):
+def test_invalid_arguments_raise(make, message):
     with pytest.raises((TypeError, ValueError), match=message):
         make()
 

@@ -1,4 +1,4 @@
-"""Stores that were damaged, and functions that are no longer those of the store."""
+"""Damaged stores, and stores of another function."""
 
 import importlib
 import json
@@ -27,7 +27,7 @@ def whole(tmp_path_factory):
     return path, {name: x.values for name, x in scanned(path).variables.items()}
 
 
-def test_a_store_is_opened_by_others_without_a_warning(whole):
+def test_xarray_opens_a_store_without_a_warning(whole):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         kept = xr.open_zarr(whole[0])
@@ -55,7 +55,7 @@ def _cut(path):
         (_cut, "start.Y/c/0", "start.Y", 0),
     ],
 )
-def test_what_is_damaged_is_told_and_computed_again(
+def test_damaged_blocks_are_computed_again_with_a_warning(
     whole, tmp_path, monkeypatch, damage, where, words, blocks
 ):
     path = tmp_path / "store"
@@ -79,8 +79,8 @@ def test_what_is_damaged_is_told_and_computed_again(
     assert len(computed) == blocks
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(whole, monkeypatch):
-    """Though the folder above can be."""
+def test_a_read_only_folder_raises_before_any_work(whole, monkeypatch):
+    """Its parent folder is writable."""
     checks = importlib.import_module("vi_jax._checks")
     create = checks.tempfile.TemporaryFile
 
@@ -94,14 +94,14 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(whole, mo
         scanned(whole[0])
 
 
-def test_a_block_is_no_larger_than_the_grid():
+def test_blocks_are_not_larger_than_the_grid():
     data = vi.scan(
         SCENE, {"start.Y": [0.0, 0.5]}, measure="extremes", settle=5, cycles=4, lanes=10**9
     )
     assert (data.result == 0).all()
 
 
-def test_two_writers_are_refused(whole, tmp_path, monkeypatch):
+def test_a_second_writer_raises(whole, tmp_path, monkeypatch):
     computed = importlib.import_module("vi_jax.scans._scan")
     compute = computed.compute
 
@@ -116,7 +116,7 @@ def test_two_writers_are_refused(whole, tmp_path, monkeypatch):
     scanned(tmp_path / "store")
 
 
-def test_a_store_whose_head_is_cut_is_refused(whole, tmp_path):
+def test_a_store_with_a_truncated_header_raises(whole, tmp_path):
     path = tmp_path / "store"
     shutil.copytree(whole[0], path)
     _cut(path / "zarr.json")
@@ -124,8 +124,8 @@ def test_a_store_whose_head_is_cut_is_refused(whole, tmp_path):
         scanned(path)
 
 
-def test_failed_lanes_are_no_damage(tmp_path):
-    """They are NaN, which Zarr by default stores as the empty chunk."""
+def test_failed_lanes_do_not_count_as_damage(tmp_path):
+    """Failed lanes are NaN, which Zarr stores as an empty chunk by default."""
 
     def run():
         axes = {"start.Y": np.linspace(2.5, 3.0, 256)}
@@ -141,12 +141,12 @@ def test_failed_lanes_are_no_damage(tmp_path):
     assert [str(w.message)[:7] for w in said] == ["256 of "]
 
 
-def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, monkeypatch):
-    """First and last lane are alike: only their code tells them apart."""
+def test_another_function_with_equal_probed_lanes_raises(tmp_path, monkeypatch):
+    """The first and the last lane agree, so that only the code differs."""
     module = importlib.import_module("vi_jax.scans._scan")
     monkeypatch.setattr(module, "run_blocks", lambda *arguments: None)
 
-    def run(name, change=0.0, hidden=None):  # functions that close over what differs
+    def run(name, change=0.0, hidden=None):  # its functions close over `change` and `hidden`
         def machine(zeta):
             bump = change * (zeta - 0.8) * (1.2 - zeta)
             return vi.Scene.ideal(frequency_ratio=zeta + bump, damping_ratio=0.02)
@@ -173,7 +173,7 @@ def test_functions_that_differ_between_the_probed_lanes_are_refused(tmp_path, mo
         run("measure", hidden=opaque)
 
 
-def test_another_release_that_finishes_a_store_warns(whole, tmp_path):
+def test_a_store_of_another_release_warns(whole, tmp_path):
     path = tmp_path / "store"
     shutil.copytree(whole[0], path)
     head = json.loads((path / "zarr.json").read_text())

@@ -1,4 +1,4 @@
-"""Sweeps: what is carried from value to value, and what is said of it."""
+"""Sweeps: the state carried from value to value, and the text about jumps."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +8,7 @@ import vi_jax as vi
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
 
-def test_a_sweep_takes_the_body_along_with_a_stop_that_comes_nearer():
+def test_a_sweep_moves_the_body_with_an_approaching_stop():
     gaps = [2.0, 1.2, 0.5, -0.5, 0.5, 2.0]
     sweep = vi.sweep(SCENE, "stops.0.gap", gaps, settle=50, cycles=8)
     assert bool(sweep.successful.all())
@@ -41,17 +41,17 @@ def _described(y_min, period, impacts, zeta=None):
     return str(sweep).splitlines()[1:]
 
 
-def test_a_sweep_tells_what_happens_to_the_motion():
-    # The period stays, and all else changes.
+def test_the_text_of_a_sweep_reports_jumps():
+    # The period is constant, but the motion jumps.
     lost = _described([-3.3, -3.4, -0.7, -0.68], [1] * 4, [1.0, 1.0, 0.0, 0.0], [1.0, 1, 1.3, 1.3])
     assert lost == [
         "  2π with 1 impact from 1",
         "  2π with 0 impacts from 1.2, jump since 1.1: min Y -3.4 → -0.7 a, ζ 1 → 1.3 ω",
     ]
-    # A motion of the same kind on another branch.
+    # A jump to another branch with the same period and impacts.
     other = _described([-1.0, -1.05, -1.1, -2.0, -2.04, -2.08], [2] * 6, [3.0] * 6)
     assert other[1] == "  still 4π with 3 impacts from 1.3, jump since 1.2: min Y -1.1 → -2 a"
-    # What goes on steadily, however steep, is none; nor is what chaos does from value to value.
+    # Neither a steep steady change nor chaos is a jump.
     assert len(_described([-1.0, -2.0, -3.0, -4.2], [1] * 4, [1.0] * 4)) == 1
     assert (
         len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [-2] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
@@ -63,13 +63,13 @@ def test_a_sweep_tells_what_happens_to_the_motion():
 
 
 @pytest.mark.slow
-def test_a_weak_motor_that_comes_off_the_stop_is_told():
+def test_the_text_reports_that_a_weak_motor_leaves_the_stop():
     motor = vi.Parameters(torque=2.0, restitution=0.5, gap=0.08, control=1.45).scene(drive="motor")
     sweep = vi.sweep(motor, "drive.control", [1.45, 1.5, 1.55, 1.6], start=motor.start(W=1.2))
     _, before, after = str(sweep).splitlines()
     assert before == "  2π with 1 impact from 1.45"
     assert after.startswith("  2π with 0 impacts from 1.55, jump since 1.5: min Y -3.47")
-    # Off the stop it is driven vibration, of the amplitude of the speed told (to the motor's hum).
+    # Without impacts: the linear response at the reported speed, except for the speed's ripple.
     zeta, xi = float(sweep.frequency_ratio[2]), float(motor.damping_ratio)
     amplitude = 1 / abs(1 - zeta**2 + 2j * xi * zeta)
     assert float(sweep.y_min[2]) == pytest.approx(-amplitude, rel=0.02)

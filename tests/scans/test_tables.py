@@ -1,4 +1,4 @@
-"""Results as labelled data sets, and as tables with one row for each thing that is told."""
+"""Results as labelled data sets and as tables."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def test_a_run_in_tables():
     assert counts.to_dict() == {i + 1: n for i, n in enumerate(run.impacts.tolist()) if n}
     met = np.asarray(run.impact_log.stop) >= 0
     assert tables["impact"].log_speed.tolist() == np.asarray(run.impact_log.speed)[met].tolist()
-    # Nothing is lost: each number is in one table, or stands alone.
+    # Each variable is in a table, or is a scalar.
     everything = run.to_xarray()
     told = {str(name) for name in rows for name in run.to_xarray(along=name)}
     assert told == {name for name, x in everything.items() if x.ndim}
