@@ -238,13 +238,13 @@ def test_machines_with_other_arguments_and_without_a_drive(run):
 PARTS = "[simulate]\ncycles = 40\nsettle = 30\nsamples = 4\noutput = 'o.csv'\n"
 
 
-def short(monkeypatch):
+def split_runs(monkeypatch):
     """Split runs into parts of ten cycles."""
     monkeypatch.setattr(command, "_CYCLES", 10)
 
 
 def test_a_run_in_parts_is_the_same_run(monkeypatch):
-    short(monkeypatch)
+    split_runs(monkeypatch)
     scene = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.02)
     options = {"settle": 3, "samples": 4, "impact_log": 2, "method": vi.Adaptive()}
     whole = vi.simulate(scene, scene.start(Y=0.3), 23, **options)
@@ -258,7 +258,7 @@ def test_a_run_in_parts_is_the_same_run(monkeypatch):
 
 
 def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
-    short(monkeypatch)
+    split_runs(monkeypatch)
     scene = vi.Parameters(control=-1.0).scene()  # its motor stalls
     found, _ = command.run_in_parts(scene, scene.start(W=0.1), 40)
     assert not bool(found.successful) and found.impacts.size == 10
@@ -267,7 +267,7 @@ def test_a_run_in_parts_ends_with_the_part_that_fails(monkeypatch):
 @pytest.mark.parametrize("pressed, kept", [(1, None), (3, 81)])
 def test_ctrl_c_keeps_the_recorded_cycles_of_a_run(run, monkeypatch, capsys, pressed, kept):
     """Send Ctrl-C in the first part or a later one, and again while results are written."""
-    short(monkeypatch)
+    split_runs(monkeypatch)
     compute, calls = command.simulate, []
 
     def computed(*args, **options):

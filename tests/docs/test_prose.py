@@ -61,12 +61,12 @@ def documented():
 
 def test_docstrings_of_public_names():
     """Docstrings of functions begin with a verb, those of classes not with a clause."""
-    for name, public, told in documented():
+    for name, public, text in documented():
         if "." not in name and inspect.isfunction(public):
-            assert told.split()[0] in VERBS, name
+            assert text.split()[0] in VERBS, name
         elif inspect.isclass(public):
-            assert told.split()[0] not in CLAUSES, name
-        found = [x for x in paragraphs(told) if HEADLESS.search(x) or PHRASES.search(x)]
+            assert text.split()[0] not in CLAUSES, name
+        found = [x for x in paragraphs(text) if HEADLESS.search(x) or PHRASES.search(x)]
         assert not found, name
 
 
@@ -74,8 +74,8 @@ def test_docstrings_of_private_names_do_not_begin_with_a_clause():
     for path in sorted(Path(inspect.getfile(vi)).parent.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
-                told = ast.get_docstring(node) or "None"
-                assert told.split()[0] not in [*CLAUSES, *"Of That Those Whether".split()], told
+                text = ast.get_docstring(node) or "None"
+                assert text.split()[0] not in [*CLAUSES, *"Of That Those Whether".split()], text
 
 
 def test_the_patterns_find_bad_sentences_only():

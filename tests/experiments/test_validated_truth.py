@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 CLOSE = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
 
 
-def theirs(script):
+def published(script):
     """Return the other code's numbers by quantity; the first one for equal names."""
     return {row[0]: row[1] for row in reversed(rows(sections()[script]))}
 
@@ -33,12 +33,12 @@ def test_balls_in_a_row():
         return np.concatenate([v, -np.diff(push, prepend=0, append=0)])
 
     v = solve_ivp(rate, (0, 60), np.eye(20)[10], **CLOSE).y[10:, -1]
-    known = theirs("siconos_chain")
+    known = published("siconos_chain")
     for name, i in (("the first", 0), ("the ninth", 8), ("the last", 9)):
         agree(known[f"by SciPy: {name}"], v[i])
 
 
-def lifted(flow_rate, y):
+def valve_cycle(flow_rate, y):
     """Integrate the valve between two maxima of its lift; return state, time and impacts."""
 
     def rate(t, y):
@@ -66,10 +66,10 @@ def lifted(flow_rate, y):
 )
 def test_a_relief_valve(flow_rate, guess, hits, lift):
     def left(x):
-        return lifted(flow_rate, (x[0], 0, x[1]))[0][[0, 2]] - x
+        return valve_cycle(flow_rate, (x[0], 0, x[1]))[0][[0, 2]] - x
 
     x = fsolve(left, guess, xtol=1e-10)
-    _, time, struck = lifted(flow_rate, (x[0], 0, x[1]))
+    _, time, struck = valve_cycle(flow_rate, (x[0], 0, x[1]))
     assert struck == hits
     printed = rows(sections()["mpgos_valve"])
     known = {row[0]: row[1] for row in (printed[:3] if hits else printed[3:])}
@@ -79,7 +79,7 @@ def test_a_relief_valve(flow_rate, guess, hits, lift):
         agree(known["pressure there"], x[1])
 
 
-def half(omega, z):
+def half_period(omega, z):
     """Integrate the two masses for half a period and reverse the sign."""
 
     def rate(t, z):
@@ -98,10 +98,10 @@ def half(omega, z):
     return -z
 
 
-def multipliers_of_half(omega, z):
+def multipliers_of_half_period(omega, z):
     """Return the multipliers by central differences."""
     steps = 1e-5 * np.eye(4)
-    slopes = [(half(omega, z + e) - half(omega, z - e)) / 2e-5 for e in steps]
+    slopes = [(half_period(omega, z + e) - half_period(omega, z - e)) / 2e-5 for e in steps]
     return np.linalg.eigvals(np.transpose(slopes))
 
 
@@ -109,20 +109,20 @@ def test_stability_limits_of_the_two_masses():
     """At a fold a multiplier is 1; at a Neimark–Sacker point a pair has modulus 1."""
     *_, fold, _, first, second = [row[1] for row in rows(sections()["pwsdde_pair"])]
 
-    def lacks(x):
-        det = np.prod(multipliers_of_half(x[4], x[:4]) - 1).real
-        return [*(half(x[4], x[:4]) - x[:4]), det]
+    def residual(x):
+        det = np.prod(multipliers_of_half_period(x[4], x[:4]) - 1).real
+        return [*(half_period(x[4], x[:4]) - x[:4]), det]
 
     near = [-1.80955, -2.78315, 0.18278, 2.18286, 1.29897]
-    agree(fold, fsolve(lacks, near, xtol=1e-11)[4])
+    agree(fold, fsolve(residual, near, xtol=1e-11)[4])
     for printed, low, high, near in (
         (first, 1.9764, 1.9767, (-0.2794, -0.9533, 0.0951, -1.3286)),
         (second, 2.0948, 2.0951, (-0.2376, -0.8723, 0.0954, -1.3877)),
     ):
 
         def beyond(omega, near=near):
-            z = fsolve(lambda z: half(omega, z) - z, near, xtol=1e-12)
-            largest = multipliers_of_half(omega, z)
+            z = fsolve(lambda z: half_period(omega, z) - z, near, xtol=1e-12)
+            largest = multipliers_of_half_period(omega, z)
             assert abs(largest[np.argmax(np.abs(largest))].imag) > 0.01
             return np.abs(largest).max() - 1
 
@@ -131,10 +131,10 @@ def test_stability_limits_of_the_two_masses():
 
 
 def test_two_masses():
-    known, guess = theirs("pwsdde_pair"), np.array([-0.686, -1.514, 0.1256, -1.2246])
+    known, guess = published("pwsdde_pair"), np.array([-0.686, -1.514, 0.1256, -1.2246])
 
     def orbit(omega, guess):
-        return fsolve(lambda z: half(omega, z) - z, guess, xtol=1e-12)
+        return fsolve(lambda z: half_period(omega, z) - z, guess, xtol=1e-12)
 
     z = orbit(1.5, guess)
     agree(known["x1 at phase 0, ω = 1.5"], z[0])
@@ -144,7 +144,7 @@ def test_two_masses():
 
     def above(omega):
         """Return a function that is zero at the symmetry breaking (multiplier -1)."""
-        return multipliers_of_half(omega, orbit(omega, z)).real.min() + 1
+        return multipliers_of_half_period(omega, orbit(omega, z)).real.min() + 1
 
     # Central differences have an error of 1e-9.
     agree(known["ω of the symmetry-breaking"], brentq(above, 1.438, 1.441, xtol=1e-11))

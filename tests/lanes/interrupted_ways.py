@@ -47,7 +47,7 @@ WAYS = {
 }
 
 
-def struck(way, delay):
+def time_to_end(way, delay):
     np.asarray(way(1))  # compile
     at = []
 
@@ -70,4 +70,4 @@ def struck(way, delay):
 
 
 for name in sys.argv[1:] or WAYS:
-    print(name, *(struck(WAYS[name], delay) for delay in (0.3, 0.55)))
+    print(name, *(time_to_end(WAYS[name], delay) for delay in (0.3, 0.55)))

@@ -69,7 +69,7 @@ class Collected(vi.AbstractMachine):
 
 
 @pytest.fixture
-def pressed():
+def interrupt_in_collection():
     """Return a function that sends Ctrl-C in a garbage collection, where Python drops it."""
     waiting = []
 
@@ -84,19 +84,19 @@ def pressed():
 
 
 @pytest.mark.slow
-def test_interrupts_within_the_garbage_collector_are_kept(pressed):
+def test_interrupts_within_the_garbage_collector_are_kept(interrupt_in_collection):
     """The interrupt comes during tracing, before a progress report, or before lanes run."""
     hook = sys.unraisablehook
     motion = jax.jit(lambda settle: vi.simulate(SCENE, SCENE.start(), 1, settle=settle).last.Y)
     motion(1)
-    pressed()
+    interrupt_in_collection()
     with pytest.raises(KeyboardInterrupt):
         vi.simulate(Collected(), Collected().start(), 1, settle=10**8)
     for more in (None, lambda: motion(10**8).block_until_ready()):
         kept = functools.partial(vi.Interrupted, "work", 7)
         with pytest.raises(vi.Interrupted) as caught, at_work("", kept, progress=False) as tell:
             tell(1)
-            pressed()
+            interrupt_in_collection()
             gc.collect()
             (more or functools.partial(tell, 1))()
         assert caught.value.partial == 7

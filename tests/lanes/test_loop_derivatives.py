@@ -70,16 +70,16 @@ INNER = {
     "while_loop": lambda x: jax.lax.while_loop(lambda a: a < 5, lambda a: a * a, x),
     "cond": lambda x: jax.lax.cond(x > 1, lambda a: a * a, lambda a: a, x),
     "checkpoint": lambda x: jax.checkpoint(jnp.sin)(x),
-    "custom_jvp": lambda x: with_its_own_derivative(x),
+    "custom_jvp": lambda x: with_custom_derivative(x),
 }
 
 
 @jax.custom_jvp
-def with_its_own_derivative(x):
+def with_custom_derivative(x):
     return jax.lax.stop_gradient(x)
 
 
-with_its_own_derivative.defjvps(lambda slope, out, x: 3 * x * slope)
+with_custom_derivative.defjvps(lambda slope, out, x: 3 * x * slope)
 
 
 @pytest.mark.parametrize("name", INNER)

@@ -23,7 +23,7 @@ def by_tape(monkeypatch):
     monkeypatch.setattr(_backward, "_COLUMNS_EACH", 0)
 
 
-def lost(p, backend=None):
+def loss(p, backend=None):
     """A loss of results and rows; lanes share `r`, and some do not reach all rows."""
     x, r = p[:3], p[3]
     (last, _), rows = jax.vmap(lambda x: logistic(x, r, 6.0, backend=backend))(x)
@@ -61,11 +61,11 @@ ORDERS = {
 
 @pytest.mark.parametrize("order", quick(ORDERS, "gradient"))
 def test_derivatives_of_any_order_agree_with_those_by_columns(by_tape, order):
-    program = jax.make_jaxpr(ORDERS[order](lost))(P)
+    program = jax.make_jaxpr(ORDERS[order](loss))(P)
     # A failure means that JAX has renamed primitives in transposed derivatives (see `reverse`).
     assert "lanes_backward" in str(program), "no tape"
-    taped = jax.jit(ORDERS[order](lost))(P)
-    columns = jax.jit(ORDERS[order](lambda p: lost(p, "xla")))(P)
+    taped = jax.jit(ORDERS[order](loss))(P)
+    columns = jax.jit(ORDERS[order](lambda p: loss(p, "xla")))(P)
     np.testing.assert_allclose(taped, columns, rtol=1e-12, atol=1e-12 * np.abs(columns).max())
 
 
@@ -268,9 +268,9 @@ def test_columns_are_used_without_llvm(by_tape, monkeypatch):
     monkeypatch.setattr(runtime, "llvm", missing)
     runtime._register_bits.cache_clear()
     with pytest.warns(UserWarning, match="no llvmlite"):
-        slope = jax.jit(lambda p: jax.grad(lost)(1.0 * p))(P)
+        slope = jax.jit(lambda p: jax.grad(loss)(1.0 * p))(P)
     runtime._register_bits.cache_clear()
-    np.testing.assert_allclose(slope, jax.grad(lambda p: lost(p, "xla"))(P), rtol=1e-12)
+    np.testing.assert_allclose(slope, jax.grad(lambda p: loss(p, "xla"))(P), rtol=1e-12)
 
 
 @pytest.mark.parametrize("room", [{"entries": 1 << 44}, {"entries": 1, "most": 300}])
@@ -281,4 +281,4 @@ def test_too_little_memory_is_an_error(by_tape, monkeypatch, room):
     monkeypatch.setattr(runtime, "_keys", type(runtime._keys)())
     jax.clear_caches()
     with pytest.raises(Exception, match=r"tape of this gradient needs more .* forward \(`jax.jacf"):
-        jax.block_until_ready(jax.jit(lambda p: jax.grad(lost)(p * 1.0))(P))
+        jax.block_until_ready(jax.jit(lambda p: jax.grad(loss)(p * 1.0))(P))

@@ -55,14 +55,14 @@ class Drawn(Own):
         pen.ball(float(state.Y), phase, 0.1, color=pen.red)
 
 
-def moved(scene, start=None, cycles=2):
+def sampled_run(scene, start=None, cycles=2):
     start = scene.start() if start is None else start
     return vi.simulate(scene, start, cycles, samples=32, impact_log=4, throw=True)
 
 
 @pytest.fixture(scope="module")
 def run():
-    return moved(MACHINES["ideal"], MACHINES["ideal"].start(Y=1.6, V=-1.9))
+    return sampled_run(MACHINES["ideal"], MACHINES["ideal"].start(Y=1.6, V=-1.9))
 
 
 def picture(figure):
@@ -78,7 +78,7 @@ def test_every_machine_is_drawn(name):
     assert ax.texts and (ax.patches or ax.lines)
     if name == "soft stop":
         return
-    shown = vi.animate(moved(scene), scene, seconds=0.4, fps=10)
+    shown = vi.animate(sampled_run(scene), scene, seconds=0.4, fps=10)
     assert len(shown) == 4
     first, third = (picture(shown.draw(i)) for i in (0, 2))
     half = first.shape[0] // 3  # the machine must move, not only the history
@@ -118,7 +118,7 @@ def test_frames_are_even_in_time():
     """A shaft that starts at rest is slow at first."""
     scene = MACHINES["motor"].in_clock("time")
     start = scene.start(W=0.0)
-    shown = vi.animate(moved(scene, start), scene, seconds=1.0, fps=40)
+    shown = vi.animate(sampled_run(scene, start), scene, seconds=1.0, fps=40)
     cycles = shown._frames.cycles
     assert np.diff(cycles)[0] < 0.3 * np.diff(cycles)[-1]
 

@@ -18,7 +18,7 @@ def motion():
     return vi.find_orbit(SCENE, SCENE.start(Y=1.283, V=1.007), 2)
 
 
-def seen_from(motion, number, of):
+def moved_to_section(motion, number, of):
     """Return the motion on a section at the crank angle 2π number/of."""
     samples = vi.simulate(SCENE, motion.state, 2, samples=of, record="sections").samples.state
     there = SCENE.at_section(number % of * 2 * np.pi / of)
@@ -28,7 +28,7 @@ def seen_from(motion, number, of):
 @pytest.mark.slow
 def test_a_kick_at_a_phase_equals_that_on_a_section_there(motion):
     for number, components in ((1, ["V"]), (6, ["Y", "V"])):
-        here = seen_from(motion, number, 4)
+        here = moved_to_section(motion, number, 4)
         there = vi.minimal_kick(here.machine, here, **{**BLOW, "components": components})
         at = {"cycle": number // 4, "phase": number % 4 * np.pi / 2}
         found = vi.minimal_kick(SCENE, motion, **at, **{**BLOW, "components": components})

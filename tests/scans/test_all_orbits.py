@@ -89,9 +89,9 @@ def test_interrupted_after_a_period(found, scene, monkeypatch):
         return plain(machine, guess, cycles, **options)
 
     monkeypatch.setattr(_all_orbits, "find_orbit", pressed)
-    with pytest.raises(KeyboardInterrupt) as told:
+    with pytest.raises(KeyboardInterrupt) as caught:
         vi.all_orbits(scene, 3, region=REGION, starts=128)
-    partial = told.value.partial  # pyright: ignore[reportAttributeAccessIssue]
+    partial = caught.value.partial  # pyright: ignore[reportAttributeAccessIssue]
     assert len(partial.searched) == 1 and str(partial) == str(found)
 
 

@@ -18,7 +18,7 @@ MOTOR = vi.Parameters().scene(drive="motor")
 VALUES = jnp.linspace(0.7, 1.3, 40)
 
 
-def struck(monkeypatch, place, after):
+def interrupt_at(monkeypatch, place, after):
     """Raise `KeyboardInterrupt` at the call of a function after `after` calls."""
     module, name = (
         importlib.import_module("vi_jax." + place.rpartition(".")[0]),
@@ -62,7 +62,7 @@ def test_interrupted_basins_end_soon():
 def test_an_interrupted_sweep_keeps_completed_values(monkeypatch):
     whole = vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     assert whole.values.shape == (40,) and bool(whole.successful.all())
-    struck(monkeypatch, "scans._sweep._sweep", after=2)
+    interrupt_at(monkeypatch, "scans._sweep._sweep", after=2)
     error = interrupted_by(
         vi.Interrupted, lambda: vi.sweep(MOTOR, "drive.control", VALUES, settle=4, cycles=4)
     )
@@ -79,7 +79,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
 
-    struck(monkeypatch, "orbit._follow.advance", after=5)
+    interrupt_at(monkeypatch, "orbit._follow.advance", after=5)
     options = {"parameter": "stops.0.gap", "bounds": (1.5, 2.5)}
     part = interrupted_by(vi.Interrupted, lambda: vi.continue_orbit(orbit, **options)).partial
     assert isinstance(part, vi.Branch) and part.ends == ("interrupted", "interrupted")
@@ -89,7 +89,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_completed_starts(monkeypatch):
-    struck(monkeypatch, "scans._basins._sorted_out", after=0)
+    interrupt_at(monkeypatch, "scans._basins._sorted_out", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
     error = interrupted_by(
@@ -116,12 +116,12 @@ def test_interrupted_exponents_use_completed_cycles(monkeypatch):
     plain = jax.vmap(lambda y: vi.lyapunov(scene, scene.start(Y=y), 1100))(jnp.zeros(1))
     np.testing.assert_allclose(whole.exponents, plain.exponents[0], rtol=1e-11)
     np.testing.assert_allclose(float(whole.state.Y), float(plain.state.Y[0]), rtol=1e-11)
-    struck(monkeypatch, "scans._lyapunov._part", after=0)
+    interrupt_at(monkeypatch, "scans._lyapunov._part", after=0)
     with pytest.raises(KeyboardInterrupt) as nothing:
         vi.lyapunov(scene, scene.start(), 1100)
     assert not isinstance(nothing.value, vi.Interrupted)
     monkeypatch.undo()
-    struck(monkeypatch, "scans._lyapunov._part", after=1)
+    interrupt_at(monkeypatch, "scans._lyapunov._part", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.lyapunov(scene, scene.start(), 1100))
     assert float(error.partial.exponents[0]) == pytest.approx(-0.2, rel=1e-6)
 
@@ -135,13 +135,13 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
     best = kicks.nearest_first
     # Search a second ray, at which the interrupt comes.
     monkeypatch.setattr(kicks, "nearest_first", lambda *arguments: best(*arguments)[:1] * 2)
-    struck(monkeypatch, "robust._minimal_kick._exact", after=1)
+    interrupt_at(monkeypatch, "robust._minimal_kick._exact", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.minimal_kick(scene, one))
     assert error.partial.confirmed and error.partial.exact
-    struck(monkeypatch, "robust._settling.find_orbit", after=0)
+    interrupt_at(monkeypatch, "robust._settling.find_orbit", after=0)
     edge = interrupted_by(vi.Interrupted, lambda: vi.edge_state(scene, two, one)).partial
     assert edge.kind == "irregular" and edge.orbit is None and edge.sections.Y.size > 0
-    struck(monkeypatch, "robust._manifold._ahead", after=3)
+    interrupt_at(monkeypatch, "robust._manifold._ahead", after=3)
     found = interrupted_by(vi.Interrupted, lambda: vi.manifold(saddle, length=0.5)).partial
     first, second = found.branches
     assert first.Y.size > 1 and second.Y.size == 1
@@ -155,14 +155,14 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
         amplitude=1.0, frequency=0.9, damping=10.1, gap=1.1 * amplitude, two_sided=False
     )
     point = grazing_of(machine, "gap", (0.9 * amplitude, 1.2 * amplitude))
-    struck(monkeypatch, "orbit.grazing.simulated", after=0)
+    interrupt_at(monkeypatch, "orbit.grazing.simulated", after=0)
     found = interrupted_by(vi.Interrupted, lambda: vi.grazing(point)).partial
     assert found.machine is None and found.windows is not None
-    struck(monkeypatch, "orbit._follow.advance", after=4)
+    interrupt_at(monkeypatch, "orbit._follow.advance", after=4)
     options = {"parameter": "amplitude", "bounds": ((0.05, 0.5), (0.5, 2.0))}
     curve = interrupted_by(vi.Interrupted, lambda: vi.boundary(point, **options)).partial
     assert curve.ends == ("interrupted", "interrupted") and len(curve.parameters) > 1
-    struck(monkeypatch, "scans._basins._sorted_out", after=1)
+    interrupt_at(monkeypatch, "scans._basins._sorted_out", after=1)
     asked = "gap", [1.0, 1.1], {"start.Y": (-0.5, 0.5), "start.V": (-0.5, 0.5)}
     options = {"resolution": 2, "settle": 5, "longest": 4}
     error = interrupted_by(

@@ -16,7 +16,7 @@ NOISE, KEY = vi.WhiteNoise({"V": 0.1}, impulses=16), jax.random.key(3)
 AXES = {"noise.V": [0.05, 0.1], "noise.path": np.arange(300)}
 
 
-def scanned(**options):
+def scan_with(**options):
     given = {
         "measure": ("sections", "extremes"), "settle": 3, "cycles": 16, "noise": NOISE,
         "key": KEY, "progress": False, "lanes": 256, "workers": 1,
@@ -26,7 +26,7 @@ def scanned(**options):
 
 @pytest.fixture(scope="module")
 def whole():
-    return scanned().load()
+    return scan_with().load()
 
 
 @pytest.mark.slow
@@ -43,13 +43,13 @@ def test_a_lane_equals_the_run_with_its_key(whole):
 
 def test_paths_do_not_depend_on_blocks_workers_or_threads(whole):
     with vi.threads(1):
-        other = scanned(lanes=512, workers=2)
+        other = scan_with(lanes=512, workers=2)
     xr.testing.assert_identical(other, whole)
-    assert np.any(scanned(key=jax.random.key(4)).V != whole.V)
+    assert np.any(scan_with(key=jax.random.key(4)).V != whole.V)
 
 
 def test_a_store_rejects_another_noise(whole, tmp_path):
-    data = scanned(store=tmp_path / "s")
+    data = scan_with(store=tmp_path / "s")
     assert np.array_equal(data.V, whole.V) and '"impulses": 16' in data.noise
     for other, word in (
         ({"key": jax.random.key(4)}, "noise key"),
@@ -57,7 +57,7 @@ def test_a_store_rejects_another_noise(whole, tmp_path):
         ({"noise": None, "key": None}, "noise"),
     ):
         with pytest.raises(ValueError, match=f"in .* the {word} is|`axes`, which names"):
-            scanned(store=tmp_path / "s", **other)
+            scan_with(store=tmp_path / "s", **other)
 
 
 def test_a_store_rejects_another_amplitude_function(tmp_path):
@@ -76,7 +76,7 @@ def test_a_store_rejects_another_amplitude_function(tmp_path):
 
 @pytest.mark.slow
 def test_verification_uses_the_paths_of_the_lanes():
-    data = scanned(verify=40, method=vi.FixedStep())
+    data = scan_with(verify=40, method=vi.FixedStep())
     assert data.verified_error_V < 1e-5
     assert np.std(data.V) > 1e-2
 
@@ -144,7 +144,7 @@ def test_a_sweep_uses_a_key_for_each_value():
 )
 def test_invalid_arguments_raise(options, message):
     with pytest.raises((TypeError, ValueError), match=message):
-        scanned(**options)
+        scan_with(**options)
 
 
 @pytest.mark.parametrize(

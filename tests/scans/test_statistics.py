@@ -251,11 +251,11 @@ def test_extremes_detect_escapes_between_sections():
         (lambda: vi.Escape("Y"), "one of them finite"),
         (lambda: vi.Escape("Y", low=1.0, high=0.0), "ends of an interval"),
         (lambda: vi.escape_rate(xr.Dataset()), "measure `Escape`"),
-        (lambda: scanned(vi.Statistics("W")), "must be one of Y, V, impacts"),
-        (lambda: scanned(vi.Statistics("impacts", samples=4)), "must be one of Y, V, but"),
-        (lambda: scanned(vi.Statistics("V", 4), cycles=3), "at least 4 for the measure Statistics"),
+        (lambda: scan_of(vi.Statistics("W")), "must be one of Y, V, impacts"),
+        (lambda: scan_of(vi.Statistics("impacts", samples=4)), "must be one of Y, V, but"),
+        (lambda: scan_of(vi.Statistics("V", 4), cycles=3), "at least 4 for the measure Statistics"),
         (
-            lambda: scanned((vi.Statistics("V", samples=4), vi.Escape("Y", high=1.0, samples=2))),
+            lambda: scan_of((vi.Statistics("V", samples=4), vi.Escape("Y", high=1.0, samples=2))),
             r"one number of samples, but asks for \[2, 4\]",
         ),
     ],
@@ -265,7 +265,7 @@ def test_invalid_arguments_raise(make, message):
         make()
 
 
-def scanned(measure, cycles=32):
+def scan_of(measure, cycles=32):
     return vi.scan(
         Free(), {"start.Y": [0.0]}, measure=measure, start=START, cycles=cycles, progress=False
     )

@@ -15,7 +15,7 @@ SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ra
 AXES = {"start.Y": np.linspace(-1.0, 1.0, 600)}
 
 
-def scanned(path, machine=SCENE):
+def scan_into(path, machine=SCENE):
     return vi.scan(
         machine, AXES, measure="extremes", settle=5, cycles=4, lanes=256, workers=1, store=path
     )
@@ -24,7 +24,7 @@ def scanned(path, machine=SCENE):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "whole"
-    return path, {name: x.values for name, x in scanned(path).variables.items()}
+    return path, {name: x.values for name, x in scan_into(path).variables.items()}
 
 
 def test_xarray_opens_a_store_without_a_warning(whole):
@@ -69,13 +69,13 @@ def test_damaged_blocks_are_computed_again_with_a_warning(
     compute, computed = work.compute, []
     monkeypatch.setattr(work, "compute", lambda *a: computed.append(1) or compute(*a))
     with pytest.warns(UserWarning, match=f"lost or damaged, and are computed again: {words}[.]"):
-        found = scanned(path)
+        found = scan_into(path)
     assert len(computed) == blocks
     for name, numbers in whole[1].items():
         np.testing.assert_array_equal(found[name].values, numbers)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        scanned(path)
+        scan_into(path)
     assert len(computed) == blocks
 
 
@@ -91,7 +91,7 @@ def test_a_read_only_folder_raises_before_any_work(whole, monkeypatch):
 
     monkeypatch.setattr(checks.tempfile, "TemporaryFile", refused)
     with pytest.raises(ValueError, match=r"`store` must be a path .*: Permission denied"):
-        scanned(whole[0])
+        scan_into(whole[0])
 
 
 def test_blocks_are_not_larger_than_the_grid():
@@ -107,13 +107,13 @@ def test_a_second_writer_raises(whole, tmp_path, monkeypatch):
 
     def twice(*arguments):
         with pytest.raises(ValueError, match="`store` must not be in use, but another scan writes"):
-            scanned(tmp_path / "store")
+            scan_into(tmp_path / "store")
         return compute(*arguments)
 
     monkeypatch.setattr(computed, "compute", twice)
-    found = scanned(tmp_path / "store")
+    found = scan_into(tmp_path / "store")
     np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
-    scanned(tmp_path / "store")
+    scan_into(tmp_path / "store")
 
 
 def test_a_store_with_a_truncated_header_raises(whole, tmp_path):
@@ -121,7 +121,7 @@ def test_a_store_with_a_truncated_header_raises(whole, tmp_path):
     shutil.copytree(whole[0], path)
     _cut(path / "zarr.json")
     with pytest.raises(ValueError, match=r"`store` must be the store of a scan, but .*zarr.json"):
-        scanned(path)
+        scan_into(path)
 
 
 def test_failed_lanes_do_not_count_as_damage(tmp_path):
@@ -181,5 +181,5 @@ def test_a_store_of_another_release_warns(whole, tmp_path):
     head["attributes"]["vi_jax"] = "0.0.1"
     (path / "zarr.json").write_text(json.dumps(head))
     with pytest.warns(UserWarning, match=rf"begun by vi_jax 0\.0\.1, and this is {vi.__version__}"):
-        found = scanned(path)
+        found = scan_into(path)
     np.testing.assert_array_equal(found.y_min, whole[1]["y_min"])
