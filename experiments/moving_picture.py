@@ -1,4 +1,4 @@
-"""The moving picture of the README: one machine in motion, and the sections of many.
+"""The animation of the README: one machine in motion, and the sections of many starts.
 
 `python experiments/moving_picture.py` writes `experiments/figures/moving_picture.gif`.
 """

@@ -77,11 +77,11 @@ def test_each_name_is_listed_once_and_belongs_to_its_package():
         vi_jax.simulat  # noqa: B018
 
 
-def test_a_machine_has_the_members_that_a_user_writes_or_calls():
+def test_members_of_a_machine_are_few_and_documented():
     members = [name for name in dir(vi_jax.AbstractMachine) if not name.startswith("_")]
     assert len(members) <= 20
-    told = " ".join(vi_jax.AbstractMachine.__doc__.split())  # in its table or below
-    assert not [name for name in members if f"`{name}`" not in told and f".{name}(" not in told]
+    text = " ".join(vi_jax.AbstractMachine.__doc__.split())
+    assert not [name for name in members if f"`{name}`" not in text and f".{name}(" not in text]
 
 
 def test_simulate_loads_no_other_package():

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Long chains beside heyoka
+# # Long chains, compared with heyoka
 #
 # N masses in a row are coupled by springs and dashpots. A moving wall shakes the first one, and the
 # last one strikes a stop. With linear springs the chain is a `vi.machines.Structure` with a

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Gradients by many numbers
+# # Gradients with respect to many parameters
 #
 # The cost of a gradient is measured in simulations of the same lanes. One machine has a motor, and
 # the gradient is with respect to its parameters. The other is an oscillator with a stop and a

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # vi_jax beside its peers: same machines, same cores, same error
+# # vi_jax compared with other codes: same machines, same cores, same error
 #
 # 1,024 lanes of Table 1's machine (T0 = 10 N·m, d = 2) run for 200 drive cycles with k = 0.5 and
 # 0.8. The control κ of the motor, or ζ of the ideal drive, is from 0.5 to 1.9. Each code has the

@@ -32,7 +32,7 @@ def check_faults() -> list[Fault]:
 
 
 def _groups() -> dict[str, float]:
-    """ε and μ of Table 1's machine, as arguments of `energy_drift`."""
+    """Return ε and μ of Table 1's machine, as arguments of `energy_drift`."""
     drive: Any = Parameters().scene().drive
     return {"coupling": float(drive.coupling), "slider_inertia": float(drive.slider_inertia)}
 

@@ -46,7 +46,7 @@ comparison = Comparison(
     "H. Dankowicz and F. Schilder, Recipes for Continuation, SIAM, 2013 (stick and slip)",
     "from the equations of the example, at V = 0.57, by SciPy's DOP853 from event to event",
     [
-        ("first impact: time", "2.9054088655", time[0], 1e-9),  # their tolerances: 1e-12
+        ("first impact: time", "2.9054088655", time[0], 1e-9),  # published with tolerances of 1e-12
         ("its speed", "0.3200474159", speed[0], 1e-9),
         ("sixth impact: time", "23.1264321092", time[10], 1e-9),
     ],

@@ -27,7 +27,7 @@ class Block(vi.AbstractMachine):
 start = vi.OscillatorState(jnp.array(12.0), jnp.array(6.0))
 run = vi.simulate(Block(), start, 8, method=vi.Adaptive(rtol=1e-12))
 
-# %% Theirs is the row of the reference file after each turn, within a step of 0.01
+# %% The published number is the row of the reference file after each turn, within a step of 0.01
 comparison = Comparison(
     "Siconos",
     "https://github.com/siconos/siconos-tutorials, `examples/mechanics/FrictionOscillator`",

@@ -21,7 +21,7 @@ def legs(a, w):  # just after a heel strike
 
 strikes = lambda walker, s, x: x[2] - 2 * x[0]
 changed = lambda walker, s, x: legs(-x[0], x[1] * jnp.cos(2 * x[0]))
-apart = lambda walker, s, x: x[2] < -0.05  # the foot scuffs the ground as the legs pass each other
+apart = lambda walker, s, x: x[2] < -0.05  # ignores foot scuffing as the legs pass each other
 
 
 class Walker(vi.AbstractMachine):

@@ -13,7 +13,7 @@ from _comparison import Comparison
 
 jax.config.update("jax_enable_x64", True)
 
-# %% The friction coefficient is 0.3, as in theirs
+# %% The friction coefficient is 0.3, as in the published model
 toy = vi.machines.Woodpecker()
 run = vi.simulate(toy, toy.start(), 1, settle=150, event_log=16)
 assert run.duration is not None and run.event_log is not None

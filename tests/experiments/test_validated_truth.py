@@ -143,7 +143,7 @@ def test_two_masses():
         z = orbit(omega, z)
 
     def above(omega):
-        """Return a function that is zero at the symmetry breaking (multiplier -1)."""
+        """Return a number that is zero at the symmetry breaking (multiplier -1)."""
         return multipliers_of_half_period(omega, orbit(omega, z)).real.min() + 1
 
     # Central differences have an error of 1e-9.

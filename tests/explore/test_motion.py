@@ -121,7 +121,7 @@ def test_a_diagram_agrees_with_runs(ideal):
     values = {**ideal.beginning(), "start.Y": 0.5}
     found = ideal.diagram(values, K)
     assert found.values[0] == 0.0 and found.values[-1] == 1.0
-    assert ideal.diagram({**values, K: 0.7, SETTLE: 3.0}, K) is found  # the slider moves along it
+    assert ideal.diagram({**values, K: 0.7, SETTLE: 3.0}, K) is found  # its axis is the slider's
     assert ideal.diagram({**values, GAP: 1.5}, K) is not found
     here, start = ideal.at({**values, K: found.values[60]})
     run = vi.simulate(here, start, CYCLES, settle=ideal.before)
@@ -136,7 +136,7 @@ def test_a_diagram_agrees_with_runs(ideal):
 def test_pictures(ideal):
     picture, found = MotionPicture(ideal.machine.labels), ideal.seen(ideal.beginning())
     check_picture(first := picture.draw(found), found)
-    assert picture.draw(found) == first  # within kept limits
+    assert picture.draw(found) == first  # the axes keep their limits
     assert len({picture.draw(found, which) for which in MAPS}) == len(MAPS)
     check_picture(picture.draw(other := seen(ideal, zeta=0.902)), other)
 
@@ -160,8 +160,8 @@ def test_slider_ranges_are_valid_for_the_machine():
             steps = (control.value - control.low) / control.step
             assert abs(steps - round(steps)) < 1e-9
             for end in (control.low, control.high):
-                if not isinstance(subject.machine, vi.machines.Woodpecker):  # its sleeve and pole
-                    subject.at({**subject.beginning(), name: end})  # no machine refuses it
+                if not isinstance(subject.machine, vi.machines.Woodpecker):  # may not fit its pole
+                    subject.at({**subject.beginning(), name: end})
     duffing = made["Duffing"].controls
     assert (duffing["restitution"].low, duffing["restitution"].high) == (0.0, 1.0)
     assert (duffing["amplitude"].low, duffing["amplitude"].high) == pytest.approx((0.0, 0.6))

@@ -76,7 +76,7 @@ def test_entropy_of_half_planes_and_stripes():
     one = -(0.4 * np.log(0.4) + 0.6 * np.log(0.6))
     assert cut.boundary == pytest.approx(one) and cut.total == pytest.approx(one / 20)
     assert (cut.boxes, cut.boundary_boxes) == (400, 20)
-    # Three alternating outcomes; each box of six cells has all of them twice.
+    # Three alternating outcomes; each row of a box has all of them twice.
     turns = np.broadcast_to(np.arange(60) % 3, (60, 60))
     found = entropy_of(turns, box=6)
     assert found.total == pytest.approx(np.log(3)) and found.boundary == pytest.approx(np.log(3))

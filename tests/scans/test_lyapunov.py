@@ -64,7 +64,7 @@ def test_exponents_in_single_precision():
 
 @pytest.mark.slow
 def test_the_sum_of_exponents_is_the_mean_contraction():
-    """Volumes shrink by e^{-2ξ} in unit time and by k² in an impact, whatever the motion does.
+    """Volumes shrink by e^{-2ξ} per unit time and by k² per impact in any motion.
 
     Impacts are counted in another run with the same weights. The cycles are so few that rounding
     does not separate the two runs.

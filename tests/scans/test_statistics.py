@@ -174,7 +174,7 @@ def test_the_escape_rate_agrees_with_the_map_of_densities():
     "of, samples, settle", [("Y", 4, 2), pytest.param("y_max", 0, 2, marks=pytest.mark.slow)]
 )
 def test_a_lane_ends_at_its_escape(of, samples, settle):
-    """Results agree with those beside a measure for which all lanes continue."""
+    """Results agree with those of a scan whose second measure needs all cycles."""
     given = {"settle": settle, "cycles": 32, "noise": NOISE, "key": jax.random.key(2)}
     alone = vi.Escape(of, high=2.0, samples=samples)
     other = vi.Density({"V": EDGES}, samples=samples)

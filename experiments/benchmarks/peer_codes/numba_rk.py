@@ -56,25 +56,25 @@ def ideal_field(s, y, p):
 
 @nb.njit(**INLINE)
 def add3(y, a, k):
-    """y + a k."""
+    """Return y + a k."""
     return y[0] + a * k[0], y[1] + a * k[1], y[2] + a * k[2]
 
 
 @nb.njit(**INLINE)
 def add2(y, a, k):
-    """y + a k."""
+    """Return y + a k."""
     return y[0] + a * k[0], y[1] + a * k[1]
 
 
 @nb.njit(**INLINE)
 def bounce3(y, gap, k):
-    """The state after an impact."""
+    """Return the state after an impact."""
     return gap, -k * y[1], y[2]
 
 
 @nb.njit(**INLINE)
 def bounce2(y, gap, k):
-    """The state after an impact."""
+    """Return the state after an impact."""
     return gap, -k * y[1]
 
 
@@ -87,14 +87,14 @@ def part(e, a, b, tol):
 
 @nb.njit(**INLINE)
 def norm3(e, a, b, tol):
-    """Root mean square over the components, relative to the tolerance."""
+    """Return the root mean square over the components, relative to the tolerance."""
     total = part(e[0], a[0], b[0], tol) + part(e[1], a[1], b[1], tol) + part(e[2], a[2], b[2], tol)
     return math.sqrt(total / 3)
 
 
 @nb.njit(**INLINE)
 def norm2(e, a, b, tol):
-    """Root mean square over the components, relative to the tolerance."""
+    """Return the root mean square over the components, relative to the tolerance."""
     return math.sqrt((part(e[0], a[0], b[0], tol) + part(e[1], a[1], b[1], tol)) / 2)
 
 
