@@ -1,5 +1,4 @@
-"""The studies' headline numbers, computed with the library as it is, by cheaper ways.
+"""Headline numbers of the studies, computed by cheaper methods.
 
-The function named after a study returns numbers by the names under which the study keeps them, each
-with the difference that is allowed.
+Each function is named after a study. Its keys are the names of the numbers in that study.
 """

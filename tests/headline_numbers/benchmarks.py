@@ -1,4 +1,4 @@
-"""Of the benchmarks: errors and sizes of programs, which no clock changes."""
+"""Headline numbers of the benchmarks that do not depend on timing."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from .closed_forms import XI, Expected
 
 
 def fixed_steps_error(cycles: int) -> float:
-    """Median error of 10 steps of Verner9, of 64 lanes of Table 1's machine, k = 0.8, d = 2."""
+    """Return the median error of Verner9, 10 steps, in 64 lanes of Table 1's machine (k = 0.8)."""
 
     def lane(method, zeta):
         scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.8, gap=2.0, damping_ratio=XI)
@@ -28,7 +28,7 @@ def fixed_steps_error(cycles: int) -> float:
     return float(np.median(np.abs(exact - fixed).max(axis=1)))
 
 
-# The lanes of the test are fewer than a study's, so that the median is the same within a third.
+# The studies have more lanes, so that the medians agree only within a third.
 
 
 def speed_accuracy() -> Expected:
@@ -44,7 +44,7 @@ def peers() -> Expected:
 
 
 def chains() -> Expected:
-    """Where the last of ten masses is; lanes that impact often differ by what rounding became."""
+    """Compare the median only, since rounding grows in lanes with many impacts."""
 
     def lane(frequency):
         machine = linear_chain(frequency, 10)
@@ -56,7 +56,7 @@ def chains() -> Expected:
 
 
 def gradients() -> Expected:
-    """By columns: the derivative along the gradient's own direction is its length."""
+    """Return the gradient's length as the forward derivative along its direction."""
     method = vi.FixedStep(diffrax.Dopri8(), 24)
     starts = jnp.linspace(-0.3, 0.3, 32)
     value, numbers = last_places(oscillator(43, "law"), starts, 50, method)

@@ -1,4 +1,4 @@
-"""Closed forms of the ideal drive: where motions double, touch the stop, fold and are born."""
+"""Period doublings, touches, folds and first impacts with the ideal drive, in closed form."""
 
 from functools import partial
 from typing import Any
@@ -9,21 +9,21 @@ import vi_jax as vi
 from scipy.optimize import brentq
 
 Expected = dict[str, tuple[float, float]]
-"""Numbers by name, each with the difference that is allowed."""
+"""Values and tolerances by name."""
 XI = float(vi.Parameters().scene(drive="ideal").damping_ratio)
-# Roots by brentq beside located special points, both to rounding of a multiplier or a clearance.
+# Tolerance of roots: both brentq and located points err by rounding of multiplier or clearance.
 ROOT = 1e-8
 
 
 @partial(jax.jit, static_argnames="cycles")
 def closed(zeta: Any, k: Any, xi: Any, gap: Any, *, cycles: int) -> vi.ClosedFormOrbits:
-    """Motions with one impact in so many cycles."""
+    """Return the motions with one impact in `cycles` cycles."""
     scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=gap, damping_ratio=xi)
     return vi.closed_form_orbits(scene, cycles=cycles)
 
 
 def doubling(k: float, xi: float, cycles: int, low: float, high: float) -> float:
-    """ζ at which a multiplier is -1."""
+    """Return ζ at which a multiplier is -1."""
 
     def test(zeta):
         found = closed(zeta, k, xi, 2.0, cycles=cycles)
@@ -33,7 +33,7 @@ def doubling(k: float, xi: float, cycles: int, low: float, high: float) -> float
 
 
 def touch(k: float, xi: float, low: float, high: float) -> float:
-    """ζ at which the 4π motion touches the stop between its impacts."""
+    """Return ζ at which the 4π motion touches the stop between its impacts."""
 
     def clearance(zeta):
         return float(closed(zeta, k, xi, 2.0, cycles=2).clearance[0])
@@ -42,7 +42,7 @@ def touch(k: float, xi: float, low: float, high: float) -> float:
 
 
 def fold(k: float, xi: float, low: float, high: float) -> float:
-    """ζ beyond which there is no 2π motion with an impact."""
+    """Return ζ beyond which there is no 2π motion with an impact."""
     while high - low > 1e-10:
         middle = 0.5 * (low + high)
         there = bool(closed(middle, k, xi, 2.0, cycles=1).exists.any())
@@ -51,6 +51,6 @@ def fold(k: float, xi: float, low: float, high: float) -> float:
 
 
 def births(xi: float) -> tuple[float, float]:
-    """ζ at which the steady vibration without impacts reaches the stop at d = 2."""
+    """Return both ζ at which the steady vibration without impacts reaches the stop at d = 2."""
     half = np.sqrt((1 - 2 * xi**2) ** 2 - 0.75)
     return float(np.sqrt(1 - 2 * xi**2 - half)), float(np.sqrt(1 - 2 * xi**2 + half))

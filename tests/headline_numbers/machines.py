@@ -1,4 +1,4 @@
-"""Of the studies of motors and of other machines."""
+"""Headline numbers of the studies of motors and of the relief valve."""
 
 import numpy as np
 import vi_jax as vi
@@ -9,7 +9,7 @@ from .closed_forms import XI, Expected, fold
 
 def motors() -> Expected:
     numbers: Expected = {}
-    # On the study's grid of ζ, 1e-4 apart at the fold.
+    # The study's grid of ζ has a spacing of 1e-4 at the fold.
     numbers["ideal drive: 2π motion folds, ζ"] = (fold(0.5, XI, 1.44, 1.45), 1.1e-4)
     table = vi.Parameters()
     coupling = float(table.body_mass * table.crank_radius**2 / table.inertia)
@@ -23,14 +23,14 @@ def motors() -> Expected:
         kappa = fine + idle / (per_nm * torque)
         name = f"T0 = {torque:g} N·m, gap {gap:g}a"
         down = kappa[(fine > 1) & (clear | (gap == 20))].min()
-        numbers[f"{name}, close-down: forecast, κ"] = (float(down), 1.1e-3)  # its grid of ζ
+        numbers[f"{name}, close-down: forecast, κ"] = (float(down), 1.1e-3)  # grid spacing
         if gap == 20:
             numbers[f"{name}, run-up: forecast, κ"] = (float(kappa[fine < 1.05].max()), 1.1e-3)
     return numbers
 
 
 def relief_valve() -> Expected:
-    """The Hopf bifurcation by eigenvalues, the others from motions beside them."""
+    """Compute the Hopf point from eigenvalues, the others by branches that start nearby."""
 
     def growth(rate: float) -> float:
         lift = brentq(lambda y: rate - y * np.sqrt(y + 10), 1e-9, 50)

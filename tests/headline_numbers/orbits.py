@@ -1,4 +1,4 @@
-"""Of the studies of single motions: orbits, basins, designs, records."""
+"""Headline numbers of the studies of orbits, basins, designs and records."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from .closed_forms import XI, Expected, closed
 def basins_map() -> Expected:
     zeta, k, gap, xi = 3.2, 0.9, 1.05, 0.002
     free = float(np.exp(-2 * np.pi * xi / zeta))
-    # From Lyapunov exponents over 600 cycles, which the first cycles' turning leaves inexact.
+    # The study uses Lyapunov exponents over 600 cycles, inexact because of the first cycles.
     watched: Expected = {"multiplier of the 2π motion, 0 impacts": (free, 2e-3)}
     numbers = {"largest multiplier of A": free}
     for names, cycles in (("BC", 2), ("DE", 3)):
@@ -42,7 +42,7 @@ def design_percussion(kept: dict[str, float]) -> Expected:
 
 
 def grazing_forecast(kept: dict[str, float]) -> Expected:
-    """Where the vibration without impacts just reaches the stop of the paper's machine."""
+    """Return the gaps that the vibration without impacts just reaches."""
     names = [name.removesuffix(": d") for name in kept if name.endswith(": d")]
     numbers: Expected = {}
     for name in names:
@@ -52,7 +52,6 @@ def grazing_forecast(kept: dict[str, float]) -> Expected:
 
 
 def robustness() -> Expected:
-    """The kick again."""
     scene = vi.Scene.ideal(frequency_ratio=0.968, restitution=0.8, gap=2.0, damping_ratio=XI)
     form = closed(0.968, 0.8, XI, 2.0, cycles=2)
     best = int(np.argmin(np.where(form.admissible, np.abs(form.multipliers).max(axis=1), np.inf)))
@@ -63,7 +62,7 @@ def robustness() -> Expected:
 
 
 def posterior() -> Expected:
-    """The record of the picture, drawn from the prior, and what it can tell by its Jacobian."""
+    """Compute the plotted record, drawn from the prior, and its information from the Jacobian."""
     key, _, _ = jax.random.split(jax.random.key(1), 3)
     truth = jax.random.normal(key, (200, 3))
 

@@ -1,4 +1,4 @@
-"""Of the studies of the paper and of its discrepancy, and of the motor."""
+"""Headline numbers of the reproduction, the bifurcation diagram and the regime maps."""
 
 import numpy as np
 import vi_jax as vi
@@ -8,7 +8,7 @@ from .closed_forms import ROOT, XI, Expected, births, closed, doubling, fold, to
 
 
 def reproduction() -> Expected:
-    """Of its Figure 2, and of its boundaries."""
+    """Return the points of Figure 2 and of the boundaries."""
     numbers = {}
     places = {
         (0.8, 0.0): (0.99377, 1.73167), (0.8, XI): (0.96554, 1.58722),
@@ -69,7 +69,7 @@ def _boundaries() -> Expected:
         "doubling at Table 1's c, k = 0.5, ζ": doubling(0.5, XI, 1, 0.82, 0.83),
         "fold at Table 1's c, k = 0.5, ζ": fold(0.5, XI, 1.44, 1.45),
     }
-    # Splines through the curves' points, good to 1e-5.
+    # The study interpolates its curves by splines, with an error of 1e-5.
     return {name: (value, 1e-5) for name, value in numbers.items()}
 
 
@@ -84,7 +84,7 @@ def bifurcation_diagram() -> Expected:
 
 
 def regime_maps() -> Expected:
-    """Every fourth lane each way of the map with Table 1's damping."""
+    """Use every fourth lane in both directions of the map with Table 1's damping."""
     data = vi.scan(
         lambda zeta, k: vi.Scene.ideal(
             frequency_ratio=zeta, restitution=k, gap=2.0, damping_ratio=XI
@@ -98,6 +98,6 @@ def regime_maps() -> Expected:
         "2π with impacts, %": (impacts > 0) & (period == 1),
         "4π with one impact, %": (impacts == 1) & (period == 2),
     }
-    # Borders cross the coarse grid elsewhere, by about half its step: 1 % of a side.
+    # On the coarse grid the borders shift by half a grid step, about 1 % of a side.
     name = "(ζ, k), c = 0.5 N·s/m (Table 1)"
     return {f"{name}: {kind}": (100 * float(np.mean(x)), 1.0) for kind, x in parts.items()}
