@@ -1,4 +1,4 @@
-"""A driven pendulum that rotates: orbits, branches, regimes and basins up to whole turns."""
+"""Orbits, branches, regimes and basins of a rotating pendulum, modulo whole turns."""
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -11,7 +11,7 @@ DAMPING, TORQUE = 0.3, 0.9
 
 
 class Pendulum(vi.AbstractMachine):
-    """Its angle is counted from `zero`; by name it is the second of its state."""
+    """A driven pendulum. `zero` is the origin of its angle, the second name in sorted order."""
 
     amplitude: float = 1.6
     zero: float = 0.0
@@ -26,9 +26,7 @@ class Pendulum(vi.AbstractMachine):
         return vi.State(phi=0.1, dphi=1.0)
 
 
-def a_cycle_later(amplitude, phi, v):
-    """By SciPy."""
-
+def cycle_by_scipy(amplitude, phi, v):
     def field(t, x):
         return [x[1], TORQUE + amplitude * np.cos(t) - np.sin(x[0]) - DAMPING * x[1]]
 
@@ -43,21 +41,21 @@ def orbit():
 
 
 def test_a_rotation_is_periodic(orbit):
-    """Three turns a cycle; the product of the multipliers is Liouville's."""
+    """Compare three turns per cycle with SciPy, and the determinant with Liouville's formula."""
     phi, v = float(orbit.state.phi), float(orbit.state.dphi)
-    later = a_cycle_later(1.6, phi, v)
+    later = cycle_by_scipy(1.6, phi, v)
     np.testing.assert_allclose(later, [phi + 6 * np.pi, v], atol=1e-8)
     assert np.prod(orbit.multipliers) == pytest.approx(np.exp(-2 * np.pi * DAMPING), abs=1e-8)
 
 
 @pytest.mark.slow
 def test_a_branch_passes_half_a_turn(orbit):
-    """Its section passes ±π, where the angle begins again; its end is SciPy's."""
+    """The section angle passes ±π, where it wraps. Compare the last orbit with SciPy."""
     branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.5, 6.0))
     assert branch.ends == ("bounds", "bounds") and np.ptp(branch.sections["phi"]) > 6
     end = branch.orbit(-1)
     assert float(end.machine.amplitude) == pytest.approx(6.0)
-    later = a_cycle_later(6.0, float(end.state.phi), float(end.state.dphi))
+    later = cycle_by_scipy(6.0, float(end.state.phi), float(end.state.dphi))
     turns = (later[0] - float(end.state.phi)) / (2 * np.pi)
     assert turns == pytest.approx(round(turns), abs=1e-8) and round(turns) != 0
     assert later[1] == pytest.approx(float(end.state.dphi), abs=1e-8)
@@ -67,8 +65,8 @@ def test_a_branch_passes_half_a_turn(orbit):
     plt.close(ax.figure)
 
 
-class Locked(vi.AbstractMachine):
-    """A motor that a rotating field keeps at its own speed: phi = t + ψ, torque = h - K sin ψ."""
+class LockedMotor(vi.AbstractMachine):
+    """A motor locked to a rotating field: phi = t + ψ, torque = 0.3 - 0.2 sin ψ."""
 
     torque: float = 0.25
     cycle = 2 * np.pi
@@ -79,9 +77,9 @@ class Locked(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_a_motor_that_is_locked_lies_on_a_closed_curve():
-    """Its phase makes a whole turn along the curve, and each fold is listed once."""
-    machine = Locked()
+def test_branch_of_a_locked_motor_is_closed():
+    """The phase ψ turns by 2π along the branch, and each fold is listed once."""
+    machine = LockedMotor()
     start = vi.State(phi=np.pi - np.arcsin(0.25), dphi=1.0)
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 20).last, throw=True)
     branch = vi.continue_orbit(orbit, parameter="torque", bounds=(0.0, 0.6), progress=False)
@@ -94,8 +92,8 @@ def test_a_motor_that_is_locked_lies_on_a_closed_curve():
     np.testing.assert_allclose(branch.parameter, DAMPING - 0.2 * np.sin(phase), atol=1e-9)
 
 
-def test_a_section_at_half_a_turn_is_one_motion(orbit):
-    """Rounding puts it on either side, a whole turn apart."""
+def test_an_orbit_with_its_section_at_half_a_turn_is_counted_once(orbit):
+    """Rounding puts the section angle near π or near -π."""
     machine = Pendulum(zero=float(orbit.state.phi) - np.pi)
     speeds = jnp.linspace(2.5, 3.5, 16)
     data = vi.scan(machine, {"start.dphi": speeds}, measure="regime", progress=False)
@@ -116,8 +114,8 @@ def test_an_erosion_profile_passes_half_a_turn(orbit):
 
 
 @pytest.mark.slow
-def test_a_picture_of_an_angle_has_no_line_across(orbit):
-    """It is drawn within a turn, and in the middle of one a cycle ends."""
+def test_plots_of_an_angle_break_the_line_where_it_wraps(orbit):
+    """The angle is plotted modulo 2π, and a cycle ends in the middle of a turn."""
     run = orbit.trajectory(cycles=3, samples=64)
     phi = np.asarray(run.samples.state.phi)
     figure, (left, right) = plt.subplots(1, 2)
@@ -133,7 +131,7 @@ REST = np.arcsin(0.3)
 
 
 class Hanging(Pendulum):
-    """It hangs still, or rotates for ever; in between it stands on its head."""
+    """A pendulum that settles at rest or in rotation. The inverted rest is a saddle between."""
 
     cycle = 2.0
 
@@ -142,9 +140,9 @@ class Hanging(Pendulum):
 
 
 @pytest.mark.slow
-def test_an_edge_at_half_a_turn():
-    """The pendulum on its head, with multipliers in closed form, and how it falls from there,
-    wherever its angle is counted from."""
+def test_an_edge_state_at_half_a_turn():
+    """The edge state is the inverted pendulum, with multipliers in closed form. Its unstable
+    manifold does not depend on the origin of the angle."""
     rates, ends = np.roots([1.0, 0.1, np.cos(np.pi - REST)]), []
     for zero in (-REST, np.pi / 2):
         machine, rest = Hanging(zero=zero), vi.State(phi=REST - zero, dphi=0.0)
@@ -158,8 +156,8 @@ def test_an_edge_at_half_a_turn():
 
 
 @pytest.mark.slow
-def test_a_ball_of_starts_reaches_around_half_a_turn():
-    """As far as where the angle is counted from another place."""
+def test_local_integrity_extends_across_half_a_turn():
+    """The radius of the ball does not depend on the origin of the angle."""
     region = {"start.phi": (-np.pi, np.pi), "start.dphi": (-4.0, 4.0)}
     options = {"resolution": 16, "settle": 300, "longest": 4, "progress": False}
     found = [vi.basins(Hanging(zero=x), region, **options) for x in (REST, REST + np.pi)]

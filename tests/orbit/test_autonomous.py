@@ -1,4 +1,4 @@
-"""Branches of machines without a drive: a walker on its slope, a body on a belt."""
+"""Branches of autonomous machines: a passive walker, a body on a belt, a rimless wheel."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ from rimless_wheel import MULTIPLIER, Wheel
 
 
 class Walker(resets.Walker):
-    """A cycle ends on a section, with which the legs change their parts."""
+    """The walker of `resets`, with its heel strike at a section instead of a reset."""
 
     @property
     def events(self):
@@ -25,9 +25,7 @@ class Walker(resets.Walker):
         return legs(-x.stance, x.turning * jnp.cos(2 * x.stance))
 
 
-def strode(slope, stance, turning):
-    """The next step of a walker, by SciPy."""
-
+def step_by_scipy(slope, stance, turning):
     def field(_, x):
         falls = np.sin(x[0] - slope)
         pull = (x[1] ** 2 - np.cos(x[0] - slope)) * np.sin(x[2])
@@ -39,14 +37,14 @@ def strode(slope, stance, turning):
     strikes.terminal, strikes.direction = True, 1
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
     x = [stance, turning, 2 * stance, turning * (1 - np.cos(2 * stance))]
-    x = solve_ivp(field, (0, 1), x, **options).y[:, -1]  # past the start, which is on the section
+    x = solve_ivp(field, (0, 1), x, **options).y[:, -1]  # the start is on the section
     x = solve_ivp(field, (1, 10), x, events=strikes, **options).y[:, -1]
     return np.array([-x[0], x[1] * np.cos(2 * x[0])])
 
 
 @pytest.mark.slow
-def test_a_walker_doubles_its_step():
-    """On a branch whose cycles begin with a jump of the first coordinate."""
+def test_period_doubling_of_a_walker():
+    """Each cycle begins with a jump of the first coordinate."""
     orbit = vi.find_orbit(Walker(0.009), legs(0.2003, -0.1998))
     assert float(orbit.duration) == pytest.approx(3.88246375285, abs=1e-9)
     branch = vi.continue_orbit(orbit, parameter="slope", bounds=(0.008, 0.017))
@@ -56,32 +54,32 @@ def test_a_walker_doubles_its_step():
     (doubling,) = branch.special
     assert doubling.kind == "period-doubling"
     at = [float(doubling.orbit.state.stance), float(doubling.orbit.state.turning)]
-    np.testing.assert_allclose(strode(doubling.parameter, *at), at, atol=1e-10)
+    np.testing.assert_allclose(step_by_scipy(doubling.parameter, *at), at, atol=1e-10)
     h = 2e-6
-    ends = [[strode(doubling.parameter, *(np.array(at) + sign * h * e)) for sign in (1, -1)]
+    ends = [[step_by_scipy(doubling.parameter, *(np.array(at) + sign * h * e)) for sign in (1, -1)]
             for e in np.eye(2)]  # fmt: skip
     jacobian = np.array([(up - down) / (2 * h) for up, down in ends]).T
     assert np.linalg.eigvals(jacobian).real.min() == pytest.approx(-1, abs=3e-7)
 
 
-class Ahead(Belt):
-    """Observed where the body is farthest ahead."""
+class BeltAtGreatestPosition(Belt):
+    """A belt whose section is at the body's greatest position."""
 
     cycle = vi.falling("V", usual=2 * np.pi)
 
 
 @pytest.mark.slow
-def test_cycles_with_sticking_end_where_the_belt_is_only_just_reached():
-    """Wherever the branch begins. Those that only slide do so too, and shrink to rest on the other
-    side: the friction 0.5 + 0.5 exp(-2v) where the body stands has the slope exp(-2v), which is the
-    damping 0.1 at v = ½ ln 10."""
-    # There a body that the belt has let go is next as fast as the belt, by SciPy.
+def test_stick_slip_branches_end_at_grazing_sliding():
+    """Branches of motions that stick and of motions that only slide end at the same point. The
+    sliding ones begin at a Hopf point: the friction 0.5 + 0.5 exp(-2v) of a body at rest has the
+    slope -exp(-2v), which cancels the damping 0.1 at v = ½ ln 10."""
+    # At this speed the greatest velocity after a release equals the belt speed, by SciPy.
     ending = 1.83660097221
     sliding = vi.OscillatorState(jnp.asarray(1.7), jnp.asarray(0.0))
     stuck = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.5))
-    sticking = vi.simulate(Ahead(), stuck, 1, settle=40).last
+    sticking = vi.simulate(BeltAtGreatestPosition(), stuck, 1, settle=40).last
     for start, bounds in ((sticking, (1.3, 1.9)), (sticking, (0.05, 2.0)), (sliding, (1.1, 1.9))):
-        orbit = vi.find_orbit(Ahead(), start)
+        orbit = vi.find_orbit(BeltAtGreatestPosition(), start)
         branch = vi.continue_orbit(orbit, parameter="speed", bounds=bounds)
         assert branch.ends[1] == "grazing-sliding"
         assert branch.parameter[-1] == pytest.approx(ending, abs=1e-10)
@@ -94,8 +92,8 @@ def test_cycles_with_sticking_end_where_the_belt_is_only_just_reached():
 
 
 @pytest.mark.slow
-def test_a_branch_towards_a_homoclinic_motion_ends_before_its_steps_are_too_long():
-    """A rimless wheel on ever gentler slopes comes to rest upright in the end."""
+def test_a_branch_ends_near_a_homoclinic_motion():
+    """On gentler slopes a rimless wheel slows down ever more as it passes its upright rest."""
     wheel = Wheel()
     orbit = vi.find_orbit(wheel, vi.simulate(wheel, wheel.start(), 40).last)
     branch = vi.continue_orbit(orbit, parameter="slope", bounds=(0.02, 0.2))

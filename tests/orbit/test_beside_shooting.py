@@ -1,5 +1,5 @@
-"""A branch of motions that hit, stick and slip: its special points beside a shooting code without
-this package, SciPy from event to event, multipliers by differences."""
+"""Compare branches with impacts and stick-slip with independent shooting: SciPy from event to
+event, multipliers by differences."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from scipy.optimize import newton
 from shooting import fixed_point, flown
 
 
-class Inside:
-    """The mass in a capsule that rubs on the ground (`vi.machines.Capsule` with its default
-    numbers), from event to event: its place and speed, the capsule's speed, at phase -1 of the
-    force, where the capsule slides back. Once a cycle the mass hits the stop, the capsule slides
-    on, comes to stand, and is pulled back."""
+class Capsule:
+    """`vi.machines.Capsule` with its default parameters, from event to event. The state is the
+    relative position and velocity of the mass, and the velocity of the capsule. A cycle begins at
+    phase -1 of the force, where the capsule slides backwards. Then the mass hits the stop, and the
+    capsule slides forwards, sticks, and slides back."""
 
     spring, ratio, gap, restitution = 0.1, 5.0, 0.5, 0.6
 
@@ -31,8 +31,8 @@ class Inside:
         return field
 
     def cycle(self, x):
-        """The state a cycle later; the `impact`'s phase, the `capsule`'s speed before it, and how
-        far from the stop the mass turns after it (`room`)."""
+        """Return the state after a cycle. Set `impact`, its phase; `capsule`, the capsule's
+        velocity before it; and `room`, the mass's least distance from the stop where it turns."""
         _, s, x, _ = flown(self.field(-1.0), -1.0, x, 3.0, [lambda s, x: x[0] - self.gap])
         self.impact, self.capsule, self.room, mode = s, x[2], np.inf, 1.0
         gained = (1 + self.restitution) * x[1]
@@ -52,8 +52,8 @@ class Inside:
 
 
 def settled(amplitude, x):
-    """The motion after cycles as many as it takes to repeat."""
-    motion = Inside(amplitude)
+    """Return the motion once it repeats, after at most 60 cycles."""
+    motion = Capsule(amplitude)
     for _ in range(60):
         before, x = x, motion.cycle(x)
         if np.abs(x - before).max() < 1e-13:
@@ -62,22 +62,22 @@ def settled(amplitude, x):
     return motion
 
 
-def capsule_from(orbit):
+def follow_capsule(orbit):
     return vi.continue_orbit(orbit, parameter="amplitude", bounds=(1.2, 4.0))
 
 
 @pytest.mark.slow
 def test_a_capsule_that_sticks_once_a_cycle():
-    """What ends its branches: that it stands still as the mass hits it; that the mass hits it as a
-    cycle begins, where the other branch goes on; that the mass comes to the stop a second time."""
+    """One branch ends where the capsule is at rest at the impact, and where the impact is on the
+    section. The other one goes on from there, until the mass touches the stop a second time."""
     machine = vi.machines.Capsule(amplitude=1.6)  # pyright: ignore[reportCallIssue]
     orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 1, settle=300).last)
-    first = capsule_from(orbit)
-    branches = first, capsule_from(first.special[-1].switch())
+    first = follow_capsule(orbit)
+    branches = first, follow_capsule(first.special[-1].switch())
     (stands, begins), (goes_on, touches) = (branch.special for branch in branches)
     back = goes_on.switch()
     np.testing.assert_array_less(back.machine.amplitude, goes_on.parameter)
-    # It sticks where it stood still: an event less, that it comes to stand.
+    # Beyond, the capsule sticks where it was at rest, so that its stopping is no event.
     assert float(stands.switch().machine.amplitude) < stands.parameter
     assert begins.parameter == pytest.approx(goes_on.parameter, abs=1e-10)
     assert touches.detail.startswith("touches a stop")
@@ -98,7 +98,7 @@ def test_a_capsule_that_sticks_once_a_cycle():
         i = len(branch.parameter) // 2
         amplitude = branch.parameter[i]
         x = motions[round(amplitude, 1)].x
-        _, matrix = fixed_point(lambda x, a=amplitude: Inside(a).cycle(x), settled(amplitude, x).x)
+        _, matrix = fixed_point(lambda x, a=amplitude: Capsule(a).cycle(x), settled(amplitude, x).x)
         expected = [*np.linalg.eigvals(matrix), 0.0]
         mine = np.sort_complex(branch.multipliers[i])
         np.testing.assert_allclose(mine, np.sort_complex(expected), atol=1e-8)

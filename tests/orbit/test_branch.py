@@ -1,4 +1,4 @@
-"""Branches, what happens on them, and boundaries, beside closed forms and found orbits."""
+"""Compare branches, their special points and boundaries with closed forms and found orbits."""
 
 import dataclasses
 import pickle
@@ -27,7 +27,7 @@ def branch_of(scene):
     return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.5, 1.9))
 
 
-def the(branch, kind):
+def first_of(branch, kind):
     return next(point for point in branch.special if point.kind == kind)
 
 
@@ -38,16 +38,16 @@ def short():
 
 @pytest.fixture(scope="module")
 def family():
-    """Of a restitution of 0.8: the 2π motion; the doubled one with two impacts, which turns back at
-    1e-5 (in ζ) from where it springs; the 4π motion with one impact beyond its grazing."""
+    """Branches at restitution 0.8: the 2π motion; the doubled motion with two impacts, which folds
+    1e-5 (in ζ) from its origin; the 4π motion with one impact beyond its grazing."""
     single = branch_of(scene_at(0.9, 0.8))
     options = {"parameter": ZETA, "bounds": (0.5, 1.9)}
-    doubled = vi.continue_orbit(the(single, "period-doubling").switch(), **options)
-    return single, doubled, vi.continue_orbit(the(doubled, "grazing").switch(), **options)
+    doubled = vi.continue_orbit(first_of(single, "period-doubling").switch(), **options)
+    return single, doubled, vi.continue_orbit(first_of(doubled, "grazing").switch(), **options)
 
 
-def beside_closed_forms(branch, restitution):
-    """Checks a branch of motions with one impact point by point."""
+def check_closed_forms(branch, restitution):
+    """Compare each point of a branch of motions with one impact."""
 
     @jax.jit
     @jax.vmap
@@ -72,13 +72,13 @@ def beside_closed_forms(branch, restitution):
             assert least[branch.parameter == point.parameter] == pytest.approx(-1, abs=1e-7)
 
 
-def beside_equation_21(branch, restitution, near):
-    """Checks the special points of the 2π motion; the fold lies near this ζ."""
+def check_equation_21(branch, restitution, near):
+    """Check the special points of the 2π motion, whose fold lies near the given ζ."""
     assert branch.ends == ("grazing", "grazing")
     born = min((p for p in branch.special if p.kind == "grazing"), key=lambda p: p.parameter)
     assert born.parameter == pytest.approx(1 / np.sqrt(2), abs=1e-9)
     assert abs(float(born.orbit.impact_speed[0])) < 1e-9
-    fold = the(branch, "fold")
+    fold = first_of(branch, "fold")
     wanted = fold_by_eq_21(restitution, 2.0, near - 0.1, near + 0.1)
     assert fold.parameter == pytest.approx(wanted, abs=1e-8)
     assert np.abs(np.asarray(fold.orbit.multipliers) - 1).min() < 1e-6
@@ -91,38 +91,38 @@ def test_the_2pi_branch_is_the_closed_form(short):
         "grazing",
         "period-doubling",
     ]
-    beside_closed_forms(short, 0.5)
-    beside_equation_21(short, 0.5, 1.5)
+    check_closed_forms(short, 0.5)
+    check_equation_21(short, 0.5, 1.5)
 
 
 @pytest.mark.slow
 def test_branches_of_4pi(family):
     single, doubled, long = family
-    beside_equation_21(single, 0.8, 1.7)
+    check_equation_21(single, 0.8, 1.7)
     for branch in (single, long):
-        beside_closed_forms(branch, 0.8)
+        check_closed_forms(branch, 0.8)
     assert doubled.cycles == 2 and doubled.impact_speed.shape[1] == 2
     assert "period-doubling" in doubled.ends
     springs = next(p for p in doubled.special if "begins at" in p.detail)
-    at = the(single, "period-doubling").parameter
+    at = first_of(single, "period-doubling").parameter
     assert springs.kind == "period-doubling" and springs.parameter == pytest.approx(at, abs=1e-11)
     assert float(springs.orbit.residual) < 1e-12
-    # Where it loses an impact the one-impact 4π motion begins, with the same parameter.
-    lost = the(doubled, "grazing")
+    # The 4π motion with one impact begins where the doubled motion loses an impact.
+    lost = first_of(doubled, "grazing")
     assert long.cycles == 2 and long.impact_speed.shape[1] == 1
     touches = [p for p in long.special if p.kind == "grazing"]
     assert min(abs(p.parameter - lost.parameter) for p in touches) < 1e-8
     assert all(abs(float(p.orbit.clearance)) < 1e-9 for p in touches)
-    for point in touches:  # the place is told within the period, and there the body is at the stop
-        told = re.search(r"touches a stop at crank angle φ = ([0-9.]+) of 4π", str(point))
-        assert told is not None and 0 <= float(told[1]) < 4 * np.pi
+    for point in touches:  # the message gives a phase in the period, with the body at the stop
+        matched = re.search(r"touches a stop at crank angle φ = ([0-9.]+) of 4π", str(point))
+        assert matched is not None and 0 <= float(matched[1]) < 4 * np.pi
         run = point.orbit.trajectory(samples=4096)
-        there = np.interp(float(told[1]) / (2 * np.pi), run.samples.cycles, run.samples.state.Y)
+        there = np.interp(float(matched[1]) / (2 * np.pi), run.samples.cycles, run.samples.state.Y)
         assert float(there) == pytest.approx(2.0, abs=1e-4)
     slowest = int(np.argmin(np.abs(lost.orbit.impact_speed)))
-    told = re.search(r"the impact at crank angle φ = ([0-9.]+) of 4π is lost", str(lost))
-    assert told is not None
-    assert float(told[1]) == pytest.approx(float(lost.orbit.impact_phase[slowest]), abs=1e-4)
+    matched = re.search(r"the impact at crank angle φ = ([0-9.]+) of 4π is lost", str(lost))
+    assert matched is not None
+    assert float(matched[1]) == pytest.approx(float(lost.orbit.impact_phase[slowest]), abs=1e-4)
 
 
 @pytest.mark.slow
@@ -149,40 +149,40 @@ def test_special_points_do_not_depend_on_the_step(family):
         kinds = sorted(p.kind for p in again.special)
         assert kinds == ["fold", "grazing", "period-doubling"]
         for mine in again.special:
-            assert mine.parameter == pytest.approx(the(doubled, mine.kind).parameter, abs=1e-8)
+            assert mine.parameter == pytest.approx(first_of(doubled, mine.kind).parameter, abs=1e-8)
 
 
 @pytest.mark.slow
 def test_branches_do_not_depend_on_where_they_begin(short):
-    """At ζ = 1.2 the impact lies on the other side of the section than at 0.9."""
+    """At ζ = 0.9 and at ζ = 1.2 the impact lies on different sides of the section."""
     other = branch_of(scene_at(1.2))
     same = {(p.kind, round(p.parameter, 8)) for p in short.special}
     assert {(p.kind, round(p.parameter, 8)) for p in other.special} == same
-    switched = the(other, "period-doubling").switch()
+    switched = first_of(other, "period-doubling").switch()
     assert (np.asarray(switched.impact_phase) < 4 * np.pi).all()
 
 
 @pytest.mark.slow
 def test_boundaries_in_a_second_parameter(short, tmp_path):
-    doubling, xi = the(short, "period-doubling"), "oscillator.damping_ratio"
+    doubling, xi = first_of(short, "period-doubling"), "oscillator.damping_ratio"
     curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.2), (0.0, 0.1)))
     scenes = lambda z, xi: vi.Scene.ideal(frequency_ratio=z, damping_ratio=xi)
     closed = jax.jit(jax.vmap(lambda *x: vi.closed_form_orbits(scenes(*x)).multipliers[0]))
     multipliers = np.asarray(closed(*jnp.asarray(curve.parameters.T)))
     np.testing.assert_allclose(multipliers.real.min(1), -1, atol=1e-8)
-    # At ζ = 0.9 it is met at c = 0.2711 N·s/m.
+    # The curve passes ζ = 0.9 at c = 0.2711 N·s/m.
     table = vi.Parameters(restitution=0.5, gap=0.08)
     order = np.argsort(curve.parameters[:, 0])
     ratio = float(table.scene(drive="ideal").damping_ratio / table.damping)
     met = np.interp(0.9, *curve.parameters[order].T) / ratio
     assert met == pytest.approx(0.2711, abs=2e-3)
     bounds = ((1.2, 1.9), (0.1, 0.9))
-    folds = vi.boundary(the(short, "fold"), parameter="stops.0.restitution", bounds=bounds)
+    folds = vi.boundary(first_of(short, "fold"), parameter="stops.0.restitution", bounds=bounds)
     for zeta, k in folds.parameters[::10]:
         assert zeta == pytest.approx(fold_by_eq_21(k, 2.0, zeta - 1e-3, zeta + 1e-3), abs=1e-8)
     ax = vi.plot_boundary(folds)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("frequency ratio ζ", "restitution k")
-    # It ends on its bounds, also of a parameter whose scale is far below 1.
+    # The curve also ends on bounds far below 1.
     curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.9), (0.0, 0.004)))
     ends = curve.parameters[[0, -1], 1]
     assert "bounds" in curve.ends
@@ -196,7 +196,7 @@ def test_boundaries_in_a_second_parameter(short, tmp_path):
     assert len(curve.to_xarray(along="point").to_dataframe()) == len(curve.parameters)
 
 
-def test_the_motions_at_its_bounds_and_ends(short):
+def test_at_finds_the_motions_at_bounds_and_ends(short):
     low, high = bounds = (0.88, 0.92)
     (start,) = short.at(0.9)
     branch = vi.continue_orbit(start, parameter=ZETA, bounds=bounds)
@@ -208,8 +208,8 @@ def test_the_motions_at_its_bounds_and_ends(short):
         speed = float(closed.impact_speed[0])
         assert float(orbit.impact_speed[0]) == pytest.approx(speed, abs=1e-9)
     assert branch.at(high + 1e-9) == []
-    # On the fold two motions are one; where the second one's impact is lost, there is the first.
-    assert len(short.at(the(short, "fold").parameter)) == 1
+    # At the fold both motions coincide. The first one exists where the second loses its impact.
+    assert len(short.at(first_of(short, "fold").parameter)) == 1
     first, lost = short.at(short.parameter[-1])
     assert float(lost.impact_speed[0]) == pytest.approx(0, abs=1e-9)
     assert float(first.impact_speed[0]) > 0.1
@@ -225,18 +225,18 @@ def test_a_branch_as_data(short):
     assert "period-doubling at" in str(short)
     restitution = float(short.orbit(0).machine.stops[0].restitution)
     lost = 0.5 * (1 - restitution**2) * (short.impact_speed**2).sum(axis=1) / short.cycles
-    np.testing.assert_allclose(short.impact_energy, lost, rtol=1e-11, atol=1e-13)  # it grazes
+    np.testing.assert_allclose(short.impact_energy, lost, rtol=1e-11, atol=1e-13)  # 0 at a graze
     table = short.to_xarray(along="point").to_dataframe()
     assert table.y_min.tolist() == short.y_min.tolist()
-    # Where stability changes, at points of the branch, it is neither.
+    # At the special points where stability changes it is neutral.
     sure = table[table.stability != "neutral"]
     assert len(sure) >= len(table) - len(short.special)
     np.testing.assert_array_equal(sure.stability == "stable", sure.stable)
-    np.testing.assert_array_equal(table[ZETA], table.parameter)  # a file tells what it is
+    np.testing.assert_array_equal(table[ZETA], table.parameter)  # a column of this name
     kinds = short.to_xarray(along="special").to_dataframe()
     np.testing.assert_array_equal(kinds[f"special_{ZETA}"], kinds.special_parameter)
     assert kinds.special_kind.tolist() == [point.kind for point in short.special]
-    # Each special point is one of the branch's.
+    # Each special point is also a point of the branch.
     np.testing.assert_array_equal(
         short.parameter[kinds.special_point], kinds.special_parameter.to_numpy()
     )
@@ -244,7 +244,7 @@ def test_a_branch_as_data(short):
 
 
 def test_a_branch_in_files(short, tmp_path):
-    """NetCDF keeps all of it; a table all digits of the numbers at its points."""
+    """NetCDF stores the whole branch, CSV its points with all digits."""
     few = dataclasses.replace(short, special=[])
     for branch in (short, few):
         data, path = branch.to_xarray(), tmp_path / f"{len(branch.special)}.nc"
@@ -257,14 +257,14 @@ def test_a_branch_in_files(short, tmp_path):
     pd.testing.assert_frame_equal(table, again, check_dtype=False, check_exact=True)
 
 
-def test_a_restored_branch_goes_on(short):
-    """A pickled or reversed copy can be switched at: its points hold their row by number."""
+def test_a_restored_branch_can_be_switched(short):
+    """Special points refer to their row by index, in a pickled or a reversed copy too."""
     again = pickle.loads(pickle.dumps(short))
     turned = dataclasses.replace(again, steps=again.steps[::-1], ends=again.ends[::-1])
     np.testing.assert_array_equal(turned.multipliers[::-1], short.multipliers)
     for point in again.special:
         assert again.parameter[point.index] == point.parameter
-    orbit, same = (the(branch, "period-doubling").switch() for branch in (short, again))
+    orbit, same = (first_of(branch, "period-doubling").switch() for branch in (short, again))
     np.testing.assert_array_equal(orbit.impact_speed, same.impact_speed)
 
 
@@ -279,26 +279,26 @@ def test_a_restored_branch_goes_on(short):
         ),
     ],
 )
-def test_says_what_is_wrong(short, arguments, message):
+def test_invalid_arguments_raise(short, arguments, message):
     (orbit,) = short.at(0.9)
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(orbit, **{"parameter": ZETA, "bounds": (0.5, 1.9), **arguments})
 
 
-def test_steps_bounds_and_distances_that_are_none(short):
+def test_invalid_steps_bounds_and_distances_raise(short):
     point, gap, free = short.special[0], "stops.0.gap", (1.0, 3.0)
 
-    def refused(bounds, message, **settings):
+    def expect_error(bounds, message, **settings):
         with pytest.raises(ValueError, match=message):
             vi.continue_orbit(point.orbit, parameter=gap, bounds=bounds, **settings)
         with pytest.raises(ValueError, match=message):
             vi.boundary(point, parameter=gap, bounds=((0.5, 1.9), bounds), **settings)
 
-    for name in ("step", "max_step"):  # those with which they would never end
+    for name in ("step", "max_step"):  # the continuation would never end
         for value in (0.0, -1.0, np.nan, np.inf):
-            refused(free, f"Argument `{name}` must be finite and in", **{name: value})
+            expect_error(free, f"Argument `{name}` must be finite and in", **{name: value})
     for bounds in [(3.0, 1.0), (1.0, np.nan), (2.0, 2.0), (1.0, np.inf)]:
-        refused(bounds, "Argument `bounds` must be two finite numbers")
+        expect_error(bounds, "Argument `bounds` must be two finite numbers")
     for distance in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="Argument `distance` must be finite"):
             point.switch(distance=distance)

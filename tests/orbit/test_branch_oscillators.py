@@ -1,4 +1,4 @@
-"""Branches of oscillators known from elsewhere, and of a motor beside SciPy."""
+"""Compare branches of oscillators with closed forms, and of a motor with SciPy."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ ZETA = "drive.frequency_ratio"
 
 @pytest.mark.slow
 def test_grazing_of_the_classic_impact_oscillator():
-    """The motion that stays off the stop has the amplitude 1/√((1 - ζ²)² + (2ξζ)²); it grazes
-    where that is the gap (Shaw and Holmes 1983; Nordmark 1991)."""
+    """The motion without impacts has amplitude 1/√((1 - ζ²)² + (2ξζ)²). It grazes where this
+    equals the gap (Shaw and Holmes 1983; Nordmark 1991)."""
     xi, gap = 0.05, 1.5
     scene = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.8, gap=gap, damping_ratio=xi)
     rest = vi.find_orbit(scene, scene.start(), throw=True)
@@ -25,7 +25,7 @@ def test_grazing_of_the_classic_impact_oscillator():
     assert grazing.kind == "grazing" and grazing.parameter == pytest.approx(wanted, abs=1e-9)
     amplitude = 1 / np.hypot(1 - branch.parameter**2, 2 * xi * branch.parameter)
     np.testing.assert_allclose(branch.y_max, amplitude, rtol=1e-10)
-    # Beyond it an impact is gained: the closed form knows that motion.
+    # Beyond, the motion has gained an impact. Compare with the closed form.
     gained = grazing.switch()
     assert int(gained.impacts) == 1 and float(gained.impact_speed[0]) > 0
     there = vi.Scene.ideal(
@@ -34,7 +34,7 @@ def test_grazing_of_the_classic_impact_oscillator():
     )  # fmt: skip
     closed = vi.closed_form_orbits(there)
     assert np.nanmin(np.abs(closed.impact_speed - gained.impact_speed[0])) < 1e-9
-    # In ζ and d the grazing is the resonance curve itself.
+    # In ζ and d the curve of grazings is the resonance curve.
     curve = vi.boundary(grazing, parameter="stops.0.gap", bounds=((0.3, 0.95), (1.1, 3.0)))
     zeta, d = curve.parameters.T
     np.testing.assert_allclose(1 / np.hypot(1 - zeta**2, 2 * xi * zeta), d, rtol=1e-9)
@@ -42,9 +42,9 @@ def test_grazing_of_the_classic_impact_oscillator():
 
 
 @pytest.mark.slow
-def test_without_damping_the_touch_is_on_the_section_and_nothing_else_is_special():
-    """The body turns where φ = 0, with a rate that is rounding, and its multipliers have modulus 1,
-    to rounding: A = 1/(1 - ζ²) = 2 is at ζ = √½ whatever the signs of these are."""
+def test_the_only_special_point_without_damping_is_a_touch_on_the_section():
+    """The body turns on the section, where its velocity is rounding, and its multipliers have
+    modulus 1 to rounding. Neither may displace the grazing, A = 1/(1 - ζ²) = 2 at ζ = √½."""
     for start in (0.6, 0.65, 0.68):
         scene = vi.Scene.ideal(frequency_ratio=start, restitution=0.5, gap=2.0, damping_ratio=0.0)
         orbit = vi.find_orbit(scene, scene.start(Y=1 / (1 - start**2), V=0.0), throw=True)
@@ -56,9 +56,9 @@ def test_without_damping_the_touch_is_on_the_section_and_nothing_else_is_special
 
 @pytest.mark.slow
 def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
-    """Equal steps of crank angle, enough for the crank's speed on the section, are too few then:
-    with them the branch had points where branches cross and a torus. At the fold and the grazing
-    SciPy's own flights come back to the state, by time, to 1e-8. A branch with too few says so."""
+    """Steps chosen for the crank's speed on the section are too few: they gave false branch points
+    and a false torus. Compare the grazing and the fold with SciPy, which integrates in time. A
+    branch with too few steps gives a warning."""
     scene = vi.Scene(
         oscillator=vi.Oscillator(0.02),
         drive=vi.Motor(strength=0.08, control=0.9, coupling=0.35, slider_inertia=0.02),
@@ -102,8 +102,8 @@ def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
 
 @pytest.mark.slow
 def test_a_period_doubling_right_before_an_impact_is_lost():
-    """Of the closed form's multipliers one passes -1 beside the grazing, and goes to -∞ there; a
-    step that spans both tells it from none only by the side from which the grazing is reached."""
+    """In the closed form one multiplier passes -1 near the grazing, and tends to -∞ there. A step
+    that spans both detects the doubling only by the side from which it reaches the grazing."""
 
     def scene_at(zeta):
         return vi.Scene.ideal(frequency_ratio=zeta, restitution=0.8, gap=1.2, damping_ratio=0.2)

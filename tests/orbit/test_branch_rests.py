@@ -19,7 +19,7 @@ ZETA, GAP = "drive.frequency_ratio", 0.3
 
 
 def scene_at(zeta, restitution=0.3, gap=GAP, damping=0.05):
-    """Its body chatters to rest once a cycle; on the section it flies."""
+    """Return a scene whose body chatters to rest once a cycle, and flies on the section."""
     scene = vi.Scene.ideal(
         frequency_ratio=zeta, restitution=restitution, gap=gap, damping_ratio=damping
     )
@@ -40,8 +40,7 @@ def branch(orbit):
     return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.6, 0.8))
 
 
-def test_a_motion_says_that_it_rests(orbit):
-    """And one that never leaves its stop."""
+def test_an_orbit_reports_rests(orbit):
     assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
     pressed = scene_at(0.7, gap=-3.0)
     held = vi.find_orbit(pressed, pressed.start(Y=-3.0), impact_log=32)
@@ -50,8 +49,8 @@ def test_a_motion_says_that_it_rests(orbit):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("q", [("y", "x"), ("x", "y")])
-def test_rests_beside_another_body(q):
-    """Newton's method leaves the resting body a velocity of 1e-28, which was one more impact."""
+def test_rests_with_another_body_in_motion(q):
+    """Newton's method leaves the resting body a velocity of 1e-28, which is no impact."""
     base = dict(
         q=q, mass=(1.0, 1.0), cycle=2 * np.pi, contacts=vi.RigidStop(0, 0.5, "left", on="y")
     )
@@ -63,7 +62,7 @@ def test_rests_beside_another_body(q):
 
 
 def rate(zeta, clock, y, v):
-    """d(y, v)/ds of the body in flight, from the section on."""
+    """Return d(y, v)/ds of the body in flight, at a clock from the section."""
     scene = scene_at(zeta)
     x = scene.start(Y=y, V=v)
     return np.asarray(ravel_pytree(RATE(scene, clock, x))[0])
@@ -74,8 +73,7 @@ RATE = jax.jit(lambda scene, clock, x: scene.field(clock, x))
 
 @pytest.mark.slow
 def test_motions_of_the_branch_are_flights_from_release(branch):
-    """A rest ends where the force on the body in it turns away from the stop, by a root; from there
-    to the section the body flies, by scipy."""
+    """Compare with SciPy from the release, where the contact force is zero, to the section."""
     assert set(branch.rests) == {1}
     for i in (0, len(branch.parameter) // 2):
         zeta = float(branch.parameter[i])
@@ -98,7 +96,7 @@ def test_motions_of_the_branch_are_flights_from_release(branch):
 
 
 @pytest.mark.slow
-def test_a_branch_says_that_its_motions_rest(branch):
+def test_a_branch_reports_rests(branch):
     point = branch.orbit(0)
     again = vi.find_orbit(point.machine, point, impact_log=32, throw=True)
     for motion in (point, again):
@@ -120,7 +118,7 @@ def test_a_branch_says_that_its_motions_rest(branch):
     [(0.1, 0.6, 0.2, (0.89, 0.92)), (0.7, 0.3, 0.2, (0.46, 0.5))],
 )
 def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping, bounds):
-    """Beside flights in 40 digits; those of double precision lose it 3e-7 elsewhere."""
+    """Compare with flights in 40 digits, since double precision displaces the loss by 3e-7."""
     scene = scene_at(bounds[0] + 0.01, k, gap, damping)
     orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
     branch = vi.continue_orbit(orbit, parameter=ZETA, bounds=bounds)
@@ -133,7 +131,7 @@ def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping,
 
 @pytest.mark.slow
 def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
-    """Until then the motion does not know of that stop, so that its least position is the place."""
+    """Before the graze the left stop has no effect, so that the least position gives its gap."""
     scene = scene_at(0.7)
     other = vi.RigidStop(gap=2.5, restitution=0.3, side="left")
     scene = dataclasses.replace(scene, stops=(*scene.stops, other))
@@ -142,7 +140,7 @@ def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
     assert branch.ends == ("grazing", "bounds")
     point = branch.special[0]
     assert point.parameter == pytest.approx(-float(orbit.y_min), abs=1e-10)
-    beyond = point.switch()  # strikes it
+    beyond = point.switch()  # strikes the left stop
     again = vi.simulate(beyond.machine, beyond.state, 1, impact_log=64)
     assert 1 in again.impact_log.stop[0] and again.rests[0] == beyond.rests == 1
     last = [float(again.last.Y), float(again.last.V)]
@@ -152,15 +150,15 @@ def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
 
 
 @pytest.mark.slow
-def test_a_motor_remembers_its_speed_through_a_rest():
-    """Rest forgets two of three numbers; the third's multiplier beside differences of the map."""
+def test_a_rest_leaves_one_multiplier_of_a_motor():
+    """A rest makes two of three multipliers zero. Compare with differences of the map."""
     motor = vi.Parameters(torque=10.0, control=0.55, restitution=0.3, gap=0.006)
     scene = motor.scene(drive="motor").at_section(np.pi)
     orbit = vi.find_orbit(scene, settled(scene, 100), impact_log=32, throw=True)
     bounds = tuple(np.array([0.95, 1.0]) * float(scene.stops[0].gap))
     branch = vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=bounds, max_step=0.3)
     there = branch.orbit(0)
-    # Both are crank angles, not clocks since the section.
+    # Both phases are crank angles, not clocks from the section.
     turns = (branch.impact_phase[0, 0] - float(there.impact_phase[0])) / (2 * np.pi)
     assert turns == pytest.approx(round(turns), abs=1e-12)
     x, unravel = ravel_pytree(there.state)
@@ -178,7 +176,7 @@ def test_a_motor_remembers_its_speed_through_a_rest():
 
 
 class Pair(vi.machines.ImpactPair):
-    """A ball in a shaken box, observed at another place in the cycle."""
+    """A ball in a shaken box, whose section is at the phase `since`."""
 
     since: float = 1.0
 
@@ -186,16 +184,16 @@ class Pair(vi.machines.ImpactPair):
         return super().field(s + self.since, state)
 
 
-def carried(half_gap, restitution=0.5):
-    """Phases of the ball's impacts with the right wall after the left one has let go of it at phase
-    0 of y'' = sin s, and its speeds after them; until its hops are no longer than rounding, or one
-    is not over as the wall lets go of it at phase π."""
+def wall_impacts(half_gap, restitution=0.5):
+    """Return the phases of the ball's impacts on the right wall, and the speeds after them, for
+    y'' = sin s. The left wall releases the ball at phase 0. The list ends when hops are as short
+    as rounding, or when one lasts beyond phase π, where the right wall releases the ball."""
     s = brentq(lambda s: s - np.sin(s) - 2 * half_gap, 0.0, np.pi, xtol=1e-15)
     v = restitution * (1 - np.cos(s))
     found = [(s, v)]
 
     def pressed(d):
-        """How fast the ball falls back on average in a time d."""
+        """Return the mean velocity that the drive gives towards the wall over a time d."""
         short = d * d / 6 if d < 1e-3 else 1 - np.sin(d) / d
         return np.cos(s) * short + 2 * np.sin(s) * np.sin(d / 2) ** 2 / d
 
@@ -207,22 +205,20 @@ def carried(half_gap, restitution=0.5):
     return found
 
 
-def widest(restitution):
-    """Half the greatest gap with which the hops are over before the wall would let go of the
-    ball."""
+def largest_half_gap(restitution):
+    """Return the largest half gap with which the hops end before the wall releases the ball."""
     low, high = 0.1, 0.25
     while high - low > 1e-12:
         middle = 0.5 * (low + high)
-        over = carried(middle, restitution)[-1][1] < 1e-14
+        over = wall_impacts(middle, restitution)[-1][1] < 1e-14
         low, high = (middle, high) if over else (low, middle)
     return low
 
 
 @pytest.mark.slow
 def test_chatter_and_rest_pass_over_the_section():
-    """Both walls of a shaken box carry its ball for a while. On the section the ball flies at
-    first; as the gap gets smaller its first impact comes upon the section, where the state jumps
-    and the motion goes on."""
+    """The ball rests on each wall for a part of the cycle. It flies on the section at first. As
+    the gap decreases, its first impact reaches the section; the state jumps, the branch goes on."""
     pair = Pair(half_gap=0.1, since=1.0)
     last = vi.simulate(pair, pair.start(), 60).last
     orbit = vi.find_orbit(pair, last, impact_log=64, throw=True)
@@ -230,7 +226,7 @@ def test_chatter_and_rest_pass_over_the_section():
     assert set(branch.rests) == {2} and branch.ends == ("bounds", "rest")
     places, speeds = branch.column("section_place"), branch.column("section_v.place")
     for i in (0, 1, -2):
-        (hit, speed), *_ = carried(float(branch.parameter[i]))
+        (hit, speed), *_ = wall_impacts(float(branch.parameter[i]))
         # At phase 1 the ball flies from the left wall, or back from its first impact.
         y, v, s = -branch.parameter[i], 0.0, 0.0
         if hit < 1.0:
@@ -238,14 +234,14 @@ def test_chatter_and_rest_pass_over_the_section():
         y += (v + np.cos(s)) * (1.0 - s) - np.sin(1.0) + np.sin(s)
         v += np.cos(s) - np.cos(1.0)
         np.testing.assert_allclose([places[i], speeds[i]], [y, v], atol=1e-9)
-    assert carried(float(branch.parameter[0]))[0][0] < 1.0 < carried(0.1)[0][0]
+    assert wall_impacts(float(branch.parameter[0]))[0][0] < 1.0 < wall_impacts(0.1)[0][0]
     (point,) = branch.special
-    assert point.parameter == pytest.approx(widest(0.5), abs=1e-9)
+    assert point.parameter == pytest.approx(largest_half_gap(0.5), abs=1e-9)
     bounds = (0.05, 0.3), (0.48, 0.52)
     curve = vi.boundary(point, parameter="restitution", bounds=bounds, max_step=0.3)
     assert curve.ends == ("bounds", "bounds")
     for half_gap, restitution in curve.parameters[[0, -1]]:
-        assert half_gap == pytest.approx(widest(restitution), abs=1e-9)
+        assert half_gap == pytest.approx(largest_half_gap(restitution), abs=1e-9)
 
 
 class Uneven(vi.AbstractMachine):
@@ -265,8 +261,8 @@ class Uneven(vi.AbstractMachine):
         return vi.OscillatorState(x.V / self.frequency, pull / self.frequency)
 
 
-def released(frequency):
-    """How far from the other stop the body of `Uneven` turns after its rest, without that stop."""
+def clearance(frequency):
+    """Return the distance from the left stop at which the body turns after its rest."""
 
     def pull(s, y, v):
         return 0.35 * np.sin(2 * s) - np.cos(s) - 0.16 * v - y
@@ -286,14 +282,13 @@ def released(frequency):
 
 @pytest.mark.slow
 def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
-    """An impact comes upon the section, where the corrector finds a solution far beyond the bounds;
-    then the body just reaches the other stop, where its release alone says: at one place both
-    motions lead back, at the other one the motion goes on. Restitution 0 is a bound beyond which
-    there is no machine."""
+    """As an impact reaches the section, the corrector finds a solution far beyond the bounds. The
+    branch ends where the body grazes the left stop after its release: one graze is a fold, at the
+    other the motion persists. No machine has a restitution below 0."""
     start = vi.OscillatorState(jnp.zeros(()), jnp.zeros(()))
     settled = vi.simulate(Uneven(), start, 1, settle=40).last
     orbit = vi.find_orbit(Uneven(), settled, impact_log=64, throw=True)
-    wanted = [brentq(released, *bracket, xtol=1e-13) for bracket in ((0.37, 0.385), (0.55, 0.6))]
+    wanted = [brentq(clearance, *bracket, xtol=1e-13) for bracket in ((0.37, 0.385), (0.55, 0.6))]
     over_both = {"step": 0.5, "max_step": 0.5}
     branch = vi.continue_orbit(orbit, parameter="frequency", bounds=(0.2, 0.6), **over_both)
     assert branch.ends == ("grazing", "grazing")
@@ -303,25 +298,24 @@ def test_a_branch_passes_its_section_and_ends_at_a_graze_or_a_bound():
     assert soft.parameter[0] == pytest.approx(0.0, abs=1e-12)
 
 
-def listing(orbit, count):
-    """An orbit with so many of its impacts listed, as by a shorter `impact_log`."""
+def with_listed_impacts(orbit, count):
+    """Return the orbit as if it was found with `impact_log=count`."""
     listed = {name: getattr(orbit, f"impact_{name}")[:count] for name in ("phase", "speed", "stop")}
     return dataclasses.replace(orbit, **{f"impact_{name}": x for name, x in listed.items()})
 
 
 @pytest.mark.slow
-def test_a_motion_at_rest_on_its_section():
-    """Is followed, however many of its impacts are listed: chatter, one that sticks, and rest all
-    the time."""
+def test_a_branch_of_motions_at_rest_on_their_section():
+    """Follow chatter, an impact that sticks, and permanent rest, with a single impact listed."""
     for gap, k in ((0.3, 0.3), (0.3, 0.0), (-3.0, 0.3)):
         scene = vi.Scene.ideal(frequency_ratio=0.5, restitution=k, gap=gap, damping_ratio=0.05)
         orbit = vi.find_orbit(scene, scene.start(Y=gap), impact_log=32, throw=True)
         assert (int(orbit.impacts) > 1) == (gap > 0)
-        listed, bounds = listing(orbit, 1), (0.4, 0.6)
+        listed, bounds = with_listed_impacts(orbit, 1), (0.4, 0.6)
         branch = vi.continue_orbit(listed, parameter=ZETA, bounds=bounds, max_step=0.3)
         assert branch.ends == ("bounds", "bounds") and not branch.special
         np.testing.assert_allclose(branch.multipliers, 0.0, atol=1e-12)
-        for i in (0, -1):  # at the last one it has been let go of again
+        for i in (0, -1):  # at the last one the stop has released it
             there = branch.orbit(i)
             run = vi.simulate(there.machine, there.machine.start(Y=gap), 3)
             last = [float(run.last.Y), float(run.last.V)]
@@ -331,13 +325,13 @@ def test_a_motion_at_rest_on_its_section():
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     moving = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2, throw=True)
     with pytest.raises(ValueError, match=r"list all its 1 impacts, .* larger `impact_log`"):
-        vi.continue_orbit(listing(moving, 0), parameter=ZETA, bounds=(0.5, 1.9))
+        vi.continue_orbit(with_listed_impacts(moving, 0), parameter=ZETA, bounds=(0.5, 1.9))
 
 
 class Busy(vi.AbstractMachine):
-    """x'' + 0.1 x' + x + 2 (x - z) = cos(ωt + 2.6), x ≤ d, with a harder spring far from the stop
-    and a brake there, which notes that it has acted until x comes back; and z'' + 0.1 z' + z/2 +
-    2 (z - x) = 0 with dry friction."""
+    """x'' + 0.1 x' + x + 2 (x - z) = cos(ωt + 2.6), x ≤ d; z'' + 0.1 z' + z/2 + 2 (z - x) = 0 with
+    dry friction. A switch makes the spring stiffer below d - 0.1. A reset at d - 0.25 reduces the
+    velocity of x as it leaves, and sets a mode until x returns."""
 
     omega: Any = 0.35
     restitution: Any = 0.4
@@ -373,9 +367,9 @@ class Busy(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_a_rest_beside_friction_a_switch_and_a_reset():
-    """Each happens in every cycle, and the friction sticks. Beside settled simulations, and
-    differences of the simulated map."""
+def test_a_rest_with_friction_a_switch_and_a_reset():
+    """All of them act in every cycle, and the friction sticks. Compare with settled simulations and
+    differences of their map."""
 
     def after(omega, start, settle=0):
         return vi.simulate(Busy(omega=omega), start, 1, settle=settle, event_log=64)
@@ -385,8 +379,8 @@ def test_a_rest_beside_friction_a_switch_and_a_reset():
     kinds = run.event_log.kind
     assert all((kinds == kind).any(axis=1).all() for kind in range(len(vi.EVENTS)))
     orbit = vi.find_orbit(Busy(), run.last, impact_log=64, throw=True)
-    way = {"parameter": "omega", "step": 0.5, "max_step": 0.5}
-    branch = vi.continue_orbit(orbit, bounds=(0.348, 0.352), **way)
+    options = {"parameter": "omega", "step": 0.5, "max_step": 0.5}
+    branch = vi.continue_orbit(orbit, bounds=(0.348, 0.352), **options)
     assert branch.ends == ("bounds", "bounds") and (branch.rests == 1).all()
     for i in (0, -1):
         there = branch.orbit(i)

@@ -1,4 +1,4 @@
-"""Curves that come back to where they began: isolas and closed boundaries, beside closed forms."""
+"""Closed branches (isolas) and closed boundaries, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 class Ring(Kicked):
-    """x ← x + (x² + a² + 4b² - 1)/2: fixed points on an ellipsoid, that meet at its equator."""
+    """x ← x + (x² + a² + 4b² - 1)/2: fixed points on an ellipsoid, folds on its equator."""
 
     def kick(self, x, y):
         return x + 0.5 * (x**2 + self.a**2 + 4 * self.b**2 - 1), 0.3 * y
@@ -23,7 +23,7 @@ def ring():
     return vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
 
 
-def test_a_closed_branch_is_gone_round_once(ring):
+def test_a_closed_branch_is_traversed_once(ring):
     assert ring.ends == ("closed", "closed")
     x, a = ring.column("section_0"), ring.parameter
     np.testing.assert_allclose(x**2 + a**2, 0.96, rtol=1e-11)
@@ -40,7 +40,7 @@ def test_a_closed_branch_is_gone_round_once(ring):
         np.testing.assert_allclose(np.sort(found), [-root, root], atol=1e-11)
 
 
-def test_a_closed_boundary_is_gone_round_once(ring):
+def test_a_closed_boundary_is_traversed_once(ring):
     curve = vi.boundary(ring.special[0], parameter="b", bounds=((-3.0, 3.0), (-3.0, 3.0)))
     assert curve.ends == ("closed", "closed")
     a, b = curve.parameters.T
@@ -50,14 +50,14 @@ def test_a_closed_boundary_is_gone_round_once(ring):
 
 
 class Hairpin(Kicked):
-    """x ← x + 100 (x - 1)² + a/10⁴: two sheets that a fold joins at a = 0."""
+    """x ← x + 100 (x - 1)² + a/10⁴: two sheets joined by a fold at a = 0."""
 
     def kick(self, x, y):
         return x + 100 * (x - 1) ** 2 + 1e-4 * self.a, 0.3 * y
 
 
 def test_a_branch_that_comes_near_itself_is_not_closed():
-    """Where it begins its other sheet is a fifteenth of a step away, x being half as large as 1."""
+    """At the start the other sheet is 1/15 of a step away, as the scale of x is 1/2."""
     orbit = vi.find_orbit(Hairpin(-0.5, 0.0), at(1 - np.sqrt(0.5) / 1000, 0.0), throw=True)
     branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
     assert branch.ends == ("bounds", "bounds") and len(branch.special) == 1
@@ -69,15 +69,15 @@ def test_a_branch_that_comes_near_itself_is_not_closed():
 
 
 class Twisted(Kicked):
-    """z ← -z - G/5 in the plane, where G = 0 if x² - y² = a and x² + y² = 1: motions of two cycles
-    ±z, that are one another after a round of their isola."""
+    """z ← -z - G/5 in the plane, with G = 0 where x² - y² = a and x² + y² = 1. Motions of two
+    cycles alternate between z and -z; a round of their isola leads from z to -z."""
 
     def kick(self, x, y):
         first, second = x**2 - y**2 - self.a, x**2 + y**2 - 1
         return -x - 0.2 * (x * first + y * second), -y - 0.2 * (y * first - x * second)
 
 
-def test_a_motion_that_comes_again_a_cycle_later_is_the_same():
+def test_a_branch_closes_at_the_same_motion_a_cycle_later():
     x, y = np.sqrt([0.65, 0.35])
     orbit = vi.find_orbit(Twisted(0.3, 0.0), at(x, y), cycles=2, throw=True)
     branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
@@ -91,14 +91,14 @@ def test_a_motion_that_comes_again_a_cycle_later_is_the_same():
 
 
 class Node(Kicked):
-    """x ← x + (a² - x² (x + 1))/4: a curve with a loop, that crosses itself at 0."""
+    """x ← x + (a² - x² (x + 1))/4: a curve with a loop that crosses itself at 0."""
 
     def kick(self, x, y):
         return x + 0.25 * (self.a**2 - x**2 * (x + 1)), 0.3 * y
 
 
 def test_a_curve_that_crosses_itself_is_not_closed():
-    """Both passages of the crossing are there, and no point of the curve is off."""
+    """The branch passes the crossing twice, and all its points are on the curve."""
     orbit = vi.find_orbit(Node(np.sqrt(1.152), 0.0), at(0.8, 0.0), throw=True)
     branch = vi.continue_orbit(orbit, parameter="a", bounds=(-1.5, 1.5))
     assert branch.ends == ("bounds", "bounds")

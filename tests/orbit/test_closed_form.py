@@ -1,4 +1,4 @@
-"""The closed form against the paper's numbers, and against flights computed in other ways."""
+"""Compare the closed form with the paper's numbers and with independent flights."""
 
 from functools import partial
 
@@ -15,7 +15,7 @@ from closed_forms import FIELDS, ideal, solve
 
 
 def flight(zeta, xi, phase, Y, V, tau):
-    """Y and V a time tau after (Y, V) at crank angle `phase`: free plus steady response, NumPy."""
+    """Return (Y, V) a time tau after the crank angle `phase`: free plus steady response."""
     steady = np.exp(1j * phase) / (1 - zeta**2 + 2j * xi * zeta)
     y, v = Y - steady.real, V - (1j * zeta * steady).real
     omega = np.sqrt(1 - xi**2 + 0j)
@@ -28,7 +28,7 @@ def flight(zeta, xi, phase, Y, V, tau):
 
 
 def samples(seed, count=400):
-    """ζ, ξ, k, d drawn at random, half of them undamped and some overdamped."""
+    """Draw ζ, ξ, k, d at random, half of them undamped and some overdamped."""
     draw = np.random.default_rng(seed)
     zeta, k, d = (
         draw.uniform(0.4, 2.5, count),
@@ -36,7 +36,7 @@ def samples(seed, count=400):
         draw.uniform(0, 3, count),
     )
     xi = np.where(draw.random(count) < 0.5, 0.0, 10 ** draw.uniform(-3, 0.3, count))
-    apart = np.abs(1 - zeta**2 + 2j * xi * zeta) > 0.02  # the reference flight cancels there
+    apart = np.abs(1 - zeta**2 + 2j * xi * zeta) > 0.02  # `flight` loses digits near resonance
     return zeta[apart], xi[apart], k[apart], d[apart]
 
 
@@ -46,7 +46,7 @@ solve_many = jax.jit(
 )
 
 
-# Printed values: the numbers of `FIELDS`, and the multipliers.
+# Printed in the paper: the first five of `FIELDS`, and the multipliers.
 TABLE = {
     1: ((1.92303, -0.876442, 6.19998, 1.57475, -1.883583), [-0.214402, -1.166036]),
     2: ((1.609674, -1.943612, 12.37807, 3.54674, -3.254293), [-0.298755 + 0.400931j] * 2),
@@ -84,10 +84,10 @@ def test_meets_the_boundary_conditions_and_passes_the_section(n):
     assert np.nanmax(np.abs(V - orbits.V) / scale) < 1e-12
 
 
-def test_admissible_ones_come_first_then_faster_ones():
+def test_admissible_motions_come_first_then_faster_ones():
     orbits = solve_many(*samples(0), 1)
     admissible, exists = np.asarray(orbits.admissible), np.asarray(orbits.exists)
-    assert (exists.sum(1) == 2).sum() > 5  # the draw holds pairs
+    assert (exists.sum(1) == 2).sum() > 5  # some have two motions
     assert not (admissible & ~exists).any()
     for flag in (admissible, exists):
         assert not (~flag[:, 0] & flag[:, 1]).any()
@@ -98,7 +98,7 @@ def test_admissible_ones_come_first_then_faster_ones():
 
 @pytest.mark.parametrize(("zeta", "xi"), [(1.0, 0.0), (0.8, 1.0)])
 def test_meets_the_boundary_conditions_by_runge_kutta(zeta, xi):
-    """At resonance and critically damped."""
+    """The cases are resonance and critical damping."""
     k, d = 0.5, (2.0 if xi < 1 else 0.1)
     orbits = solve(zeta, xi, k, d, 1)
     phase, v = float(orbits.impact_phase[0]), float(orbits.impact_speed[0])
@@ -119,7 +119,7 @@ def test_every_motion_and_its_extremes():
         period = 2 * np.pi * n / zeta[i]
         Y0, V0 = fly(phases, d[i], 0.0, period)
         dY, dV = np.subtract(fly(0.0, d[i], 1.0, period), fly(0.0, d[i], 0.0, period))
-        v = (Y0 - d[i]) / (k[i] * dY)  # returns to the stop at any phase, with a wrong speed
+        v = (Y0 - d[i]) / (k[i] * dY)  # closes the position at every phase, but not the speed
         wrong = V0 - k[i] * v * dV - v
         crossings = np.diff(np.sign(wrong)) != 0
         assert (crossings & (v[1:] > 0)).sum() == orbits.exists[i].sum()
@@ -158,7 +158,7 @@ def test_multipliers_have_the_determinant_and_are_those_of_the_cycle_map():
         size = np.abs(np.asarray(orbits.multipliers)).max(-1) ** 2
         assert np.nanmax(np.abs(product - wanted) / (1 + size)) < 1e-12
 
-    # The map from the state just before an impact to the one before the next, differenced.
+    # Differences of the map from just before an impact to just before the next one.
     zeta, xi, k, d, n = 0.9, 0.02, 0.5, 1.5, 1
     orbits = solve(zeta, xi, k, d, n)
     phase, v = float(orbits.impact_phase[0]), float(orbits.impact_speed[0])
@@ -209,7 +209,7 @@ def test_damped_motions_tend_to_the_undamped_one():
 
 
 def test_resonance_is_the_limit_from_both_sides():
-    # There cos φ0 = 1 and v = nπ/(1 + k), whatever the gap.
+    # At resonance cos φ0 = 1 and v = nπ/(1 + k), for every gap.
     for n in (1, 2):
         at = solve(1.0, 0.0, 0.5, 2.0, n)
         np.testing.assert_allclose(at.impact_speed[0], np.pi * n / 1.5, rtol=1e-12)
@@ -222,7 +222,7 @@ def test_resonance_is_the_limit_from_both_sides():
 @partial(jax.jit, static_argnums=4)
 @partial(jax.vmap, in_axes=(0, 0, 0, None, None))
 def simulated(zeta, k, d, section, n):
-    """The first motion, and what one period of it lacks to close."""
+    """Return the motions, and the impacts and the closure error of a period of the first."""
     scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=k, gap=d).at_section(section)
     orbits = closed_form_orbits(scene, cycles=n)
     start = vi.OscillatorState(jnp.nan_to_num(orbits.Y[0]), jnp.nan_to_num(orbits.V[0]))
@@ -233,7 +233,7 @@ def simulated(zeta, k, d, section, n):
 
 @pytest.mark.slow
 def test_an_impact_on_the_section_is_met_once():
-    """At ζ = 1 without damping all fall on φ = 0."""
+    """At ζ = 1 without damping all impacts are at φ = 0."""
     draw = np.random.default_rng(6)
     d, k = draw.uniform(0.3, 2.5, 200), draw.uniform(0.1, 1, 200)
     at_zero, impacts, apart = simulated(np.ones(200), k, d, 0.0, 1)
@@ -269,8 +269,8 @@ def test_nothing_exists_where_the_free_motion_is_periodic():
 
 
 def numbers_of(at):
-    """All of the first motion, the derivatives of which the absent second must not spoil; last, the
-    sum of the numbers of motions that are there."""
+    """Return the values of the first motion, then the sum over the motions that exist. The absent
+    second motion must not affect the derivatives."""
     orbits = one_impact_orbits(*at, 1)
     first = jnp.stack([getattr(orbits, name)[0] for name in FIELDS])
     first = jnp.where(jnp.isinf(first), 0.0, first)
@@ -281,12 +281,12 @@ def numbers_of(at):
 
 @pytest.mark.slow
 def test_derivatives():
-    """Damped, undamped, at resonance and critically damped; and where there is no motion."""
+    """The cases are damped, undamped, resonance, critical damping, and three without a motion."""
     at = jnp.array([
         (0.9, 0.03, 0.5, 1.5), (0.9, 0.0, 0.5, 2.0), (1.0, 0.0, 0.4, 1.5), (0.8, 1.0, 0.5, 0.1),
     ])  # fmt: skip
     absent = jnp.array([(0.5, 0.0, 0.5, 2.0), (0.9, 0.0, 0.5, 9.0), (0.9, 0.1, 0.0, 2.0)])
-    h = 1e-5  # ξ may step below zero: the formulas continue there
+    h = 1e-5  # ξ - h may be negative, where the formulas still hold
     ahead, behind = (at[:, None] + sign * h * jnp.eye(4) for sign in (1, -1))
     rows = jnp.concatenate([at, absent, ahead.reshape(-1, 4), behind.reshape(-1, 4)])
     slopes = lambda at: (numbers_of(at), jax.jacfwd(numbers_of)(at), jax.jacrev(numbers_of)(at))
@@ -295,8 +295,8 @@ def test_derivatives():
     np.testing.assert_allclose(forward[:4], reverse[:4], rtol=1e-9, atol=1e-10)
     difference = (values[7:23] - values[23:]).reshape(4, 4, -1) / (2 * h)
     for i, case in enumerate(at):
-        # At resonance the section is at the impact itself, where its state jumps, and the
-        # multiplier is double, so that it has no derivative.
+        # At resonance the impact is on the section, where the state jumps, and the multiplier is
+        # double, so that it has no derivative.
         kept = slice(3, 5) if case[0] == 1 else slice(None)
         np.testing.assert_allclose(forward[i][kept], difference[i].T[kept], rtol=2e-6, atol=2e-7)
 

@@ -1,4 +1,4 @@
-"""Which scenes have their motions in closed form, and what is said of others."""
+"""Scenes with and without motions in closed form."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,14 +20,14 @@ def stopped_on_the_left():
 
 
 class Doubled(vi.CosineCrank):
-    """Of twice the throw."""
+    """A crank of twice the throw."""
 
     def slide(self, phase):
         return vi.CosineCrank().slide(phase)._replace(U=2 * jnp.cos(phase))
 
 
 class Hardening(vi.Scene):
-    """With a spring of its own."""
+    """A scene with an additional cubic spring."""
 
     def field(self, s, state, *modes):
         flow = super().field(s, state, *modes)
@@ -35,13 +35,13 @@ class Hardening(vi.Scene):
 
 
 class Softening(vi.RigidStop):
-    """Another law, of the speed of approach."""
+    """A stop whose restitution falls with the approach speed."""
 
     def rebound(self, V):
         return -self.restitution * V / (1 + 0.3 * jnp.abs(V))
 
 
-def of(kind=vi.Scene, crank=None, stop=None):
+def scene_of(kind=vi.Scene, crank=None, stop=None):
     crank, stop = crank or vi.CosineCrank(), stop or vi.RigidStop(1.5, 0.9)
     return kind(vi.Oscillator(0.05), vi.IdealDrive(0.9), (stop,), crank)
 
@@ -51,13 +51,13 @@ def falling(approach):
 
 
 @pytest.mark.slow
-def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
-    """Parts with a law of their own are refused, or carried as by steps."""
-    for other in (of(crank=Doubled()), of(Hardening)):
+def test_exact_flight_is_used_only_where_it_applies():
+    """Another crank or field raises. Flights with another restitution agree with adaptive steps."""
+    for other in (scene_of(crank=Doubled()), scene_of(Hardening)):
         with pytest.raises(ValueError, match=r"`ExactFlight` needs a .*(Doubled|Hardening)"):
             vi.simulate(other, other.start(), 8, method=vi.ExactFlight())
         assert isinstance(vi.preset(other), vi.FixedStep)
-    for law in (of(stop=Softening(1.5, 0.9)), of(stop=vi.RigidStop(1.5, falling))):
+    for law in (scene_of(stop=Softening(1.5, 0.9)), scene_of(stop=vi.RigidStop(1.5, falling))):
         exact, stepped = (
             vi.simulate(law, law.start(), 8, method=method, record="sections")
             for method in (vi.ExactFlight(), vi.Adaptive(rtol=1e-11))
@@ -69,10 +69,10 @@ def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
 @pytest.mark.parametrize(
     "scene, message",
     [
-        (lambda: of(crank=Doubled()), "`scene`.*`CosineCrank`.*Doubled"),
-        (lambda: of(Hardening), "`scene`.*Hardening` has another `field`"),
-        (lambda: of(stop=Softening(1.5, 0.9)), "`scene`.*has a law: Softening"),
-        (lambda: of(stop=vi.RigidStop(1.5, falling)), "`scene`.*has a law"),
+        (lambda: scene_of(crank=Doubled()), "`scene`.*`CosineCrank`.*Doubled"),
+        (lambda: scene_of(Hardening), "`scene`.*Hardening` has another `field`"),
+        (lambda: scene_of(stop=Softening(1.5, 0.9)), "`scene`.*has a law: Softening"),
+        (lambda: scene_of(stop=vi.RigidStop(1.5, falling)), "`scene`.*has a law"),
         (driven_by_a_motor, "`scene`.*IdealDrive.*Motor"),
         (lambda: ideal(crank=vi.SliderCrank(1 / 3)), "`scene`.*CosineCrank.*SliderCrank"),
         (stopped_on_the_left, r"`scene`.*on the right.*\['left'\]"),
@@ -80,11 +80,11 @@ def test_flight_in_closed_form_is_asked_for_only_where_it_is_that():
         (lambda: ideal(frequency_ratio=jnp.array([0.8, 0.9])), r"`scene`.*vmap.*\(2,\)"),
     ],
 )
-def test_says_what_is_wrong_with_the_scene(scene, message):
+def test_scenes_without_closed_form_raise(scene, message):
     with pytest.raises(ValueError, match=message):
         closed_form_orbits(scene())
 
 
-def test_says_what_is_wrong_with_the_cycles():
+def test_zero_cycles_raise():
     with pytest.raises(ValueError, match="`cycles` must be at least 1, but got 0"):
         closed_form_orbits(ideal(), cycles=0)

@@ -1,4 +1,4 @@
-"""Points of codimension two on boundaries of maps, where all of them are known in closed form."""
+"""Codimension-two points on boundaries of maps, compared with their closed forms."""
 
 import dataclasses
 import pickle
@@ -19,7 +19,7 @@ FADES = {(0, 1, 0, 0): 0.3}
 
 
 def special_of(machine, start, kind):
-    """The special points of a kind on the branch in a."""
+    """Return the special points of a kind on the branch in the parameter a."""
     orbit = vi.find_orbit(machine, at(*start), throw=True)
     branch = vi.continue_orbit(orbit, parameter="a", bounds=FREE[0])
     found = [point for point in branch.special if point.kind == kind]
@@ -31,7 +31,7 @@ def kinds_of(curve):
     return [point.kind for point in curve.special]
 
 
-def the(curve, kind):
+def only(curve, kind):
     (point,) = (point for point in curve.special if point.kind == kind)
     return point
 
@@ -47,7 +47,7 @@ def test_folds_meet_in_a_cusp():
     a, b = curve.parameters.T
     np.testing.assert_allclose((a - 0.2) ** 2 / 4, ((b - 0.1) / 3) ** 3, atol=1e-10)
     assert a.min() < -2 and a.max() > 2 and kinds_of(curve) == ["cusp"]
-    cusp = the(curve, "cusp")
+    cusp = only(curve, "cusp")
     np.testing.assert_allclose(cusp.parameters, [0.2, 0.1], atol=1e-10)
     assert float(cusp.orbit.state[0]) == pytest.approx(0, abs=1e-8)
     with pytest.raises(ValueError, match=r"at a cusp of a curve of fold\. .* has: fold-flip, "):
@@ -55,9 +55,9 @@ def test_folds_meet_in_a_cusp():
 
 
 def test_a_doubling_becomes_degenerate():
-    """x ← -(1 + a - 0.1b²) x + x² + b x³, with x' = -decay x³ before and after for half a cycle:
-    x - decay x³/2 + … It doubles at a = 0.1b², to stable motions where (f''/2)² + f'''/6 =
-    1 + b + decay is positive."""
+    """x ← -(1 + a - 0.1b²) x + x² + b x³. In the half cycles before and after, x' = -decay x³ gives
+    x - decay x³/2 + … The motion doubles at a = 0.1b², to stable motions where
+    (f''/2)² + f'''/6 = 1 + b + decay is positive."""
     decay = 1.0
     terms = {
         (1, 0, 0, 0): -1.0, (1, 0, 1, 0): -1.0, (1, 0, 0, 2): 0.1, (2, 0, 0, 0): 1.0,
@@ -82,7 +82,7 @@ def test_folds_meet_doublings():
     (fold,) = special_of(polynomial(-0.25, 0.0, *rows), (-0.5, 0.0), "fold")
     fold = pickle.loads(pickle.dumps(fold))
     curve = vi.boundary(fold, parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0)))
-    # From a file the curve goes on as if it had just been followed.
+    # A pickled curve has the same points and switches as the original.
     curve = dataclasses.replace(pickle.loads(pickle.dumps(curve)), ends=("bounds", "bounds"))
     assert kinds_of(curve) == ["fold-flip"]
     (meets,) = curve.special
@@ -91,9 +91,9 @@ def test_folds_meet_doublings():
     assert other.kind == "period-doubling" and "fold-flip" in kinds_of(other)
     a, b = other.parameters.T
     np.testing.assert_allclose(a, -((0.3 - b) ** 2), atol=1e-10)
-    np.testing.assert_allclose(the(other, "fold-flip").parameters, [0.0, 0.3], atol=1e-9)
+    np.testing.assert_allclose(only(other, "fold-flip").parameters, [0.0, 0.3], atol=1e-9)
     back = vi.boundary(
-        the(other, "fold-flip").switch(), parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0))
+        only(other, "fold-flip").switch(), parameter="b", bounds=((-1.0, 1.0), (-1.0, 1.0))
     )
     assert back.kind == "fold"
     np.testing.assert_allclose(back.parameters[:, 0], 0, atol=1e-9)
@@ -107,22 +107,22 @@ HENON = (
 )
 
 
-def point_of(x, b):
-    """Where there is a fixed point at x."""
+def parameters_at(x, b):
+    """Return (a, b) for a fixed point at x."""
     return np.array([(b + 1) * x + (1 - R) * x**2, b])
 
 
 def resonance(cosine):
     x = 2 * cosine / (R - 2)
-    return point_of(x, 1 + R * x)
+    return parameters_at(x, 1 + R * x)
 
 
 @pytest.fixture(scope="module")
 def torus():
     """The curve of Neimark–Sacker points of the map."""
-    a = point_of(0.3, 1.02)[0]
+    a = parameters_at(0.3, 1.02)[0]
     (point,) = special_of(polynomial(a, 1.02, *HENON), (0.3, 0.3), "neimark-sacker")
-    assert point.parameter == pytest.approx(point_of(0.2, 1.02)[0], abs=1e-9)
+    assert point.parameter == pytest.approx(parameters_at(0.2, 1.02)[0], abs=1e-9)
     return vi.boundary(point, parameter="b", bounds=FREE)
 
 
@@ -131,12 +131,12 @@ def test_neimark_sacker_points_and_their_resonances(torus):
     assert sorted(torus.ends) == ["resonance-1:1", "resonance-1:2"]
     a, b = torus.parameters.T
     x = 2 * np.cos(torus.angle) / (R - 2)
-    np.testing.assert_allclose(np.stack([a, b]), point_of(x, 1 + R * x), atol=1e-7)
+    np.testing.assert_allclose(np.stack([a, b]), parameters_at(x, 1 + R * x), atol=1e-7)
     np.testing.assert_allclose(np.abs(torus.multipliers), 1, atol=1e-7)
     order = ["resonance-1:1", "resonance-1:4", "resonance-1:3", "resonance-1:2"]
     assert kinds_of(torus) in (order, order[::-1])
     for kind, cosine in zip(order, (1, 0, -0.5, -1), strict=True):
-        found = the(torus, kind).parameters
+        found = only(torus, kind).parameters
         np.testing.assert_allclose(found, resonance(cosine), atol=1e-8)
     table = torus.to_xarray(along="point").to_dataframe()
     np.testing.assert_array_equal(table.angle, torus.angle)
@@ -150,8 +150,8 @@ def test_neimark_sacker_points_and_their_resonances(torus):
 
 @pytest.mark.parametrize("periods", [3, 4])
 def test_motions_of_three_and_of_four_periods(torus, periods):
-    """Beside the resonances the map has cycles, whatever becomes of them."""
-    point = the(torus, f"resonance-1:{periods}")
+    """Compare the cycles near a resonance with iterates of the map."""
+    point = only(torus, f"resonance-1:{periods}")
     for distance in (0.003, 0.01, 0.1):
         orbit = point.switch(distance=distance)
         x, y = first = np.array([float(value) for value in orbit.state])
@@ -166,7 +166,7 @@ def test_motions_of_three_and_of_four_periods(torus, periods):
         np.testing.assert_allclose(values, np.sort_complex(np.linalg.eigvals(M)), atol=1e-9)
 
 
-def test_a_picture_marks_them(torus):
+def test_plot_boundary_marks_special_points(torus):
     ax = vi.plot_boundary(torus)
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), torus.parameters)
     marked = {line.get_label(): line.get_xydata()[0] for line in ax.lines[1:]}
@@ -184,15 +184,15 @@ def test_a_picture_marks_them(torus):
     [("fold", "resonance-1:1", 1), ("period-doubling", "resonance-1:2", -1)],
 )
 def test_curves_on_which_neimark_sacker_points_begin(torus, kind, resonant, cosine):
-    """There and back: from the resonance at its end to the curve of folds or doublings."""
+    """Switch from a resonance to the curve of folds or doublings, and back."""
     bounds = ((-6.0, 6.0), (-2.0, 4.0))
-    curve = vi.boundary(the(torus, resonant).switch(), parameter="b", bounds=bounds)
+    curve = vi.boundary(only(torus, resonant).switch(), parameter="b", bounds=bounds)
     assert curve.kind == kind
     a, b = curve.parameters.T
     x = (1 + b) / (2 * R - 2) if kind == "fold" else (1 + b) / 2
     assert np.ptp(b) > 1
-    np.testing.assert_allclose(np.stack([a, b]), point_of(x, b), atol=1e-8)
-    point = the(curve, resonant)
+    np.testing.assert_allclose(np.stack([a, b]), parameters_at(x, b), atol=1e-8)
+    point = only(curve, resonant)
     np.testing.assert_allclose(point.parameters, resonance(cosine), atol=1e-8)
     again = vi.boundary(point.switch(), parameter="b", bounds=FREE)
     assert again.kind == "neimark-sacker" and sorted(again.ends) == sorted(torus.ends)
@@ -200,7 +200,7 @@ def test_curves_on_which_neimark_sacker_points_begin(torus, kind, resonant, cosi
 
 class Pitchfork(vi.AbstractMachine):
     """x' = (a - 0.1b²) x + (b - 0.5) x³ - x⁵, y' = -y: the rest x = 0 loses its symmetry at
-    a = 0.1b², to motions on the other side where b > 0.5."""
+    a = 0.1b², in a subcritical pitchfork where b > 0.5."""
 
     a: jax.Array = eqx.field(converter=jnp.asarray)
     b: jax.Array = eqx.field(converter=jnp.asarray)

@@ -1,4 +1,4 @@
-"""Points of codimension two of oscillators with a stop, beside closed forms and SciPy."""
+"""Codimension-two points of oscillators with a stop, compared with closed forms and shooting."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,27 +10,27 @@ from grazings import grazing_of
 pytestmark = pytest.mark.slow
 
 
-def the(curve, kind):
+def only(curve, kind):
     (point,) = (point for point in curve.special if point.kind == kind)
     return point
 
 
-# ω* = 2√(1 - ζ²) at ζ = .05, and the coefficients of both curves there (computed with 40 digits).
+# ω* = 2√(1 - ζ²) at ζ = 0.05, and the coefficients of both curves there (from 40 digits).
 MEETS, FOLD, DOUBLING = 1.99749843554, -33.9869, 2.443565
 
 
-def grazes(omega):
-    """F at which x'' + 0.1x' + x = F cos ωt just reaches x = 1."""
+def grazing_force(omega):
+    """Return F at which x'' + 0.1x' + x = F cos ωt just reaches x = 1."""
     return np.hypot(1 - omega**2, 0.1 * omega)
 
 
 def coefficient_at(omega, curve, reach):
-    """c of F = F_graze (1 + c (ω - ω*)²) on a curve in (F, ω), from points near ω* to it."""
+    """Return c of F = F_graze (1 + c (ω - ω*)²), fitted to points of a curve near ω*."""
     near = np.abs(curve.parameters[:, 1] - omega)
     near = curve.parameters[(near > 1e-3) & (near < reach)]
     away = near[:, 1] - omega
     assert len(away) > 6
-    share = (near[:, 0] / grazes(near[:, 1]) - 1) / away**2
+    share = (near[:, 0] / grazing_force(near[:, 1]) - 1) / away**2
     return np.polynomial.Polynomial.fit(away, share, 5)(0.0)
 
 
@@ -39,11 +39,10 @@ def coefficient_at(omega, curve, reach):
     [("fold", 1.95, FOLD), ("period-doubling", 2.04, DOUBLING)],
 )
 def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency, coefficient):
-    """Of x'' + 0.1x' + x = F cos ωt with k = 0.8 the motion with one impact a cycle folds at one
-    side of ω* and doubles at the other, at F = F_graze (1 + c (ω - ω*)²)."""
-
+    """For x'' + 0.1x' + x = F cos ωt with k = 0.8, the motion with one impact per cycle folds on
+    one side of ω* and doubles on the other, at F = F_graze (1 + c (ω - ω*)²)."""
     machine = vi.machines.Duffing(
-        amplitude=0.9 * grazes(frequency), frequency=frequency, damping=0.1, gap=1.0,
+        amplitude=0.9 * grazing_force(frequency), frequency=frequency, damping=0.1, gap=1.0,
         restitution=0.8, two_sided=False,
     )  # fmt: skip
     point = grazing_of(machine, "amplitude", (0.5, 5.0))
@@ -52,16 +51,16 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     bounds = ((0.5, 5.0), (1.8, 2.2))
     curve = vi.boundary(special, parameter="frequency", bounds=bounds, max_step=0.01)
     assert "grazing" in curve.ends
-    end = the(curve, "grazing")
-    np.testing.assert_allclose(end.parameters, [grazes(MEETS), MEETS], atol=1e-8)
+    end = only(curve, "grazing")
+    np.testing.assert_allclose(end.parameters, [grazing_force(MEETS), MEETS], atol=1e-8)
     assert "is lost" in end.detail and end.impact == 0
     assert coefficient_at(MEETS, curve, 3e-2) == pytest.approx(coefficient, rel=1e-4)
     other = vi.boundary(end.switch(), parameter="frequency", bounds=bounds)
     assert other.kind == "grazing"
     force, omega = other.parameters.T
-    np.testing.assert_allclose(force, grazes(omega), rtol=1e-11)
-    meets = the(other, "resonant-grazing")
-    np.testing.assert_allclose(meets.parameters, [grazes(MEETS), MEETS], atol=1e-10)
+    np.testing.assert_allclose(force, grazing_force(omega), rtol=1e-11)
+    meets = only(other, "resonant-grazing")
+    np.testing.assert_allclose(meets.parameters, [grazing_force(MEETS), MEETS], atol=1e-10)
     assert meets.detail.endswith("with one impact in 1 period")
 
 
@@ -73,14 +72,14 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     ],
 )
 def test_curves_that_leave_a_resonant_grazing(to, frequency, force, speed):
-    """Of the motion with one impact in two periods (Ghosh and Simpson, arXiv 2510.16218); the
-    numbers are those of a shooting code with 40 digits."""
+    """Compare the motion with one impact in two periods (Ghosh and Simpson, arXiv 2510.16218) with
+    a shooting code in 40 digits."""
     machine = vi.machines.Duffing(
         amplitude=0.36, frequency=0.79, damping=0.04, gap=1.0, restitution=0.9, two_sided=False
     )
     bounds = ((0.78, 0.85), (0.25, 0.45))
     point = grazing_of(machine, "frequency", bounds[0])
-    resonant = the(vi.boundary(point, parameter="amplitude", bounds=bounds), "resonant-grazing")
+    resonant = only(vi.boundary(point, parameter="amplitude", bounds=bounds), "resonant-grazing")
     wanted = 0.7998399840, 0.361673852989
     np.testing.assert_allclose(resonant.parameters, wanted, atol=1e-10)
     curve = vi.boundary(resonant.switch(to), parameter="amplitude", bounds=bounds)
@@ -95,7 +94,7 @@ def test_curves_that_leave_a_resonant_grazing(to, frequency, force, speed):
 
 
 class Two(vi.Mechanical):
-    """Two masses on springs, the first one shaken and with a stop at 1."""
+    """Two masses on springs. The first one is driven and has a stop at 1."""
 
     q = ("x", "y")
     mass = (1.0, 0.5)
@@ -116,9 +115,9 @@ class Two(vi.Mechanical):
         return {"x": pull - q.x - 0.1 * v.x + drive, "y": -pull}
 
 
-def test_folds_and_doublings_of_a_larger_machine_begin_apart():
-    """With four numbers in the state they leave the curve of grazings at points of their own, at
-    which the curves end that begin with a slow impact."""
+def test_folds_and_doublings_of_a_larger_machine_begin_at_different_points():
+    """With four state components, they leave the curve of grazings at different points. A curve
+    that starts with a slow impact ends at the same point."""
     bounds = ((0.001, 20.0), (0.93, 1.05))
     point = grazing_of(Two(), "amplitude", bounds[0])
     grazings = vi.boundary(point, parameter="frequency", bounds=bounds)
@@ -141,7 +140,7 @@ def test_folds_and_doublings_of_a_larger_machine_begin_apart():
 
 
 def test_a_fold_that_touches_the_stop():
-    """It does where the gap is what its motion reaches without a stop."""
+    """The gap there is the greatest position of the motion without a stop."""
     machine = vi.machines.Duffing(
         amplitude=0.1, frequency=1.4, damping=0.1, cubic=0.1, gap=8.0, two_sided=False
     )
@@ -152,7 +151,7 @@ def test_a_fold_that_touches_the_stop():
     bent = max(folds, key=lambda point: float(point.orbit.y_max))
     high, force = float(bent.orbit.y_max), bent.parameter
     curve = vi.boundary(bent, parameter="gap", bounds=((0.05, 2.0), (1.0, 10.0)))
-    end = the(curve, "grazing")
+    end = only(curve, "grazing")
     np.testing.assert_allclose(end.parameters, [force, high], atol=1e-9)
     assert end.impact is None and "touches a stop" in end.detail
     touches = vi.boundary(end.switch(), parameter="gap", bounds=((0.05, 2.0), (0.5, 6.0)))

@@ -1,5 +1,4 @@
-"""Orbits and branches of machines with friction, with a motor and with a section of their own, and
-the methods by which branches are followed."""
+"""Orbits and branches of a motor and of a relief valve, and the methods that branches accept."""
 
 import equinox as eqx
 import numpy as np
@@ -10,10 +9,9 @@ MOTOR = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene
 
 
 @pytest.mark.slow
-def test_a_branch_agrees_with_a_search():
-    """Two ways to an orbit of a motor and its multipliers: by the cycle map, whose derivative
-    passes the events as they are met, and from event to event, by the saltation matrix. Those of
-    friction, resets and other machines are in `test_units_of_branches`."""
+def test_a_branch_agrees_with_find_orbit():
+    """Compare orbit and multipliers by the cycle map, differentiated through its events, with those
+    from event to event, by saltation matrices. `test_units_of_branches` has other machines."""
     settled = vi.simulate(MOTOR, MOTOR.start(), 1, settle=200).last
     orbit = vi.find_orbit(MOTOR, settled, 2, throw=True)
     bounds = (0.88, 0.95)
@@ -28,8 +26,8 @@ def test_a_branch_agrees_with_a_search():
 
 
 @pytest.mark.slow
-def test_a_flow_has_a_zero_exponent():
-    """Along an autonomous motion nothing grows or fades."""
+def test_an_autonomous_motion_has_a_zero_exponent():
+    """A perturbation along an autonomous motion neither grows nor decays."""
     machine = vi.machines.ReliefValve(flow_rate=5.0)
     settled = vi.simulate(machine, machine.start(), 1, settle=300).last
     found = vi.lyapunov(machine, settled, 400, settle=20)
@@ -44,7 +42,7 @@ def test_a_flow_has_a_zero_exponent():
 
 
 class Counted(vi.AbstractMethod):
-    """A method of one's own, of so many equal steps in a cycle."""
+    """A user's method of equal steps."""
 
     steps_per_cycle: int = eqx.field(static=True, default=20)  # pyright: ignore
 
@@ -65,8 +63,8 @@ DUFFING = vi.machines.Duffing(
 
 
 @pytest.mark.slow
-def test_a_branch_is_followed_by_the_method_of_its_orbit_or_the_one_given():
-    """Of fixed steps: one's own, and `Taylor` without a tolerance; others are refused."""
+def test_a_branch_uses_the_method_of_its_orbit_or_the_argument():
+    """Accept a user's method and `Taylor` without a tolerance. Methods with a tolerance raise."""
     start = DUFFING.start(Y=0.709689275, V=0.323053158)
     options = {"parameter": "frequency", "bounds": (0.69, 0.71), "max_points": 2}
     orbit = vi.find_orbit(DUFFING, start, method=Counted(60))

@@ -1,4 +1,4 @@
-"""Numbers that are largest or least along a branch, beside closed forms."""
+"""Extrema of quantities along a branch, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,12 @@ ZETA, XI = "drive.frequency_ratio", 0.1
 
 @pytest.fixture(scope="module")
 def orbit():
-    """Of the linear oscillator, out of reach of its stop."""
+    """Return the orbit of a linear oscillator whose stop is out of reach."""
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=20.0, damping_ratio=XI)
     return vi.find_orbit(scene, scene.start(), throw=True)
 
 
-def test_unknown_names_are_refused(orbit):
+def test_unknown_names_raise(orbit):
     for names in ("speed", ("y_min", "speed")):
         with pytest.raises(
             ValueError, match=r"`extrema` must be one of .*'fastest_impact'|'y_max'"
@@ -23,9 +23,9 @@ def test_unknown_names_are_refused(orbit):
 
 
 @pytest.mark.slow
-def test_of_the_linear_oscillator(orbit):
-    """Resonance of the amplitude 1/√((1 - ζ²)² + (2ξζ)²), and of what is seen on the section, its
-    real part and that of its velocity."""
+def test_extrema_of_the_linear_oscillator(orbit):
+    """The amplitude is 1/√((1 - ζ²)² + (2ξζ)²). The section values are the real parts of the
+    complex response and of its velocity."""
     sought = ("y_max", "y_min", "section_Y", "section_V", "clearance", "multiplier", "duration")
     free = vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.5, 1.5), extrema=sought)
     places = free.to_xarray(along="special").to_dataframe()
@@ -42,4 +42,4 @@ def test_of_the_linear_oscillator(orbit):
     np.testing.assert_allclose(places, np.sqrt([1 - 2 * XI, 1 + 2 * XI]), atol=1e-11)
     (fastest,) = at["section_V"]  # Re iζ/(1 - ζ² + 2iξζ)
     assert fastest.parameter == pytest.approx(1.0, abs=1e-11)
-    assert not at["duration"] and not at["multiplier"]  # both change one way
+    assert not at["duration"] and not at["multiplier"]  # both are monotonic

@@ -1,4 +1,4 @@
-"""Found orbits beside the closed form, long simulations, differences and each other."""
+"""Compare found orbits with the closed form, long simulations, differences and each other."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ def near(scene, cycles, by=0.01):
     return scene.start(Y=closed.Y[0] - by, V=closed.V[0] - by)
 
 
-def test_the_cycles_of_an_orbit_are_taken_as_a_number():
+def test_cycles_accepts_the_number_of_an_orbit():
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1))
     again = vi.find_orbit(UNDAMPED, orbit.state, cycles=orbit.cycles)
     run = vi.simulate(UNDAMPED, orbit.state, orbit.cycles, method=vi.ExactFlight())
@@ -28,7 +28,7 @@ def test_the_cycles_of_an_orbit_are_taken_as_a_number():
 
 
 class VanDerPol(vi.AbstractMachine):
-    """Y'' - μ(1 - Y²)Y' + Y = 0, observed where Y and Y' have risen, by a guard with a kink."""
+    """Y'' - μ(1 - Y²)Y' + Y = 0, with a nonsmooth guard of the section: min(Y, 2Y') = 0.1."""
 
     mu: jax.Array
 
@@ -38,15 +38,15 @@ class VanDerPol(vi.AbstractMachine):
         return vi.OscillatorState(state.V, self.mu * (1 - state.Y**2) * state.V - state.Y)
 
 
-def test_an_orbit_is_the_motion_that_is_simulated():
-    """Under the same method, in a machine of one's own; the period is SciPy's."""
+def test_an_orbit_agrees_with_a_simulation():
+    """Compare with the same method in a simulation, and the period with SciPy."""
     machine = VanDerPol(jnp.asarray(5.0))
     start = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
     settled = vi.simulate(machine, start, 1, settle=40)
     orbit = vi.find_orbit(machine, settled.last)
     run = vi.simulate(machine, orbit.state, 1)
-    # Both meet the section to 1e-9 in the clock, which enters the period in second order. Steps by
-    # a tolerance fall otherwise where code is compiled otherwise: 3e-11 was seen.
+    # Both locate the section to 1e-9 in the clock, with a second-order effect on the period.
+    # Adaptive steps depend on how the code is compiled: 3e-11 was observed.
     assert float(orbit.duration) == pytest.approx(float(run.duration[0]), abs=1e-10)
     assert float(orbit.y_max) == pytest.approx(float(run.y_max[0]), abs=1e-12)
 
@@ -61,10 +61,10 @@ def test_an_orbit_is_the_motion_that_is_simulated():
     assert float(orbit.duration) == pytest.approx(np.diff(truth.t_events[0])[-1], abs=1e-9)
 
 
-def test_orbits_are_told_in_words():
+def test_text_and_tables_of_orbits():
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=1)
     assert "are listed" not in str(orbit)
-    # As where a body that comes to rest has more impacts than are logged.
+    # A body that comes to rest has more impacts than are logged.
     more = dataclasses.replace(orbit, impacts=jnp.asarray(38))
     assert "  only 1 of 38 impacts are listed: see `impact_log`" in str(more)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
@@ -102,8 +102,8 @@ def test_a_grid_of_closed_forms(cycles):
 
     closed, found, (trace, determinant) = both(zeta, k, d, xi)
     there = np.asarray(closed.admissible)[:, 0] & (np.asarray(closed.impact_speed)[:, 0] > 0.1)
-    # At resonance without damping the impact falls on the section, where the cycle map jumps: the
-    # state just after it has no neighbourhood in which a search could end.
+    # At resonance without damping the impact is on the section, where the cycle map jumps, so that
+    # a search cannot converge.
     phase = np.asarray(closed.impact_phase)[:, 0]
     there &= np.minimum(phase, 2 * np.pi * cycles - phase) > 1e-6
     assert there.sum() > (20 if cycles == 1 else 10)
@@ -133,7 +133,7 @@ def test_optax_finds_the_start_without_transient():
 
 
 @pytest.mark.slow
-def test_steps_of_a_tolerance_find_the_same():
+def test_adaptive_steps_find_the_same_orbit():
     exact, stepped = (
         vi.find_orbit(UNDAMPED, near(UNDAMPED, 2), cycles=2, method=method)
         for method in (None, vi.Adaptive(rtol=1e-11))
@@ -176,7 +176,7 @@ def test_many_guesses_in_one_program(compilations):
 
 
 @pytest.mark.slow
-def test_there_is_no_gradient_where_there_is_no_orbit():
+def test_a_gradient_without_an_orbit_is_nan():
     def lowest(zeta):
         scene = vi.Scene.ideal(
             frequency_ratio=zeta, restitution=0.56437685, gap=1.22917006, damping_ratio=0.02
@@ -189,11 +189,11 @@ def test_there_is_no_gradient_where_there_is_no_orbit():
 
 
 @pytest.mark.slow
-def test_multiple_shooting_where_one_arc_cannot():
+def test_multiple_shooting_converges_where_one_arc_fails():
     """200 cycles of the unstable 2π motion amplify rounding by 1.166^200 = 2e13."""
     closed = vi.closed_form_orbits(UNDAMPED)
-    # Right to rounding: from 1e-13 beside it the last arcs begin on another motion, and whether
-    # the search comes back from there is a matter of the last digits.
+    # The guess is exact to rounding. With an error of 1e-13 the last arcs begin on another motion,
+    # and the last digits decide whether the search converges.
     guess = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1)).state
     one = vi.find_orbit(UNDAMPED, guess, cycles=200)
     many = vi.find_orbit(UNDAMPED, guess, cycles=200, root_finder=vi.Newton(arcs=20))
@@ -204,12 +204,12 @@ def test_multiple_shooting_where_one_arc_cannot():
 
 
 @pytest.mark.slow
-def test_edges_are_told_apart():
+def test_results_of_unsuccessful_searches():
     results = vi.ORBIT_RESULTS
     twice = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1), cycles=2)
     assert twice.result == results.smaller_period and int(twice.cycles) == 1
-    assert float(twice.multipliers[0].real) == pytest.approx(-1.166036, abs=1e-6)  # printed
-    # Below ζ = 1/√2 the 2π impact motion is not yet born, and the free one passes the stop.
+    assert float(twice.multipliers[0].real) == pytest.approx(-1.166036, abs=1e-6)  # from the paper
+    # Three Newton steps from this guess do not converge.
     scene = vi.Scene.ideal(frequency_ratio=0.72, gap=1.5, restitution=0.8)
     none = vi.find_orbit(scene, scene.start(Y=-3.0, V=3.0), root_finder=vi.Newton(max_steps=3))
     assert none.result == results.no_orbit and "no orbit" in str(none)
@@ -227,8 +227,8 @@ def test_edges_are_told_apart():
 
 
 @pytest.mark.parametrize("section", [-2 * np.pi, np.pi])
-def test_every_section_is_searched_from(section):
-    """The search moves to a section far from impacts, which must not lie beyond a turn."""
+def test_the_search_accepts_every_section(section):
+    """The search moves its section away from impacts, but by no more than a turn."""
     scene = vi.Scene.ideal(
         frequency_ratio=3.2, restitution=0.9, gap=1.05, damping_ratio=0.002
     ).at_section(section)
@@ -241,7 +241,7 @@ def test_every_section_is_searched_from(section):
 
 @pytest.mark.slow
 def test_gradients_by_the_implicit_function_theorem():
-    """Of an extreme, a speed of impact and a multiplier."""
+    """Compare gradients of an extremum, an impact speed and a multiplier with differences."""
 
     def quantities(x):
         zeta, k, xi, gap = x
@@ -259,7 +259,7 @@ def test_gradients_by_the_implicit_function_theorem():
 
 @pytest.mark.slow
 def test_second_derivatives_where_a_body_may_rest():
-    """Beside differences of first ones; without multipliers, which would take third ones."""
+    """Compare with differences of gradients. Multipliers would need third derivatives."""
 
     def orbit(gap):
         scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5, gap=gap, damping_ratio=0.05)
@@ -272,7 +272,7 @@ def test_second_derivatives_where_a_body_may_rest():
     np.testing.assert_allclose(jax.grad(slope)(0.5), wanted, rtol=1e-6)
 
 
-def test_says_what_is_wrong():
+def test_invalid_arguments_raise():
     for arguments, message in (
         ({"cycles": 0}, "`cycles` must be at least 1"),
         ({"root_finder": vi.Newton(arcs=3), "cycles": 4}, "arcs that divides the 4 cycles"),

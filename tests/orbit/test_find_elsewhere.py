@@ -9,7 +9,7 @@ import vi_jax as vi
 
 
 class Sledges(eqx.Module):
-    """Places and speeds of two bodies."""
+    """Positions and velocities of two bodies."""
 
     x: jax.Array
     v: jax.Array
@@ -18,8 +18,8 @@ class Sledges(eqx.Module):
 
 
 class Coupled(vi.AbstractMachine):
-    """Two bodies on a spring that nothing else holds: x'' = y - x - c x' + cos s, y'' = x - y -
-    c y' + push; where they are as a pair is free."""
+    """Two bodies joined by a spring: x'' = y - x - c x' + cos s, y'' = x - y - c y' + push. Their
+    mean position is arbitrary."""
 
     damping: jax.Array = eqx.field(default=0.3, converter=jnp.asarray)
     push: jax.Array = eqx.field(default=0.0, converter=jnp.asarray)
@@ -38,15 +38,15 @@ class Coupled(vi.AbstractMachine):
 
 
 def sledge_speeds(damping):
-    """Of both bodies at s = 0: of their sum, which is free, and of their distance."""
+    """Return both velocities at s = 0, from the responses of sum and difference."""
     both, apart = 1 / (1j + damping), 1j / (1 + 1j * damping)
     return (both + apart).real / 2, (both - apart).real / 2
 
 
 @pytest.mark.slow
-def test_a_motion_that_may_be_anywhere_is_found_beside_the_guess():
-    """A multiplier is 1 to rounding: the equations of the orbit are singular."""
-    guess = Sledges(*map(jnp.asarray, (0.35, 0.1, 0.35, -0.2)))  # places of one size
+def test_a_motion_of_arbitrary_position_is_found_near_the_guess():
+    """A multiplier is 1 to rounding, so that the equations of the orbit are singular."""
+    guess = Sledges(*map(jnp.asarray, (0.35, 0.1, 0.35, -0.2)))  # equal positions
     orbit = vi.find_orbit(Coupled(), guess)
     assert bool(orbit.successful) and orbit.stability == vi.STABILITY.neutral
     assert not bool(orbit.stable)
@@ -71,7 +71,7 @@ def motor(torque, restitution, damping=0.5):
 
 
 @pytest.mark.slow
-def test_motor_orbits_are_where_long_simulation_settles():
+def test_motor_orbits_agree_with_long_simulations():
     for torque, restitution in ((2.0, 0.5), (100.0, 0.8)):
         scene = motor(torque, restitution)
         run = vi.simulate(scene, scene.start(), 400, method=vi.Adaptive(rtol=1e-10))

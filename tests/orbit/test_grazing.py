@@ -1,4 +1,4 @@
-"""What a grazing leads to, beside closed forms, the root map and flights of SciPy's."""
+"""Compare the outcome of a grazing with closed forms, published windows and SciPy."""
 
 import dataclasses
 
@@ -18,8 +18,8 @@ K = 0.8
 
 
 def overdamped(share):
-    """x'' + 10.1 x' + x = cos ωt, whose slower multiplier over a cycle is this share, and the
-    amplitude of its motion without impact, in closed form."""
+    """Return x'' + 10.1 x' + x = cos ωt with `share` as its slower multiplier, its frequency, and
+    the amplitude of its motion without impacts."""
     frequency = 0.2 * np.pi / np.log(1 / share)
     amplitude = 1 / np.hypot(1 - frequency**2, 10.1 * frequency)
     machine = vi.machines.Duffing(
@@ -37,13 +37,13 @@ def half():
 
 
 @pytest.mark.slow
-def test_local_map_is_that_of_the_closed_form(half):
+def test_local_map_agrees_with_the_closed_form(half):
     _, found, frequency, amplitude = half
     assert found.value == pytest.approx(amplitude, rel=1e-12)
     field = np.array([[0.0, 1.0], [-1.0, -10.1]])
     np.testing.assert_allclose(found.matrix, expm(field * 2 * np.pi / frequency), atol=1e-12)
     np.testing.assert_allclose(np.sort(np.abs(found.multipliers)), [0, 0.5], atol=1e-12)
-    # By the phase: h = gap - amplitude·cos, and dh/ds = -V/ω.
+    # With respect to the phase, h = gap - amplitude·cos and dh/ds = -V/ω.
     assert found.rate[0] == pytest.approx(amplitude, rel=1e-11)
     np.testing.assert_allclose(found.gradient, [[-1, 0]], atol=1e-15)
     jump = -np.sqrt(2 * amplitude) * (1 + K) * frequency
@@ -55,8 +55,8 @@ def test_local_map_is_that_of_the_closed_form(half):
 
 @pytest.mark.slow
 def test_periods_after_a_grazing(half):
-    """Windows of motions with one impact, chaos between, as in `scans/test_regimes.py` and by Chin,
-    Ott, Nusse and Grebogi (Phys. Rev. E 50, 1994)."""
+    """Windows of motions with one impact have chaos between them (`scans/test_regimes.py`; Chin,
+    Ott, Nusse and Grebogi, Phys. Rev. E 50, 1994)."""
     point, found, _, amplitude = half
     beyond = {4.0e-6: 7, 1.5e-5: 6, 3.5e-5: 0, 8.4e-5: 5}
     offsets = amplitude / (1 + np.array([*beyond])) - amplitude
@@ -69,8 +69,8 @@ def test_periods_after_a_grazing(half):
             assert impacts == 1 and far < offset < near
 
 
-def flown(field, hit, s0, s1, x):
-    """A flight of SciPy's with the stop's jump where it is met, or without a stop."""
+def fly(field, hit, s0, s1, x):
+    """Integrate by SciPy with the guard and the jump in `hit`, or without a stop if `None`."""
     options = {"rtol": 1e-12, "atol": 1e-14, "max_step": 0.02}
     while True:
         events = None if hit is None else hit[0]
@@ -81,8 +81,8 @@ def flown(field, hit, s0, s1, x):
 
 
 @pytest.mark.slow
-def test_discontinuity_mapping_beside_flights():
-    """A nonlinear oscillator: what an impact changes is of the order of y, to an error of y²."""
+def test_error_of_the_discontinuity_mapping():
+    """An impact changes the state at order y; the mapping has an error of order y²."""
     machine = vi.machines.Duffing(
         amplitude=0.5, frequency=0.9, damping=0.6, cubic=0.4, gap=1.5, restitution=K,
         two_sided=False,
@@ -103,10 +103,10 @@ def test_discontinuity_mapping_beside_flights():
     depths, errors = 0.02 / 2.0 ** np.arange(4), []
     for y in depths:
         deep = touch.state - y**2 * touch.gradient / (touch.gradient @ touch.gradient)
-        before = flown(field, None, touch.clock, touch.clock - 0.5, deep)
-        free = flown(field, None, touch.clock, touch.clock + 0.5, deep)
-        struck = flown(field, hit, touch.clock - 0.5, touch.clock + 0.5, before)
-        kicked = flown(field, None, touch.clock, touch.clock + 0.5, deep + y * touch.kick.vector)
+        before = fly(field, None, touch.clock, touch.clock - 0.5, deep)
+        free = fly(field, None, touch.clock, touch.clock + 0.5, deep)
+        struck = fly(field, hit, touch.clock - 0.5, touch.clock + 0.5, before)
+        kicked = fly(field, None, touch.clock, touch.clock + 0.5, deep + y * touch.kick.vector)
         errors.append(np.abs(struck - kicked).max())
         assert np.abs(struck - free).max() > 10 * errors[-1]
     slopes = np.diff(np.log(errors)) / np.diff(np.log(depths))
@@ -115,8 +115,8 @@ def test_discontinuity_mapping_beside_flights():
 
 @pytest.mark.slow
 def test_grazing_of_the_paper():
-    """Where the 2π motion of the paper is lost (its BB'): e₁ > 0 > e₂, so that an impact brings
-    the next but one nearer to the stop, and nothing near attracts."""
+    """The 2π motion of the paper is lost at BB'. Since e₁ > 0 > e₂, an impact brings the body
+    nearer to the stop two periods later, and there is no attractor near."""
     restitution, damping, zeta = 0.5, 0.04483682577, 0.70998
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=restitution, damping_ratio=damping)
     closed = vi.closed_form_orbits(scene)
@@ -133,7 +133,7 @@ def test_grazing_of_the_paper():
     assert found.entries[0] > 0 > found.entries[1]
     assert found.outcome == vi.SCENARIOS.jump
     assert found.checked[1] > 1e3 * found.checked[0] and found.agreement == 1
-    # What the machine does instead is in the picture; unasked, that nothing near attracts.
+    # The plot shows the distant motion of the machine or, without a check, no attractor.
     labels = [text.get_text() for text in vi.plot_grazing(found).get_legend().get_texts()]
     assert labels == [f"the machine, far away: {found.distant_in_words}", "grazing"]
     ax = vi.plot_grazing(dataclasses.replace(found, machine=None, far=None))
@@ -142,7 +142,7 @@ def test_grazing_of_the_paper():
 
 @pytest.mark.slow
 def test_two_stops_are_touched_at_once():
-    """A symmetric motion grazes on both sides; half a period leads from one to the other."""
+    """A symmetric motion grazes both stops, half a period apart."""
     machine = vi.machines.Duffing(amplitude=0.3, frequency=0.7, damping=0.4, gap=1.0)
     found = vi.grazing(grazing_of(machine, "gap", (0.3, 1.2)))
     assert found.kick.shape == (2, 2) and found.touched == "left stop and the right stop"
@@ -152,7 +152,7 @@ def test_two_stops_are_touched_at_once():
 
 
 class Limit(vi.AbstractMachine):
-    """A van der Pol oscillator against a stop, observed as it rises."""
+    """A van der Pol oscillator with a stop, and a section at rising Y."""
 
     gap: jax.Array | float = 2.2
 
@@ -167,7 +167,7 @@ class Limit(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_said_is_refused(half):
+def test_unsupported_points_raise(half):
     machine = Limit()
     start = vi.simulate(machine, vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(2.0)), 100).last
     point = grazing_of(machine, "gap", (1.8, 2.3), start)
@@ -182,9 +182,9 @@ def test_what_cannot_be_said_is_refused(half):
 
 
 @pytest.mark.slow
-def test_it_says_what_follows(half):
+def test_text_and_plot_of_a_grazing(half):
     _, found, _, _ = half
-    low, high = found.checked  # the machine agrees over decades
+    low, high = found.checked  # over decades of the offset
     assert high / low > 1e3 and found.agreement > 0.9
     assert set(found.machine.offset) <= set(found.forecast.offset)
     text = str(found)
@@ -205,8 +205,8 @@ def test_it_says_what_follows(half):
 
 @pytest.mark.slow
 def test_resonant_grazings_of_a_linear_oscillator():
-    """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, ω_d the damped frequency; it begins a motion of
-    n cycles where the entries before it are positive."""
+    """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, with the damped frequency ω_d. A motion of n
+    cycles begins there if all earlier entries are positive."""
     damped = np.sqrt(1 - 0.05**2)
     machine = vi.machines.Duffing(
         amplitude=0.01, frequency=1.9, damping=0.1, gap=1.0, restitution=K, two_sided=False
@@ -227,6 +227,6 @@ def test_resonant_grazings_of_a_linear_oscillator():
     ):
         amplitude, frequency = point.parameters
         assert frequency == pytest.approx(w, abs=1e-12)
-        # By the swing of the motion without impact at the stop, one away.
+        # There the motion without impacts has the gap, 1, as its amplitude.
         swing = np.hypot(1 - frequency**2, 0.1 * frequency)
         assert amplitude == pytest.approx(swing, rel=1e-10)

@@ -1,4 +1,4 @@
-"""What a grazing leads to, of a machine whose state is an array."""
+"""The outcome of a grazing for a machine whose state is an array."""
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import vi_jax as vi
 
 
 class InOneArray(eqx.Module):
-    z: jax.Array  # place and velocity
+    z: jax.Array  # position and velocity
 
 
 class Shaken(vi.AbstractMachine):
@@ -36,9 +36,9 @@ class Shaken(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_a_state_that_is_an_array_is_simulated_beside_its_forecast():
-    """The motion without impacts has the amplitude 1/√((1 - ω²)² + (2ξω)²), which is the gap where
-    it grazes, and a touch's second derivative is ω² of it."""
+def test_forecast_and_simulation_agree_for_an_array_state():
+    """The motion without impacts has amplitude 1/√((1 - ω²)² + (2ξω)²). This is the gap at the
+    grazing; the second derivative of a touch is ω² times the amplitude."""
     orbit = vi.find_orbit(Shaken(), InOneArray(jnp.zeros(2)), throw=True)
     branch = vi.continue_orbit(orbit, parameter="gap", bounds=(1.0, 1.25))
     (point,) = (p for p in branch.special if p.kind == "grazing" and p.impact is None)

@@ -1,4 +1,4 @@
-"""The local map of a grazing: root map, and signs of its entries."""
+"""The local map of a grazing: the square-root map, and the signs of its entries."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from vi_jax.orbit.grazing import _next_to_each_other, scenario_of, settled, wind
 
 
 def root_map(share):
-    """One multiplier and a kick that comes back: eₙ = λⁿ."""
+    """Return the map with one multiplier λ = `share` and the entries eₙ = λⁿ."""
     ones = np.ones((1, 1))
     return LocalMap(np.array([[[share]]]), ones, ones, np.array([0.5]), np.array([1.0]))
 
@@ -24,7 +24,7 @@ def root_map(share):
     ],
 )  # fmt: skip
 def test_thresholds_of_the_root_map(share, outcome, least, most):
-    """1/4 and 2/3 (Nusse, Ott and Yorke 1994), and the shares of aperiodic motion."""
+    """Thresholds are 1/4 and 2/3 (Nusse, Ott and Yorke 1994)."""
     local = root_map(share)
     offsets = -np.geomspace(1e-7, 1e-3, 1000) * share**2
     name, aperiodic = scenario_of(local, offsets, settled(local, offsets))
@@ -38,9 +38,9 @@ def test_windows_of_the_root_map_shrink_by_the_square_of_the_multiplier():
     assert np.isnan(found.stable[0]).all()
 
 
-def test_signs_of_the_entries_decide():
-    """One multiplier, by hand: a kick towards the stop leaves nothing near, and with a sum of
-    entries below zero the motion with an impact in each period is on the other side."""
+def test_signs_of_the_entries_decide_the_outcome():
+    """With one multiplier, a kick towards the stop leaves no attractor near. If the entries have a
+    negative sum, the motion with an impact in each period is on the other side."""
     offsets = -np.geomspace(1e-7, 1e-3, 60) * 0.25
     ones, half = np.ones((1, 1)), np.array([0.5])
     away = LocalMap(np.array([[[0.5]]]), ones, -ones, half, np.ones(1))
@@ -53,8 +53,8 @@ def test_signs_of_the_entries_decide():
     assert scenario_of(smooth, offsets, settled(smooth, offsets))[0] == "persistence"
 
 
-def test_periods_are_added_only_if_some_follow_each_other():
-    """5 and 7 without 6, as between two stops, are no period adding; nor are periods that fall."""
+def test_period_adding_needs_consecutive_periods():
+    """Neither 5 and 7 without 6, as between two stops, nor falling periods are period adding."""
     offsets = np.geomspace(1e-3, 1e-7, 30)
     for kinds, adding in (((5, 6, 7), True), ((5, 7, 9), False), ((7, 6, 5), False)):
         assert _next_to_each_other(offsets, np.repeat(kinds, 10)) == adding

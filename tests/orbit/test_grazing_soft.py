@@ -1,4 +1,4 @@
-"""Soft stops that are just touched, relaxed and prestressed."""
+"""Grazings of soft stops, relaxed and prestressed."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from grazings import grazing_of
 
 
 class Soft(vi.Mechanical):
-    """A shaken body with a soft stop."""
+    """A driven body with a soft stop."""
 
     q, mass, cycle = ("x",), (1.0,), 2 * jnp.pi
     stop: vi.SoftStop
@@ -33,10 +33,10 @@ def soft_grazing(stiffness=30.0, **options):
 
 
 @pytest.mark.slow
-def test_soft_stops():
-    """The impulse of a spring K over the parabola of the depth is K (4/3) √(2/a) y³. A prestressed
-    one, at which the field jumps, turns the body back with a + F0 by its force F0. A dashpot that
-    may not pull has an impulse of y²."""
+def test_orders_and_kicks_of_soft_stops():
+    """Over a parabola of depth, a spring of stiffness K gives the impulse K (4/3) √(2/a) y³. At a
+    prestress F0 the field jumps, and the body turns back with the acceleration a + F0. A dashpot
+    that cannot pull gives an impulse of order y²."""
     for stiffness in (1e-3, 1e8, 30.0):
         found = vi.grazing(soft_grazing(stiffness), check=False)
         assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
@@ -55,7 +55,7 @@ def test_soft_stops():
 
 @pytest.mark.slow
 def test_grazings_from_the_side_of_contact():
-    """Touch and release vanish at once. The push at a grazing is that of the linear oscillator."""
+    """Touch and release vanish together. Compare the push with that of the linear oscillator."""
     machine, bounds = Soft(vi.SoftStop(1.0, 20.0, restitution=0.8), 0.9), ((0.2, 1.0), (0.5, 1.5))
     start = vi.simulate(machine, machine.start(), 1, settle=200).last
     point = grazing_of(machine, "push", bounds[0], start)

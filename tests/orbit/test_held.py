@@ -1,4 +1,4 @@
-"""Branches on which numbers of the motion are held and others of the machine are free."""
+"""Branches with fixed quantities of the motion and further free parameters of the machine."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def linear():
     return vi.find_orbit(scene, scene.start(), throw=True)
 
 
-def held(orbit, size):
+def branch_of_amplitude(orbit, size):
     return vi.continue_orbit(
         orbit, parameter=ZETA, bounds=(0.5, 1.5), free={XI: (0.001, 0.5)}, fixed={"y_max": size}
     )
@@ -30,8 +30,8 @@ def held(orbit, size):
 
 @pytest.mark.slow
 def test_an_amplitude_is_held_by_the_damping(linear, monkeypatch):
-    """1/√((1 - ζ²)² + (2ξζ)²) = A; the branch ends where no damping would be needed."""
-    branch = held(linear, 3.0)
+    """The amplitude 1/√((1 - ζ²)² + (2ξζ)²) is fixed. The branch ends at the least damping."""
+    branch = branch_of_amplitude(linear, 3.0)
     np.testing.assert_allclose(branch.y_max, 3.0, atol=1e-12)
     zeta, xi = branch.parameter, branch.free[XI]
     np.testing.assert_allclose(np.hypot(1 - zeta**2, 2 * xi * zeta), 1 / 3, atol=1e-12)
@@ -40,17 +40,17 @@ def test_an_amplitude_is_held_by_the_damping(linear, monkeypatch):
     data = branch.to_xarray()
     np.testing.assert_array_equal(data[XI], xi)
     assert vi.plot_branch(branch, x=XI, y="multiplier").get_xlabel() == "damping ratio ξ"
-    # Another value is not another program.
+    # Another value compiles no other program.
     traced, plain = [], _conditions.quantity_of
     monkeypatch.setattr(_conditions, "quantity_of", lambda *a: (traced.append(a[-1]), plain(*a))[1])
-    branch = held(linear, 2.9)
+    branch = branch_of_amplitude(linear, 2.9)
     assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
     assert f"held: y_max = 2.9 a; by {XI} in [0.001, " in str(branch)
 
 
 @pytest.fixture(scope="module")
 def struck():
-    """Motions with one impact whose least position is held by moving the stop."""
+    """Return a branch of motions with one impact, of fixed least position and free gap."""
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5)
     near = vi.closed_form_orbits(scene)
     orbit = vi.find_orbit(scene, scene.start(Y=near.Y[0] - 1e-3, V=near.V[0]), throw=True)
@@ -66,8 +66,8 @@ def closed(zeta, gap):
 
 
 @pytest.mark.slow
-def test_a_motion_with_one_impact_beside_its_closed_form(struck):
-    inside = slice(1, None)  # at the first point its impact is lost
+def test_a_motion_with_one_impact_agrees_with_its_closed_form(struck):
+    inside = slice(1, None)  # the first point has lost its impact
     found = closed(jnp.asarray(struck.parameter), jnp.asarray(struck.free[GAP]))
     apart = np.abs(np.asarray(found.impact_speed) - struck.impact_speed)
     which = np.argmin(np.where(np.isnan(apart), np.inf, apart), axis=1)[inside]
@@ -80,8 +80,8 @@ def test_a_motion_with_one_impact_beside_its_closed_form(struck):
 
 
 @pytest.mark.slow
-def test_special_points_where_numbers_are_held(struck):
-    """The impact is lost where the free oscillator itself has the amplitude, 1/(1 - ζ²) = 3."""
+def test_special_points_with_a_fixed_quantity(struck):
+    """The impact is lost where the oscillator without a stop has amplitude 1/(1 - ζ²) = 3."""
     lost, doubling = struck.special
     assert (lost.kind, doubling.kind) == ("grazing", "period-doubling")
     assert lost.parameter == pytest.approx(np.sqrt(2 / 3), abs=1e-9)
@@ -94,7 +94,7 @@ def test_special_points_where_numbers_are_held(struck):
 
     at = brentq(beyond, doubling.parameter - 1e-3, doubling.parameter + 1e-3, xtol=1e-13)
     assert doubling.parameter == pytest.approx(at, abs=1e-8)
-    # From there on the gap is a number like any other.
+    # After a switch the gap is an ordinary parameter.
     doubled = doubling.switch()
     assert int(doubled.cycles) == 2 and float(doubled.machine.stops[0].gap) == gap
     curve = vi.boundary(
@@ -117,12 +117,12 @@ def test_special_points_where_numbers_are_held(struck):
         ({"free": {XI: (0.5, 0.0)}, "fixed": {"y_max": 3.0}}, r"`free\['.*'\]` must be two finite"),
     ],
 )
-def test_says_what_is_wrong(linear, arguments, message):
+def test_invalid_arguments_raise(linear, arguments, message):
     with pytest.raises(ValueError, match=message):
         vi.continue_orbit(linear, parameter=ZETA, bounds=(0.5, 1.5), **arguments)
 
 
-def test_an_orbit_without_multipliers_is_refused_by_what_needs_them(linear):
+def test_calls_that_need_multipliers_raise_without_them(linear):
     without = dataclasses.replace(linear, multipliers=jnp.nan * linear.multipliers)
     given = {"free": {XI: (0.001, 0.5)}, "fixed": {"multiplier": 0.5}}
     for call in (
@@ -139,8 +139,8 @@ def test_an_orbit_without_multipliers_is_refused_by_what_needs_them(linear):
 
 @pytest.mark.slow
 def test_a_multiplier_is_held_until_another_is_as_large():
-    """Two multipliers μ, ν of a motion with one impact have the product (k exp(-2π ξ/ζ))², so that
-    they meet where k exp(-2π ξ/ζ) = |μ|."""
+    """The two multipliers of a motion with one impact have the product (k exp(-2π ξ/ζ))². They
+    have equal size where k exp(-2π ξ/ζ) equals the fixed size."""
     zeta, xi = 0.9, 0.05
     scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.5, gap=1.6, damping_ratio=xi)
     near = vi.closed_form_orbits(scene)
@@ -152,14 +152,14 @@ def test_a_multiplier_is_held_until_another_is_as_large():
         vi.continue_orbit(orbit, parameter="stops.0.restitution", bounds=(0.3, end), **given)
         for end in (0.99, size * np.exp(2 * np.pi * xi / zeta) + 1e-4)
     )
-    assert branch.ends[1] == cut.ends[1] == "multiplier"  # though a bound lies in the same step
+    assert branch.ends[1] == cut.ends[1] == "multiplier"  # although a bound lies in the same step
     assert cut.parameter[-1] == pytest.approx(branch.parameter[-1], abs=1e-8)
     np.testing.assert_allclose(branch.multiplier, size, rtol=1e-6)
     assert branch.parameter[-1] == pytest.approx(size * np.exp(2 * np.pi * xi / zeta), abs=1e-8)
 
 
 def test_a_pair_of_multipliers_is_held_until_it_turns_real():
-    """On a matrix of known eigenvalues: those of its second compound are their products."""
+    """The second compound of a matrix has the products of its eigenvalues as eigenvalues."""
     turn = 0.7 * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
     matrix = np.zeros((3, 3))
     matrix[:2, :2], matrix[2, 2] = turn, 0.3

@@ -1,4 +1,4 @@
-"""Where a rest on a stop is lost or divided, followed in two parameters."""
+"""Curves in two parameters on which a rest on a stop is lost or divided."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,17 +10,17 @@ from two_coupled import Coupled, settled
 ZETA = "drive.frequency_ratio"
 
 
-def found(machine, start, cycles=40):
+def search(machine, start, cycles=40):
     last = vi.simulate(machine, start, 1, settle=cycles).last
     return vi.find_orbit(machine, last, impact_log=64, throw=True)
 
 
 @pytest.mark.slow
 def test_a_lost_rest_of_one_body():
-    """Beside flights in 60 digits at the place and at the ends of both curves, and beside
-    simulations in between. The steps are so long that the corrector begins far off."""
+    """Compare the point and the ends of both curves with flights in 60 digits, and the curves
+    between with simulations. Long steps make the corrector begin far off."""
     scene = vi.Scene.ideal(frequency_ratio=0.6, restitution=0.5, gap=0.0, damping_ratio=0.05)
-    branch = vi.continue_orbit(found(scene, scene.start(Y=0.0)), parameter=ZETA, bounds=(0.5, 0.8))
+    branch = vi.continue_orbit(search(scene, scene.start(Y=0.0)), parameter=ZETA, bounds=(0.5, 0.8))
     (point,) = branch.special
     assert point.kind == "rest" and point.parameter == pytest.approx(0.65836157060536189, abs=1e-11)
     beyond = point.switch()
@@ -37,11 +37,11 @@ def test_a_lost_rest_of_one_body():
         zeta, other = curve.parameters[-3]
         numbers = {"restitution": 0.5, "gap": 0.0, "damping_ratio": 0.05, name: other}
         machine_at = lambda zeta, numbers=numbers: vi.Scene.ideal(frequency_ratio=zeta, **numbers)
-        assert rest_beside(machine_at, zeta) == [1, 0]
+        assert rests_around(machine_at, zeta) == [1, 0]
 
 
-def rest_beside(machine_at, value, by=1e-6):
-    """The rests in a cycle of settled simulations on both sides of a value."""
+def rests_around(machine_at, value, by=1e-6):
+    """Return the rests in a cycle of settled simulations on both sides of a value."""
 
     def rests(machine):
         start = machine.start(Y=-0.7) if isinstance(machine, vi.Scene) else machine.start()
@@ -52,16 +52,16 @@ def rest_beside(machine_at, value, by=1e-6):
 
 @pytest.mark.slow
 def test_a_rest_that_is_divided():
-    """Two bodies. The place, the curve and the multipliers are those of a shooting code with exact
-    hops; on both sides of the curve simulations count the rests."""
-    way = {"parameter": "omega", "method": vi.FixedStep(steps_per_cycle=24)}
+    """Compare point, curve and multipliers of two bodies with a shooting code with exact hops, and
+    the rests on both sides of the curve with simulations."""
+    options = {"parameter": "omega", "method": vi.FixedStep(steps_per_cycle=24)}
     bounds, orbit = (0.346, 0.3505), settled(Coupled())
-    branch = vi.continue_orbit(orbit, bounds=bounds, step=0.3, max_step=0.3, **way)
+    branch = vi.continue_orbit(orbit, bounds=bounds, step=0.3, max_step=0.3, **options)
     assert branch.ends == ("rest", "bounds") and (branch.rests == 1).all()
     point = branch.special[0]
     divided = point.switch()
     assert "divided" in point.detail and divided.rests == 2
-    back = vi.continue_orbit(divided, bounds=(0.34708, 0.348), **way)
+    back = vi.continue_orbit(divided, bounds=(0.34708, 0.348), **options)
     joined = back.special[-1]
     assert "become one" in joined.detail and joined.switch().rests == 1
     assert joined.parameter == pytest.approx(point.parameter, abs=1e-5)
@@ -79,21 +79,21 @@ def test_a_rest_that_is_divided():
 
 
 @pytest.mark.exhaustive
-def test_a_ball_on_its_table():
-    """Beside simulations on both sides of the curve."""
+def test_a_lost_rest_of_a_ball_on_its_table():
+    """Compare with simulations on both sides of the curve."""
     machine, bounds = vi.machines.BouncingBall(acceleration=1.3, restitution=0.4), (1.2, 2.0)
-    orbit = found(machine, machine.start(), 60)
+    orbit = search(machine, machine.start(), 60)
     point = vi.continue_orbit(orbit, parameter="acceleration", bounds=bounds).special[-1]
     assert point.kind == "rest"
     curve = vi.boundary(point, parameter="restitution", bounds=(bounds, (0.35, 0.55)))
     for i in (2, -3):
         value, k = curve.parameters[i]
-        rests = rest_beside(lambda a, k=k: type(machine)(acceleration=a, restitution=k), value)
+        rests = rests_around(lambda a, k=k: type(machine)(acceleration=a, restitution=k), value)
         assert rests[0] == int(orbit.rests) and rests[1] < rests[0]
 
 
 class Switched(vi.AbstractMachine):
-    """x'' + 0.1 x' + x = cos 0.6 t, x ≤ 0, with a switch at a phase, which changes nothing."""
+    """x'' + 0.1 x' + x = cos 0.6 t, x ≤ 0, with a switch at `phase` that changes nothing."""
 
     phase: float = 1.2
 
@@ -115,10 +115,10 @@ class Switched(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_an_event_before_a_chatter_is_over():
-    """The body rests for 1.1788045220098, by hops in 60 digits, until the drive changes its sign:
-    the switch cannot come before that rest begins."""
-    orbit = found(Switched(), Switched().start())
+def test_an_event_reaches_the_end_of_a_chatter():
+    """The rest begins 1.1788045220098 before the drive changes its sign, by hops in 60 digits. The
+    branch ends where the switch reaches the beginning of the rest."""
+    orbit = search(Switched(), Switched().start())
     branch = vi.continue_orbit(orbit, parameter="phase", bounds=(0.5, 1.4), progress=False)
     assert branch.ends == ("grazing", "bounds") and (branch.rests == 1).all()
     (point,) = branch.special

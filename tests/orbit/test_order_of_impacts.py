@@ -1,4 +1,4 @@
-"""Where two impacts of a motion fall together they come in the other order beyond."""
+"""Two impacts that coincide on a branch come in the other order beyond."""
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ def field(s, x, shift, cos):
 
 
 def after_a_cycle(x, shift):
-    """The state a cycle later and which body strikes, by SciPy."""
+    """Return the state after a cycle and the bodies that strike, by SciPy."""
     s, guards, struck = 0.0, [lambda s, y: y[0] - 0.3, lambda s, y: y[2] - 0.3], []
     while True:
         rate = lambda s, y: field(s, y, shift, np.cos)

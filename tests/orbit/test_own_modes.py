@@ -1,4 +1,4 @@
-"""Orbits of machines with modes of their own, which a state alone does not tell."""
+"""Orbits of machines with discrete modes that do not follow from the state."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 class Flipped(vi.AbstractMachine):
-    """x'' = -(1 + 0.3 m) x - 0.04 x' + cos 2.2 s before a stop; each impact turns m over."""
+    """x'' = -(1 + 0.3 m) x - 0.04 x' + cos 2.2 s with a stop; each impact changes m to -m."""
 
     depth: Any = 0.3
     contacts: tuple = (vi.RigidStop(0.1, 0.8, modes=lambda machine, s, x, m: (-m,)),)
@@ -27,7 +27,7 @@ class Flipped(vi.AbstractMachine):
 
 
 def settled(cycles):
-    """Y, V and m after so many cycles, by SciPy from impact to impact."""
+    """Return Y, V and m after some cycles, by SciPy from impact to impact."""
     period, x, m = 2 * np.pi / 2.2, np.array([-1.4, 0.0]), 1.0
 
     def field(t, x, m):
@@ -57,7 +57,7 @@ def orbit(start):
     return vi.find_orbit(Flipped(), start, 2)
 
 
-def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orbit):
+def test_modes_that_alternate_double_the_period(start, orbit):
     once = vi.find_orbit(Flipped(), start)
     assert bool(once.result == vi.ORBIT_RESULTS.other_modes) and not bool(once.successful)
     assert int(orbit.cycles) == 2 and bool(orbit.stable)
@@ -67,7 +67,7 @@ def test_a_motion_that_comes_back_in_other_modes_has_twice_the_period(start, orb
     assert float(orbit.sections.Y.max()) == pytest.approx(-0.461410495, abs=1e-9)
 
 
-def test_all_orbits_finds_none_in_other_modes(start):
+def test_all_orbits_rejects_returns_in_other_modes(start):
     region = {"start.Y": (-2.0, 0.1), "start.V": (-2.0, 2.0)}
     found = vi.all_orbits(Flipped(), 2, region=region, starts=8, start=start)
     once, twice = found.searched
@@ -75,7 +75,7 @@ def test_all_orbits_finds_none_in_other_modes(start):
     np.testing.assert_allclose(found.orbits[0].sections.Y.max(), -0.461410495, atol=1e-9)
 
 
-def test_exponents_and_runs_go_on_in_an_orbits_modes(orbit):
+def test_exponents_and_simulations_start_in_the_modes_of_an_orbit(orbit):
     run = vi.simulate(orbit.machine, orbit.state, 2)
     np.testing.assert_allclose(run.sections.Y[:2], orbit.sections.Y, atol=1e-8)
     np.testing.assert_allclose(run.last.Y, orbit.state.Y, atol=1e-8)
@@ -94,7 +94,7 @@ def test_a_branch_and_a_table_keep_the_modes(orbit):
     np.testing.assert_array_equal(kept, run.modes[0])
 
 
-def test_kicks_are_refused_where_a_state_does_not_tell_its_modes(orbit):
-    """The modes of a start were those in which a motion begins, whatever the orbit's were."""
+def test_minimal_kick_raises_if_modes_do_not_follow_from_the_state(orbit):
+    """Perturbed starts have the machine's initial modes, which are not those of the orbit."""
     with pytest.raises(ValueError, match="must have modes that follow from its state"):
         vi.minimal_kick(orbit.machine, orbit, progress=False)

@@ -1,4 +1,4 @@
-"""A machine's own averages and quantities along orbits and branches."""
+"""Averages and quantities that a machine defines, along orbits and branches."""
 
 import itertools
 
@@ -11,7 +11,7 @@ from shaken_oscillator import Shaken
 
 
 def missing(power, orbit):
-    """Of the power taken what is neither lost in damping nor in impacts; zero for an orbit."""
+    """Return the power taken minus the losses in damping and impacts, zero for an orbit."""
     dissipated = 0.5 * (1 - 0.6**2) * jnp.nansum(orbit.impact_speed**2) / orbit.duration
     return power["taken"] - power["lost"] - dissipated
 
@@ -29,7 +29,7 @@ def branch(orbit):
 
 
 @pytest.mark.slow
-def test_an_orbit_takes_the_power_that_it_loses(orbit):
+def test_power_balance_of_an_orbit(orbit):
     assert bool(orbit.successful)
     np.testing.assert_allclose(missing(orbit.averages, orbit), 0.0, atol=1e-8)
     assert f"mean taken: {float(orbit.averages['taken']):.9g} W" in repr(orbit)
@@ -41,7 +41,7 @@ def test_an_orbit_takes_the_power_that_it_loses(orbit):
 
 
 @pytest.mark.slow
-def test_along_a_branch(branch, orbit):
+def test_quantities_along_a_branch(branch, orbit):
     assert len(branch.parameter) > 3
     here = branch.at(0.8)[0]
     np.testing.assert_allclose(here.averages["taken"], orbit.averages["taken"], atol=1e-8)
@@ -59,10 +59,10 @@ def test_along_a_branch(branch, orbit):
 
 
 @pytest.mark.slow
-def test_pictures_by_name(branch):
+def test_plots_of_quantities(branch):
     ax = vi.plot_branch(branch, y="taken")
     assert ax.get_ylabel() == "mean taken (W)"
-    drawn = ax.lines[0].get_ydata()  # the first of its parts, stable or not
+    drawn = ax.lines[0].get_ydata()  # of the first segment, stable or not
     np.testing.assert_array_equal(drawn, branch.averages["taken"][: len(drawn)])
     assert len(drawn) > 5
     with pytest.raises(ValueError, match=r"lost.*section_push.*'power'"):
@@ -70,7 +70,7 @@ def test_pictures_by_name(branch):
 
 
 @pytest.mark.slow
-def test_tables_are_checked(branch):
+def test_invalid_tables_raise(branch):
     with pytest.raises(TypeError, match="'word' is 'high'"):
         branch.table(lambda at: {"word": "high"})
     counts = itertools.count()

@@ -1,7 +1,7 @@
-"""Bifurcations that fall together, or nearly so; branches that begin at a special point.
+"""Bifurcations that coincide, or nearly so; branches that begin at a special point.
 
-The numbers of the two Duffing oscillators were found by an independent shooting code, and are
-checked here by their variational equations, integrated by SciPy.
+The numbers of the two Duffing oscillators are from an independent shooting code. SciPy checks them
+by variational equations.
 """
 
 import functools
@@ -17,7 +17,7 @@ from kicked import Kicked, at
 
 
 class Twins(vi.AbstractMachine):
-    """Y'' + 0.15 Y' - Y + Y³ = f cos ωs twice, coupled by κ (Y2 - Y1)."""
+    """Two oscillators Y'' + 0.15 Y' - Y + Y³ = f cos ωs, coupled by κ (Y2 - Y1)."""
 
     force: float = 0.15
     coupling: float = 0.0
@@ -29,7 +29,6 @@ class Twins(vi.AbstractMachine):
         return 2 * jnp.pi / self.omega
 
     def field(self, s, state):
-        """Both oscillators; the second one's force is larger by a share."""
         y1, v1, y2, v2 = (state[name] for name in ("y1", "v1", "y2", "v2"))
         push, pull = self.force * jnp.cos(self.omega * s), self.coupling * (y2 - y1)
         return {
@@ -40,7 +39,7 @@ class Twins(vi.AbstractMachine):
 
 @functools.cache
 def branch_of(coupling, excess=0.0):
-    """The branch of the motion in one well that both oscillators share."""
+    """Return the branch on which both oscillators move alike in one well."""
     machine = Twins(coupling=coupling, excess=excess)
     start = {"y1": 0.9, "v1": 0.2, "y2": 0.9, "v2": 0.2}
     orbit = vi.find_orbit(machine, vi.simulate(machine, start, 200).last, 1, throw=True)
@@ -48,12 +47,12 @@ def branch_of(coupling, excess=0.0):
 
 
 def places(branch, kind):
-    """The parameters of the special points of a kind, in increasing order."""
+    """Return the sorted parameters of the special points of a kind."""
     return sorted(point.parameter for point in branch.special if point.kind == kind)
 
 
 def monodromy(point):
-    """The monodromy matrix at a special point, by SciPy."""
+    """Return the monodromy matrix at a special point, by SciPy."""
     machine = point.orbit.machine
     numbers = machine.force, machine.coupling, machine.excess, machine.omega
     f, k, e, omega = map(float, numbers)
@@ -80,9 +79,9 @@ def monodromy(point):
 
 
 @pytest.mark.slow
-def test_of_two_oscillators_each_bifurcation_is_seen():
-    """Uncoupled, slightly coupled and slightly different: within one step two multipliers pass 1,
-    or -1, and leave no sign in the determinants."""
+def test_each_bifurcation_of_two_oscillators_is_found():
+    """Two multipliers of uncoupled, weakly coupled or slightly different oscillators pass 1 or -1
+    within one step, so that no determinant changes its sign."""
     one, weak, strong, unlike = (branch_of(*at) for at in ((0.0,), (0.003,), (0.01,), (0.0, 0.001)))
     doublings = [places(branch, "period-doubling") for branch in (one, weak, strong, unlike)]
     np.testing.assert_allclose(doublings[0], [0.19582944], atol=1e-8)
@@ -101,8 +100,8 @@ def test_of_two_oscillators_each_bifurcation_is_seen():
 
 @pytest.mark.slow
 def test_a_branch_that_leaves_another_to_both_sides():
-    """The one on which both oscillators differ touches the other one where its own parameter turns
-    back: that is a branch point, and no fold, and a switch leads to the other one."""
+    """The branch of unequal motions turns back in its parameter where it meets that of equal ones.
+    This is a branch point, not a fold, and a switch leads to the other branch."""
     branch = branch_of(0.1)
     wanted = [0.1034185332, 0.1281540734]
     np.testing.assert_allclose(places(branch, "branch-point"), wanted, atol=1e-10)
@@ -117,8 +116,8 @@ def test_a_branch_that_leaves_another_to_both_sides():
 
 @pytest.mark.slow
 def test_a_curve_of_folds_of_both_oscillators():
-    """Two multipliers are 1 all along it. It is that of one oscillator: folds in (f, ω) that meet
-    in a cusp, found by an independent shooting code."""
+    """Two multipliers are 1 along the curve, which is that of one oscillator. Compare its cusp with
+    an independent shooting code."""
     fold = next(point for point in branch_of(0.0).special if point.kind == "fold")
     curve = vi.boundary(fold, parameter="omega", bounds=((0.02, 0.25), (1.0, 1.4)))
     assert curve.ends == ("bounds", "bounds")
@@ -132,8 +131,8 @@ def test_a_curve_of_folds_of_both_oscillators():
 
 @pytest.mark.slow
 def test_curves_of_branch_points():
-    """Both end where the oscillators are uncoupled and fold, and one touches the curve of folds:
-    that is no resonance, since each multiplier 1 has its own eigenvector."""
+    """Both curves end at folds of the uncoupled oscillators. One touches the curve of folds, which
+    is no resonance, since the double multiplier 1 has two eigenvectors."""
     points = [point for point in branch_of(0.1).special if point.kind == "branch-point"]
     bounds = ((0.02, 0.25), (0.0, 0.3))
     for point, fold in zip(points, (0.1082731067, 0.0799657809), strict=True):
@@ -149,7 +148,7 @@ def test_curves_of_branch_points():
 
 @pytest.mark.slow
 def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
-    """The motion that stays off the stop is the linear one, of the amplitude that grazes."""
+    """The gap at the grazing is the amplitude of the linear motion."""
     zeta, xi = 0.31, 0.25
     grazes = 1 / np.hypot(1 - zeta**2, 2 * xi * zeta)
     scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.76, gap=1.2, damping_ratio=xi)
@@ -162,8 +161,8 @@ def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
     assert again.parameter.min() == pytest.approx(grazes, abs=1e-10)
 
 
-def test_numbers_that_a_user_watches():
-    """A function of the orbit is located where it is zero: here the greatest position at 1.3."""
+def test_watch_locates_the_zero_of_a_function():
+    """Locate the point at which the greatest position is 1.3."""
     scene = vi.Scene.ideal(frequency_ratio=0.31, restitution=0.76, gap=9.0, damping_ratio=0.25)
     orbit = vi.find_orbit(scene, scene.start(), throw=True)
     options = {"parameter": "drive.frequency_ratio", "bounds": (0.1, 0.9), "progress": False}
@@ -180,7 +179,7 @@ def test_numbers_that_a_user_watches():
 
 
 class Turning(Kicked):
-    """x ← x + 0.3 x (a - (x - b)²): the fold at a = 0 is b beside the crossing with x = 0."""
+    """x ← x + 0.3 x (a - (x - b)²): the fold at a = 0 is at x = b, the crossing at x = 0."""
 
     def kick(self, x, y):
         return x + 0.3 * x * (self.a - (x - self.b) ** 2), 0.3 * y
@@ -188,21 +187,21 @@ class Turning(Kicked):
 
 @pytest.mark.slow
 def test_a_fold_and_a_branch_point_in_one_step():
-    """One branch point was named, at the place of the fold. A branch that begins at the fold has
-    the other point, too."""
+    """Regression: a single branch point was reported, at the fold. A branch that begins at the fold
+    also has the branch point."""
     orbit = vi.find_orbit(Turning(0.495**2, 0.005), at(0.5, 0.0), throw=True)
-    way = {"parameter": "a", "bounds": (-1.0, 0.6), "max_step": 0.3}
-    branch = vi.continue_orbit(orbit, **way)
+    options = {"parameter": "a", "bounds": (-1.0, 0.6), "max_step": 0.3}
+    branch = vi.continue_orbit(orbit, **options)
     assert [point.kind for point in branch.special] == ["branch-point", "fold"]
     places = [point.parameter for point in branch.special]
     np.testing.assert_allclose(places, [0.005**2, 0.0], atol=1e-12)
-    begun = vi.continue_orbit(branch.special[1].orbit, **way)
+    begun = vi.continue_orbit(branch.special[1].orbit, **options)
     assert [point.kind for point in begun.special] == ["branch-point"]
 
 
 @pytest.mark.slow
 def test_a_curve_of_touches_ends_where_the_other_stop_is_touched():
-    """The amplitude of the linear oscillator is then the other gap."""
+    """The amplitude of the linear oscillator equals the other gap at the end."""
     stops = vi.RigidStop(9.0, 0.5), vi.RigidStop(10.0, 0.5, "left")
     scene = vi.Scene(oscillator=vi.Oscillator(0.005), drive=vi.IdealDrive(0.9), stops=stops)
     orbit = vi.find_orbit(scene, scene.start(Y=5.2, V=0.2), throw=True)

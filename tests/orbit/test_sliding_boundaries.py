@@ -1,5 +1,4 @@
-"""Curves in two parameters along which a motion gains or loses a part in which it is held, beside
-closed forms and motions that SciPy follows."""
+"""Curves of sliding bifurcations in two parameters, compared with closed forms and SciPy."""
 
 from typing import Any
 
@@ -17,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 
 class Belted(Rough):
-    """The same body on a belt, which runs faster than the body as long as it slips."""
+    """The same body on a belt that is faster than the body while it slips."""
 
     belt: Any = 2.0
 
@@ -27,8 +26,8 @@ class Belted(Rough):
 
 
 def test_grazing_sliding_of_a_linear_motion():
-    """As long as it slips, friction is constant and x' swings by ω/|1 - ω² + iδω|: the belt is just
-    reached where it runs as fast."""
+    """While the body slips, friction is constant and x' has amplitude ω/|1 - ω² + iδω|. The body
+    just reaches a belt of this speed."""
     damping = 0.3
 
     def reached(omega):
@@ -49,8 +48,8 @@ def test_grazing_sliding_of_a_linear_motion():
     np.testing.assert_allclose(belt, reached(omega), rtol=1e-9)
 
 
-def test_sticking_begins_along_den_hartogs_curve():
-    """From the motion that does not stop, and from the one that does."""
+def test_sticking_begins_on_den_hartogs_curve():
+    """Follow the curve from the motion without stops, and from the one with stops."""
     limit = den_hartog(0.75, 0.0)[1]
     bounds = (0.6 * limit, 1.3 * limit)
     branch = branch_of("level", bounds, omega=0.75, level=0.7 * limit)
@@ -70,7 +69,7 @@ def test_sticking_begins_along_den_hartogs_curve():
 
 
 class Damped(Belt):
-    """Observed where the body is farthest ahead."""
+    """A belt whose section is at the body's greatest position."""
 
     damping: Any = 0.1
     cycle = vi.falling("V", usual=2 * np.pi)
@@ -79,9 +78,9 @@ class Damped(Belt):
         return vi.OscillatorState(x.V, -x.Y - self.damping * x.V)
 
 
-def test_the_belt_is_only_just_reached():
-    """A body that the belt has let go is next as fast as the belt where it was let go, by
-    shooting: from the motion that sticks, whose part in which it does is the one that vanishes."""
+def test_grazing_sliding_of_a_motion_that_sticks():
+    """The segment of sticking vanishes where the greatest velocity after a release equals the belt
+    speed. Compare with shooting by SciPy."""
     machine = Damped()
     stuck = vi.simulate(machine, machine.start(V=1.5), 1, settle=40).last
     branch = vi.continue_orbit(
@@ -94,11 +93,11 @@ def test_the_belt_is_only_just_reached():
     ends = np.sort(curve.parameters[[0, -1], 0])
     np.testing.assert_allclose(ends, [0.727689234646, 3.024654895060], atol=1e-10)
     for speed, damping in curve.parameters[5::12]:
-        assert returns_to(speed, damping) == pytest.approx(0, abs=1e-8)
+        assert excess_velocity(speed, damping) == pytest.approx(0, abs=1e-8)
 
 
-def returns_to(speed, damping):
-    """How far from where the belt let it go a body is next as fast as the belt, by SciPy."""
+def excess_velocity(speed, damping):
+    """Return the greatest velocity after a release from the belt, minus `speed`, by SciPy."""
 
     def field(_, x):
         slip = max(speed - x[1], 0.0)

@@ -1,4 +1,4 @@
-"""Along a curve flights may ask for more steps than those of the motion with which it begins."""
+"""Along a curve, flights may need more steps than those of its first motion."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 
 class Oscillator(vi.AbstractMachine):
-    """A linear oscillator in its own time, of which nothing says how fast it is."""
+    """A linear oscillator in its own time unit, without a `step_limit`."""
 
     omega: jax.Array | float = 0.5
     gap: jax.Array | float = 20.0
@@ -36,7 +36,7 @@ def amplitude(omega):
 
 
 @pytest.mark.slow
-def test_a_branch_takes_more_where_the_drive_is_slow():
+def test_a_branch_takes_more_steps_for_a_slow_drive():
     machine = Oscillator()
     orbit = vi.find_orbit(machine, machine.start())
     branch = vi.continue_orbit(orbit, parameter="omega", bounds=(0.03, 0.55))
@@ -52,7 +52,7 @@ def test_a_branch_takes_more_where_the_drive_is_slow():
 
 
 @pytest.mark.slow
-def test_a_curve_in_two_parameters_does_too():
+def test_a_boundary_takes_more_steps_for_a_slow_drive():
     machine = Oscillator(gap=1.5)
     orbit = vi.find_orbit(machine, machine.start())
     branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.9, 2.0))
@@ -64,8 +64,8 @@ def test_a_curve_in_two_parameters_does_too():
 
 @pytest.mark.slow
 def test_flights_of_a_long_period_have_the_steps_of_the_longest():
-    """Twelve impacts in sixteen cycles: its multipliers are those of the cycle map, and it begins
-    where a multiplier of the motion of eight cycles is -1, in each interval of the parameter."""
+    """Compare the multipliers of a motion with twelve impacts in sixteen cycles with the cycle map,
+    and its origin with the doubling of the motion of eight cycles."""
     at = 2.2836
     scene = vi.Scene.ideal(frequency_ratio=at, restitution=0.8, gap=0.2, damping_ratio=0.02)
     last = vi.simulate(scene, scene.start(), 1, settle=3000).last

@@ -1,4 +1,4 @@
-"""Machines that are their own image: where motions lose the symmetry, and branches that spring."""
+"""Symmetric machines: points where motions lose their symmetry, and the branches from there."""
 
 import dataclasses
 
@@ -67,8 +67,8 @@ def test_a_scene_between_equal_stops_loses_its_symmetry(whole):
 
 
 @pytest.mark.slow
-def test_a_curve_of_lost_symmetry_of_a_scene(whole):
-    """Each of its motions is its own image as simulated, and has a multiplier 1."""
+def test_a_curve_of_symmetry_breaking_of_a_scene(whole):
+    """Each motion has a multiplier 1. Simulations of both ends are symmetric."""
     curve = vi.boundary(
         whole.special[1], parameter="oscillator.damping_ratio", bounds=((0.3, 2.5), (0.0, 0.1))
     )  # fmt: skip
@@ -89,7 +89,7 @@ def test_a_curve_of_lost_symmetry_of_a_scene(whole):
 
 @pytest.fixture(scope="module")
 def lost():
-    """Where the ball in a box loses its symmetry."""
+    """Return the point at which the ball in a box loses its symmetry."""
     pair = M.ImpactPair(half_gap=1.35, restitution=0.5)
     branch = vi.continue_orbit(settled(pair), parameter="half_gap", bounds=(1.25, 1.5))
     (point,) = branch.special
@@ -98,8 +98,8 @@ def lost():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("max_step", "distance"), [(0.1, 0.005), (0.4, 0.03)])
-def test_a_broken_branch_ends_nowhere_else(lost, max_step, distance):
-    """At steps at which branches may be cut, or special points missed or told twice."""
+def test_a_branch_of_asymmetric_motions_ends_only_at_its_origin(lost, max_step, distance):
+    """With these steps a branch may be cut, or special points missed or listed twice."""
     broken = vi.continue_orbit(
         lost.switch(distance=distance), parameter="half_gap", bounds=(1.05, 6.0),
         max_step=max_step,
@@ -115,13 +115,13 @@ def test_a_broken_branch_ends_nowhere_else(lost, max_step, distance):
 
 
 def gap_of(e):
-    """Half the box in which a ball of restitution e loses its symmetry."""
+    """Return the half gap at which a ball of restitution e loses its symmetry."""
     return (np.pi / 2 - 2 / np.pi) / np.hypot(2 / np.pi, (1 - e) / (1 + e))
 
 
-def touched_again(e):
-    """How far beyond the wall that it has left the ball would come there once more. Between walls
-    it flies with the speed w, sin s₀ = π w/2 - λ and cos s₀ = -σ w at the wall."""
+def overshoot(e):
+    """Return how far beyond the wall that it left the ball would come on its return. It flies with
+    the speed w between the walls; sin s₀ = π w/2 - λ and cos s₀ = -σ w at the wall."""
     share, gap = (1 - e) / (1 + e), gap_of(e)
     w = np.roots([np.pi**2 / 4 + share**2, -np.pi * gap, gap**2 - 1]).max()
     begin = np.arctan2(np.pi * w / 2 - gap, -share * w)
@@ -135,10 +135,10 @@ def test_grazings_end_where_the_motion_becomes_symmetric(lost):
     bounds = ((0.5, 2.0), (0.0, 1.0))
     curve = vi.boundary(broken.special[0], parameter="restitution", bounds=bounds)
     assert curve.ends == ("symmetry-breaking", "bounds")
-    assert curve.parameters[-1, 1] == 1.0  # a restitution of more has no machine
+    assert curve.parameters[-1, 1] == 1.0  # no machine has a larger restitution
     end = curve.special[0]
     assert end.kind == "symmetry-breaking"
-    e = brentq(touched_again, 0.05, 0.1, xtol=1e-14)
+    e = brentq(overshoot, 0.05, 0.1, xtol=1e-14)
     np.testing.assert_allclose(end.parameters, [gap_of(e), e], atol=1e-9)
     other = vi.boundary(end.switch(), parameter="restitution", bounds=bounds)
     gaps, shares = other.parameters.T
@@ -162,7 +162,7 @@ SNAP = M.Duffing(
 
 @pytest.mark.slow
 def test_a_motion_without_impacts_loses_its_symmetry():
-    """Near where branches cross the equations may have no answer, or that of the other branch."""
+    """Near a branch point the equations may have no solution, or that of the other branch."""
     orbit = vi.find_orbit(SNAP, SNAP.start(Y=-0.305011053, V=0.0199429225), throw=True)
     for max_step in (0.05, 0.15):
         branch = vi.continue_orbit(
@@ -173,8 +173,8 @@ def test_a_motion_without_impacts_loses_its_symmetry():
 
 
 @pytest.mark.slow
-def test_a_lost_impact_is_no_lost_symmetry():
-    """A motion of one impact cannot be its own image; its branch ends at a grazing."""
+def test_a_lost_impact_breaks_no_symmetry():
+    """A motion with one impact cannot be symmetric. Its branch ends at grazings."""
     machine = M.Duffing(
         amplitude=0.6, frequency=0.7, damping=0.05, stiffness=1.0, cubic=0.3, gap=0.8,
         restitution=0.6,

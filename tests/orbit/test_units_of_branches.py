@@ -14,7 +14,7 @@ UNITS = ((1.0, 1.0), (1e-6, 1e-3), (1e3, 1.0), (1e-6, 1e6), (1.0, 1e6))
 
 
 class Struck(vi.AbstractMachine):
-    """x'' + 0.1 x' + x + c x³ = f cos ws with a stop, in a unit of length and one of time."""
+    """x'' + 0.1 x' + x + c x³ = f cos ws with a stop, in given units of length and time."""
 
     length: float
     time: float
@@ -42,7 +42,7 @@ class Struck(vi.AbstractMachine):
 
 
 class Rubbed(Struck):
-    """The same with dry friction in place of the stop: it sticks twice a cycle, or not at all."""
+    """The same body with dry friction instead of a stop. It sticks twice a cycle, or never."""
 
     @property
     def contacts(self):
@@ -60,7 +60,7 @@ class Sliding(Struck):
 
 
 class Heated(Struck):
-    """The impact is a reset, which warms the body; heat has a third unit."""
+    """The impact is a reset that heats the body. Heat has a third unit."""
 
     reset = lambda m, s, x: {"v": -0.6 * x.v, "heat": x.heat + (x.v * m.time / m.length**2) ** 2}
     contacts, events = (), vi.Reset(lambda m, s, x: x.x - m.gap * m.length, reset)
@@ -102,8 +102,8 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_branch_is_the_same_in_all_units(case):
-    """And the same with friction as a contact and as a switch that slides; a branch, from event to
-    event, passes through the orbit that was searched by the cycle map."""
+    """Friction gives the same branch as a contact and as a switch that slides. A branch, computed
+    from event to event, contains the orbit found by the cycle map."""
     kinds, numbers, parameter, bounds = CASES[case]
     kinds = kinds if isinstance(kinds, tuple) else (kinds,)
     found, forecasts, searched = [], [], []
@@ -121,13 +121,13 @@ def test_a_branch_is_the_same_in_all_units(case):
         points = {p.kind: p for p in branch.special}
         names = branch.ends, [p.kind for p in branch.special]
         found.append((names, [p.parameter for p in branch.special]))
-        if case == "heats" and length == 1:  # the curve is a line: motions grow with gap and force
+        if case == "heats" and length == 1:  # the curve is a line, since motions scale
             at = points["period-doubling"]
             curve = vi.boundary(at, parameter="force", bounds=(bounds, (0.5, 2.0)), max_points=20)
             gap, force = curve.parameters.T
             np.testing.assert_allclose(gap / force, at.parameter, rtol=1e-9)
             assert not curve.special, str(curve)
-        if case == "impacts" and len(found) < 4:  # the parameter changes how long a cycle takes
+        if case == "impacts" and len(found) < 4:  # the parameter changes the period
             ahead = vi.grazing(points["grazing"], progress=False)
             assert ahead.agreement == 1
             forecasts.append((ahead.entries / ahead.entries[0], ahead.forecast.period))
@@ -154,8 +154,8 @@ def test_manifolds_and_exponents_are_the_same_in_all_units():
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), other, curves[0])
 
 
-def test_all_orbits_are_told_apart():
-    """Those of one period were one motion."""
+def test_all_orbits_distinguishes_small_motions():
+    """Regression: orbits of equal period were merged."""
     found = []
     numbers = {"frequency": 0.9, "damping": 0.04, "stiffness": 1.0, "cubic": 0.0}
     for size in (1.0, 1e-6):
@@ -191,8 +191,8 @@ class Tool(vi.Mechanical):
 
 
 def test_lengths_are_compared_with_lengths_only():
-    """Motions of a machine of millimetres had a period, since lengths were compared with a speed in
-    radians per second."""
+    """Regression: motions in millimetres were called periodic, because lengths were compared with a
+    speed in radians per second."""
     found, errors = [], []
     for size in (1.0, 1e-3, 1e3):
         tool = Tool(size=size)
