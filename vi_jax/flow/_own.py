@@ -21,9 +21,9 @@ from .._types import Scalar, Scalars, State
 from ..machine import (
     AbstractEvent,
     AbstractMachine,
-    AbstractSwitch,
     Coordinate,
     DryFriction,
+    Friction,
     LinearMachine,
     Mechanical,
     Reset,
@@ -57,9 +57,9 @@ _NO_NUMBERS = (
     jax.errors.TracerIntegerConversionError,
 )
 
-# A field whose values at the ends of its cycle differ by more than this share has another period;
-# with a period of five digits they differ by less. They are compared with the field's size there,
-# and at this share of a cycle, where few inputs are zero.
+# A field whose values a cycle apart differ by more than this share has another period; with a
+# period of five digits they differ by less. They are compared at the start and at this share of a
+# cycle, where few inputs are zero.
 _APART, _INSIDE = 1e-4, 0.29
 
 
@@ -176,34 +176,53 @@ _TRIED, _MODES, _FAR = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 
 def check_values(machine: AbstractMachine, start: State) -> None:
-    """Warn once if the field differs at the ends of its cycle, or if an event's guard is not
-    negative in any of many states around the start. Machines of this package and machines with
-    traced numbers are not checked."""
+    """Check numbers of a machine around its start. Warn once if the field is not periodic, or if an
+    event's guard is not negative in any of many states. Machines of this package and machines with
+    traced numbers are not checked.
+
+    **Raises:** `ValueError` for invalid masses, or if a stop's velocity is not that of its position.
+    """
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if ours or any(isinstance(x, Tracer) for x in leaves):
         return
     _check_slips(machine, start)
     try:
-        ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
-        if not (ticks or others_of(machine)):
+        if clock_of(machine, start) is not None:
             return
+        ticks = not is_autonomous(machine, start)
         with jax.ensure_compile_time_eval():
             zero, state = jtu.tree_map(jnp.asarray, (np.zeros(()), start))
-            found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
+            found = jtu.tree_map(np.asarray, _values(machine, zero, state))
     except Exception:  # the error is raised with a better message when field and guards are traced
         return
-    cycle, first, within, last, below = found
-    parts = jtu.tree_leaves_with_path(start) if ticks else []
-    if len(first) != len(parts):  # the field returns no state: it is refused where it is traced
-        return
-    for (path, _), one, inside, other in zip(parts, first, within, last, strict=True):
-        if np.any(abs(one - other) > _APART * np.maximum(abs(inside), abs(one) + abs(other))):
-            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
+    cycle, fields, below, timed, backward, masses = found
+    if masses.size and not _is_definite(masses):
+        raise ValueError(
+            f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
+            f"matrix, but at the start it is {masses.tolist()}."
+        )
+    if backward.any():
+        raise ValueError(
+            f"A stop of a {kind.__name__} must be `on` a position and its velocity, in this order, "
+            f"but the position falls where the velocity is positive (coordinate "
+            f"{int(np.argmax(backward))})."
+        )
+    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=True):
+        name, size = jtu.keystr(path).lstrip(".") or "state", abs(rates).max(axis=0)
+        first, second = (rates[:2], rates[2:]) if ticks else (rates[:1], rates[1:2])
+        if np.any(abs(first - second) > _APART * size) and (ticks or not timed):
+            _warn_of_period(kind, name, cycle.item(), ticks)
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
         _warn_of_guard(kind, int(i), event.name or type(event).__name__)
+
+
+def _is_definite(masses: np.ndarray) -> bool:
+    """Return whether a matrix is symmetric, to rounding, and positive definite."""
+    even = np.allclose(masses, masses.T, rtol=0, atol=1e-9 * abs(masses).max())
+    return bool(np.isfinite(masses).all() and even and np.linalg.eigvalsh(masses).min() > 0)
 
 
 # A slip is evaluated at this many instants of a cycle. Then the interval of its greatest change is
@@ -260,22 +279,46 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
-def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """Return the cycle; the field at its start, within it and at its end (if `ticks`); for each
-    guard, whether it is negative in any state around the start. `zero` is an argument, since JAX
-    compiles expressions of constants separately."""
+def _values(machine: AbstractMachine, zero: Scalar, start: State) -> Any:
+    """Return the cycle; the rates of each number of the state at the start, within the cycle and a
+    cycle after both; for each event, whether its guard is negative in any state around the start;
+    whether a guard depends on time; for each coordinate, whether its velocity has the wrong sign in
+    such a state; and the masses. `zero` is an argument, since JAX compiles expressions of constants
+    separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
-    instants = (zero, _INSIDE * cycle, cycle) if ticks else ()
-    fields = [jtu.tree_leaves(field_in(machine, s, start, modes)) for s in instants] or [()] * 3
-    return cycle, *fields, _guards_below(machine, zero, start, modes) if others_of(machine) else ()
+    instants = zero + cycle * np.array([0.0, _INSIDE, 1.0, 1.0 + _INSIDE])
+    fields = jax.vmap(lambda s: field_in(machine, s, start, modes))(instants)
+    around = _states_around(zero, cycle, start, modes)
+
+    def guards(s: Scalar, state: State, modes: Scalars) -> Array:
+        numbers = range(len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)))
+        found = [guard_of(machine, i, s, state, modes) for i in numbers[:-1]]
+        return jnp.stack([jnp.asarray(x, zero.dtype) for x in found])
+
+    def falling(s: Scalar, state: State, modes: Scalars) -> Array:
+        rate = field_in(machine, s, state, modes)
+        moves = [jax.jvp(x.position, (state,), (rate,))[1] for x in machine.coordinates]
+        return jnp.stack([v * x.velocity(state) for v, x in zip(moves, machine.coordinates)])
+
+    below, timed, backward, masses = (), False, jnp.zeros(0, bool), jnp.zeros(0)
+    if others_of(machine):
+        below = jnp.any(jax.vmap(guards)(*around) < 0, axis=0)
+        first, later = (guards(s, start, modes) for s in instants[:2])
+        timed = jnp.any(first != later)
+    if contacts_in(machine) and not isinstance(machine, Mechanical):
+        backward = jnp.any(jax.vmap(falling)(*around) < 0, axis=0)
+    if isinstance(machine, Mechanical) and not any(machine.q_shapes.values()):
+        rows = machine.masses(machine.places(start))
+        masses = jnp.stack([jnp.stack([zero + x for x in row]) for row in rows])
+    return cycle, jtu.tree_leaves(fields), below, timed, backward, masses
 
 
-def _guards_below(machine: AbstractMachine, zero: Scalar, start: State, modes: Scalars) -> Array:
-    first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
+def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:
+    """Return instants, states and modes: those of the start, and random ones around it."""
     random = np.random.default_rng(0)
     far = np.resize(_FAR, _TRIED)
-    s = zero + machine.cycle * np.append(0.0, random.uniform(size=_TRIED))
+    s = zero + cycle * np.append(0.0, random.uniform(size=_TRIED))
 
     def spread(x: Any) -> Array:
         x = jnp.asarray(x)
@@ -288,20 +331,20 @@ def _guards_below(machine: AbstractMachine, zero: Scalar, start: State, modes: S
         values = np.append(_MODES, 0.0)[others].astype(zero.dtype)
         return jnp.where(others == len(_MODES), zero + mode, values)
 
-    def guards(s: Scalar, state: State, modes: Scalars) -> Array:
-        found = [guard_of(machine, i, s, state, modes) for i in range(first, last)]
-        return jnp.stack([jnp.asarray(x, zero.dtype) for x in found])
-
-    around = s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
-    return jnp.any(jax.vmap(guards)(*around) < 0, axis=0)
+    return s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
 
 
 @functools.lru_cache(maxsize=64)
-def _warn_of_period(kind: type, name: str, cycle: float) -> None:
+def _warn_of_period(kind: type, name: str, cycle: float, ticks: bool) -> None:
+    if ticks:
+        what = f"is not the same a `cycle` = {cycle:.6g} later"
+        rule = "`cycle` must be a period of the field, unless the field is meant to jump there"
+    else:
+        what = "depends on time, but an event ends its cycles"
+        rule = "make the drive's phase a component of the state"
     warn(
-        f"The `field` of a {kind.__name__} is not the same at `s` = 0 and at `s` = `cycle` = "
-        f"{cycle:.6g}: the rate of its {name} differs. `s` restarts from 0 in each cycle, so "
-        "`cycle` must be a period of the field, unless the field is meant to jump there."
+        f"The `field` of a {kind.__name__} {what}: the rate of its {name} differs. Time restarts "
+        f"from 0 in each cycle, so {rule}."
     )
 
 
@@ -324,12 +367,16 @@ def _warn_of_guard(kind: type, i: int, name: str) -> None:
     )
 
 
+_CONTACTS = (RigidStop, SoftStop, Friction)
 _KINDS = {
     "contacts": (
-        (RigidStop, AbstractSwitch),
-        "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s",
+        lambda part: isinstance(part, _CONTACTS),
+        "contacts: `RigidStop`s, `SoftStop`s and `DryFriction`s. Others belong to `events`",
     ),
-    "events": (AbstractEvent, "`AbstractEvent`s, as `Reset` and `Switch` are"),
+    "events": (
+        lambda part: isinstance(part, AbstractEvent) and not isinstance(part, _CONTACTS),
+        "`AbstractEvent`s, as `Reset` and `Switch` are. Stops and friction belong to `contacts`",
+    ),
 }
 
 
@@ -337,13 +384,11 @@ def check_parts(machine: AbstractMachine) -> None:
     """Check the parts of a machine before anything is traced. **Raises:** `TypeError` or
     `ValueError` for an invalid one."""
     name = type(machine).__name__
-    for what, (kind, words) in _KINDS.items():
+    for what, (belongs, words) in _KINDS.items():
         parts = listed(getattr(machine, what))
-        if not isinstance(parts, tuple) or not all(isinstance(part, kind) for part in parts):
+        if not isinstance(parts, tuple) or not all(map(belongs, parts)):
             hint = " Write `@property` above its `def`." if callable(parts) else ""
-            raise TypeError(
-                f"`{what}` of a {name} must be a tuple of {words}, but is {parts!r}.{hint}"
-            )
+            raise TypeError(f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}")
     _check_names(machine)
     if callable(machine.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
@@ -390,6 +435,11 @@ def _check_names(machine: AbstractMachine) -> None:
                 "by whole turns: leave the angle out there, with a stop at each end of its range."
             )
         if isinstance(machine, Mechanical):
+            if getattr(stop, "mass", None) is not None:
+                raise ValueError(
+                    f"Argument `mass` of a {type(stop).__name__} must be left out in a "
+                    f"{type(machine).__name__}, whose own masses are used."
+                )
             continue
         pair = isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
         if isinstance(stop, RigidStop | SoftStop) and on is not None and not pair:

@@ -374,6 +374,11 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
             "some are arrays. Write a machine with a matrix of them as an `AbstractMachine`, or a "
             "linear one as a `vi.machines.Structure`."
         )
+    wrong = [len(row) for row in rows if len(row) != n]
+    if wrong:
+        raise ValueError(
+            f"`mass` of a {whose} must be a matrix with {n} columns, but has a row of {wrong[0]}."
+        )
     return [[row[j] for j in range(n)] for row in rows]
 
 
