@@ -18,6 +18,7 @@ from jaxtyping import Array
 from .._checks import concrete
 from .._messages import warn
 from .._types import Scalar, Scalars, State
+from ..lanes import dependent_results
 from ..machine import (
     AbstractEvent,
     AbstractMachine,
@@ -180,7 +181,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     event's guard is not negative in any of many states. Machines of this package and machines with
     traced numbers are not checked.
 
-    **Raises:** `ValueError` for invalid masses, or if a stop's velocity is not that of its position.
+    **Raises:** `ValueError` for invalid masses, or a stop's velocity that is not its position's.
     """
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
@@ -188,15 +189,17 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         return
     _check_slips(machine, start)
     try:
-        if clock_of(machine, start) is not None:
-            return
-        ticks = not is_autonomous(machine, start)
+        ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
+        zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
+        restarts = not ticks and _depends_on_time(machine, zero, state)
+        backward, cycle, fields, below = np.zeros(0), 0.0, (), ()
         with jax.ensure_compile_time_eval():
-            zero, state = jtu.tree_map(jnp.asarray, (np.zeros(()), start))
-            found = jtu.tree_map(np.asarray, _values(machine, zero, state))
+            masses = np.asarray(_masses(machine, state))
+            if ticks or others_of(machine):
+                found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
+                cycle, fields, below, backward = found
     except Exception:  # the error is raised with a better message when field and guards are traced
         return
-    cycle, fields, below, timed, backward, masses = found
     if masses.size and not _is_definite(masses):
         raise ValueError(
             f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
@@ -208,11 +211,12 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             f"but the position falls where the velocity is positive (coordinate "
             f"{int(np.argmax(backward))})."
         )
-    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=True):
-        name, size = jtu.keystr(path).lstrip(".") or "state", abs(rates).max(axis=0)
-        first, second = (rates[:2], rates[2:]) if ticks else (rates[:1], rates[1:2])
-        if np.any(abs(first - second) > _APART * size) and (ticks or not timed):
-            _warn_of_period(kind, name, cycle.item(), ticks)
+    if restarts:
+        _warn_of_time(kind)
+    paths = jtu.tree_leaves_with_path(start) if ticks else ()
+    for (path, _), rates in zip(paths, fields, strict=True):
+        if np.any(abs(rates[:2] - rates[2:]) > _APART * abs(rates).max(axis=0)):
+            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
@@ -279,39 +283,57 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
-def _values(machine: AbstractMachine, zero: Scalar, start: State) -> Any:
-    """Return the cycle; the rates of each number of the state at the start, within the cycle and a
-    cycle after both; for each event, whether its guard is negative in any state around the start;
-    whether a guard depends on time; for each coordinate, whether its velocity has the wrong sign in
-    such a state; and the masses. `zero` is an argument, since JAX compiles expressions of constants
-    separately."""
+def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
+    """Return the cycle; if `ticks`, the rates of each number of the state at the start, within the
+    cycle and a cycle after both; for each event, whether its guard is negative in any state around
+    the start; for each coordinate, whether its velocity has the wrong sign in such a state. `zero`
+    is an argument, since JAX compiles expressions of constants separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     instants = zero + cycle * np.array([0.0, _INSIDE, 1.0, 1.0 + _INSIDE])
-    fields = jax.vmap(lambda s: field_in(machine, s, start, modes))(instants)
+    fields = jax.vmap(lambda s: field_in(machine, s, start, modes))(instants) if ticks else ()
     around = _states_around(zero, cycle, start, modes)
-
-    def guards(s: Scalar, state: State, modes: Scalars) -> Array:
-        numbers = range(len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)))
-        found = [guard_of(machine, i, s, state, modes) for i in numbers[:-1]]
-        return jnp.stack([jnp.asarray(x, zero.dtype) for x in found])
 
     def falling(s: Scalar, state: State, modes: Scalars) -> Array:
         rate = field_in(machine, s, state, modes)
         moves = [jax.jvp(x.position, (state,), (rate,))[1] for x in machine.coordinates]
-        return jnp.stack([v * x.velocity(state) for v, x in zip(moves, machine.coordinates)])
+        speeds = [x.velocity(state) for x in machine.coordinates]
+        return jnp.stack([v * u for v, u in zip(moves, speeds, strict=True)])
 
-    below, timed, backward, masses = (), False, jnp.zeros(0, bool), jnp.zeros(0)
+    below, backward = (), jnp.zeros(0)
     if others_of(machine):
+        guards = lambda *here: jnp.stack(_guards(machine, *here))
         below = jnp.any(jax.vmap(guards)(*around) < 0, axis=0)
-        first, later = (guards(s, start, modes) for s in instants[:2])
-        timed = jnp.any(first != later)
     if contacts_in(machine) and not isinstance(machine, Mechanical):
         backward = jnp.any(jax.vmap(falling)(*around) < 0, axis=0)
-    if isinstance(machine, Mechanical) and not any(machine.q_shapes.values()):
-        rows = machine.masses(machine.places(start))
-        masses = jnp.stack([jnp.stack([zero + x for x in row]) for row in rows])
-    return cycle, jtu.tree_leaves(fields), below, timed, backward, masses
+    return cycle, jtu.tree_leaves(fields), below, backward
+
+
+def _guards(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Array]:
+    first, last = len(stops_of(machine)) + len(switches_of(machine)), len(events_of(machine)) - 1
+    found = (guard_of(machine, i, s, state, modes) for i in range(first, last))
+    return [jnp.asarray(x, s.dtype) for x in found]
+
+
+def _depends_on_time(machine: AbstractMachine, zero: Any, start: State) -> bool:
+    """Return whether the field may depend on time, but no guard does, which could be a timer's."""
+
+    def depends(function: Callable[..., Any]) -> bool:
+        of_time = lambda s, x: function(machine, s, x, begin_modes(machine, s, x))
+        traced = jax.make_jaxpr(of_time)(zero, start).jaxpr
+        sources = [True] + [False] * len(jtu.tree_leaves(start))
+        return any(dependent_results(traced, sources, smooth=False))
+
+    return depends(field_in) and not depends(_guards)
+
+
+def _masses(machine: AbstractMachine, start: State) -> Any:
+    """Return the mass matrix at the start; an empty array if the machine has none."""
+    if not isinstance(machine, Mechanical) or any(machine.q_shapes.values()):
+        return np.zeros(0)
+    matrix = lambda state: machine.masses(machine.places(state))
+    varies = callable(machine.mass)
+    return np.array(eqx.filter_jit(matrix)(start) if varies else matrix(start), float)
 
 
 def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:
@@ -335,16 +357,19 @@ def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) ->
 
 
 @functools.lru_cache(maxsize=64)
-def _warn_of_period(kind: type, name: str, cycle: float, ticks: bool) -> None:
-    if ticks:
-        what = f"is not the same a `cycle` = {cycle:.6g} later"
-        rule = "`cycle` must be a period of the field, unless the field is meant to jump there"
-    else:
-        what = "depends on time, but an event ends its cycles"
-        rule = "make the drive's phase a component of the state"
+def _warn_of_period(kind: type, name: str, cycle: float) -> None:
     warn(
-        f"The `field` of a {kind.__name__} {what}: the rate of its {name} differs. Time restarts "
-        f"from 0 in each cycle, so {rule}."
+        f"The `field` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} later: the rate "
+        f"of its {name} differs. `s` restarts from 0 in each cycle, so `cycle` must be a period of "
+        "the field, unless the field is meant to jump there."
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _warn_of_time(kind: type) -> None:
+    warn(
+        f"The `field` of a {kind.__name__} depends on time, which restarts from 0 in each cycle, "
+        "but an event ends its cycles. Make the phase of its drive a component of the state."
     )
 
 
@@ -388,7 +413,9 @@ def check_parts(machine: AbstractMachine) -> None:
         parts = listed(getattr(machine, what))
         if not isinstance(parts, tuple) or not all(map(belongs, parts)):
             hint = " Write `@property` above its `def`." if callable(parts) else ""
-            raise TypeError(f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}")
+            raise TypeError(
+                f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}"
+            )
     _check_names(machine)
     if callable(machine.cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
