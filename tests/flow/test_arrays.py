@@ -1,4 +1,4 @@
-"""Arrays in a state, beside the same machine in a state of numbers."""
+"""States with array components, compared with the same machine in scalar components."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def one_array(x, y, u, w):
 
 
 class Chain(vi.AbstractMachine):
-    """Two bodies on springs, the first of which is driven against a wall."""
+    """Two masses on springs; a force drives the first one against a stop."""
 
     made: Any = eqx.field(static=True)
     gap: Any = 0.6
@@ -67,7 +67,7 @@ class Chain(vi.AbstractMachine):
 
 
 def table(state):
-    """The numbers of states in a row, one state in a line."""
+    """Return the scalar components as an array with one state per row."""
     return np.stack([np.asarray(x) for x in jax.tree.leaves(state)], axis=-1)
 
 
@@ -83,7 +83,7 @@ def plain():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("made", [rows, one_array])
-def test_a_run_is_that_of_numbers(made, plain):
+def test_run_with_arrays_equals_run_with_scalars(made, plain):
     machine, wanted = Chain(made), plain[1]
     run = vi.simulate(machine, machine.start(), 3, samples=4, estimate=True)
 
@@ -103,7 +103,7 @@ def test_a_run_is_that_of_numbers(made, plain):
     np.testing.assert_array_equal(column, flat(run.sections)[:, 1])
 
 
-def test_lanes_beside_each_other(plain):
+def test_vmap_with_arrays_equals_vmap_with_scalars(plain):
     gaps = jnp.asarray([0.5, 0.6, 0.9])
 
     def last(made):
@@ -122,13 +122,13 @@ def test_lanes_beside_each_other(plain):
 
 
 @pytest.mark.slow
-def test_the_cycle_map_and_its_exponents(plain):
+def test_cycle_map_and_lyapunov_exponents(plain):
     machine = Chain(rows)
     the_map = vi.cycle_map(machine)
     end = the_map(machine.start())
     wanted = table(plain[1].sections)[1]
     np.testing.assert_allclose(np.concatenate([end.q, end.v]), wanted, atol=1e-9)
-    # Damping takes exp(-0.2 T) of the volume, and each impact k².
+    # In each cycle damping multiplies the phase volume by exp(-0.2 T), and each impact by k².
     impacts = np.asarray(vi.simulate(machine, machine.start(), 16, settle=200).impacts)
     assert np.ptp(impacts) == 0
     found = vi.lyapunov(machine, machine.start(), 16, settle=200)
@@ -140,8 +140,7 @@ MACHINE = Chain(rows)
 
 
 @pytest.mark.slow
-def test_verbs_take_arrays_as_numbers():
-    """Orbits, branches, sweeps, scans and basins."""
+def test_orbits_sweeps_scans_and_basins_equal_those_with_scalars():
     found = []
     for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
         machine = Chain(made)
@@ -176,12 +175,12 @@ def test_verbs_take_arrays_as_numbers():
         lambda: vi.scan(MACHINE, {"start.q[2]": [0.5, 0.6]}, progress=False),
     ],
 )
-def test_names_of_numbers_in_arrays(call):
+def test_names_that_are_not_scalars_of_the_state_raise(call):
     with pytest.raises(ValueError, match=r"must be .*number of the machine"):
         call()
 
 
-def test_what_is_no_state():
+def test_invalid_states_raise():
     empty = Rows(jnp.zeros(2), jnp.zeros((2, 0)))
     for call in (vi.simulate, vi.find_orbit):
         with pytest.raises(ValueError, match=r"must hold numbers, but its v has shape \(2, 0\)"):
@@ -204,7 +203,7 @@ METHOD = vi.FixedStep(steps_per_cycle=40)
 
 
 class Row(vi.AbstractMachine):
-    """Masses in a row on springs and dampers, the first of them shaken, the last before a stop."""
+    """Chain of masses on springs and dampers; a force drives the first, a stop limits the last."""
 
     springs: Any
     force: Any = 1.0
@@ -235,7 +234,7 @@ SPRINGS = jnp.linspace(1.0, 2.0, MASSES)
 
 
 @pytest.mark.slow
-def test_both_backends_and_every_lane_alone():
+def test_backends_agree_and_each_lane_equals_its_own_run():
     forces = jnp.linspace(0.9, 1.1, 5)
 
     def last(force):
@@ -251,7 +250,7 @@ def test_both_backends_and_every_lane_alone():
 
 
 @pytest.mark.slow
-def test_derivatives_by_arrays_beside_differences():
+def test_derivatives_with_respect_to_arrays_match_differences():
     def loss(springs):
         machine = Row(springs)
         run = vi.simulate(machine, machine.start(), 3, method=METHOD)
@@ -265,8 +264,8 @@ def test_derivatives_by_arrays_beside_differences():
     np.testing.assert_allclose(along, slope, rtol=1e-6)
 
 
-def test_a_thousand_numbers():
-    """A wave that has not come to the end: the last mass rests, energy is what was put in."""
+def test_state_of_a_thousand_numbers():
+    """The wave from the first mass has not reached the last one, which is still at rest."""
     machine = Row(jnp.ones(500), force=0.0)
     still, method = machine.start(), vi.FixedStep(steps_per_cycle=60)
     start = still.replace(v=still.v.at[0].set(1.0))

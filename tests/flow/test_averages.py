@@ -1,7 +1,7 @@
-"""Averages and quantities that a machine names: energy that goes in and comes out, by each method.
+"""Averages and quantities of a machine, checked with the energy balance.
 
-Over any cycle of a driven oscillator the work taken is the work lost to damping, that lost in
-impacts, and what its energy has grown by.
+In any cycle of a driven oscillator, the work of the drive is the sum of three terms: losses to
+damping, losses in impacts, and the growth of the energy.
 """
 
 from typing import NamedTuple
@@ -15,9 +15,7 @@ import vi_jax as vi
 from shaken_oscillator import Shaken
 
 
-class Flown(vi.Scene):
-    """A ready machine with averages."""
-
+class AveragedScene(vi.Scene):
     def averages(self, s, state):
         return {"taken": jnp.cos(s) * state.V, "lost": 2 * self.damping_ratio * state.V**2}
 
@@ -26,23 +24,22 @@ class Flown(vi.Scene):
 
 
 class Driven(vi.Scene):
-    """A motor whose mean speed is known: one turn in each cycle."""
+    """A motor scene that averages its speed. The mean is one turn per cycle."""
 
     def averages(self, s, state):
         return {"speed": state.W}
 
 
-def flown(gap):
+def averaged_scene(gap):
     stop = vi.RigidStop(gap, 0.5)
-    return Flown(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.7), stops=(stop,))
+    return AveragedScene(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.7), stops=(stop,))
 
 
 def begin(gap=0.5):
     return vi.OscillatorState(jnp.minimum(0.1, gap), jnp.asarray(0.2))
 
 
-def unbalanced(run):
-    """What is missing of the energy in each cycle."""
+def energy_defects(run):
     work = (run.averages["taken"] - run.averages["lost"]) * run.duration
     return work - run.impact_energy - jnp.diff(run.quantities["energy"])
 
@@ -51,26 +48,24 @@ def unbalanced(run):
     ("method", "close"),
     [(vi.Adaptive(), 1e-9), pytest.param(vi.Taylor(), 1e-10, marks=pytest.mark.slow)],
 )
-def test_energy_is_balanced_by_steps(method, close):
-    """Through impacts, and through chatter and rest."""
-
+def test_energy_is_balanced_through_impacts_chatter_and_rest(method, close):
     def one(gap):
         return vi.simulate(Shaken(gap=gap), begin(gap), 12, method=method, samples=8)
 
     run = jax.vmap(one)(jnp.array([0.5, -0.3]))
     assert int(run.impacts.sum(axis=1).min()) > 20 and run.rests.sum(axis=1).tolist() == [0, 1]
-    left = jax.vmap(unbalanced)(run)
+    left = jax.vmap(energy_defects)(run)
     np.testing.assert_allclose(left, 0.0, atol=close)
     push = np.cos(np.arange(97) * np.pi / 4)
     np.testing.assert_allclose(run.samples.quantities["push"], [push, push], atol=1e-12)
 
 
 @pytest.mark.parametrize("gap", [1.3, 0.1], ids=["impacts", "chatter and rest"])
-def test_energy_is_balanced_along_flights_in_closed_form(gap):
-    scene = flown(gap)
+def test_energy_is_balanced_with_exact_flight(gap):
+    scene = averaged_scene(gap)
     run = vi.simulate(scene, scene.start(Y=0.05), 12)
     assert int(run.impacts.sum()) > 10 and (run.rests is not None) == (gap < 1)
-    np.testing.assert_allclose(unbalanced(run), 0.0, atol=1e-13)
+    np.testing.assert_allclose(energy_defects(run), 0.0, atol=1e-13)
 
 
 def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
@@ -81,19 +76,19 @@ def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
     run = vi.simulate(scene, scene.start(), 8)
     assert int(run.impacts.sum()) > 5
     np.testing.assert_allclose(run.averages["speed"], 2 * np.pi / run.duration, rtol=1e-14)
-    assert float(jnp.ptp(run.duration)) > 0.01  # so that the mean of the means is another number
+    assert float(jnp.ptp(run.duration)) > 0.01  # so the mean of the means would differ
     mean = run.mean_averages()["speed"]
     np.testing.assert_allclose(mean, 8 * 2 * np.pi / run.duration.sum(), rtol=1e-14)
 
 
 @pytest.mark.slow
 def test_derivatives_through_impacts():
-    """Beside finite differences; and with them energy stays balanced, to the last bit or so."""
+    """Compare with finite differences. The derivatives of the energy defect are zero."""
 
     def power(x):
         machine = Shaken(amplitude=x[0], frequency=x[1], gap=x[2], restitution=x[3])
         run = vi.simulate(machine, begin(), 6, method=vi.Taylor())
-        return run.averages["taken"], unbalanced(run)
+        return run.averages["taken"], energy_defects(run)
 
     at, alone = jnp.array([1.0, 0.8, 0.5, 0.6]), vi.jit(lambda x: power(x)[0])
     slopes, left = vi.jit(jax.jacfwd(power))(at)
@@ -105,12 +100,12 @@ def test_derivatives_through_impacts():
     np.testing.assert_allclose(back, slopes[-1], rtol=1e-11)
 
 
-class Rubbed(NamedTuple):
+class Sawtooth(NamedTuple):
     place: jax.Array
 
 
 class Switching(vi.AbstractMachine):
-    """A clock with a mode: ±1, by the sign of a sawtooth, which a reset begins anew."""
+    """A sawtooth: at height 1 a reset returns it to 0 and changes the sign of the mode."""
 
     cycle = 3.0
 
@@ -120,7 +115,7 @@ class Switching(vi.AbstractMachine):
 
     @staticmethod
     def _again(machine, s, state, mode):
-        return Rubbed(jnp.zeros_like(state.place))
+        return Sawtooth(jnp.zeros_like(state.place))
 
     @staticmethod
     def _other(machine, s, state, mode):
@@ -130,22 +125,22 @@ class Switching(vi.AbstractMachine):
         return (1.0,)
 
     def field(self, s, state, mode):
-        return Rubbed(jnp.ones_like(state.place))
+        return Sawtooth(jnp.ones_like(state.place))
 
     def averages(self, s, state, mode):
         return {"upward": 0.5 * (1 + mode), "height": state.place}
 
 
-def test_modes_and_resets():
-    """A sawtooth of height 1: 1.25 of each 3 s in the first mode, by turns."""
-    run = vi.simulate(Switching(), Rubbed(jnp.asarray(0.25)), 2)
+def test_averages_with_modes_and_resets():
+    """The mode is +1 for 1.75 s of the first cycle of 3 s, and for 1.25 s of the second."""
+    run = vi.simulate(Switching(), Sawtooth(jnp.asarray(0.25)), 2)
     np.testing.assert_allclose(run.averages["upward"], [1.75 / 3, 1.25 / 3], atol=1e-12)
     height = (0.5 - 0.25**2 / 2 + 0.5 + 0.5 + 0.25**2 / 2) / 3
     np.testing.assert_allclose(run.averages["height"], [height, height], atol=1e-9)
 
 
 @pytest.mark.slow
-def test_what_a_run_tells_of_them():
+def test_averages_in_repr_and_xarray():
     run = vi.simulate(Shaken(), begin(), 2, samples=2)
     assert "mean taken: " in repr(run) and f"{run.averages['taken'][-1]:.6g} W" in repr(run)
     data = run.to_xarray()
@@ -167,7 +162,7 @@ def test_what_a_run_tells_of_them():
         (3.0, TypeError, "mapping of names to numbers, but returned float"),
     ],
 )
-def test_names_are_checked_before_any_work(said, kind, match):
+def test_invalid_averages_raise_before_any_work(said, kind, match):
     class Named(Shaken):
         def averages(self, s, state):
             return said

@@ -1,4 +1,4 @@
-"""The loop as vector code and by XLA: the same motion to rounding, impact by impact."""
+"""The two backends, vector code and XLA, give the same motion up to rounding."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ def motor(kappa):
 
 
 class Ball(AbstractMachine):
-    """Falls by 1 on a stop at 1, over and over; an impact ends a cycle, long before `cycle`."""
+    """A ball that falls on a stop at 1. Each impact ends a cycle, earlier than `cycle` would."""
 
     restitution: Any
     cycle = 6.0
@@ -41,7 +41,7 @@ class Ball(AbstractMachine):
         return vi.OscillatorState(jnp.asarray(Y), jnp.asarray(V))
 
 
-# Scene of a lane's number, method, options of `simulate`.
+# Values: the scene as a function of the lane's parameter, the method, options of `simulate`.
 CASES = {
     "cycles that an impact ends": (
         lambda r: Ball(0.6 * r),
@@ -55,7 +55,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", quick(CASES, "cycles that an impact ends", "exact flight"))
-def test_roads_agree(name):
+def test_backends_agree(name):
     make, method, options = CASES[name]
 
     def lane(ratio):
@@ -70,16 +70,15 @@ def test_roads_agree(name):
     fast, slow = runs
     assert bool(jnp.all(fast.successful))
     np.testing.assert_array_equal(fast.impacts, slow.impacts)
-    # Rounding sizes the steps of an adaptive method, and of the thousand aims of a chatter it may
-    # ask for one more.
+    # Rounding changes the steps of an adaptive method, and can add one to a thousand in a chatter.
     if not isinstance(method, vi.Adaptive):
         np.testing.assert_allclose(fast.steps, slow.steps, rtol=2e-3 if "rest" in name else 0)
-    if name == "cycles that an impact ends":  # each at k times the speed of the one before
+    if name == "cycles that an impact ends":  # each impact multiplies the speed by k
         first = np.sqrt(0.2**2 + 2 * 0.9)
         fall = first * np.outer(0.6 * ratios, np.ones(12)).cumprod(axis=1)
         np.testing.assert_allclose(fast.sections.V[:, 1:], -fall, rtol=1e-9)
-    # Rounding grows with the motion, by a factor of 1e3 at most in these lanes; where it sizes the
-    # steps, results differ as the tolerance allows.
+    # The motion amplifies rounding errors, by at most 1e3 in these lanes. An adaptive method also
+    # changes its steps, so its results differ within the tolerance.
     close = 1e-9 if isinstance(method, vi.Adaptive) else 1e-12
     for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
         if a.dtype == jnp.float64:

@@ -1,4 +1,4 @@
-"""Subclasses of ready machines and parts: what they change is carried, or refused by name."""
+"""Subclasses of ready machines and parts: a change is used, or an error names it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +7,7 @@ import vi_jax as vi
 
 
 class Weighted(vi.IdealDrive):
-    """Of a body that has a weight."""
+    """Drive of a body with a weight."""
 
     def field(self, scene, s, state, pushes):
         rate = super().field(scene, s, state, pushes)
@@ -26,7 +26,7 @@ class Pulled(vi.Scene):
 
 
 class Named(vi.Scene):
-    """With other words only, and a mean."""
+    """A scene with other labels and an average, but the same equations."""
 
     labels = "x", "v"
 
@@ -40,7 +40,7 @@ class Wide(vi.CosineCrank):
 
 
 class Hooked(vi.SoftStop):
-    """Pulls at the body from afar."""
+    """A stop with a force at any distance."""
 
     def contribution(self, machine, s, state, mode):
         return jnp.ones_like(state.Y)
@@ -60,7 +60,7 @@ def scene(kind=vi.Scene, drive=vi.IdealDrive, crank=vi.CosineCrank, gap=1.2, sof
         (scene(crank=Wide), "`Wide`"),
     ],
 )
-def test_a_closed_form_is_that_of_the_librarys_equations(machine, what):
+def test_changed_equations_have_no_closed_form(machine, what):
     with pytest.raises(ValueError, match=what):
         vi.ExactFlight().check(machine)
     assert isinstance(vi.preset(machine), vi.FixedStep)
@@ -81,12 +81,12 @@ def test_a_closed_form_is_that_of_the_librarys_equations(machine, what):
         (scene(soft=(Hooked(1.0, 10.0),)), True),
     ],
 )
-def test_a_body_may_rest_where_anything_may_press_it_on(machine, may):
+def test_may_rest_if_a_force_can_press_the_body_on_a_stop(machine, may):
     assert machine.may_rest() is may
 
 
 class Slanted(vi.machines.Structure):
-    """With a coordinate that is no sum of displacements."""
+    """Doubles the position, so that `at` alone no longer defines the coordinate."""
 
     @property
     def coordinates(self):
@@ -94,8 +94,8 @@ class Slanted(vi.machines.Structure):
         return (own._replace(position=lambda x: 2 * own.position(x)),)
 
 
-def test_a_structure_has_its_stops_and_the_coordinates_of_its_subclass():
-    """x'' + x = 0 from x = 0: the stop at 0.5 = sin(π/6) turns the phase to 5π/6."""
+def test_structure_uses_its_stops_and_the_coordinates_of_its_subclass():
+    """In x'' + x = 0, each impact at 0.5 = sin(π/6) moves the phase from π/6 to 5π/6."""
     matrices = {"mass": jnp.ones(1), "stiffness": jnp.ones(1)}
     stop = vi.RigidStop(0.5, 1.0, at=[1.0])
     machine = vi.machines.Structure(**matrices, frequency=1.0, contacts=(stop,))

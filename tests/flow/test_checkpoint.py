@@ -1,4 +1,4 @@
-"""`jax.checkpoint` changes no derivative: what it does not keep is simulated again."""
+"""`jax.checkpoint` changes no derivative: values that are not stored are simulated again."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Presets, `suggest_method`, estimated errors, and numbers that stay known inside of `jit`."""
+"""Presets, `suggest_method`, error estimates, and parameters that stay constants in `jit`."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def test_presets_by_scene():
 
 @pytest.mark.slow
 def test_presets_keep_their_promise_from_slow_to_fast_drives():
-    """The promise was measured for κ from 0.5 to 1.9; the steps in a free period keep it."""
+    """Errors were measured for κ from 0.5 to 1.9. Equal steps per free period keep them beyond."""
 
     def last(kappa, method):
         motor = vi.Motor(0.65, kappa, 0.0093, 0.0053)
@@ -43,13 +43,13 @@ def test_presets_keep_their_promise_from_slow_to_fast_drives():
     }
     for name, promise in (("draft", 1e-6), ("standard", 4e-9)):
         error = np.abs(runs[name] - runs["reference"]).max(axis=1)
-        # 95 of 100 lanes; some of these impact many times in a slow cycle, hence the factor.
+        # The promise is for 95 of 100 lanes. The factor allows for many impacts in a slow cycle.
         assert np.quantile(error, 0.95) < 10 * promise
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene, method", [(MOTOR, "draft"), (MOTOR, vi.Adaptive(rtol=1e-7))])
-def test_estimated_errors_are_those_made(scene, method):
+def test_estimated_errors_match_true_errors(scene, method):
     run = vi.simulate(scene, scene.start(), 40, method=method, estimate=True)
     truth = vi.simulate(scene, scene.start(), 40, method="reference")
     made = np.abs(np.asarray(run.sections.Y - truth.sections.Y))
@@ -85,14 +85,14 @@ def test_suggested_for_an_ideal_drive(quantity):
     assert found.error < 1e-10
 
 
-def test_what_cannot_be_calibrated_is_refused():
+def test_invalid_calibrations_raise():
     with pytest.raises(ValueError, match="quantity"):
         vi.suggest_method(IDEAL, quantity="speed")
     with pytest.raises(TypeError, match="outside of `jit`"):
         jax.jit(
             lambda z: vi.suggest_method(vi.Scene.ideal(frequency_ratio=z)).error
         )(0.9)  # fmt: skip
-    # Its crank stops in every lane.
+    # The crank stops in every lane.
     drive = vi.Motor(0.0, 0.0, 1.0, 0.005)
     weak = vi.Scene(oscillator=vi.Oscillator(0.0), drive=drive, stops=[vi.RigidStop(2.0, 0.5)])
     with pytest.raises(ValueError, match="4 of 4 lanes of the calibration failed"):
@@ -106,14 +106,14 @@ def test_suggested_for_a_motor():
     assert min(t.seconds for t in found.tried if t.error <= 1e-7) == next(
         t.seconds for t in found.tried if t.method is found.method
     )
-    # What it says is true on the scene itself.
+    # The scene itself has an error of this order.
     run = vi.simulate(MOTOR, MOTOR.start(), 5, method=found.method)
     truth = vi.simulate(MOTOR, MOTOR.start(), 5, method="reference")
     assert abs(float(run.last.Y - truth.last.Y)) < 1e-6
     assert "tried" in str(found)
 
 
-def test_known_numbers_stay_known_inside_of_jit():
+def test_constants_stay_constants_inside_jit():
     seen = {}
 
     @jax.jit
@@ -129,8 +129,8 @@ def test_known_numbers_stay_known_inside_of_jit():
         jax.jit(lambda z: vi.Scene.ideal(frequency_ratio=z, restitution=2.0).drive)(0.9)
 
 
-def test_an_absolute_tolerance_is_that_of_small_numbers():
-    """An oscillator from rest, its force a millionth: x = a (cos ωs - cos s)/(1 - ω²)."""
+def test_absolute_tolerance_limits_errors_of_small_states():
+    """Compare with x = a (cos ωs - cos s)/(1 - ω²), the response from rest to a force of 1e-6."""
     a, omega = 1e-6, 1.3
     numbers = {"stiffness": 1.0, "cubic": 0.0, "damping": 0.0, "gap": 1.0}
     small = vi.machines.Duffing(amplitude=a, frequency=omega, **numbers)

@@ -1,4 +1,4 @@
-"""A motor with its armature: SciPy, closed forms, the limit without inductance, energy, verbs."""
+"""The DC motor, compared with SciPy, closed forms and the mean torque of a period."""
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ def machine(clock="phase", stops=None, xi=XI, crank=None, **numbers):
     )
 
 
-def drawn(seed):
-    """A machine and its start, of numbers such as one meets."""
+def random_case(seed):
+    """Return random realistic parameters and a start."""
     draw = np.random.default_rng(seed).uniform
     numbers = {
         "strength": draw(0.1, 2.0), "control": draw(0.6, 1.6), "coupling": draw(0.0, 0.1),
@@ -40,9 +40,9 @@ def drawn(seed):
     return numbers, start
 
 
-def integrated(n, start, cycles, te):
-    """The sections by SciPy's DOP853 in time, from L i' + R i + K_e φ' = u and Lagrange's
-    equations, written out again here; and the number of impacts."""
+def integrate_with_scipy(n, start, cycles, te):
+    """Return the sections and the number of impacts from SciPy's DOP853, for the equations
+    L i' + R i + K_e φ' = u and Lagrange's equations, derived here independently."""
 
     def rates(t, x):
         Y, V, W, M, phi = x
@@ -68,8 +68,8 @@ def integrated(n, start, cycles, te):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
-def test_beside_scipy(clock):
-    cases, cycles = [drawn(seed) for seed in range(16)], 5
+def test_sections_match_scipy(clock):
+    cases, cycles = [random_case(seed) for seed in range(16)], 5
     columns = [jnp.asarray([c[i][name] for c in cases]) for i in (0, 1) for name in cases[0][i]]
     names = list(cases[0][0])
 
@@ -85,7 +85,7 @@ def test_beside_scipy(clock):
     found = np.stack([getattr(run.sections, name)[:, 1:] for name in "YVWM"], axis=-1)
     several = 0
     for i, (numbers, start) in enumerate(cases):
-        wanted, impacts = integrated(numbers, start, cycles, numbers["electrical_time"])
+        wanted, impacts = integrate_with_scipy(numbers, start, cycles, numbers["electrical_time"])
         np.testing.assert_allclose(found[i], wanted, atol=1e-9)
         assert int(run.impacts[i].sum()) == impacts
         several += impacts
@@ -93,8 +93,8 @@ def test_beside_scipy(clock):
 
 
 @pytest.mark.parametrize("te", [0.1, 4.0], ids=["overdamped", "swinging"])
-def test_a_run_up_from_rest_as_in_closed_form(te):
-    """Without load speed and current are a linear system of two equations."""
+def test_start_from_rest_matches_closed_form(te):
+    """Without a load, speed and current satisfy two linear equations."""
     scene = machine("time", stops=(), coupling=0.0, slider_inertia=0.0, electrical_time=te)
     start = scene.start(W=0.0, M=0.0)
     run = vi.simulate(scene, start, 3, method=vi.Adaptive(rtol=1e-12), samples=8)
@@ -108,8 +108,8 @@ def test_a_run_up_from_rest_as_in_closed_form(te):
 
 
 @pytest.mark.slow
-def test_derivatives_beside_differences():
-    """By an electrical, a mechanical and a starting number at once."""
+def test_derivatives_match_differences():
+    """Derivatives with respect to the electrical time, the control and the starting torque."""
 
     def last(values):
         scene = machine(electrical_time=values[0], control=values[1])
@@ -123,9 +123,7 @@ def test_derivatives_beside_differences():
 
 
 @pytest.mark.slow
-def test_fixed_steps_stay_stable():
-    """However fast the current settles, or however slowly it swings with the shaft."""
-
+def test_fixed_steps_are_stable_for_fast_and_slow_currents():
     def last(te, method):
         scene = machine(electrical_time=te, strength=5.0)
         return vi.simulate(scene, scene.start(W=0.9), 4, method=method).last
@@ -140,18 +138,18 @@ def test_fixed_steps_stay_stable():
 
 
 @pytest.mark.slow
-def test_periodic_motions_and_what_follows_from_them():
+def test_orbit_has_exponents_mean_torque_and_a_branch():
     scene = machine()
     settled = vi.simulate(scene, scene.start(Y=1.5, V=1.0), 1, settle=300).last
     orbit = vi.find_orbit(scene, settled, throw=True)
     assert bool(orbit.stable) and orbit.multipliers.shape == (4,)
-    # Where there is no chaos, exponents are the multipliers' logarithms.
+    # On a periodic orbit, Lyapunov exponents are logarithms of the multipliers per time.
     spectrum = vi.lyapunov(scene, orbit.state, cycles=96)
     growth = np.sort(np.log(np.abs(orbit.multipliers)))[::-1] / float(orbit.duration)
     np.testing.assert_allclose(spectrum.exponents, growth, atol=2e-3)
     timed = vi.lyapunov(scene, scene.in_clock("time").convert_start(orbit.state), cycles=96)
     np.testing.assert_array_equal(timed.exponents, spectrum.exponents)
-    # The motor's mean torque pays for the mean load: over a period the armature keeps nothing.
+    # The armature stores nothing over a period: the mean torque is the steady one at mean speed.
     run = orbit.trajectory(samples=256)
     drive, state = scene.drive, run.samples.state
     mean = float(np.trapezoid(np.asarray(state.M), np.asarray(run.samples.time)))
@@ -163,7 +161,7 @@ def test_periodic_motions_and_what_follows_from_them():
     assert branch.parameter.min() == pytest.approx(0.2) and branch.parameter.max() > 0.99
 
 
-def test_from_numbers_in_si():
+def test_scene_from_parameters_in_si_units():
     table = vi.Parameters(torque=10.0, control=0.9, electrical_time=0.01)
     scene = table.scene()
     assert isinstance(scene.drive, vi.DCMotor)

@@ -1,4 +1,4 @@
-"""Impacts that are easy to miss, to count twice or to take in the wrong order."""
+"""Impacts that are easily missed, counted twice or resolved in the wrong order."""
 
 import diffrax
 import equinox as eqx
@@ -18,21 +18,21 @@ def scene_with(*stops, zeta=0.8, xi=0.05):
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
 def test_the_earlier_of_two_stops_acts(method):
-    """A body so fast that a free step would take it through one stop and far beyond the other."""
+    """The body is so fast that a free step would take it far beyond a stop."""
     left, right = vi.RigidStop(1.1, 0.5, "left"), vi.RigidStop(1.05, 0.5)
     for V, first, gap, stops in ((40.0, 1, 1.05, (left, right)), (-40.0, 1, 1.1, (right, left))):
         scene = scene_with(*stops)
         run = vi.simulate(scene, scene.start(V=V), 1, method=method, impact_log=3)
         assert list(np.asarray(run.impact_log.stop[0])) == [first, 1 - first, first]
-        # Over so short a way the speed is that of the start but for spring and damping.
+        # Over so short a distance, spring and damping hardly change the speed.
         assert float(run.impact_log.phase[0, 0]) == pytest.approx(0.8 * gap / 40, rel=1e-2)
         assert float(run.impact_log.speed[0, 0]) == pytest.approx(40.0, rel=1e-2)
 
 
-# A method cannot see a graze shallower than its own error: eight steps a cycle are too few here.
+# A method cannot find a graze shallower than its error: eight steps per cycle are too few.
 @pytest.mark.parametrize("method", [*METHODS[:2], vi.FixedStep(steps_per_cycle=64)], ids=NAMES)
 def test_entry_and_exit_within_a_step(method):
-    """A graze enters and leaves inside one step; just below the peak it is an impact."""
+    """A stop just above the peak is not hit; one just below is entered and left within a step."""
     free = scene_with(zeta=0.5)
     start = free.start(Y=0.2, V=1.5)
     run = vi.simulate(free, start, 1, method=method)
@@ -50,7 +50,7 @@ def test_entry_and_exit_within_a_step(method):
     assert (speed > 0.5).all() and (speed < 3).all()
 
 
-def test_ends_with_a_reason():
+def test_failed_runs_have_a_reason():
     scene = vi.Scene.ideal(frequency_ratio=0.9)
     run = vi.simulate(scene, scene.start(), 10, method=vi.FixedStep(), max_steps=50)
     assert bool(run.result == vi.RESULTS.max_steps)
@@ -68,8 +68,8 @@ def test_ends_with_a_reason():
     ids=["exact", "fixed", "taylor"],
 )
 def test_an_impact_on_the_section_belongs_to_the_cycle_that_ends_there(method):
-    """At resonance without damping the attracting motion has its impact at φ = 2π exactly: were it
-    counted now before the section and now after it, its period would be told wrong."""
+    """At undamped resonance, the attractor has its impact exactly at φ = 2π. If rounding moved it
+    to the next cycle, the period would be wrong."""
     scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5)
     starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(
         jnp.asarray([-2.0, 0.0, -1.0, 0.5]), jnp.asarray([0.0, 0.5, 1.0, -0.8])
@@ -77,5 +77,5 @@ def test_an_impact_on_the_section_belongs_to_the_cycle_that_ends_there(method):
     run = vi.jit(jax.vmap(lambda x: vi.simulate(scene, x, 8, settle=200, method=method)))(starts)
     assert bool(run.successful.all()) and (np.asarray(run.impacts) == 1).all()
     np.testing.assert_allclose(run.sections.Y, 2.0, rtol=1e-12)
-    # The impact speed of the closed form is π/(1 + k); k of it is left.
+    # In closed form the impact speed is π/(1 + k). Restitution multiplies it by k.
     np.testing.assert_allclose(run.sections.V, -0.5 * np.pi / 1.5, rtol=1e-10)

@@ -1,4 +1,4 @@
-"""Events that come together, set each other off, jump, or change which way a motion goes."""
+"""Simultaneous events, chains of events, guards that jump, and events that change a mode."""
 
 import inspect
 import itertools
@@ -24,8 +24,7 @@ def two(x, n=0.0):
     return Two(jnp.asarray(float(x)), jnp.asarray(float(n)))
 
 
-def by_case(machine, *cases):
-    """The number that the machine's `case` picks."""
+def pick(machine, *cases):
     return jnp.stack([jnp.asarray(x, float) for x in cases])[machine.case]
 
 
@@ -34,7 +33,7 @@ CASES = ("end of the cycle", "set off", "set off back", "same guard", "jump", "c
 
 
 class Cases(vi.AbstractMachine):
-    """x' = p or -x, n' = x or 0 or -n, and a pair of resets, by the number `case`."""
+    """A field and two resets, all chosen by the number `case`."""
 
     case: Any
     p: Any = P
@@ -44,19 +43,19 @@ class Cases(vi.AbstractMachine):
     def events(self):
         def first(m, s, z):
             jumps = jnp.where(z.x > np.sqrt(2), 1.0, -1.0)
-            return by_case(m, s - 5, s - 0.5, z.x - 1, z.x - 1, jumps, 2 - s, z.x - 1)
+            return pick(m, s - 5, s - 0.5, z.x - 1, z.x - 1, jumps, 2 - s, z.x - 1)
 
         def moved(m, s, z):
             x = z.x
-            return Two(by_case(m, x + 1, x + 2, 2 * x, 0 * x, x - 1, x, -3 * x), z.n)
+            return Two(pick(m, x + 1, x + 2, 2 * x, 0 * x, x - 1, x, -3 * x), z.n)
 
         def second(m, s, z):
             x = z.x
-            return by_case(m, s - 5, x - 1, x - 1.5, x - 1, -1 - x, -1 - x, -x)
+            return pick(m, s - 5, x - 1, x - 1.5, x - 1, -1 - x, -1 - x, -x)
 
         def counted(m, s, z):
             x, n = z.x, z.n
-            after = Two(by_case(m, x, x, -x, x, x, x, -x), n + by_case(m, 1, 1, x, 1, 1, 1, 1))
+            after = Two(pick(m, x, x, -x, x, x, x, -x), n + pick(m, 1, 1, x, 1, 1, 1, 1))
             return after
 
         return vi.Reset(first, moved), vi.Reset(second, counted)
@@ -64,14 +63,14 @@ class Cases(vi.AbstractMachine):
     def field(self, s, z):
         still, p = 0 * z.x, self.p + 0 * z.x
         return Two(
-            by_case(self, -z.x, still, p, p, p, p, p),
-            by_case(self, -z.n, still, z.x, still, still, z.x, still),
+            pick(self, -z.x, still, p, p, p, p, p),
+            pick(self, -z.n, still, z.x, still, still, z.x, still),
         )
 
 
 @pytest.fixture(scope="module")
 def cases():
-    """Each case for three cycles, with derivatives by p."""
+    """Simulate each case for three cycles, with derivatives with respect to p."""
 
     def run(p):
         return jax.vmap(
@@ -81,42 +80,41 @@ def cases():
     return jax.jvp(run, (jnp.asarray(P),), (jnp.asarray(1.0),))
 
 
-def named(cases, name):
-    """State on the sections behind the start, its derivative, and the run."""
+def select_case(cases, name):
+    """Return the states on the sections after the start, their derivatives, and the run."""
     run, slope = (jax.tree.map(lambda x: x[CASES.index(name)], y) for y in cases)
     return *((y.sections.x[1:], y.sections.n[1:]) for y in (run, slope)), run
 
 
 def test_two_events_at_the_end_of_a_cycle(cases):
-    (x, n), _, run = named(cases, "end of the cycle")
+    (x, n), _, run = select_case(cases, "end of the cycle")
     shares = np.cumsum(np.exp(-5.0) ** np.arange(3))
     np.testing.assert_allclose([x, n], [shares, shares], rtol=1e-10)
     assert run.event_log.number[:, :3].tolist() == [[0, 1, -1]] * 3
 
 
-def test_an_event_sets_off_another(cases):
-    """And not itself; and none twice."""
-    (x, n), _, run = named(cases, "set off")
+def test_event_triggers_another_once(cases):
+    (x, n), _, run = select_case(cases, "set off")
     np.testing.assert_allclose([x, n], [[2, 4, 6], [1, 1, 1]], rtol=1e-14)
     assert run.event_log.number[0, :3].tolist() == [0, 1, -1]
 
 
-def test_derivatives_pass_through_an_event_that_another_sets_off(cases):
-    """x = 1 at t = 1/p becomes 2, which n takes up, then -2: 1/2p + 2 + ∫(pt - 3)dt."""
-    (x, n), (dx, dn), _ = named(cases, "set off back")
+def test_derivatives_pass_through_an_event_that_another_triggers(cases):
+    """At t = 1/p, x jumps from 1 to 2, n grows by 2, and x becomes -2: 1/2p + 2 + ∫(pt - 3)dt."""
+    (x, n), (dx, dn), _ = select_case(cases, "set off back")
     np.testing.assert_allclose([x[0], n[0]], [5 * P - 3, 12.5 * P + 3 / P - 13], rtol=1e-10)
     np.testing.assert_allclose([dx[0], dn[0]], [5.0, 12.5 - 3 / P**2], rtol=1e-9)
 
 
 def test_two_events_with_the_same_guard_both_happen(cases):
-    """The second too, although the first has taken its guard back."""
-    (x, n), _, _ = named(cases, "same guard")
+    """The second happens although the first has already made the guard negative."""
+    (x, n), _, _ = select_case(cases, "same guard")
     way = 5 * P * np.arange(1, 4)
     np.testing.assert_allclose([x, n], [way % 1, way // 1], atol=1e-9)
 
 
-def test_a_guard_that_jumps_is_located(cases):
-    (x, n), _, run = named(cases, "jump")
+def test_guard_that_jumps_is_located(cases):
+    (x, n), _, run = select_case(cases, "jump")
     way = 5 * P * np.arange(1, 4)
     times = np.ceil(way - np.sqrt(2))
     np.testing.assert_allclose([x, n], [way - times, 0 * way], atol=1e-10)
@@ -124,20 +122,20 @@ def test_a_guard_that_jumps_is_located(cases):
     np.testing.assert_allclose(run.event_log.phase[0, :3], clock, atol=1e-10)
 
 
-def test_a_clock_that_begins_anew_takes_a_guard_above_zero(cases):
-    """2 - s, from -3 to 2 with each cycle but the first; it is met before anything moves."""
-    _, _, run = named(cases, "clock")
+def test_restart_of_the_clock_triggers_a_guard(cases):
+    """The guard 2 - s jumps from -3 to 2 at the start of each cycle but the first."""
+    _, _, run = select_case(cases, "clock")
     assert run.event_log.number[:, 0].tolist() == [-1, 0, 0]
     np.testing.assert_array_equal(run.event_log.phase[1:, 0], 0.0)
 
 
-def test_events_that_set_each_other_off_for_ever_end_the_lane(cases):
-    assert bool(named(cases, "for ever")[-1].result == vi.RESULTS.simultaneous)
+def test_endless_chain_of_events_fails_the_lane(cases):
+    assert bool(select_case(cases, "for ever")[-1].result == vi.RESULTS.simultaneous)
     assert int(cases[0].successful.sum()) == len(CASES) - 1
 
 
 class Furnace(vi.AbstractMachine):
-    """Off above 296, on below 294: T' = -2 (T - 285) + 25 if on."""
+    """A furnace, off above 296 and on below 294: T' = -2 (T - 285) + 25 if on."""
 
     cycle: float = 1.0
     events: tuple = (
@@ -153,7 +151,7 @@ class Furnace(vi.AbstractMachine):
 
 
 def heated(T, time):
-    """From exponential to exponential."""
+    """Return the temperature from the closed form between the thresholds."""
     on = T < 294
     while True:
         limit, edge = (297.5, 296.0) if on else (285.0, 294.0)
@@ -174,11 +172,11 @@ def test_a_furnace_with_two_thresholds():
         assert bool(run.successful.all())
         np.testing.assert_allclose(run.last[0], [heated(T, 4) for T in begins], rtol=1e-11)
     assert heated(300.0, 4) == pytest.approx(294.497730558, abs=1e-9)
-    np.testing.assert_allclose(runs[0].y_max[:, 2:], 296.0, rtol=1e-12)  # a turn where it switches
+    np.testing.assert_allclose(runs[0].y_max[:, 2:], 296.0, rtol=1e-12)  # switched off there
 
 
-def test_a_motion_goes_on_in_its_modes():
-    """Cycle by cycle as in one run; between the thresholds its state does not tell its mode."""
+def test_last_state_keeps_its_modes():
+    """Compare runs of one cycle with a long run. Between the thresholds both modes are possible."""
     furnace = Furnace(cycle=0.37)
     whole = vi.simulate(furnace, (jnp.asarray(300.0),), 12, method=CLOSE)
     state, found = (jnp.asarray(300.0),), []
@@ -193,8 +191,7 @@ def test_a_motion_goes_on_in_its_modes():
 
 
 class Wave(vi.AbstractMachine):
-    """x' = ±1 - κx by a switch of the clock, whose side at the end of a cycle is not that at its
-    begin."""
+    """x' = ±1 - κx; the sign changes at s = 5, and back as the next cycle begins."""
 
     decay: Any = 0.0
     cycle: float = 10.0
@@ -216,7 +213,7 @@ def test_a_rate_that_changes_its_sign_with_a_mode():
 
 
 class Bodies(vi.Mechanical):
-    """Two bodies that nothing pulls, each before a stop."""
+    """Two bodies without forces, each with a stop."""
 
     q = ("x", "y")
     mass = (1.0, 1.0)
@@ -234,7 +231,7 @@ def test_two_bodies_land_together_as_a_cycle_ends():
     assert int(run.impacts[0]) == 2
 
 
-class Watched(vi.AbstractMachine):
+class WithIdleReset(vi.AbstractMachine):
     """An oscillator with a stop, and a reset that never happens."""
 
     gap: Any
@@ -249,9 +246,9 @@ class Watched(vi.AbstractMachine):
         return vi.OscillatorState(x.V, jnp.cos(0.9 * s) - x.Y - 0.1 * x.V)
 
 
-def test_derivatives_of_extremes_beside_events():
+def test_derivatives_of_extremes_with_events():
     def extremes(gap):
-        run = vi.simulate(Watched(gap), vi.OscillatorState(0 * gap, 0 * gap), 3, method=CLOSE)
+        run = vi.simulate(WithIdleReset(gap), vi.OscillatorState(0 * gap, 0 * gap), 3, method=CLOSE)
         return run.y_max[-1], run.y_min[-1]
 
     h = 1e-5
@@ -261,8 +258,8 @@ def test_derivatives_of_extremes_beside_events():
     assert float(low[1]) == pytest.approx(float(lowest[2] - lowest[0]) / (2 * h), rel=1e-6)
 
 
-class Behind(vi.AbstractMachine):
-    """y'' = 2 - y, from where a reset has its surface."""
+class WithReset(vi.AbstractMachine):
+    """y'' = 2 - y, with a reset at y = 1."""
 
     cycle: float = 9.0
     events: tuple = (
@@ -273,31 +270,31 @@ class Behind(vi.AbstractMachine):
         return vi.OscillatorState(x.V, 2 - x.Y)
 
 
-def test_a_start_on_a_surface_is_behind_it():
-    """To rounding, even if rounding makes it fall at first; what falls by more comes back."""
+def test_start_on_a_guard_does_not_trigger_it():
+    """Only the last start falls by more than rounding, so it returns and triggers the reset."""
     places = 1 + jnp.array([0.0, -1e-16, 0.0, -1e-12, 0.0])
     speeds = jnp.array([-1e-17, -1e-17, -1e-9, 0.0, -0.1])
     starts = vi.OscillatorState(places, speeds)
-    run = jax.vmap(lambda x: vi.simulate(Behind(), x, 1, event_log=2))(starts)
+    run = jax.vmap(lambda x: vi.simulate(WithReset(), x, 1, event_log=2))(starts)
     assert run.event_log.number[:, 0, 0].tolist() == [-1, -1, -1, -1, 0]
     phase = 2 * np.arctan(0.1)  # y - 2 = -cos s - sin(s)/10
     np.testing.assert_allclose(run.event_log.phase[-1, 0, 0], phase, rtol=1e-8)
 
 
-class ByNumber(Behind):
+class ByNumber(WithReset):
     events: tuple = (
         vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: x, when=lambda m, s, x: x.V),
     )
 
 
-def test_a_condition_of_the_wrong_kind_is_named():
+def test_condition_of_the_wrong_kind_raises():
     start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
     with pytest.raises(TypeError, match=r"`when` of event 0 .* must return a flag"):
         vi.simulate(ByNumber(), start, 1)
 
 
-def test_a_blow_is_felt_along_any_path_of_contacts():
-    """Of six bodies in a row, in all the ways in which they can be numbered."""
+def test_impact_reaches_bodies_along_any_path_of_contacts():
+    """Six bodies in a row, numbered in every order."""
 
     def reached(order):
         ones = jnp.zeros((6, 6)).at[order[:-1], order[1:]].set(1.0)

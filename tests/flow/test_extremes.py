@@ -1,5 +1,5 @@
-"""Numbers at the ends of their ranges: states after some cycles beside matrix exponentials, from
-impact to impact; tolerances, single precision, and many cycles."""
+"""Extreme parameters, compared with matrix exponentials from impact to impact; tolerances, single
+precision and many cycles."""
 
 import warnings
 from functools import cache
@@ -13,7 +13,7 @@ import vi_jax as vi
 from linear_truth import Contact, LinearTruth
 from truth import integrated
 
-# ζ, ξ, gap and restitution; Y and V at the start; cycles, and those in single precision.
+# ζ, ξ, gap, restitution, Y and V at the start, cycles in double and in single precision.
 CORNERS = {
     "undamped": (0.9, 0.0, 1.2, 0.5, 0.0, 1.0, 10, 3),
     "critically damped": (0.9, 1.0, 1.2, 0.5, 0.0, 10.0, 10, 3),
@@ -35,7 +35,7 @@ CORNERS = {
     "on the stop, pulled off": (0.9, 0.05, 2.0, 0.5, 2.0, 0.0, 3, 3),
     "held until cos φ = d": (0.9, 0.05, 0.5, 0.0, 0.5, 0.0, 3, 3),
 }  # fmt: skip
-# Of these the sections lie where the crank pulls the body off.
+# In these cases the section is at φ = π, where the crank pulls the body off the stop.
 PULLED = {"no room", "pressed on", "let go of for a moment", "held until cos φ = d"}
 ONE = np.ones((1, 1))
 
@@ -53,7 +53,7 @@ def truth(name, cycles):
 
 
 def errors(method, cycles):
-    """By name, relative to 1 + |state|; all corners by one program."""
+    """Return the error of each corner, relative to 1 + |state|, from one compiled program."""
     names = [name for name, corner in CORNERS.items() if corner[cycles] is not None]
     numbers = np.array([CORNERS[name][:6] for name in names]).T
     settle = np.array([CORNERS[name][cycles] - 1.0 for name in names])
@@ -87,15 +87,14 @@ def test_corners(method, close):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-5)])
 def test_corners_in_single_precision(method):
-    """Near resonance and with k → 1 errors grow, as there is nothing to damp them."""
+    """Near resonance and for k → 1, nothing damps the errors, so they grow."""
     with jax.enable_x64(False), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
         found = errors(method, 7)
     assert max(found.values()) < 1e-4, found
 
 
-def test_every_tolerance():
-    """The error after 20 cycles is at most ten tolerances, down to rounding."""
+def test_error_is_at_most_ten_tolerances():
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
     exact = vi.simulate(scene, scene.start(), 20, method=vi.ExactFlight()).last
     rtol = 10.0 ** -np.arange(1, 16)
@@ -107,8 +106,8 @@ def test_every_tolerance():
 
 
 @pytest.mark.slow
-def test_a_strong_motor_is_the_ideal_drive():
-    """Off by 1/τ0, until its cycles take more steps than are allowed."""
+def test_strong_motor_approaches_the_ideal_drive():
+    """The difference falls as 1/τ0. The strongest motor needs more steps than allowed."""
     method = vi.Adaptive(rtol=1e-11)
     stops, oscillator = (vi.RigidStop(2.0, 0.5),), vi.Oscillator(0.05)
     still = vi.Scene(oscillator, vi.IdealDrive(0.9), stops)
@@ -130,8 +129,7 @@ def test_a_strong_motor_is_the_ideal_drive():
 @pytest.mark.parametrize(
     ("method", "close"), [(vi.FixedStep(), 1e-5), (vi.Adaptive(rtol=1e-11), 1e-8)]
 )
-def test_a_spring_that_rules_the_shaft(method, close):
-    """A coupling of 1 and of 10, beside SciPy."""
+def test_strong_coupling_matches_scipy(method, close):
     for eps, tau0, kappa, W in ((1.0, 3.0, 2.0, 2.0), (10.0, 30.0, 8.0, 8.0)):
         scene = vi.Scene(
             vi.Oscillator(0.05), vi.Motor(tau0, kappa, eps, 0.005), (vi.RigidStop(2.0, 0.5),)
@@ -145,8 +143,8 @@ def test_a_spring_that_rules_the_shaft(method, close):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-11)])
-def test_hardly_any_room(method):
-    """Two stops 1e-6 apart: rest on one side, then on the other, twice a cycle."""
+def test_narrow_gap_between_stops(method):
+    """Two stops are 1e-6 apart, and the body rests twice in each cycle."""
     stops = vi.RigidStop(0.3, 0.5), vi.RigidStop(-0.3 + 1e-6, 0.5, "left")
     scene = vi.Scene(vi.Oscillator(0.05), vi.IdealDrive(0.5), stops=stops)
     run = vi.simulate(scene, scene.start(Y=0.3 - 5e-7), 4, settle=4, method=method)
@@ -163,8 +161,8 @@ def test_hardly_any_room(method):
         (vi.ExactFlight(), False, 1e-4),
     ],
 )
-def test_nothing_degrades_with_the_number_of_cycles(method, double, close):
-    """On the stable 4π motion, after 10³ and 10⁵ cycles."""
+def test_errors_do_not_grow_with_the_number_of_cycles(method, double, close):
+    """Compare with the stable 4π orbit after 10³ and 10⁵ cycles."""
     with jax.enable_x64(double), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="vi_jax is running in single precision")
         scene = vi.Scene.ideal(frequency_ratio=0.9)

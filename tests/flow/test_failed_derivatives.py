@@ -1,4 +1,4 @@
-"""Derivatives of lanes that fail: never a zero that looks like a stationary point."""
+"""Derivatives of failed lanes are NaN, never a zero that looks like a stationary point."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def run(gap, k):
     return vi.simulate(scene, start, CYCLES, max_steps=STEPS, rests=True)
 
 
-def test_forward_derivatives_of_a_failed_lane_are_nan_and_its_numbers_stay():
+def test_forward_derivatives_of_a_failed_lane_are_nan_and_its_values_stay():
     def found(gap, k):
         run_ = run(gap, k)
         return run_.sections.Y, run_.y_min, run_.impact_speed, run_.last.V
@@ -34,11 +34,11 @@ def test_forward_derivatives_of_a_failed_lane_are_nan_and_its_numbers_stay():
         np.testing.assert_array_equal(a, b)
         assert np.isnan(rate[0]).all() and np.isnan(rate[2]).all()
         assert np.isfinite(rate[1]).all()
-    # It failed on its way, and what came before is told.
+    # The lane failed midway; the sections before have values.
     assert np.isfinite(plain[0][0, 0]) and np.isnan(plain[0][0, -1])
 
 
-def test_gradients_of_a_failed_lane_are_nan_unless_it_is_left_out():
+def test_gradients_of_a_failed_lane_are_nan_unless_masked():
     def last(gap, k):
         run_ = run(gap, k)
         return run_.last.Y, run_.successful
@@ -55,7 +55,7 @@ def test_gradients_of_a_failed_lane_are_nan_unless_it_is_left_out():
     np.testing.assert_array_equal(slopes_left_out, jnp.where(good, slopes, 0.0))
 
 
-def test_a_scan_tells_no_slope_of_a_failed_lane():
+def test_scan_returns_nan_slopes_for_failed_lanes():
     scene = vi.Scene.ideal(frequency_ratio=0.9, gap=-0.5, damping_ratio=0.05)
     options = {"cycles": CYCLES, "settle": 0, "max_steps": STEPS, "start": scene.start(Y=-0.6)}
     axes, slope = {"stops.0.gap": jnp.asarray([-0.5, 1.5])}, ("stops.0.gap",)

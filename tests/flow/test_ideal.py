@@ -1,4 +1,4 @@
-"""The ideal scene against the closed form: the table of values, the route to the 4π motion."""
+"""The ideal scene compared with the closed form, and its convergence to the 4π motion."""
 
 import diffrax
 import jax
@@ -60,7 +60,7 @@ def test_from_rest_settles_on_the_4pi_motion(method):
 
 
 def generator(zeta, xi):
-    """d/dτ of (Y, V, cos φ, sin φ) is this matrix times it, between impacts."""
+    """Return the matrix A with dx/dτ = A x between impacts, for x = (Y, V, cos φ, sin φ)."""
     matrix = np.zeros((*np.shape(zeta), 4, 4))
     matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1] = 1.0, -1.0, -2 * xi
     matrix[..., 1, 2], matrix[..., 2, 3], matrix[..., 3, 2] = 1.0, -zeta, zeta
@@ -68,7 +68,7 @@ def generator(zeta, xi):
 
 
 def test_flight_is_the_matrix_exponential():
-    """Under-, critically and over-damped, the secular case, and both sides of the near switch."""
+    """Weak, critical and strong damping, resonance, and both sides of the switch near resonance."""
     zetas = [1e-3, 0.4, 1.0, 1 + 1e-9, 1 - 1e-6, 1.001, 0.991, 1.011, 30.0]
     zeta, xi = map(np.ravel, np.meshgrid(zetas, [0.0, 1e-4, 0.3, 1.0, 1.5, 10.0]))
     draw = np.random.default_rng(0)

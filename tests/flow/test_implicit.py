@@ -1,4 +1,4 @@
-"""Implicit solvers carry what is stiff: strong motors and strong dashpots."""
+"""Implicit solvers handle stiff systems: strong motors and strong dashpots."""
 
 import dataclasses
 
@@ -25,13 +25,13 @@ def test_inverse_of_small_matrices():
     rng = np.random.default_rng(0)
     for n in range(1, 6):
         matrix = rng.normal(size=(n, n))
-        matrix[0, 0] = 0.0 if n > 1 else 1.0  # no pivot where it is looked for first
+        matrix[0, 0] = 0.0 if n > 1 else 1.0  # the first pivot is zero
         np.testing.assert_allclose(inverse_of(jnp.asarray(matrix)) @ matrix, np.eye(n), atol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock", ["phase", "time"])
-def test_a_strong_motor_beside_scipy(clock):
+def test_strong_motor_matches_scipy(clock):
     scene = strong(1e4)
     run = vi.simulate(scene, scene.start(), 4, method=IMPLICIT, clock=clock)
     drive, (stop,), start = scene.drive, scene.stops, scene.start()
@@ -51,7 +51,7 @@ def test_a_strong_motor_beside_scipy(clock):
     assert bool(run.successful) and int(run.impacts.sum()) >= 3
 
 
-def test_steps_do_not_grow_with_the_motor():
+def test_steps_do_not_grow_with_the_strength_of_the_motor():
     @vi.jit
     @jax.vmap
     def steps(torque):
@@ -76,8 +76,8 @@ def test_derivatives():
     )  # fmt: skip
 
 
-def test_a_strong_dashpot_beside_explicit_steps():
-    """A stop that is a dashpot of ten times its critical damping."""
+def test_strong_dashpot_matches_explicit_steps():
+    """The stop has ten times its critical damping."""
     base = vi.Scene.ideal(frequency_ratio=0.9, gap=None, damping_ratio=0.02)
     stop = vi.SoftStop(1.0, 1e3, damping=20 * 1e3**0.5)
     scene = dataclasses.replace(base, soft_stops=(stop,))
@@ -91,7 +91,7 @@ def test_a_strong_dashpot_beside_explicit_steps():
 
 
 @pytest.mark.slow
-def test_suggest_method_takes_it_where_a_scene_is_stiff():
+def test_suggest_method_tries_implicit_solvers_for_stiff_scenes():
     found = vi.suggest_method(strong(1e3), error=1e-5, cycles=4, lanes=16)
     assert found.reached and found.error <= 1e-5
     assert any("Kvaerno5" in t.name for t in found.tried)

@@ -1,4 +1,4 @@
-"""Numbers of a machine are no part of its programs, however they were written."""
+"""Parameters of a machine, floats or arrays, can change without a new compilation."""
 
 import importlib
 from collections.abc import Callable
@@ -31,7 +31,7 @@ class Law(eqx.Module):
 
 
 class Shaken(vi.AbstractMachine):
-    """A body on a spring under a number of harmonics; the field loops over what is whole."""
+    """A body on a spring under several harmonics; the field loops over their integer number."""
 
     shaking: jax.Array | float = 1.0
     law: Any = 0.5
@@ -63,7 +63,7 @@ MACHINES: dict[str, Callable[[Any], vi.AbstractMachine]] = {
 
 @pytest.fixture
 def traces(monkeypatch):
-    """How often each of the verbs was traced."""
+    """Count how often each function is traced."""
     counts = {"simulate": 0, "find_orbit": 0}
 
     def counted(verb, path, name):
@@ -82,9 +82,9 @@ def traces(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["own", "law", "pair", "paper"])
-def test_ten_numbers_are_one_program(traces, name):
-    """From `with_leaf` too, and the same numbers make the same motion."""
-    cycles = 5 + sorted(MACHINES).index(name)  # a program that no other test has
+def test_ten_values_compile_one_program(traces, name):
+    """`with_leaf` reuses the program, and equal parameters give the same motion."""
+    cycles = 5 + sorted(MACHINES).index(name)  # no other test compiles this
     found = {}
     for x in NUMBERS:
         machine = MACHINES[name](x)
@@ -100,21 +100,21 @@ def test_ten_numbers_are_one_program(traces, name):
 
 
 @pytest.mark.slow
-def test_ten_numbers_are_one_program_to_find_orbits(traces):
+def test_ten_values_compile_one_program_to_find_orbits(traces):
     for x in NUMBERS:
         machine = MACHINES["own"](x)
-        vi.find_orbit(machine, machine.start(), impact_log=11)  # a program that no other test has
+        vi.find_orbit(machine, machine.start(), impact_log=11)  # no other test compiles this
     assert traces["find_orbit"] == 1
 
 
 @pytest.mark.slow
-def test_what_is_whole_is_a_part_of_the_program(traces):
+def test_integers_are_compile_time_constants(traces):
     two, three = Shaken(), Shaken(harmonics=3)
     last = {float(vi.simulate(m, m.start(), 11).last.Y) for m in (two, three)}
     assert traces["simulate"] == 2 and len(last) == 2
 
 
-def test_a_number_written_as_a_whole_one_is_not_cut_off():
+def test_float_written_as_an_integer_is_not_truncated():
     machine = with_leaf(Shaken(shaking=1), "shaking", 1.5)
     same = replace(machine, shaking=1.5)
     a, b = (vi.simulate(m, m.start(), 11).last.Y for m in (machine, same))

@@ -1,4 +1,4 @@
-"""Motor scenes: both clocks, energy, the ideal limit, stall and start from rest."""
+"""Motor scenes: energy, stall, start from rest and strong motors."""
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +24,14 @@ def test_energy_is_conserved_through_impacts(crank):
     assert float(jnp.abs(energy / energy[0] - 1).max()) < 1e-9
 
 
-def test_a_stall_points_to_the_time_clock():
+def test_error_of_a_stall_suggests_the_time_clock():
     scene = vi.Parameters(torque=0.5, control=-0.5).scene()  # the motor brakes
     start = scene.start(V=0.5, W=0.5)
     run = vi.simulate(scene, start, 20)
     assert bool(run.result == vi.RESULTS.stalled)
     assert 'clock="time"' in vi.RESULTS[run.result]
     assert bool(jnp.isnan(run.sections.Y[-1])) and bool(jnp.isfinite(run.sections.Y[0]))
-    # Time carries on, the crank turns back, and cycles are never complete: bounded all the same.
+    # With the time clock the crank turns back and no cycle ends, so `max_steps` ends the run.
     carried = vi.simulate(scene, start, 20, clock="time", max_steps=2000)
     assert bool(carried.result == vi.RESULTS.max_steps)
 
@@ -47,7 +47,7 @@ def test_start_from_rest():
 
 
 def test_fixed_steps_stay_stable_for_a_strong_motor():
-    # Its shaft comes back to speed within a small part of a cycle, at low speed most of all.
+    # The shaft returns to its speed within a small part of a cycle, above all at low speed.
     def last(torque, kappa, method):
         scene = vi.Parameters(torque=torque, control=kappa, gap=0.08).scene()
         run = vi.simulate(scene, scene.start(), 20, method=method)

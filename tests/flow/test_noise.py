@@ -1,6 +1,6 @@
-"""White noise as impulses: the path, its random numbers, and stationary means in closed form.
+"""White noise as impulses: paths, random numbers, and stationary means in closed form.
 
-The oscillator is x'' + 0.2 x' + x = 0.5 dW, of temperature σ²/(4ζ) = 0.625.
+The oscillator is x'' + 0.2 x' + x = 0.5 dW, with temperature σ²/(4ζ) = 0.625.
 """
 
 import jax
@@ -19,7 +19,7 @@ START = vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
 
 
 class Walled(Free):
-    """With a rigid stop to its left."""
+    """A free oscillator with a rigid stop on its left."""
 
     restitution: jax.Array
     place: jax.Array
@@ -36,7 +36,7 @@ def walled(restitution=0.7, place=0.0):
     return Walled(jnp.array(restitution), jnp.array(place))
 
 
-def shaken(impulses=16, amplitude=SIGMA):
+def white_noise(impulses=16, amplitude=SIGMA):
     return vi.WhiteNoise({"V": amplitude}, impulses=impulses)
 
 
@@ -47,7 +47,7 @@ def paths(keys=KEYS, machine=None, cycles=8, **options):
     machine = walled() if machine is None else machine
 
     def one(key):
-        return vi.simulate(machine, START, cycles, noise=shaken(), key=key, **options)
+        return vi.simulate(machine, START, cycles, noise=white_noise(), key=key, **options)
 
     return jax.vmap(one)(keys)
 
@@ -58,7 +58,7 @@ def many():
 
 
 def means(values):
-    """The mean over lanes, and its standard error from the means of each."""
+    """Return the mean over lanes and its standard error, from the mean of each lane."""
     each = np.asarray(values).reshape(len(values), -1).mean(axis=1)
     return np.array([each.mean(), each.std(ddof=1) / len(each) ** 0.5])
 
@@ -77,7 +77,7 @@ def test_numbers_are_normal_and_independent():
 
 def test_the_path_is_the_linear_flow_with_jumps_between():
     key, n, cycles = KEYS[3], 16, 5
-    run = vi.simulate(Free(), START, cycles, noise=shaken(n), key=key)
+    run = vi.simulate(Free(), START, cycles, noise=white_noise(n), key=key)
     words, x, found = jax.random.key_data(key), np.array([1.0, 0.0]), [[1.0, 0.0]]
     flow = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * CYCLE / n)
     for cycle in range(cycles):
@@ -91,22 +91,22 @@ def test_the_path_is_the_linear_flow_with_jumps_between():
     np.testing.assert_allclose(here, found, atol=1e-9)
 
 
-def test_impulses_on_a_machine_that_counts_in_phase_are_those_of_its_time():
-    """A cycle of which takes π, by a phase of 2π."""
+def test_impulses_are_the_same_in_phase_and_in_time():
+    """One cycle takes a phase of 2π and a time of π."""
 
     class Sooner(Free):
         cycle = np.pi
 
     forced = vi.machines.Duffing(amplitude=0.0, frequency=2.0, damping=0.2, gap=50.0)
     here, there = (
-        vi.simulate(machine, START, 4, noise=shaken(), key=KEYS[3], record="sections").sections
+        vi.simulate(machine, START, 4, noise=white_noise(), key=KEYS[3], record="sections").sections
         for machine in (forced, Sooner())
     )
     np.testing.assert_allclose(here.V, there.V, atol=1e-9)
     np.testing.assert_allclose(here.Y, there.Y, atol=1e-9)
 
 
-def test_a_path_depends_on_its_key_alone(many):
+def test_path_depends_only_on_its_key(many):
     V = np.asarray(many.sections.V)
     assert np.array_equal(paths(KEYS[5:6]).sections.V[0], V[5])
     assert np.array_equal(paths(KEYS[::-1]).sections.V[::-1], V)
@@ -115,14 +115,14 @@ def test_a_path_depends_on_its_key_alone(many):
     assert len(np.unique(V[:, 1])) == len(V)
 
 
-def test_samples_leave_the_path(many):
+def test_samples_do_not_change_the_path(many):
     V = np.asarray(many.sections.V)
     np.testing.assert_allclose(paths(samples=4).sections.V, V, atol=1e-11)
 
 
-def test_samples_lie_where_they_are_asked_for():
-    """49 and 98 of 98 impulses: 49/49 is 1, though 49 times 1/49 is less."""
-    run = vi.simulate(Free(), START, 3, samples=2, noise=shaken(98, 0.0), key=KEYS[0])
+def test_samples_lie_at_exact_instants():
+    """Samples lie at impulses 49 and 98 of 98. In floats, 49 * (1 / 49) is less than 1."""
+    run = vi.simulate(Free(), START, 3, samples=2, noise=white_noise(98, 0.0), key=KEYS[0])
     flow = expm(np.array([[0.0, 1.0], [-1.0, -0.2]]) * CYCLE / 2)
     path = [(1.0, 0.0)]
     for _ in range(6):
@@ -132,7 +132,7 @@ def test_samples_lie_where_they_are_asked_for():
 
 
 @pytest.mark.slow
-def test_methods_and_backends_leave_the_path(many):
+def test_methods_and_backends_do_not_change_the_path(many):
     V = np.asarray(many.sections.V)
     np.testing.assert_allclose(paths(method=vi.FixedStep()).sections.V, V, atol=1e-10)
     with vi.backend("xla"):
@@ -140,7 +140,7 @@ def test_methods_and_backends_leave_the_path(many):
 
 
 @pytest.mark.slow
-def test_cycles_that_settle_are_counted():
+def test_noise_counts_cycles_that_settle():
     whole = paths(record="sections").sections.V
     late = paths(cycles=5, settle=3, record="sections").sections.V
     assert np.array_equal(late, whole[:, 3:])
@@ -149,7 +149,7 @@ def test_cycles_that_settle_are_counted():
 @pytest.mark.slow
 def test_derivatives_follow_the_path():
     def last(x):
-        noise = shaken(16, x[0])
+        noise = white_noise(16, x[0])
         return vi.simulate(walled(x[1]), START, 3, noise=noise, key=KEYS[0]).last.V
 
     at, step = jnp.array([0.5, 0.7]), 1e-6
@@ -158,13 +158,13 @@ def test_derivatives_follow_the_path():
         np.testing.assert_allclose(mode(last)(at), differences, rtol=1e-6)
 
 
-def test_energy_is_balanced_for_any_number_of_impulses():
-    """The spring presses the body on its stop, where it comes to rest between impulses."""
+def test_energy_is_balanced_with_rests_between_impulses():
+    """The spring presses the body on its stop, where it rests between impulses."""
     restitution, place = 0.5, 0.3
     machine = walled(restitution, place)
 
     def one(key):
-        options = {"settle": 20, "noise": shaken(), "key": key, "impact_log": 96}
+        options = {"settle": 20, "noise": white_noise(), "key": key, "impact_log": 96}
         run = vi.simulate(machine, START, 100, **options)
         speeds = jnp.nansum(run.impact_log.speed**2, axis=-1)
         lost = 0.2 * run.averages["square"] + 0.5 * (1 - restitution**2) * speeds / CYCLE
@@ -179,7 +179,7 @@ def test_energy_is_balanced_for_any_number_of_impulses():
 
 
 class Growing(vi.AbstractMachine):
-    """x' = 0.3 x, a cycle of 1."""
+    """x' = 0.3 x, with a cycle of 1."""
 
     cycle = 1.0
 
@@ -187,14 +187,14 @@ class Growing(vi.AbstractMachine):
         return {"x": 0.3 * x["x"]}
 
 
-def in_proportion(state):
+def half_of_state(state):
     return 0.5 * state["x"]
 
 
-def test_an_amplitude_that_depends_on_the_state_is_itos():
-    """Of geometric Brownian motion dx = 0.3 x dt + 0.5 x dW both moments are known, with any number
-    of impulses; in Stratonovich's sense the mean would be larger by exp(0.25), 28 %."""
-    noise, start = vi.WhiteNoise({"x": in_proportion}, impulses=8), {"x": jnp.array(1.0)}
+def test_amplitude_that_depends_on_the_state_follows_ito():
+    """Geometric Brownian motion dx = 0.3 x dt + 0.5 x dW has known moments for any number of
+    impulses. Stratonovich's interpretation has a mean that is larger by exp(0.25), or 28 %."""
+    noise, start = vi.WhiteNoise({"x": half_of_state}, impulses=8), {"x": jnp.array(1.0)}
 
     def last(key):
         return vi.simulate(Growing(), start, 2, noise=noise, key=key).last["x"]
@@ -207,14 +207,14 @@ def test_an_amplitude_that_depends_on_the_state_is_itos():
         assert abs(mean - moment) < 3 * error
 
 
-def test_a_constant_function_is_its_number():
+def test_constant_function_equals_a_number():
     noise = vi.WhiteNoise({"V": lambda state: SIGMA}, impulses=16)
     run = vi.simulate(walled(), START, 8, noise=noise, key=KEYS[5])
     assert np.array_equal(run.sections.V, paths(KEYS[5:6]).sections.V[0])
 
 
 class Reset(Free):
-    """With an event that a jump of the velocity may pass."""
+    """An oscillator with an event that a jump of the velocity can cross."""
 
     @property
     def events(self):
@@ -244,8 +244,8 @@ VALVE = vi.machines.ReliefValve(flow_rate=5.0)
         (Reset(), {}, "without resets"),
     ],
 )
-def test_what_does_not_fit_is_refused(machine, options, message):
-    given = {"noise": shaken(), "key": KEYS[0], **options}
+def test_invalid_arguments_raise(machine, options, message):
+    given = {"noise": white_noise(), "key": KEYS[0], **options}
     start = START if isinstance(machine, Free) else machine.start()
     with pytest.raises((TypeError, ValueError), match=message):
         vi.simulate(machine, start, 2, **given)

@@ -1,4 +1,4 @@
-"""Noise on machines that rub, that measure their own time, or that move in natural modes."""
+"""Noise on machines with dry friction, with an uneven clock, or with natural modes."""
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,15 @@ SIGMA = 0.5
 REST = vi.OscillatorState(jnp.array(0.0), jnp.array(0.0))
 
 
-def shaken(impulses=16, amplitude=SIGMA):
+def white_noise(impulses=16, amplitude=SIGMA):
     return vi.WhiteNoise({"V": amplitude}, impulses=impulses)
 
 
 def averaged(machine, name, impulses, cycles=100, lanes=512):
-    """The mean over time of an average, and its standard error from those of each lane."""
+    """Return the time mean of an average over all lanes, and its standard error."""
 
     def one(key):
-        options = {"settle": 20, "noise": shaken(impulses), "key": key}
+        options = {"settle": 20, "noise": white_noise(impulses), "key": key}
         run = vi.simulate(machine, REST, cycles, **options)
         return jnp.sum(run.averages[name] * run.duration) / jnp.sum(run.duration), run.successful
 
@@ -33,23 +33,23 @@ def averaged(machine, name, impulses, cycles=100, lanes=512):
     return float(each.mean()), float(each.std(ddof=1)) / lanes**0.5
 
 
-class Rubbed(Rubbing):
-    """v' = -μ sgn v + σ dW: the work of friction is what the noise brings, μ E|v| = σ²/2."""
+class DryFriction(Rubbing):
+    """v' = -μ sgn v + σ dW: friction dissipates the power of the noise, μ E|v| = σ²/2."""
 
     def averages(self, s, x):
         return {"speed": jnp.abs(x.V)}
 
 
-def test_friction_takes_what_noise_brings():
-    """For any number of impulses, though with few of them the body sticks most of the time."""
+def test_friction_dissipates_the_power_of_the_noise():
+    """The balance holds for any number of impulses. With few, the body sticks most of the time."""
     level = 0.5
-    mean, error = averaged(Rubbed(lambda machine, s, x: 0.0 * x.V, level), "speed", 4)
+    mean, error = averaged(DryFriction(lambda machine, s, x: 0.0 * x.V, level), "speed", 4)
     assert error < 0.02 * SIGMA**2 / (2 * level)
     assert abs(mean - SIGMA**2 / (2 * level)) < 3 * error
 
 
 class Uneven(Free):
-    """The same oscillator by a clock that runs unevenly, and faster the faster the body moves."""
+    """The oscillator in a clock that runs unevenly, and faster at higher velocity."""
 
     def pace(self, s, x):
         return (1 + 0.6 * jnp.cos(s)) / (1 + 0.5 * jnp.tanh(x.V))
@@ -62,15 +62,15 @@ class Uneven(Free):
         return {"square": x.V**2}
 
 
-def test_noise_by_the_time_between_impulses_keeps_the_temperature():
-    """0.2 E[v²] = σ²/2, where that time is known only as it has passed."""
+def test_noise_over_measured_time_keeps_the_temperature():
+    """0.2 E[v²] = σ²/2, although the time between impulses is known only afterwards."""
     mean, error = averaged(Uneven(), "square", 8)
     assert error < 0.02 * 0.625 and abs(mean - 0.625) < 3 * error
 
 
-def test_measured_time_leaves_the_path_and_its_derivatives():
+def test_path_and_derivatives_over_measured_time():
     def sections(sigma=SIGMA, **options):
-        given = {"noise": shaken(16, sigma), "key": jax.random.key(5), "settle": 2, **options}
+        given = {"noise": white_noise(16, sigma), "key": jax.random.key(5), "settle": 2, **options}
         return vi.simulate(Uneven(), REST, 3, **given).sections.V
 
     whole = sections()
@@ -81,8 +81,8 @@ def test_measured_time_leaves_the_path_and_its_derivatives():
     assert jax.jacfwd(sections)(SIGMA)[-1] == pytest.approx(float(slope), rel=1e-6)
 
 
-def test_a_motor_is_shaken_alike_by_its_phase_and_in_time():
-    """Its crank's speed and the body, at equal phases of the crank: the same path by both."""
+def test_noise_on_a_motor_gives_the_same_path_in_both_clocks():
+    """Noise acts on the body and on the crank's speed, at equal phases of the crank."""
     scene = vi.Parameters(torque=10.0, control=1.2, restitution=0.7, gap=0.05).scene()
     noise = vi.WhiteNoise({"V": 0.1, "W": 0.05}, impulses=16)
     found = []
@@ -96,7 +96,7 @@ def test_a_motor_is_shaken_alike_by_its_phase_and_in_time():
 
 
 class Plain(vi.machines.Structure):
-    """A structure that is not followed in its natural modes, as it has a rule of its own."""
+    """A structure with its own methods, so it is not solved in natural modes."""
 
     def averages(self, s, state):
         return {"square": jnp.sum(state.velocity**2)}
@@ -108,7 +108,7 @@ class Plain(vi.machines.Structure):
         return jnp.asarray(1.0)
 
 
-def test_a_structure_in_its_natural_modes_is_shaken_as_without_them():
+def test_noise_on_a_structure_is_the_same_in_natural_modes():
     machine, _, start = machine_and_truth(3, 3, "general")
     names = (
         "mass", "damping", "stiffness", "contacts", "static_force", "force", "sine_force",
@@ -128,7 +128,7 @@ def test_a_structure_in_its_natural_modes_is_shaken_as_without_them():
 
 
 class Lifted(vi.AbstractMachine):
-    """A body that a force z presses on its stop, or pulls off; z jumps and stays."""
+    """A force z presses a body on its stop or pulls it off. Only noise changes z."""
 
     rebound: float = 0.5
     cycle: float = 1.0
@@ -150,8 +150,7 @@ class Lifted(vi.AbstractMachine):
         return {**x, "Y": Y, "V": V}
 
 
-def test_a_force_that_jumps_lets_go_of_a_body_at_rest():
-    """A stop does not hold a body that is pulled away from it."""
+def test_jump_of_a_force_releases_a_resting_body():
     start = {"Y": jnp.array(0.0), "V": jnp.array(0.0), "z": jnp.array(0.3)}
 
     def one(key):
@@ -164,8 +163,8 @@ def test_a_force_that_jumps_lets_go_of_a_body_at_rest():
     np.testing.assert_allclose(place, np.minimum(0.5 * force, 0.0), atol=1e-12)
 
 
-def test_a_machine_at_rest_on_its_section_goes_on():
-    """Steady sliding, to which the motion has died out: its section is met by rounding only."""
+def test_run_continues_at_rest_on_its_section():
+    """The motion has decayed to steady sliding, so only rounding crosses the section."""
     start = vi.OscillatorState(jnp.array(0.3), jnp.array(0.0))
     run = vi.simulate(Belt(1.5), start, 4, settle=300)
     assert bool(run.successful) and int(run.steps) < 65536

@@ -1,4 +1,4 @@
-"""A machine of one's own: what it is told, and what its parts may be."""
+"""User-defined machines: their parts, and the errors and warnings about wrong ones."""
 
 import warnings
 
@@ -18,7 +18,7 @@ class Ball(eqx.Module):
 
 
 class BouncingBall(vi.AbstractMachine):
-    """Free fall on a floor at Y = 0, looked at once a second: all that `simulate` has to know."""
+    """Free fall on a floor at Y = 0, with a section every second: a machine of few parts."""
 
     gravity: jax.Array
     contacts: tuple[vi.RigidStop, ...]
@@ -32,7 +32,7 @@ def ball(gravity=2.0, restitution=0.8):
     return BouncingBall(jnp.asarray(gravity), (vi.RigidStop(0.0, restitution, "left"),))
 
 
-def test_own_scenes_have_their_own_clock_and_no_closed_form():
+def test_own_machines_have_one_clock_and_no_closed_form():
     start = Ball(jnp.asarray(1.0), jnp.asarray(0.0))
     with pytest.raises(ValueError, match=r"`clock` must be left out.*'time'"):
         vi.simulate(ball(), start, 1, clock="time")
@@ -41,7 +41,7 @@ def test_own_scenes_have_their_own_clock_and_no_closed_form():
 
 
 class Wrong(BouncingBall):
-    """What a machine may be told wrong."""
+    """A machine with one wrong part, chosen by `kind`."""
 
     kind: str = eqx.field(static=True, default="")
 
@@ -62,22 +62,20 @@ class Wrong(BouncingBall):
         ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
     ],
 )
-def test_a_machine_that_is_none_is_told_what_is_wrong(kind, stops, told):
+def test_wrong_parts_raise(kind, stops, told):
     machine = Wrong(jnp.asarray(1.0), stops, kind)
     with pytest.raises((TypeError, ValueError), match=told):
         vi.simulate(machine, Ball(*map(jnp.asarray, (0.1, 0.0))), 2)
 
 
 class Swapped(BouncingBall):
-    """Its field takes the state first, as others do."""
+    """A field that takes the state first, as in other libraries."""
 
     def field(self, state, s):  # pyright: ignore
         return Ball(state.V, -self.gravity * jnp.cos(s))
 
 
-class Stateless(BouncingBall):
-    """Its field takes no clock."""
-
+class Clockless(BouncingBall):
     def field(self, state):  # pyright: ignore
         return Ball(state.V, -self.gravity)
 
@@ -86,16 +84,16 @@ class Stateless(BouncingBall):
     ("kind", "told"),
     [
         (Swapped, "`field` of a Swapped must take `s` first and then the state"),
-        (Stateless, "`field` of a Stateless must take `s`, the state: too many"),
+        (Clockless, "`field` of a Clockless must take `s`, the state: too many"),
     ],
 )
-def test_a_field_of_other_arguments_is_told_which_it_gets(kind, told):
+def test_field_with_other_arguments_raises(kind, told):
     with pytest.raises(TypeError, match=told):
         vi.simulate(kind(jnp.asarray(1.0), ()), Ball(*map(jnp.asarray, (0.1, 0.0))), 2)
 
 
 class Shaken(BouncingBall):
-    """Shaken at a frequency; its cycle is a number beside."""
+    """A driven ball; its frequency and its cycle are independent parameters."""
 
     frequency: jax.Array = eqx.field(default=1.0, converter=jnp.asarray)
     length: jax.Array = eqx.field(default=2 * np.pi, converter=jnp.asarray)
@@ -110,13 +108,13 @@ class Shaken(BouncingBall):
 
 
 @pytest.mark.slow
-def test_a_field_of_another_period_than_its_cycle_is_warned_of_once():
+def test_field_of_another_period_than_its_cycle_warns_once():
     start, floor = Ball(*map(jnp.asarray, (1.0, 0.3))), ()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for frequency, length in ((1.0, 6.28318), (2.0, np.pi), (3.0, 2 * np.pi)):
             vi.simulate(Shaken(jnp.asarray(1.0), floor, frequency, length), start, 2)
-        # What is traced is not known.
+        # Traced values cannot be compared, so there is no warning.
         machine = Shaken(jnp.asarray(1.0), floor, 1.1)
         jax.jit(lambda x: vi.simulate(machine, x, 2).last.Y)(start)
     verbs = (
@@ -139,7 +137,7 @@ def test_a_field_of_another_period_than_its_cycle_is_warned_of_once():
 
 
 class Carried(BouncingBall):
-    """The same ball, whose height above a lift is what the floor limits."""
+    """A ball in a lift at height 1. The floor limits the height above the lift."""
 
     @property
     def coordinates(self):
@@ -158,22 +156,20 @@ def test_extremes_are_those_of_the_first_coordinate():
     assert float(lifted.position(start)) == 0.5 and lifted.placed(start, start.V, start.V).Y == 1
 
 
-class Doubled(BouncingBall):
-    """The ball, named once more by what its class would say."""
-
+class CallsSuper(BouncingBall):
     @property
     def coordinates(self):
         return super().coordinates
 
 
-def test_coordinates_may_ask_their_class():
+def test_coordinates_can_call_super():
     start, stop = Ball(*map(jnp.asarray, (1.5, 0.0))), vi.RigidStop(0.0, 0.8, "left")
-    run, plain = (vi.simulate(kind(2.0, (stop,)), start, 3) for kind in (Doubled, BouncingBall))
+    run, plain = (vi.simulate(kind(2.0, (stop,)), start, 3) for kind in (CallsSuper, BouncingBall))
     jax.tree.map(np.testing.assert_array_equal, run.sections, plain.sections)
     assert int(run.impacts.sum()) > 0
 
 
-def test_samples_cost_nothing_before_they_are_taken():
+def test_samples_cost_nothing_while_settling():
     scene = vi.Parameters(control=0.9).scene()
     options = {"clock": "time", "samples": 64}
     whole = vi.simulate(scene, scene.start(), 33, **options)
@@ -187,7 +183,7 @@ def test_samples_cost_nothing_before_they_are_taken():
 
 
 @pytest.mark.parametrize("cycle", [0.0, -1.0, np.nan])
-def test_a_cycle_that_is_none(cycle):
+def test_invalid_cycle_raises(cycle):
     start, machine = Ball(*map(jnp.asarray, (1.0, 0.3))), Shaken(jnp.asarray(1.0), (), 1.0, cycle)
     with pytest.raises(
         ValueError, match=f"`cycle` of a Shaken must be positive .*, but is {cycle}"
@@ -196,7 +192,7 @@ def test_a_cycle_that_is_none(cycle):
 
 
 class Neuron(vi.AbstractMachine):
-    """Leaky integration up to a threshold, of a state that is a dictionary."""
+    """A leaky integrator with a threshold; its state is a dictionary."""
 
     current: float = 1.5
     cycle = 1.0
@@ -208,14 +204,14 @@ class Neuron(vi.AbstractMachine):
         return {"v": self.current - z["v"], "n": 0.0}
 
 
-def test_a_reset_of_a_state_that_is_a_dictionary():
+def test_reset_of_a_dictionary_state():
     run = vi.simulate(Neuron(), {"v": 0.0, "n": 0.0}, 3)
     np.testing.assert_allclose(run.duration, np.log(3), rtol=1e-8)
     assert run.last["n"] == 3
 
 
 class Guarded(BouncingBall):
-    """With an event."""
+    """A ball with events as a parameter."""
 
     events: tuple = ()
 
@@ -224,12 +220,12 @@ def _above_zero(machine, s, x):
     return jnp.maximum(x.Y - 1, 0.0)
 
 
-def _partly_no_number(machine, s, x):
+def _partly_nan(machine, s, x):
     return jnp.sqrt(x.Y) - 1
 
 
-@pytest.mark.parametrize(("guard", "number"), [(_above_zero, 1), (_partly_no_number, 0)])
-def test_a_guard_that_is_never_negative_is_warned_of_once(guard, number):
+@pytest.mark.parametrize(("guard", "number"), [(_above_zero, 1), (_partly_nan, 0)])
+def test_guard_that_is_never_negative_warns_once(guard, number):
     event = vi.Reset(guard, lambda m, s, x: Ball(x.Y, -x.V), name="lid")
     machine = type("Own", (Guarded,), {})(jnp.asarray(1.0), (), (event,))
     with warnings.catch_warnings(record=True) as told:

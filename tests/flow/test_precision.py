@@ -1,4 +1,4 @@
-"""Numbers of single precision in a session of double precision."""
+"""Single-precision numbers in a double-precision session, and the reverse."""
 
 import warnings
 
@@ -12,7 +12,7 @@ NUMBERS = {"frequency_ratio": 0.9, "restitution": 0.7, "gap": 0.6, "damping_rati
 
 
 @pytest.mark.slow
-def test_a_scene_made_before_double_precision_is_promoted_and_says_so():
+def test_single_precision_scene_is_promoted_with_a_warning():
     with jax.enable_x64(False):
         early = vi.Scene.ideal(**NUMBERS)
         started = early.start(Y=-0.3)
@@ -27,13 +27,13 @@ def test_a_scene_made_before_double_precision_is_promoted_and_says_so():
         found = jax.jvp(lambda s: last(early, s), (start,), (start,))
     assert found[0].dtype == jnp.float64
     np.testing.assert_array_equal(found, expected)
-    for scene in (late, early):  # and with nothing at all in double precision
+    for scene in (late, early):  # the second has no double-precision number
         with pytest.warns(UserWarning, match="`start`.*double precision"):
             np.testing.assert_array_equal(last(scene, started), expected[0])
 
 
 @pytest.mark.parametrize("single", [np.float32, jnp.float32])
-def test_a_number_of_single_precision_is_told_where_it_comes_in(single):
+def test_single_precision_argument_warns_with_its_name(single):
     with pytest.warns(UserWarning, match="`gap`.*double precision"):
         scene = vi.Scene.ideal(**{**NUMBERS, "gap": single(0.6)})
     assert scene.stops[0].gap.dtype == jnp.float64
@@ -41,7 +41,7 @@ def test_a_number_of_single_precision_is_told_where_it_comes_in(single):
         assert scene.start(Y=single(0.1)).Y.dtype == jnp.float64
 
 
-def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
+def test_double_precision_scene_raises_in_single_precision():
     scene, swept = vi.Scene.ideal(**NUMBERS), {"drive.frequency_ratio": [0.9, 1.0]}
     start = scene.start(Y=-0.3)
     with jax.enable_x64(False):
@@ -61,8 +61,8 @@ def test_a_scene_that_outlived_double_precision_is_refused_by_that_name():
 
 
 @pytest.mark.slow
-def test_single_precision_is_told_once_and_no_branch_is_begun_in_it():
-    """A search simulates within several programs; the corrector of a branch asks for 1e-11."""
+def test_single_precision_warns_once_and_cannot_continue_orbits():
+    """A search runs several programs. The corrector of a branch needs a tolerance of 1e-11."""
     with jax.enable_x64(False), warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         scene = vi.Scene.ideal(frequency_ratio=0.9)

@@ -1,4 +1,4 @@
-"""Numbers that no check has seen, traced or put in by `eqx.tree_at`: such a lane is refused."""
+"""Invalid parameters that are traced or set by `eqx.tree_at` fail their lane."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ PLACES = {
     "section_phase": lambda s: s.section_phase,
     "gap": lambda s: s.stops[1].gap,
 }
-# The last beside the other stop's gap of 2.
+# The last gap leaves no room to the other stop at 2.
 OUTSIDE = [2.0, -0.1, -0.9, -0.5, -1.0, -1.0, -1.0, 0.0, 7.0, -2.0]
 
 
@@ -50,7 +50,7 @@ def inside():
     return [float(place(BASE)) for place in PLACES.values()]
 
 
-def test_a_traced_number_out_of_range_ends_its_lane_and_no_other():
+def test_traced_parameter_out_of_range_fails_only_its_lane():
     rows = [inside()]
     for i, value in enumerate(OUTSIDE):
         rows += [[*rows[0][:i], value, *rows[0][i + 1 :]], rows[0]]
@@ -65,20 +65,20 @@ def test_a_traced_number_out_of_range_ends_its_lane_and_no_other():
     assert (np.asarray(steps)[~fine] == 0).all()
 
 
-def test_a_traced_settle_is_a_number_of_cycles_or_the_lane_is_refused():
+def test_traced_settle_must_be_a_number_of_cycles():
     settle = jnp.asarray([0.0, -5.0, jnp.nan, 2.5, jnp.inf, 1e300, 2.0])
     rows = jnp.asarray([inside()] * len(settle))
     codes, Y, _ = lanes(rows, settle)
     assert codes.tolist() == [0, *[code_of("bad_start")] * 5, 0]
     assert np.isfinite(np.asarray(Y)[[0, -1]]).all()
-    # The same with integers that are traced.
+    # The same with traced integers.
     codes, again, _ = lanes(rows, jnp.asarray([0, -5, -1, 2, 2, 2, 2]))
     assert codes.tolist() == [0, code_of("bad_start"), code_of("bad_start"), 0, 0, 0, 0]
     np.testing.assert_array_equal(again[-1], Y[-1])
 
 
 class Limited(vi.AbstractMachine):
-    """A body that a force of limited strength pulls back."""
+    """A body under a restoring force of limited strength."""
 
     limit: Any
     cycle: Any = 1.0
@@ -87,7 +87,7 @@ class Limited(vi.AbstractMachine):
         return vi.OscillatorState(state.V, -jnp.clip(state.Y, -self.limit, self.limit))
 
 
-def test_a_number_of_ones_own_may_be_infinite_but_the_cycle_may_not():
+def test_own_parameter_may_be_infinite_but_cycle_may_not():
     start = vi.OscillatorState(jnp.asarray(2.0), jnp.asarray(0.0))
     limits, cycles = (
         jnp.asarray([np.inf, np.inf, np.nan, 0.5]),
@@ -99,15 +99,15 @@ def test_a_number_of_ones_own_may_be_infinite_but_the_cycle_may_not():
     assert bool(vi.simulate(Limited(np.inf), start, 1).successful)
 
 
-def test_a_known_number_put_in_ends_as_bad_start():
+def test_invalid_constant_from_tree_at_is_a_bad_start():
     base = vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05)
     scene = eqx.tree_at(PLACES["damping_ratio"], base, jnp.asarray(-0.9))
     run = vi.simulate(scene, scene.start(), 2)
     assert run.result == vi.RESULTS.bad_start
 
 
-def test_parameters_out_of_range_make_no_scene_that_runs():
-    """A negative crank radius: every group but the gap's sign looks as if all were well."""
+def test_parameters_out_of_range_fail_the_run():
+    """A negative crank radius changes only the sign of the dimensionless gap."""
 
     def code(radius):
         table = eqx.tree_at(lambda p: p.crank_radius, vi.Parameters(), radius)
@@ -120,7 +120,7 @@ def test_parameters_out_of_range_make_no_scene_that_runs():
 
 
 @pytest.mark.filterwarnings("ignore:vi_jax is running in single precision")
-def test_single_precision_counts_no_further_than_it_can():
+def test_single_precision_limits_counts():
     with jax.enable_x64(False):
         scene = vi.Scene.ideal(frequency_ratio=0.9)
         start = scene.start()

@@ -1,4 +1,4 @@
-"""Lanes that end before their time: each by a reason that names what it is about."""
+"""Lanes that fail: each result names its reason."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ import vi_jax as vi
 
 
 class Bounce(vi.AbstractMachine):
-    """A body pressed on a stop of any law, and of any kind."""
+    """A constant force presses a body on a stop with any restitution law or class."""
 
     law: Any
     strength: Any = 1.0
@@ -32,7 +32,7 @@ START = vi.OscillatorState(jnp.asarray(-1.0), jnp.asarray(0.0))
 
 
 class Law(eqx.Module):
-    """k = slow up to the speed of one, fast beyond."""
+    """k = slow up to a speed of 1, and fast above."""
 
     slow: Any
     fast: Any
@@ -41,25 +41,25 @@ class Law(eqx.Module):
         return jnp.where(speed > 1, self.fast, self.slow)
 
 
-def test_a_law_out_of_range_ends_the_lane_that_meets_it():
-    """The body comes at √2, then at √2 times the coefficient."""
+def test_law_out_of_range_fails_lanes_that_reach_it():
+    """The first impact speed is √2, the second is √2 times the coefficient."""
     laws = Law(jnp.array([0.5, 0.5, 1.2, -0.1, 0.5]), jnp.array([0.9, 1.2, 0.5, 1.0, -0.5]))
     run = jax.vmap(lambda law: vi.simulate(Bounce(law), START, 2))(laws)
     bad = run.result == vi.RESULTS.bad_impact
-    # The fourth stays above the speed at which its law would fail.
+    # The fourth lane never reaches the low speeds for which its law is invalid.
     assert bad.tolist() == [False, True, True, False, True]
     assert bool(run.successful[0] & run.successful[3])
     assert not np.isfinite(run.last.Y[bad]).any()
 
 
 class Faster(vi.RigidStop):
-    """A stop that gives energy."""
+    """A stop that adds energy."""
 
     def rebound(self, V):
         return -1.1 * V
 
 
-def test_a_rebound_of_ones_own_that_gains_energy():
+def test_rebound_that_gains_energy_fails():
     assert bool(vi.simulate(Bounce(0.5, kind=Faster), START, 1).result == vi.RESULTS.bad_impact)
 
 
@@ -72,29 +72,29 @@ def test_a_rebound_of_ones_own_that_gains_energy():
         (lambda v, w: v, "function of the speed of approach"),
     ],
 )
-def test_a_law_that_is_none(law, words):
+def test_invalid_laws_raise(law, words):
     with pytest.raises(TypeError, match=words):
         vi.simulate(Bounce(law), START, 1)
 
 
 class Softer(vi.RigidStop):
-    """A stop whose law is its `rebound`."""
+    """A stop that overrides `rebound`."""
 
     def rebound(self, V):
         return -0.3 * V
 
 
-def test_rest_and_losses_follow_a_rebound_of_ones_own():
-    """As with 0.3 as the restitution, in which alone they differ."""
+def test_rest_and_losses_follow_an_overridden_rebound():
+    """Compare with a rigid stop of restitution 0.3."""
     machines = Bounce(0.9, kind=Softer), Bounce(0.3)
     own, plain = (vi.simulate(machine, START, 2) for machine in machines)
     assert own.impacts.tolist() == plain.impacts.tolist() and own.rests.tolist() == [1, 0]
     np.testing.assert_allclose(own.impact_energy, plain.impact_energy, rtol=1e-12)
-    np.testing.assert_allclose(own.impact_energy.sum(), 1.0, rtol=1e-9)  # all that it fell with
+    np.testing.assert_allclose(own.impact_energy.sum(), 1.0, rtol=1e-9)  # all of its energy
 
 
 class Pushed(vi.AbstractMachine):
-    """Forces on both sides of a line point at it."""
+    """Forces on both sides of the switching line point towards it."""
 
     @property
     def events(self):
@@ -107,14 +107,14 @@ class Pushed(vi.AbstractMachine):
 
 
 def test_a_sliding_mode_has_its_own_reason():
-    for Y, V in ((1.0, 0.0), (1.0, -1.0)):  # it comes there; it begins there
+    for Y, V in ((1.0, 0.0), (1.0, -1.0)):  # arrives at the line; starts on it
         run = vi.simulate(Pushed(), vi.OscillatorState(jnp.asarray(Y), jnp.asarray(V)), 2)
         assert bool(run.result == vi.RESULTS.sliding)
         assert "slide" in str(run)
 
 
 class Turned(vi.AbstractMachine):
-    """A spring whose body is turned round as each cycle begins."""
+    """An oscillator whose velocity is reversed at the start of each cycle."""
 
     cycle = 1.0
 
@@ -125,8 +125,8 @@ class Turned(vi.AbstractMachine):
         return vi.OscillatorState(state.Y, -state.V)
 
 
-def test_a_velocity_that_is_turned_round_as_a_cycle_begins():
-    """Back the way it came: every second section is the first again, the extremes those of arcs."""
+def test_velocity_is_reversed_at_the_start_of_each_cycle():
+    """The body retraces its path, so every second section equals the first."""
     run = vi.simulate(Turned(), vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.5)), 4)
     first, top = np.arctan2(-0.5, 1.0), np.hypot(1.0, 0.5)
     places = top * np.cos(first + np.linspace(0, 1, 10001))
@@ -137,7 +137,7 @@ def test_a_velocity_that_is_turned_round_as_a_cycle_begins():
 
 
 class Damped(vi.AbstractMachine):
-    """x'' + a x' + b x = cos s, and no word of how fast it fades."""
+    """x'' + a x' + b x = cos s, without a rate of decay for the choice of steps."""
 
     damping: Any
     spring: Any
@@ -149,8 +149,8 @@ class Damped(vi.AbstractMachine):
 
 
 @pytest.mark.parametrize("solver", [vi.Verner9(), diffrax.Tsit5()])
-def test_a_fixed_step_that_is_too_long_is_no_success(solver):
-    """Ten in a cycle: by either solver stable up to damping near 5."""
+def test_unstable_fixed_steps_fail(solver):
+    """With ten steps per cycle, both solvers are stable for damping up to about 5."""
     dampings, springs = jnp.asarray([[0.5, 3, 5, 8, 10, 30, 1e4, 0], [1.0] * 7 + [1e4]])
     start, method = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0)), vi.FixedStep(solver)
     run = jax.vmap(lambda a, b: vi.simulate(Damped(a, b), start, 12, method=method))(
@@ -162,6 +162,6 @@ def test_a_fixed_step_that_is_too_long_is_no_success(solver):
     np.testing.assert_allclose(run.last.Y[:3], by_error, rtol=0, atol=2e-4)
 
 
-def test_a_traced_restitution_out_of_range_is_a_bad_start_wherever_its_stop_is_made():
+def test_traced_restitution_out_of_range_is_a_bad_start():
     run = jax.vmap(lambda k: vi.simulate(Bounce(k), START, 2))(jnp.array([0.5, 1.2, -0.1]))
     assert (run.result == vi.RESULTS.bad_start).tolist() == [False, True, True]

@@ -1,4 +1,4 @@
-"""Coming to rest on a stop, staying there, leaving: beside closed forms."""
+"""Coming to rest on a stop, resting and leaving, compared with closed forms."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ class Ground(vi.AbstractMachine):
 
 
 def test_a_bouncing_ball_rests_after_the_time_of_the_series():
-    # From height h: the fall, then flights of 2 kⁿ times it; in all t (1 + k)/(1 - k).
+    # The fall takes t, flight n takes 2 kⁿ t; in total the ball needs t (1 + k)/(1 - k).
     height, ks = 0.5, np.array([0.0, 0.3, 0.8])
 
     def run(k):
@@ -46,7 +46,7 @@ def test_a_bouncing_ball_rests_after_the_time_of_the_series():
     for i, k in enumerate(ks):
         times = np.asarray(found.impact_log.phase[i, 0])[found.impact_log.stop[i, 0] >= 0]
         fall = np.sqrt(2 * height / 2.0)
-        # The last impact is followed by a rest of the series that begins with this flight.
+        # The remaining flights of the series begin with this one.
         last = 2 * fall * k ** len(times)
         assert times[-1] + last / (1 - k) == pytest.approx(fall * (1 + k) / (1 - k), abs=1e-9)
         assert len(times) <= 2 + np.log(1e-6) / np.log(max(k, 1e-6))
@@ -54,8 +54,8 @@ def test_a_bouncing_ball_rests_after_the_time_of_the_series():
 
 @pytest.mark.parametrize("method", METHODS, ids=IDS)
 def test_release_when_the_crank_no_longer_presses(method):
-    # U = cos φ > d presses the body on; it leaves at φ = arccos d, and moves from there as the
-    # linear oscillator does from rest.
+    # U = cos φ > d presses the body on the stop. It leaves at φ = arccos d and then moves as the
+    # linear oscillator from rest.
     body = scene()
     run = vi.simulate(body, body.start(Y=0.1), 3, method=method, samples=200)
     assert bool(run.successful) and np.asarray(run.rests).tolist() == [2, 1, 1]
@@ -85,8 +85,8 @@ def test_derivatives_pass_through_rest():
 
 
 @pytest.mark.slow
-def test_single_precision_rests_as_double_does():
-    """Random machines that chatter, rest and leave; the flattest hops are below rounding."""
+def test_rest_is_the_same_in_single_precision():
+    """Random machines chatter, rest and leave. The lowest hops are smaller than rounding."""
     rng = np.random.default_rng(0)
     lanes, uniform = 200, rng.uniform
     gap = uniform(-0.9, 1, lanes)
@@ -119,8 +119,8 @@ def test_single_precision_rests_as_double_does():
     ],
     ids=["ball", "pressed"],
 )
-def test_a_body_that_rests_for_ever_is_in_periodic_motion(machine, start):
-    """What departs a little from the stop comes to rest on it: nothing of it is left."""
+def test_permanent_rest_is_a_periodic_orbit(machine, start):
+    """A small perturbation comes to rest on the stop, so the multipliers are zero."""
     settled = vi.simulate(machine, machine.start(**start), 1, settle=200).last
     orbit = vi.find_orbit(machine, settled, throw=True)
     assert int(orbit.impacts) == 0 and int(orbit.cycles) == 1 and bool(orbit.stable)
@@ -128,8 +128,8 @@ def test_a_body_that_rests_for_ever_is_in_periodic_motion(machine, start):
     assert float(orbit.y_max) == float(orbit.y_min) == float(machine.position(settled))
 
 
-def test_a_body_that_rests_moves_with_its_stop():
-    """Its place by the stop's is 1, by its own start 0, until it leaves."""
+def test_resting_body_moves_with_its_stop():
+    """The position has derivative 1 with respect to the gap, and 0 with respect to its start."""
 
     def last(gap, start):
         pressed = scene(gap=gap)
@@ -141,7 +141,7 @@ def test_a_body_that_rests_moves_with_its_stop():
 
 @pytest.mark.slow
 def test_second_derivatives_pass_through_rest_and_release():
-    """While a shaft moves on that feels the body: by all numbers of the machine at once."""
+    """Derivatives along a direction in all parameters, while the body's force acts on the shaft."""
     numbers = jnp.asarray([0.45, -0.2, 0.8, 0.3, 0.1, -0.7, 0.4])
     direction = jnp.asarray([0.3, 0.3, 0.2, 0.1, 0.1, 0.3, -0.3])
 
@@ -185,7 +185,7 @@ def at(Y, V):
 
 
 def test_a_soft_stop_touched_at_rest():
-    """Pressed, about to be, and pulled."""
+    """Compare with SciPy under a force that presses, grows from zero, or pulls away."""
     forces = np.repeat([(1.0, 0, 0), (0, 0, 1.0), (-1.0, 0, 0)], 2, axis=0)
     gaps = np.tile([0.0, 1e-12], 3)
 
@@ -206,8 +206,8 @@ def test_a_soft_stop_touched_at_rest():
         np.testing.assert_allclose([run.last.Y[i], run.last.V[i]], truth.y[:, -1], atol=1e-6)
 
 
-def test_a_body_rests_while_the_force_that_will_press_it_on_grows():
-    """Under sin s it is held for half a cycle, and leaves then."""
+def test_body_rests_while_a_pressing_force_grows_from_zero():
+    """Under sin s the stop holds the body for half a cycle, then releases it."""
 
     def one(restitution):
         body = Body(jnp.asarray((0, 0, 1.0)), (vi.RigidStop(0.0, restitution),))
@@ -221,9 +221,9 @@ def test_a_body_rests_while_the_force_that_will_press_it_on_grows():
     np.testing.assert_allclose(run.event_log.phase[:, 0, 0], np.pi, atol=1e-9)
 
 
-def test_an_impact_without_restitution_as_the_force_turns():
-    """The force is s - 1, the body meets the stop at s = 1: there it stays, by one impact."""
-    speed, place = 0.5 + 0.5, -(0.5 - 1 / 3) - 0.5  # at s = 0, so that it is 0.5 and 0 at s = 1
+def test_impact_without_restitution_as_the_force_changes_sign():
+    """The force s - 1 changes sign as the body meets the stop at s = 1, where it stays."""
+    speed, place = 0.5 + 0.5, -(0.5 - 1 / 3) - 0.5  # at s = 0; they are 0.5 and 0 at s = 1
     body = Body(jnp.asarray((-1.0, 1.0, 0)), (vi.RigidStop(0.0, 0.0),))
     run = vi.simulate(body, at(place, speed), 1, impact_log=4)
     assert bool(run.successful) and int(run.impacts[0]) == 1 and int(run.rests[0]) == 1
@@ -232,8 +232,8 @@ def test_an_impact_without_restitution_as_the_force_turns():
 
 
 @pytest.mark.slow
-def test_every_event_is_logged_in_its_order():
-    """A ball pressed for half of each cycle on a stop and let go of; without the log, the same."""
+def test_every_event_is_logged_in_order():
+    """A force presses a ball on a stop in part of each cycle. The log changes no motion."""
     body = Body(jnp.asarray((0.3, 0, 1.0)), (vi.RigidStop(0.0, 0.4),), drag=0.1)
     plain = vi.simulate(body, at(-0.2, 0), 4, impact_log=40)
     run = vi.simulate(body, at(-0.2, 0), 4, impact_log=40, event_log=60)
@@ -247,7 +247,7 @@ def test_every_event_is_logged_in_its_order():
         np.testing.assert_array_equal(log.value[i, hits], plain.impact_log.speed[i, :count])
         used = kinds[i] >= 0
         assert (np.diff(log.phase[i, used]) >= 0).all() and used.argmin() == used.sum()
-    # It leaves where the force turns: sin s = -0.3.
+    # The ball leaves when the force changes sign: sin s = -0.3.
     leaves = np.asarray(log.phase)[kinds == 2]
     assert run.rests.sum() == len(leaves) > 1
     np.testing.assert_allclose(leaves, np.pi + np.arcsin(0.3), atol=1e-9)

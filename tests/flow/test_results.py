@@ -1,4 +1,4 @@
-"""What a run holds: samples, log, counts, words."""
+"""Contents of a run: samples, logs, counts and extremes."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_sections_only():
     assert int(lean.steps) < int(full.steps)
 
 
-def test_exact_flight_says_what_it_needs():
+def test_exact_flight_raises_with_its_requirements():
     motor = vi.Parameters().scene()
     with pytest.raises(ValueError, match=r"`ExactFlight` needs.*`IdealDrive`.*`Motor`"):
         vi.simulate(motor, motor.start(), 3, method=vi.ExactFlight())
@@ -44,7 +44,7 @@ def test_exact_flight_says_what_it_needs():
         vi.simulate(slider, slider.start(), 3, method=vi.ExactFlight())
 
 
-def test_the_impact_log_tells_crank_angles_in_both_clocks():
+def test_impact_log_has_crank_angles_in_both_clocks():
     scene = vi.Scene.ideal(frequency_ratio=0.4, restitution=0.5, gap=0.8, damping_ratio=0.05)
     logs = [
         vi.simulate(scene, scene.start(), 3, clock=clock, impact_log=6).impact_log
@@ -60,8 +60,8 @@ def test_the_impact_log_tells_crank_angles_in_both_clocks():
     [vi.ExactFlight(), vi.Adaptive(rtol=1e-11), vi.Taylor(20, 8)],
     ids=lambda method: type(method).__name__,
 )
-def test_turning_points_are_met_where_they_are_recorded(method):
-    """Settling takes fewer steps than recording, and leaves the extremes recorded as they are."""
+def test_turning_points_are_located_only_when_recorded(method):
+    """Settling takes fewer steps than recording, and the recorded extremes are the same."""
     scene = vi.Scene.ideal(frequency_ratio=0.6, gap=None, damping_ratio=0.05)
     options = {"method": method, "record": "motion"}
     whole = vi.simulate(scene, scene.start(V=1.0), 24, **options)

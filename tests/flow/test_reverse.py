@@ -1,4 +1,4 @@
-"""Gradients of all that a run has, by a tape: the same as by columns, and as differences."""
+"""Reverse-mode gradients of a run, compared with forward mode and with differences."""
 
 import equinox as eqx
 import jax
@@ -25,9 +25,9 @@ CASES = {
 }
 
 
-def lost(case):
-    """All numbers of a run, each with a weight of its own, as a function of all that it has a
-    derivative by; and where to begin."""
+def weighted_sum(case):
+    """Return the weighted sum of all numbers of a run as a function of its inputs, and the values
+    of these inputs."""
     machine, start, cycles, options = CASES[case]
     numbers, rest = eqx.partition((machine, start), eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
@@ -45,13 +45,13 @@ def lost(case):
 @pytest.mark.parametrize(
     "case", quick(CASES, "a section of its own", slow=("chatter and rest", "friction"))
 )
-def test_the_tape_gives_what_columns_give(case, monkeypatch):
-    """Forward derivatives are the columns. The two round differently, which grows along a motion:
-    1e-10 of the largest derivative (measured: at most 4e-12). Where a step lands within 1e-9 of an
-    event is a matter of rounding, and derivatives behind a change of mode depend on it: there one
-    rounding of the start makes as much as the difference, some 1e-9."""
+def test_tape_matches_forward_derivatives(case, monkeypatch):
+    """The tolerance is 1e-10 of the largest derivative: rounding grows along a motion (measured: at
+    most 4e-12). A step lands within 1e-9 of an event, at a place that depends on rounding. After a
+    change of mode, derivatives depend on this place: one rounding of the start changes them by
+    about 1e-9."""
     monkeypatch.setattr(_backward, "_BY_COLUMNS", 0)
-    function, at = lost(case)
+    function, at = weighted_sum(case)
     assert "lanes_backward" in str(jax.make_jaxpr(jax.grad(function))(at))
     flat = lambda slopes: np.concatenate([np.ravel(x) for x in slopes])
     tape, columns = (flat(jax.jit(d(function))(at)) for d in (jax.grad, jax.jacfwd))
@@ -60,21 +60,21 @@ def test_the_tape_gives_what_columns_give(case, monkeypatch):
 
 
 @pytest.mark.slow
-def test_beside_differences():
-    function, at = lost("motor in time")
+def test_gradient_matches_differences():
+    function, at = weighted_sum("motor in time")
     along = [jnp.asarray(x) for x in np.random.default_rng(2).normal(size=len(at))]
     h = 1e-6
     step = lambda h: [x + h * d * (x != 0) for x, d in zip(at, along, strict=True)]
     run = jax.jit(function)
     slope = sum(g * d * (x != 0) for g, d, x in zip(jax.grad(function)(at), along, at, strict=True))
     difference = (run(step(h)) - run(step(-h))) / (2 * h)
-    # The difference's own error: rounding 1e-13/1e-6 and (1e-6)² times a third derivative.
+    # The difference has rounding errors of 1e-13/1e-6 and truncation errors of (1e-6)² f'''.
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_many_cycles_keep_within_their_memory():
-    """10,000 cycles of a motor in a group of eight: a tape of 256 MB."""
+def test_gradient_over_many_cycles_has_limited_memory():
+    """The tape of 10,000 cycles of a motor takes 256 MB for a group of eight lanes."""
     import resource
 
     def last(x):

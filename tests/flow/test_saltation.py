@@ -28,7 +28,7 @@ def flight(time: float) -> np.ndarray:
 
 
 def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
-    """The monodromy matrix from impact phases and speeds, and the number of impacts."""
+    """Return the monodromy matrix from impact phases and speeds, and the number of impacts."""
     scene = vi.Scene.ideal(frequency_ratio=ZETA, restitution=K, gap=GAP, damping_ratio=XI)
     run = vi.simulate(scene, scene.start(Y=Y, V=V), cycles, method=vi.ExactFlight(), impact_log=4)
     matrix, time, impacts = np.eye(2), 0.0, 0
@@ -44,8 +44,8 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
     return flight(2 * np.pi * cycles / ZETA - time) @ matrix, impacts
 
 
-def test_jacobian_is_the_product():
-    """And derivatives by parameters are differences."""
+def test_jacobian_is_the_product_of_saltation_matrices():
+    """Compare derivatives with respect to parameters with differences."""
     truth, impacts = product(*START, CYCLES)
     assert impacts == 3
     f, x = jax.jit(final(vi.ExactFlight(), CYCLES)), jnp.array([ZETA, XI, K, GAP, *START])
@@ -53,13 +53,13 @@ def test_jacobian_is_the_product():
     np.testing.assert_allclose(found[:, 4:], truth, atol=1e-9)
     np.testing.assert_allclose(jax.jit(jax.jacrev(f))(x), found, rtol=1e-11, atol=1e-11)
     difference = [(f(x + h) - f(x - h)) / 2e-6 for h in 1e-6 * jnp.eye(6)]
-    # The difference's own error: rounding 1e-15/1e-6, truncation (1e-6)² f'''.
+    # The difference has rounding errors of 1e-15/1e-6 and truncation errors of (1e-6)² f'''.
     np.testing.assert_allclose(found, jnp.stack(difference, -1), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_higher_derivatives_pass_through_impacts():
-    """Along a line through the parameters and the start, beside differences of one order less."""
+    """Along a line in parameters and start, compare with differences of the next lower order."""
     at, along = jnp.array([ZETA, XI, K, GAP, 0.1, 0.2]), jnp.array([0.3, 0.2, -0.4, 0.1, 0.5, -0.2])
     functions = [lambda t: final(vi.ExactFlight(), 3)(at + t * along)]
     for _ in range(3):
@@ -67,13 +67,13 @@ def test_higher_derivatives_pass_through_impacts():
     h = 1e-3
     for lower, higher in pairwise(functions):
         near, far = ((lower(x) - lower(-x)) / (2 * x) for x in (h, 2 * h))
-        # The difference of fourth order errs by h⁴/30 times a derivative of order + 4.
+        # The error of the fourth-order difference is h⁴/30 times the derivative of order + 4.
         np.testing.assert_allclose(higher(0.0), (4 * near - far) / 3, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_gradients_are_the_forward_ones():
-    """Of a function of two numbers, also under `vmap`, and of second order."""
+def test_gradients_match_forward_derivatives():
+    """Gradients and Hessians of a function of two parameters, also under `vmap`."""
 
     def lowest(numbers):
         scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=numbers[0], gap=numbers[1])
@@ -101,7 +101,7 @@ RECORDED = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "clock", "method"), RECORDED)
 def test_derivatives_of_all_that_is_recorded(kind, clock, method):
-    """States on sections and between them, extremes, times, and the impacts' phases and speeds."""
+    """Compare derivatives of states, extremes, times, impact phases and speeds with differences."""
 
     def recorded(x):
         xi, k, gap, speed, V, section = x

@@ -1,4 +1,4 @@
-"""What is printed, and shown at the end of a notebook's cell: numbers, units and names."""
+"""Text and HTML representations: numbers, units and names."""
 
 import pickle
 
@@ -34,7 +34,7 @@ def test_numbers_are_shown_with_their_units(thing):
             assert f">{name}</td><td style=text-align:left>{float(number):.9g}</td>" in page
 
 
-def test_what_is_not_known_is_shown_as_before():
+def test_traced_values_are_shown_by_shape():
     told = []
 
     @jax.jit
@@ -44,14 +44,14 @@ def test_what_is_not_known_is_shown_as_before():
 
     shapes = jax.eval_shape(traced, SCENE, SCENE.start())
     assert all("f64[]" in text for text in told)
-    # Equinox 0.13.2 shows the unknown result by its parts, its kind among them.
+    # Equinox 0.13.2 shows the traced result by its parts, with its class.
     assert "Run(" in repr(shapes) and "RESULTS" in repr(shapes)
     many = vi.Scene.ideal(frequency_ratio=0.9, gap=jnp.linspace(1.0, 2.0, 12))
     assert "gap=1 … 2 a (12), " in repr(many)
     assert "gap=[1, 1.5] a, " in repr(vi.Scene.ideal(frequency_ratio=0.9, gap=[1.0, 1.5]))
 
 
-def test_results_are_shown_as_they_print():
+def test_runs_and_exponents_have_text_and_html():
     run = vi.simulate(SCENE, SCENE.start(), 5)
     assert repr(run) == str(run) and f"V = {float(run.last.V):.9g} a ω" in repr(run)
     assert f"{float(run.y_max[-1]):.6g}] a" in repr(run)
@@ -90,7 +90,7 @@ def test_reasons_print_their_names():
 
 
 @pytest.mark.parametrize("kind", [vi.RESULTS, vi.ORBIT_RESULTS])
-def test_a_misspelt_reason_names_the_near_ones(kind):
+def test_misspelt_reason_suggests_similar_names(kind):
     assert kind[kind.successful] == "" and "successful" in dir(kind)
     with pytest.raises(AttributeError, match=r"has no member 'succesful'; near names: successful"):
         _ = kind.succesful
@@ -99,6 +99,6 @@ def test_a_misspelt_reason_names_the_near_ones(kind):
     assert not hasattr(kind, "__wrapped__")
 
 
-def test_a_solver_with_functions_for_leaves_hides_no_result():
+def test_known_accepts_solvers_with_functions_as_leaves():
     assert known(vi.Adaptive(diffrax.Kvaerno5()))
     assert not known(jax.eval_shape(lambda x: x, SCENE)) and not known([object()])

@@ -1,4 +1,4 @@
-"""What a scene does not have is not in the compiled program, and numbers are not part of it."""
+"""Compiled programs contain only what a scene needs, and no values of parameters."""
 
 from collections import Counter
 
@@ -8,7 +8,7 @@ from vi_jax.lanes._program import LaneProgram
 
 
 def equations(jaxpr):
-    """Those of a jaxpr and of all that it calls."""
+    """Yield the equations of a jaxpr and of all jaxprs that it calls."""
     for equation in jaxpr.eqns:
         yield equation
         for parameter in equation.params.values():
@@ -24,7 +24,7 @@ def primitives(jaxpr) -> Counter:
 
 
 def carried(jaxpr) -> int:
-    """Number of arrays that the lane's loop hands on."""
+    """Return the number of arrays that the lane's loop carries."""
     parameters = [x for equation in equations(jaxpr) for x in equation.params.values()]
     return max(len(x.carry_avals) for x in parameters if isinstance(x, LaneProgram))
 
@@ -39,9 +39,9 @@ FREE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
 MOTOR = vi.Parameters().scene()
 
 
-def test_no_stop_no_search():
+def test_no_search_without_stops():
     with_stop, without = (primitives(program(s, s.start())) for s in (IDEAL, FREE))
-    assert with_stop["sqrt"] > 0  # of the landing
+    assert with_stop["sqrt"] > 0  # landing on an impact
     assert without["sqrt"] == 0
     assert without.total() < with_stop.total()
     two = vi.Scene(
@@ -51,18 +51,18 @@ def test_no_stop_no_search():
     assert primitives(program(two, two.start())).total() > with_stop.total()
 
 
-def test_the_state_is_what_the_scene_needs():
+def test_loop_carries_only_the_needed_state():
     ideal, motor = program(IDEAL, IDEAL.start()), program(MOTOR, MOTOR.start())
     timed = program(MOTOR, MOTOR.start(), clock="time")
     assert carried(motor) == carried(ideal) + 1  # W
     assert carried(timed) == carried(motor) + 1  # φ
     assert primitives(ideal).total() < primitives(motor).total()
-    # Elapsed time, extremes, speeds and energies are carried where they are asked for.
+    # Elapsed time, extremes, speeds and energies are carried only if they are recorded.
     assert carried(program(MOTOR, MOTOR.start(), record="motion")) == carried(motor) + 5
     assert carried(program(IDEAL, IDEAL.start(), record="motion")) == carried(ideal) + 4
 
 
-def test_a_tolerance_is_a_number():
+def test_tolerance_is_a_dynamic_leaf():
     first, second = (jax.tree.structure(vi.Adaptive(rtol=r)) for r in (1e-6, 1e-9))
     assert first == second
     assert len(jax.tree.leaves(vi.Adaptive(rtol=1e-6))) == 1

@@ -1,4 +1,4 @@
-"""Taylor series: each rule against derivatives by JAX, the method against the exact flight."""
+"""Taylor series: rules compared with derivatives by JAX, and the method with `ExactFlight`."""
 
 from collections.abc import Callable
 
@@ -30,7 +30,7 @@ RULES = {
 
 @pytest.mark.parametrize("name", quick(RULES, "saturation", "arrays", "one by one"))
 def test_a_rule_gives_the_derivatives(name):
-    """Coefficients n! c_n are the solution's derivatives, found by repeated forward mode."""
+    """Compare n! c_n with derivatives of the solution from repeated forward mode."""
     field, order = RULES[name], 6
     t0, x0 = jnp.asarray(0.3), jnp.asarray(0.7)
     _, (found,) = expand(field, t0, x0, order)
@@ -47,8 +47,8 @@ def last(scene, start, method):
 
 
 @pytest.mark.slow
-def test_an_ideal_drive_as_the_exact_flight():
-    """Hard, without restitution and with all of it, and through rest."""
+def test_ideal_drive_matches_exact_flight():
+    """Partial, zero and full restitution, and rest."""
 
     def lane(restitution, gap, method):
         scene = vi.Scene.ideal(
@@ -73,7 +73,7 @@ def test_an_ideal_drive_as_the_exact_flight():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [vi.Taylor(16, 8), vi.Taylor(16, rtol=1e-12)])
-def test_a_motor_as_the_reference(method):
+def test_motor_matches_the_reference(method):
     scene = vi.Parameters(torque=10.0, restitution=0.5, gap=0.08, control=0.9).scene()
     start = scene.start(W=0.9)
     mine = last(scene, start, method)
@@ -86,7 +86,7 @@ def test_a_motor_as_the_reference(method):
 
 
 class Own(AbstractMethod):
-    """A method that foresees a motion, and is no `Taylor`."""
+    """A method that defines `foresee` but is not a `Taylor`."""
 
     series: vi.Taylor
 
@@ -104,7 +104,7 @@ class Own(AbstractMethod):
         return Own(self.series.tighter())
 
 
-def test_a_method_of_ones_own_foresees():
+def test_own_method_can_define_foresee():
     scene = vi.Scene.ideal(frequency_ratio=0.8, restitution=0.5, gap=1.2)
     mine, other = (last(scene, scene.start(), m) for m in (Own(vi.Taylor()), vi.Taylor()))
     np.testing.assert_array_equal(mine.sections.Y, other.sections.Y)
@@ -112,7 +112,7 @@ def test_a_method_of_ones_own_foresees():
 
 
 class Wave(vi.AbstractMachine):
-    """x' = 1 + cos 12πs: about s = 0 every other term of its series vanishes."""
+    """x' = 1 + cos 12πs: at s = 0 every other term of the series vanishes."""
 
     cycle: float = 1.0
 
@@ -121,12 +121,12 @@ class Wave(vi.AbstractMachine):
 
 
 @pytest.mark.parametrize("order", [16, 17])
-def test_a_last_term_that_vanishes_shows_no_small_error(order):
+def test_vanishing_last_term_does_not_imply_a_small_error(order):
     run = vi.simulate(Wave(), jnp.zeros(()), 1, method=vi.Taylor(order, rtol=1e-12))
     np.testing.assert_allclose(run.last, 1.0, rtol=0, atol=1e-11)
 
 
-def test_what_has_no_recursion_is_named():
+def test_function_without_recursion_raises_with_its_name():
     class Odd(vi.CosineCrank):
         def slide(self, phase):
             slide = super().slide(phase)
@@ -138,7 +138,7 @@ def test_what_has_no_recursion_is_named():
 
 
 class Pushed(vi.AbstractMachine):
-    """With a force given as a function of s and Y."""
+    """A body under a force that depends on s and Y."""
 
     force: Callable
     contacts: tuple = ()
@@ -160,7 +160,7 @@ KINKS = {
 
 
 @pytest.mark.parametrize("name", KINKS)
-def test_what_is_not_smooth_is_named(name):
+def test_nonsmooth_function_raises_with_its_name(name):
     start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(1.0))
     with pytest.raises(NotImplementedError, match=f"decides by `{name}` .*`Adaptive`, or a `Swit"):
         vi.simulate(Pushed(KINKS[name]), start, 1, method=vi.Taylor())
@@ -172,7 +172,7 @@ class Damped(Pushed):
 
 
 def test_strong_damping_shortens_steps():
-    """Of x'' + a x' + x = cos s from (0, 1), a known sum of sin s/a and two exponentials."""
+    """Compare x'' + a x' + x = cos s from (0, 1) with its sum of sin s/a and two exponentials."""
 
     def end(a):
         force = lambda s, y, v: jnp.cos(s) - y - a * v
@@ -186,9 +186,8 @@ def test_strong_damping_shortens_steps():
     np.testing.assert_allclose(run.last.Y, free, rtol=0, atol=1e-6)
 
 
-def test_what_rounding_moves_when_a_body_is_let_go_is_no_turn():
-    """v = -4e-33 - 1e-17 t + t²/2 - 10 t³ is zero at 2e-17, which no clock at s = 2 can tell,
-    and at 1/20."""
+def test_rounding_at_release_is_not_a_turning_point():
+    """v = -4e-33 - 1e-17 t + t²/2 - 10 t³ is zero at 1/20, and at 2e-17 by rounding at s = 2."""
     series = [jnp.asarray(x) for x in (0.0, -4e-33, -5e-18, 1 / 6, -2.5)]
 
     def turn(path):
@@ -206,6 +205,6 @@ def test_what_rounding_moves_when_a_body_is_let_go_is_no_turn():
 @pytest.mark.parametrize(
     "options", [dict(order=3), dict(steps_per_cycle=4), dict(rtol=0.0), dict(rtol=float("nan"))]
 )
-def test_bad_numbers_are_refused(options):
+def test_invalid_arguments_raise(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         vi.Taylor(**options)

@@ -1,4 +1,4 @@
-"""Impacts, chatter, rest and release beside an independent code (`tests/truth.py`)."""
+"""Impacts, chatter, rest and release, compared with an independent code (`tests/truth.py`)."""
 
 from functools import cache
 
@@ -19,8 +19,8 @@ METHODS = {
 
 
 def draw(lanes, seed):
-    """ζ, ξ, k, d, Y, V and the section's crank angle: deep stops, and gaps near ±1, among others;
-    many start at rest on the stop."""
+    """Return random ζ, ξ, k, d, Y, V and section angles. Some stops are deep, some gaps near ±1,
+    and many lanes start at rest on the stop."""
     rng = np.random.default_rng(seed)
     uniform = rng.uniform
 
@@ -28,7 +28,7 @@ def draw(lanes, seed):
         return rng.random(lanes) < share
 
     zeta = uniform(0.2, 2, lanes)
-    zeta = np.where(np.abs(zeta - 1) < 0.05, zeta + 0.1, zeta)  # off the truth's resonance
+    zeta = np.where(np.abs(zeta - 1) < 0.05, zeta + 0.1, zeta)  # away from resonance in `truth`
     gap = uniform(-1.2, 1.2, lanes)
     gap = np.where(some(0.2), np.sign(gap) * (1 - 10 ** uniform(-5, -0.5, lanes)), gap)
     xi = np.where(some(0.2), 0.0, uniform(0, 0.3, lanes))
@@ -41,7 +41,7 @@ def draw(lanes, seed):
 
 @cache
 def program(name):
-    """All lanes under a method; compiled once."""
+    """Return the compiled program that simulates all lanes with a method."""
 
     def lane(x):
         zeta, xi, k, gap, Y, V, section = x
@@ -55,7 +55,7 @@ def program(name):
 
 
 def draw_short(lanes, seed):
-    """At rest 1e-15 to 1e-8 short of the stop, where the force on it is or falls near zero."""
+    """Return lanes at rest 1e-15 to 1e-8 before the stop, where the force is or becomes small."""
     rng = np.random.default_rng(seed)
     zeta, xi, k, gap, *_ = draw(lanes, seed)
     gap = np.clip(gap, -0.999, 0.999)
@@ -65,12 +65,12 @@ def draw_short(lanes, seed):
     return zeta, xi, k, gap, gap - off, np.zeros(lanes), section
 
 
-def compared(name, lanes, seed, draw=draw):
-    """Each lane's largest deviation, the truth's own sensitivity, and both counts of rests."""
+def compare(name, lanes, seed, draw=draw):
+    """Return each lane's deviation, the sensitivity of the reference, and both counts of rests."""
     x = draw(lanes, seed)
     states, low, high, rests, good = map(np.asarray, program(name)(tuple(map(jnp.asarray, x))))
     assert good.all()
-    # Once as they are, and once with all moved a little.
+    # In the second half, stops and starts are moved by 1e-9.
     moved = np.repeat([0.0, 1e-9], lanes)
     zeta, xi, k, gap, Y, V, section = (np.tile(numbers, 2) for numbers in x)
     stops = ((1, gap + moved, k),)
@@ -87,7 +87,7 @@ def compared(name, lanes, seed, draw=draw):
 
 def check(name, lanes, seed):
     tolerance = METHODS[name][2]
-    apart, growth, expected, rests = compared(name, lanes, seed)
+    apart, growth, expected, rests = compare(name, lanes, seed)
     # A grazing within the method's error may be an impact or not.
     clear = growth < 1e3
     assert clear.mean() > 0.999
@@ -102,8 +102,8 @@ def test_random_lanes_from_deep_stops_to_beyond_reach(name):
 
 
 @pytest.mark.slow
-def test_a_start_at_rest_just_short_of_the_stop():
-    apart, growth, expected, rests = compared("exact", 1_000, 0, draw_short)
+def test_start_at_rest_just_before_the_stop():
+    apart, growth, expected, rests = compare("exact", 1_000, 0, draw_short)
     clear = growth < 1e3
     assert clear.mean() > 0.99
     assert apart[clear].max() < 1e-9
@@ -111,8 +111,8 @@ def test_a_start_at_rest_just_short_of_the_stop():
 
 
 @pytest.mark.parametrize("method", [vi.ExactFlight(), vi.FixedStep(), vi.Adaptive(rtol=1e-13)])
-def test_a_deep_stop_lets_go_for_a_moment(method):
-    """Between two steps' ends the force turns and turns back; ζ = 1, ξ = 0 for SciPy alone."""
+def test_deep_stop_releases_the_body_for_a_moment(method):
+    """The force changes sign twice within a step. At ζ = 1, ξ = 0 only SciPy is a reference."""
     scene = vi.Scene.ideal(frequency_ratio=1.0, restitution=0.5, gap=-0.9)
     run = vi.simulate(scene, scene.start(Y=-0.9), 3, method=method, impact_log=4)
     expected = truth.integrated(1.0, 0.0, ((1, -0.9, 0.5),), (-0.9, 0.0), 3)
@@ -122,7 +122,7 @@ def test_a_deep_stop_lets_go_for_a_moment(method):
     assert abs(float(run.y_min[0]) + 0.93867) < 5e-6
 
 
-def test_a_moment_of_pressing_near_the_reach_of_the_crank():
+def test_short_pressing_near_the_reach_of_the_crank():
     zeta, xi, gap, section = 0.855403, 0.164115, 0.996002, 0.688663
     scene = vi.Scene.ideal(frequency_ratio=zeta, restitution=0.0, gap=gap, damping_ratio=xi)
     scene = scene.at_section(section)
@@ -157,8 +157,8 @@ def machine(drive, clock, stops):
         ("motor", "time", 2),
     ],
 )
-def test_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):
-    """From a hard start and, on the stop, from rest: every gap with every restitution."""
+def test_matches_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):
+    """Every gap with every restitution, from rest on the stop and from a moving start."""
     cycles = 2
     cases = [(d, k, off) for d in GAPS for k in RESTITUTIONS for off in (0.0, 0.5)]
 
@@ -188,7 +188,7 @@ def test_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sides):
         assert rests.tolist() == expected.rests.tolist(), where
 
 
-def test_the_two_truths_agree():
+def test_both_references_agree():
     for stops, start in (
         (((1, -0.9, 0.5),), (-0.9, 0.0)),
         (((1, 0.2, 0.0), (-1, 0.3, 0.5)), (0.0, 0.0)),

@@ -1,5 +1,4 @@
-"""The same machine in other units of time and length gives the same numbers: the field, the stops
-and the start are converted, and the motion is converted back."""
+"""A machine in other units of time and length gives the same motion after conversion back."""
 
 from typing import Any
 
@@ -12,7 +11,7 @@ import vi_jax as vi
 
 pytestmark = pytest.mark.slow
 
-# Units of time and of length; the first are those in which the numbers are given.
+# Units of time and of length. Parameters are given in the first.
 UNITS = np.array(
     [(1, 1), *((10.0**t, 1) for t in (-9, -5, -2, 3, 6, 9)),
      *((1, 10.0**n) for n in (-9, -6, -3, 3, 6)), (1e-9, 1e-9), (1e9, 1e6), (1e-4, 1e-7),
@@ -21,7 +20,7 @@ UNITS = np.array(
 
 
 class Body(vi.AbstractMachine):
-    """A body between two stops, with a force that is not linear; it may rub."""
+    """A body between two stops under a nonlinear force, with optional dry friction and resets."""
 
     unit: tuple
     spring: Any
@@ -54,7 +53,7 @@ class Body(vi.AbstractMachine):
             return ()
         length = self.unit[1]
         fills = vi.Reset(lambda m, t, z: z.x, lambda m, t, z: {"w": z.w + 0.2 * length})
-        full = lambda m, t, z: z.w - 0.35 * length  # in the instant in which it is filled
+        full = lambda m, t, z: z.w - 0.35 * length  # at the instant of a filling
         empties = vi.Reset(full, lambda m, t, z: {"w": z.w - 0.3 * length, "count": z.count + 1})
         return fills, empties
 
@@ -84,13 +83,13 @@ BODIES = np.array([
 
 
 def in_all_units(lane, numbers):
-    """`lane(number, unit)` of every number in every unit, but the first unit first."""
+    """Return `lane(numbers, unit)` for every row of numbers in every unit."""
     inner = jax.vmap(lane, (None, 0))
     return jax.jit(jax.vmap(inner, (0, None)))(jnp.asarray(numbers), jnp.asarray(UNITS))
 
 
-def assert_alike(found, successful, tolerance):
-    """Of arrays (machines, units, …): the numbers of every unit beside those of the first."""
+def assert_equal_in_all_units(found, successful, tolerance):
+    """Compare arrays of shape (machines, units, …) in every unit with the first unit."""
     assert bool(jnp.all(successful))
     for x in found:
         np.testing.assert_allclose(x, np.broadcast_to(x[:, :1], x.shape), rtol=0, atol=tolerance)
@@ -99,7 +98,7 @@ def assert_alike(found, successful, tolerance):
 IMPLICIT = vi.Adaptive(diffrax.Kvaerno5(), rtol=1e-12)
 
 
-# Ten tolerances; fixed steps land on events to 1e-9 of their place along the path.
+# Ten tolerances. Fixed steps locate an event within 1e-9 of its position on the path.
 @pytest.mark.parametrize("method", [vi.Adaptive(), vi.FixedStep(), IMPLICIT])
 def test_bodies_between_stops(method):
     def lane(numbers, unit):
@@ -111,12 +110,12 @@ def test_bodies_between_stops(method):
         return found, run.impacts, run.successful
 
     found, impacts, successful = in_all_units(lane, BODIES)
-    assert_alike(found, successful, 1e-8)
+    assert_equal_in_all_units(found, successful, 1e-8)
     np.testing.assert_array_equal(impacts, np.broadcast_to(impacts[:, :1], impacts.shape))
     assert np.all(impacts[:, 0].sum(axis=1) > 0)
 
 
-def test_a_body_that_rubs_and_counts():
+def test_body_with_friction_and_resets():
     def lane(numbers, unit):
         time, length = unit
         machine = Body((time, length), *numbers[:9], level=0.3)
@@ -126,7 +125,7 @@ def test_a_body_that_rubs_and_counts():
         return (z.x / length, z.u * time / length, z.count, z.w / length), run.successful
 
     found, successful = in_all_units(lane, BODIES[[0, 1, 4, 9]])
-    assert_alike(found, successful, 1e-8)
+    assert_equal_in_all_units(found, successful, 1e-8)
     assert np.any(found[2][:, 0, -1] > 0)
 
 
@@ -157,7 +156,7 @@ class Stack(vi.Mechanical):
         return {"a": a * length / time**2, "b": 2 * b * length / time**2}
 
 
-def test_bodies_that_meet():
+def test_colliding_bodies():
     def lane(numbers, unit):
         time, length = unit
         machine = Stack((time, length), *numbers)
@@ -167,19 +166,17 @@ def test_bodies_that_meet():
         places, speeds = (z.a / length, z.b / length), (z.v.a, z.v.b)
         return (*places, *(x * time / length for x in speeds)), run.impacts, run.successful
 
-    # Of the last four some ended as chatter, in milliseconds and micrometres too.
+    # Some of the last four once failed as chatter, in milliseconds and micrometres too.
     rows = np.array([
         (0.0, 0.0), (0.3, 0.0), (0.5, 0.0), (0.7, 0.0), (0.217, 0.41), (0.34, 0.743),
         (0.623, 0.193), (0.614, 0.648),
     ])  # fmt: skip
     found, impacts, successful = in_all_units(lane, rows)
-    assert_alike(found, successful, 1e-8)
+    assert_equal_in_all_units(found, successful, 1e-8)
     assert np.all(impacts[:, 0].sum(axis=1) > 0)
 
 
-def test_a_structure():
-    """Two masses, in closed form."""
-
+def test_structure_of_two_masses_in_closed_form():
     def lane(restitution, unit):
         time, length = unit
         K = jnp.array([[2.0, -1.0], [-1.0, 1.5]]) / time**2
@@ -194,6 +191,6 @@ def test_a_structure():
         return found, run.impacts, run.successful
 
     found, impacts, successful = in_all_units(lane, np.array([0.2, 0.5, 0.8]))
-    assert_alike(found, successful, 1e-9)
+    assert_equal_in_all_units(found, successful, 1e-9)
     np.testing.assert_array_equal(impacts, np.broadcast_to(impacts[:, :1], impacts.shape))
     assert np.all(impacts[:, 0].sum(axis=1) > 3)

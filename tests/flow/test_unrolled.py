@@ -1,4 +1,4 @@
-"""`Unrolled` is the solver that it wraps."""
+"""`Unrolled` takes the same steps as the solver that it wraps."""
 
 import diffrax
 import jax
@@ -20,7 +20,7 @@ START = {"x": jnp.asarray(0.3), "v": jnp.asarray(-0.7)}
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda x: type(x).__name__)
-def test_step_is_that_of_diffrax(solver):
+def test_step_equals_that_of_diffrax(solver):
     args = 0.1
     hidden = solver.init(TERM, 0.2, 0.5, START, args)
     original = solver.step(TERM, 0.2, 0.5, START, args, hidden, False)
@@ -35,7 +35,7 @@ def test_step_is_that_of_diffrax(solver):
         np.testing.assert_allclose(a["x"], b["x"], rtol=1e-14)
 
 
-def test_serves_diffeqsolve():
+def test_works_with_diffeqsolve():
     def solve(solver):
         return diffrax.diffeqsolve(
             TERM, solver, 0.0, 20.0, 0.1, START, args=0.1,
@@ -47,7 +47,7 @@ def test_serves_diffeqsolve():
 
 
 @pytest.mark.slow
-def test_an_implicit_step_is_that_of_diffrax():
+def test_implicit_step_equals_that_of_diffrax():
     kind, args = diffrax.Kvaerno5, 0.1
     solver = kind(root_finder=optx.Newton(rtol=1e-13, atol=1e-13))
     times = jnp.asarray(0.2), jnp.asarray(0.5)
@@ -61,7 +61,7 @@ def test_an_implicit_step_is_that_of_diffrax():
 
 @pytest.mark.parametrize("method", [vi.Adaptive, vi.FixedStep])
 @pytest.mark.parametrize("solver", [diffrax.SemiImplicitEuler(), "Tsit5"])
-def test_other_solvers_are_refused(method, solver):
+def test_other_solvers_raise(method, solver):
     with pytest.raises(TypeError, match=r"`solver` must be an explicit or diagonally implicit"):
         method(solver)
     with pytest.raises(TypeError, match=r"`FixedStep` must be an explicit.*Use `Adaptive`"):

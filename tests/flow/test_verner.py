@@ -1,4 +1,4 @@
-"""Verner's tableau against the conditions of its order, one for each rooted tree."""
+"""Verner's tableau satisfies its order conditions, one for each rooted tree."""
 
 import functools
 import itertools
@@ -16,7 +16,7 @@ for i, row in enumerate(TABLEAU.a_lower, start=1):
 
 @functools.cache
 def trees(order: int) -> list[tuple]:
-    """Rooted trees, each the sorted tuple of what hangs from its root."""
+    """Return the rooted trees of an order, each as the sorted tuple of its root's subtrees."""
     found = {()} if order == 1 else set()
     for parts in partitions(order - 1, order - 1):
         for children in itertools.product(*(trees(size) for size in parts)):
@@ -25,7 +25,7 @@ def trees(order: int) -> list[tuple]:
 
 
 def partitions(total: int, largest: int):
-    """Ways to write a number as a sum, largest part first."""
+    """Yield the partitions of a number, largest part first."""
     if total == 0:
         yield ()
     for first in range(min(total, largest), 0, -1):
@@ -45,16 +45,16 @@ def density(tree: tuple) -> int:
 
 @functools.cache
 def weights(tree: tuple) -> np.ndarray:
-    """Elementary weights of the stages."""
+    """Return the elementary weights of the stages."""
     return np.prod([A @ weights(x) for x in tree], axis=0) if tree else np.ones(NUMBER)
 
 
 def worst(b: np.ndarray, order: int) -> float:
-    """By how much the conditions of one order are missed."""
+    """Return the largest residual of the conditions of one order."""
     return max(abs(b @ weights(tree) - 1 / density(tree)) for tree in trees(order))
 
 
-def test_there_are_as_many_trees_as_butcher_counts():
+def test_number_of_trees_matches_butcher():
     assert [len(trees(n)) for n in range(1, 11)] == [1, 1, 2, 4, 9, 20, 48, 115, 286, 719]
 
 
@@ -64,6 +64,6 @@ def test_there_are_as_many_trees_as_butcher_counts():
     ids=["solution", "estimate"],
 )
 def test_order_conditions(b, order):
-    """All hold to rounding up to the order, and some do not beyond it."""
+    """Conditions up to the order hold to rounding; some of the next order do not."""
     assert max(worst(b, n) for n in range(1, order + 1)) < 2e-15
     assert worst(b, order + 1) > 1e-8

@@ -1,5 +1,5 @@
-"""Forces, gaps and thresholds that come and go within what would be one step, while nothing in the
-state says so: beside motions in closed form, from event to event."""
+"""Forces, gaps and thresholds that change within one step while the state does not. Motions are
+compared with closed forms from event to event."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ class Force:
         return self.steady + self._waves(s, 0) + self._pulse(s, 0)
 
     def moved(self, s, Y, V, t, drag=0.0):
-        """Place and velocity at the times t of a body that is moved by it, against a `drag`."""
+        """Return position and velocity of a body at the times t under the force and a `drag`."""
         d, steady = t - s, self.steady - drag
         once = [self._waves(x, 1) + self._pulse(x, 1) for x in (s, t)]
         twice = [self._waves(x, 2) + self._pulse(x, 2) for x in (s, t)]
@@ -47,8 +47,8 @@ class Force:
         return self.height * each[order]
 
 
-def first(function, begin, end, short):
-    """Where a function that is negative behind `begin` is positive first; infinite if nowhere."""
+def first_root(function, begin, end, short):
+    """Return where a function, negative after `begin`, first becomes positive, or infinity."""
     near = begin + short * 1.1 ** np.arange(400)
     grid = np.concatenate([near[near < begin + 1e-3], np.arange(begin + 1e-3, end, 1e-3), [end]])
     above = np.flatnonzero(function(grid) > 0)
@@ -59,15 +59,15 @@ def first(function, begin, end, short):
 
 
 def floor(force, k, end):
-    """Greatest height and the last state of a body on a floor. Hops below 1e-10 are left out."""
+    """Return greatest height and last state of a body on a floor. Hops below 1e-10 are left out."""
     s, V, top = 0.0, 0.0, 0.0
     for _ in range(500):
         if V == 0:
-            s = s if force(s) > 0 else first(force, s, end, 1e-6)
+            s = s if force(s) > 0 else first_root(force, s, end, 1e-6)
             if s >= end:
                 return top, 0.0, 0.0
         short = 0.1 * V / abs(force(s)) if V else 1e-3
-        hit = first(lambda t: -1e-14 - force.moved(s, 0.0, V, t)[0], s, end, short)  # noqa: B023
+        hit = first_root(lambda t: -1e-14 - force.moved(s, 0.0, V, t)[0], s, end, short)  # noqa: B023
         grid = np.linspace(s, min(hit, end), 2000)
         top = max(top, force.moved(s, 0.0, V, grid)[0].max())
         if hit >= end:
@@ -78,17 +78,17 @@ def floor(force, k, end):
 
 
 def block(force, level, end):
-    """Greatest place and the last state of a block with dry friction."""
+    """Return the greatest position and the last state of a block with dry friction."""
     s, Y, V, mode, top = 0.0, 0.0, 0.0, 0.0, 0.0
     for _ in range(500):
         if mode == 0:
             if abs(force(s)) <= level:
-                s = first(lambda t: abs(force(t)) - level, s, end, 1e-6)
+                s = first_root(lambda t: abs(force(t)) - level, s, end, 1e-6)
             if s >= end:
                 return top, Y, 0.0
             mode = np.sign(force(s))
         drag = mode * level
-        stop = first(lambda t: -mode * force.moved(s, Y, V, t, drag)[1], s, end, 1e-5)  # noqa: B023
+        stop = first_root(lambda t: -mode * force.moved(s, Y, V, t, drag)[1], s, end, 1e-5)  # noqa: B023
         Y, V = force.moved(s, Y, V, min(stop, end), drag)
         if stop >= end:
             return max(top, Y), Y, V
@@ -135,7 +135,7 @@ class Block(Pushed):
 
 
 def pushes(steady, count=20, seed=3):
-    """Forces of five waves, and four pulses in an otherwise steady one."""
+    """Return forces of five waves, and four steady forces with a pulse."""
     random = np.random.default_rng(seed)
     size = np.linspace(0.3, 1.5, count)[:, None]
     sizes = random.normal(size=(count, 5))
@@ -150,8 +150,8 @@ def columns(forces):
     return {name: jnp.asarray([getattr(x, name) for x in forces]) for name in names}
 
 
-def followed(make, forces, method):
-    """Greatest place and last state, of all forces."""
+def simulate_forces(make, forces, method):
+    """Return the greatest position and the last state under each force."""
 
     @jax.jit
     @jax.vmap
@@ -165,19 +165,19 @@ def followed(make, forces, method):
 
 
 @pytest.mark.parametrize("method", [None, vi.FixedStep(steps_per_cycle=20)], ids=["a", "f"])
-def test_a_body_leaves_its_floor_whenever_it_is_pulled(method):
+def test_body_leaves_its_floor_under_every_pull(method):
     forces = pushes(-1.0)
     truth = np.array([floor(x, 0.5, x.cycle) for x in forces])
-    # As published for the pulses.
+    # Published heights for the pulses.
     assert np.allclose(truth[-4:, 0], [0.868702, 0.638230, 0.443215, 0.159558], atol=1e-6)
-    found = followed(Floor, forces, method)
-    close = 1e-5 if method is None else 2e-3  # of pulses as short as a step
+    found = simulate_forces(Floor, forces, method)
+    close = 1e-5 if method is None else 2e-3  # for pulses as short as a step
     assert np.abs(found - truth)[:-4].max() < 1e-5
     assert np.abs(found - truth)[-4:].max() < close
 
 
 class Eased(vi.AbstractMachine):
-    """A body on a floor, pressed on by less and less; the pull that is left is small."""
+    """A body on a floor; the pressing force decays and leaves a small pull."""
 
     cycle: float = 2 * np.pi
     contacts: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
@@ -187,8 +187,8 @@ class Eased(vi.AbstractMachine):
 
 
 @pytest.mark.parametrize("method", [None, vi.FixedStep()], ids=["a", "f"])
-def test_a_body_leaves_where_a_small_pull_begins_that_lasts(method):
-    """The chord of the force over a step says at each aim that it begins at the step's end."""
+def test_body_leaves_when_a_small_lasting_pull_begins(method):
+    """The chord of the force over a step is zero near the step's end, at every iteration."""
     run, begin = vi.simulate(Eased(), STILL, 1, method=method), np.log(1e5) / 20
     d, fall = 2 * np.pi - begin, 1e-5 / 20  # e^(-20 begin) is 1e-5
     assert bool(run.successful)
@@ -197,15 +197,15 @@ def test_a_body_leaves_where_a_small_pull_begins_that_lasts(method):
 
 
 @pytest.mark.parametrize("method", [None, vi.Taylor(rtol=1e-10)], ids=["a", "t"])
-def test_a_block_slips_whenever_it_is_pulled_hard_enough(method):
+def test_block_slips_under_every_sufficient_pull(method):
     forces = pushes(0.0)
     truth = np.array([block(x, 0.5, x.cycle) for x in forces])
-    assert np.abs(followed(Block, forces, method) - truth).max() < 1e-6
+    assert np.abs(simulate_forces(Block, forces, method) - truth).max() < 1e-6
 
 
 @pytest.mark.slow
-def test_a_block_on_a_spring_slips_and_sticks_in_turn():
-    """Forty events in five cycles, with steps that its state alone would let grow to a fifth."""
+def test_block_on_a_spring_slips_and_sticks_in_turn():
+    """Forty events in five cycles. Steps chosen from the state alone would grow to a fifth."""
     sizes = jnp.array([0.0, 0.55, 0.0, 0.0, 0.0])
     machine = Block(sizes=sizes, phases=jnp.zeros(5), cycle=2 * np.pi, stiffness=0.3)
     start = vi.OscillatorState(jnp.array(0.1), jnp.array(0.0))
@@ -216,7 +216,7 @@ def test_a_block_on_a_spring_slips_and_sticks_in_turn():
 
 
 class Hill(vi.AbstractMachine):
-    """A ball that flies free over y = exp(-100 (x - 4)²)."""
+    """A ball that flies freely over y = exp(-100 (x - 4)²)."""
 
     cycle: float = 10.0
     contacts: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
@@ -252,7 +252,7 @@ def test_a_ball_hits_a_hill_that_is_narrower_than_a_step(method):
 
 
 class Dips(vi.AbstractMachine):
-    """y' = 2 (s - 5), which is set back a hundred higher where y falls through zero."""
+    """y' = 2 (s - 5); a reset adds 100 when y falls through zero."""
 
     cycle: float = 10.0
     events: tuple = (
@@ -263,7 +263,7 @@ class Dips(vi.AbstractMachine):
         return vi.OscillatorState(2 * (s - 5), jnp.zeros_like(s))
 
 
-def test_a_reset_that_is_hardly_reached_happens_where_turns_are_not_recorded():
+def test_barely_reached_reset_happens_without_recorded_turning_points():
     depths = jnp.array([1.0, 0.01, 1e-4, 1e-6, -1e-6])
 
     @jax.vmap
@@ -276,15 +276,15 @@ def test_a_reset_that_is_hardly_reached_happens_where_turns_are_not_recorded():
 
 
 @pytest.mark.parametrize("name", ["Adaptive", "FixedStep", "Taylor", "ExactFlight"])
-def test_what_estimates_an_error_takes_steps_half_as_long(name):
+def test_error_estimates_use_half_as_long_steps(name):
     method, scene = getattr(vi, name)(), vi.Scene.ideal(frequency_ratio=0.9)
     place = scene, jnp.array(0.3), scene.start()
     assert float(method.tighter().longest(*place)) <= 0.5 * float(method.longest(*place))
 
 
 @pytest.mark.slow
-def test_an_estimate_shows_pushes_that_fall_between_the_stages():
-    """Each push that the run itself has missed, with the same tolerance or a hundredth of it."""
+def test_error_estimate_shows_pulses_between_stages():
+    """The estimated error is large wherever the run missed the pulse."""
     places = jnp.linspace(3.0, 4.2, 25)
 
     @jax.jit

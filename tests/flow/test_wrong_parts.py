@@ -1,4 +1,4 @@
-"""Parts of a machine of one's own that are wrong: each mistake is answered by what to do."""
+"""Wrong parts of user-defined machines: each error names the part and what it must be."""
 
 import dataclasses
 from typing import Any
@@ -80,7 +80,7 @@ def test_parts_are_tuples_of_their_kind():
 
 
 class Floor(vi.AbstractMachine):
-    """A block on a floor, with one number wrong."""
+    """A block on a floor. Each test sets one wrong parameter."""
 
     friction: jax.Array | float = 0.3
     along: int = 1
@@ -121,7 +121,7 @@ def test_contacts(wrong, kind, message):
 
 
 class Flywheel(vi.AbstractDrive):
-    """One that does not say by what its states are."""
+    """A drive without a `state` class."""
 
     def field(self, scene, s, state, pushes):
         return state
@@ -180,11 +180,11 @@ ROWS = vi.State(x=jnp.zeros(2), v=jnp.ones(2))
         (Squares(), "`quantities` of a Squares must be numbers, but 'square' is an array"),
     ],
 )
-def test_arrays_where_numbers_belong(machine, words):
+def test_arrays_in_place_of_numbers_raise(machine, words):
     with pytest.raises((TypeError, ValueError), match=words):
         vi.simulate(machine, ROWS, 2)
 
 
-def test_a_whole_array_as_an_axis():
+def test_array_as_scan_axis_raises():
     with pytest.raises(ValueError, match=r"name one of its numbers, as 'k\[0\]'"):
         vi.scan(Springs(), {"k": [1.0, 2.0]}, start=ROWS, measure="extremes", cycles=2)
