@@ -1,4 +1,4 @@
-"""Friction on a stop: in its impacts, and under the force of a body that rests on it."""
+"""Friction along a stop, in impacts and while a body rests on it."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,8 @@ from rubbing import Block, Rubbing
 
 @pytest.mark.slow
 @pytest.mark.parametrize("along", [0.0, 0.5])
-def test_an_oblique_impact_slips_or_sticks(along):
-    """Closed form: the impulse along the floor is μ (1 + k) v of the speed v, or what sticking
-    takes."""
+def test_oblique_impact_slips_or_sticks(along):
+    """Closed form: the tangential impulse is at most μ (1 + k) v at the approach speed v."""
     k, mu = 0.8, 0.3
 
     def run(u, v):
@@ -34,13 +33,13 @@ def test_an_oblique_impact_slips_or_sticks(along):
         if int(runs.impacts[i, 0]) < 40 and runs.last.y[i] > 0:  # still bouncing
             assert float(runs.last.v.x[i]) == pytest.approx(slip, abs=1e-9)
             assert float(runs.impact_energy[i, 0]) == pytest.approx(lost, abs=1e-9)
-    # Some end at rest, some slipping, and none turns round but by its restitution.
+    # Without tangential restitution (`along`), no body reverses its tangential velocity.
     assert along or bool((runs.last.v.x * u >= -1e-12).all())
 
 
 def test_a_block_slides_to_rest():
-    """It lands without restitution at speed 1 along the floor and √2·.1 down: loses μ of that, then
-    slides on v²/(2μ)."""
+    """The block lands without restitution, with speed 1 along the floor and √0.02 downwards. The
+    impact takes μ times the downward speed. Then the block slides over v²/(2μ)."""
     mu = 0.3
     run = vi.simulate(Block(mu), Block().at(y=0.01, v=dict(x=1.0)), 1, event_log=6)
     fall = np.sqrt(0.02)
@@ -55,26 +54,26 @@ def test_a_block_slides_to_rest():
 
 @pytest.mark.slow
 def test_a_block_bounces_to_rest_while_it_slides():
-    """By its momentum: the floor's impulses, those of endless last bounces included, add up to its
-    weight, and friction to μ of that."""
+    """Momentum balance: the floor's impulses, with infinitely many last bounces, balance the
+    weight. The impulse of friction is μ times as large."""
     mu, restitution, way = 0.3, 0.5, -1
     block = Block(mu, restitution)
     start = block.at(y=1.0, v=dict(x=15.0 * way))
     run = vi.simulate(block, start, 1, method="reference", max_impacts=100)
     assert int(run.rests[0]) == 1
     assert float(run.last.v.x) == pytest.approx(way * (15 - mu * 2 * np.pi), abs=1e-12)
-    # What is lost in bounces, friction's work there included, and what is rubbed off afterwards.
+    # The loss in bounces: the energy 1 of the fall, and the work of friction until the bounces end.
     falls = np.sqrt(2.0)
     rests = falls * (1 + restitution) / (1 - restitution)
     speed = 15 - mu * rests
     lost = 1 + 0.5 * (15**2 - speed**2)
-    # In the last bounces, 8e-6 of the longest step, the body counts as held.
+    # In the last bounces, 8e-6 of the longest step, the body already counts as resting.
     held = mu * 15 * 8e-6 * 2 * np.pi / 5
     assert lost - held < float(run.impact_energy[0]) <= lost + 1e-9
 
 
 @pytest.mark.slow
-def test_a_grain_rubs_as_a_block_does():
+def test_tiny_block_slides_as_a_large_one():
     def end(weight):
         block = Block(0.3, 0.4, pull=0.5, lift=0.6, weight=weight)
         return vi.simulate(block, block.at(y=0.1, v=dict(x=0.5)), 4).last.v.x
@@ -105,9 +104,8 @@ PULLS = jnp.array([0.2, 0.5, 1.1])
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lift", [0.0, 0.6])
-def test_under_the_force_of_the_floor_friction_is_dry_friction(lift):
-    """Stick and slip of a block under a force that varies, and derivatives: beside friction under a
-    given load."""
+def test_contact_friction_equals_dry_friction_under_the_same_load(lift):
+    """Compare stick–slip motions and their derivatives with dry friction under a given load."""
 
     def both(pull, one):
         return ends(pull, lift, one), jax.jacfwd(lambda x: ends(x, lift, one))(pull)
@@ -118,7 +116,7 @@ def test_under_the_force_of_the_floor_friction_is_dry_friction(lift):
 
 
 class Coupled(vi.Mechanical):
-    """Two coordinates that share their mass, as those of a rod whose end hits a floor do."""
+    """Two coordinates coupled by the mass matrix, as for a rod whose end hits a floor."""
 
     q = ("x", "y")
     mass = ((1.0, 0.7), (0.7, 1.0))
@@ -130,10 +128,10 @@ class Coupled(vi.Mechanical):
 
 
 @pytest.mark.slow
-def test_a_law_that_would_gain_energy_is_refused():
-    """Newton's law across a stop and Coulomb's along it may add energy where both velocities are
-    coupled (Kane's paradox); the impulses beside the linear complementarity problem, solved by
-    trying its cases."""
+def test_impact_that_gains_energy_fails():
+    """Newton's law across a stop and Coulomb's law along it may add energy if the mass matrix
+    couples both velocities (Kane's paradox). Compare the impulses with the linear
+    complementarity problem, solved by trying its cases."""
     machine = Coupled()
     c, mu, k = 0.7, 0.5, 0.9
     mass = np.array([[1, c], [c, 1]])  # of (x, y)

@@ -1,5 +1,5 @@
-"""Contacts that act by themselves: machines in a few lines, beside numbers from SciPy, which was
-taken from event to event (rtol 1e-12), or in closed form."""
+"""Contacts of user-defined machines, compared with SciPy from event to event (rtol 1e-12) or with
+closed forms."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ class Oscillator(vi.AbstractMachine):
 
 
 class Stack(vi.Mechanical):
-    """A body on rough ground, with another one on it."""
+    """A body on rough ground, with a second body on top."""
 
     q = ("a", "b")
     mass = (1.0, 1.0)
@@ -46,7 +46,7 @@ def test_friction_on_a_floor_that_a_body_hits():
 
 
 def test_two_frictions_that_stick_together():
-    """Which bodies stick is found together: one alone would be held by what the other exerts."""
+    """Both contacts must be decided together, as the friction of each acts on both bodies."""
     machine = Stack()
     run = vi.simulate(machine, machine.at(a=0.1), 2, event_log=16)
     assert bool(run.successful) and int((run.event_log.kind >= 0).sum()) == 24
@@ -54,7 +54,7 @@ def test_two_frictions_that_stick_together():
 
 
 class Cart(vi.Mechanical):
-    """A cart that static friction holds on the ground, with a heavy load that is pulled off it."""
+    """A cart held by static friction, with a heavy load that a force pulls off it."""
 
     q = ("cart", "load")
     mass = (1.0, 100.0)
@@ -68,9 +68,9 @@ class Cart(vi.Mechanical):
         return dict(cart=1.0, load=0.2 * jnp.sin(t))
 
 
-def test_as_much_sticks_as_can():
-    """A cart that slides contradicts no force either: kinetic friction does not hold it. The load
-    slides from π/6 on until its momentum is spent."""
+def test_as_many_contacts_stick_as_possible():
+    """A sliding cart would be consistent too, as kinetic friction does not hold it. The load slides
+    from π/6 until its momentum is spent."""
     run = vi.simulate(Cart(), Cart().at(), 1, event_log=4)
     end = brentq(lambda t: 0.2 * (np.cos(np.pi / 6) - np.cos(t)) - 0.1 * (t - np.pi / 6), 2, 4)
     assert abs(run.last.cart) < 1e-14 and abs(run.last.v.cart) < 1e-15
@@ -78,7 +78,7 @@ def test_as_much_sticks_as_can():
 
 
 class Counted(vi.AbstractMachine):
-    """A ball that counts its impacts on the floor, and turns of a clock, by name."""
+    """A ball with two named modes, which count its impacts and the turns of a clock."""
 
     wrong: str = eqx.field(static=True, default="hits")
     cycle = 1.0
@@ -98,7 +98,7 @@ class Counted(vi.AbstractMachine):
         return dict(x=z.u, u=-1.0)
 
 
-def test_modes_are_taken_by_name():
+def test_modes_have_names():
     ball = vi.State(x=1.0, u=0.0)
     assert vi.simulate(Counted(), ball, 2).last.modes == (1, 2)  # it falls √2 s
     with pytest.raises(TypeError, match=r"the mode .hit., .* are hits, turns"):
@@ -113,7 +113,7 @@ def test_modes_are_taken_by_name():
         (lambda z: dict(x=z.u, u=z.w), "no component 'w'; it has x, u"),
     ],
 )
-def test_names_that_are_wrong_are_named(field, message):
+def test_wrong_components_raise_with_their_names(field, message):
     class Wrong(Oscillator):
         def field(self, t, z):
             return field(z)
@@ -132,20 +132,20 @@ def test_names_that_are_wrong_are_named(field, message):
         (lambda: vi.RigidStop(0.5, 0.8), "Write `@property` above its `def`"),
     ],
 )
-def test_contacts_that_are_wrong_are_told(contacts, message):
+def test_wrong_contacts_raise(contacts, message):
     machine = type("Wrong", (Oscillator,), {"contacts": contacts})()
     with pytest.raises((TypeError, ValueError), match=message):
         vi.simulate(machine, vi.State(x=0.0, u=0.0))
 
 
-def test_a_subclass_replaces_a_number():
+def test_subclass_can_replace_a_parameter():
     wider = type("Wider", (Oscillator,), {"gap": 3.0})
     assert jax.tree.leaves((wider(), wider(gap=2.0))) == [0.9, 3.0, 0.7, 0.9, 2.0, 0.7]
     tuned = type("Tuned", (Oscillator,), {"gap": property(lambda self: 2 * self.omega)})
     assert jax.tree.leaves(tuned()) == [0.9, 0.7] and tuned(omega=0.5).gap == 1.0
 
 
-def test_a_state_is_a_pytree_of_names():
+def test_state_is_a_pytree_with_names():
     state = vi.State(x=1.0, v=vi.State(x=2.0))
     assert jax.tree.map(lambda x: 2 * x, state) == vi.State(x=2.0, v=vi.State(x=4.0))
     assert state.replace(x=3.0).x == 3.0 and state.x == 1.0
@@ -161,7 +161,7 @@ def test_a_state_is_a_pytree_of_names():
 
 
 class Toppling(vi.AbstractMachine):
-    """A pencil on its tip, shaken, till it lies on one side or the other."""
+    """A shaken pencil on its tip, until it falls to one side."""
 
     amplitude: float = 0.5
     cycle = 2 * jnp.pi / 3
@@ -178,11 +178,11 @@ class Toppling(vi.AbstractMachine):
 
 
 def test_an_event_ends_the_motion_with_an_outcome():
-    """Beside the closed form, x = A (eᵗ + e⁻ᵗ)/20 - A cos 3t/10 + u sinh t."""
+    """Compare with the closed form x = A (eᵗ + e⁻ᵗ)/20 - A cos 3t/10 + u sinh t."""
     machine, speeds = Toppling(), jnp.array([0.3, -0.3, 0.03, -0.1])
 
     class Walled(Toppling):
-        """The same where the right side is a wall."""
+        """The same with a wall on the right."""
 
         contacts = vi.RigidStop(1.0, 0.5, on=("x", "u"), ends="right")
         events = Toppling.events[1]
@@ -197,7 +197,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
     t, at = np.linspace(0, 8, 4001), run.outcome_cycle * machine.cycle + run.outcome_phase
     places = 0.05 * np.cosh(t) - 0.05 * np.cos(3 * t) + np.outer(speeds, np.sinh(t))
     when = np.argmax(abs(places) > 1, axis=1)
-    np.testing.assert_allclose(at, t[when], atol=2e-3)  # the next of these instants
+    np.testing.assert_allclose(at, t[when], atol=2e-3)  # the spacing of t
     sides = np.sign(places[np.arange(4), when])
     np.testing.assert_array_equal(run.outcome, np.where(sides > 0, 0, 1))
     np.testing.assert_allclose(run.outcome_state.x, sides, atol=1e-12)
@@ -208,7 +208,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
     np.testing.assert_allclose(by_state, np.cosh(at) + bend * by, rtol=1e-6)
     assert "ended: right, 0 cycles and 1.79" in str(jax.tree.map(lambda x: x[0], run))
     assert str(run.to_xarray().outcome.values[1]) == "left"
-    assert bool(jnp.isnan(run.duration[:, -1]).all())  # no cycle that was not reached took time
+    assert bool(jnp.isnan(run.duration[:, -1]).all())  # unreached cycles have no duration
     walled, by_wall, _ = by_speed(Walled())
     assert walled.outcomes == ("left", "right")
     np.testing.assert_array_equal(walled.outcome, 1 - run.outcome)
@@ -221,7 +221,7 @@ def test_an_event_ends_the_motion_with_an_outcome():
 
 
 def test_an_event_in_both_directions():
-    """A wheel that is counted where a pendulum passes its lowest place, either way."""
+    """Count the passages of a pendulum through its lowest position, in either direction."""
 
     class Counted(Toppling):
         events = vi.Reset(

@@ -1,4 +1,4 @@
-"""Dry friction with sticking: Den Hartog's closed form, a belt's, SciPy, energy, derivatives."""
+"""Dry friction with sticking, compared with Den Hartog, closed forms, SciPy and energy."""
 
 from typing import Any
 
@@ -18,8 +18,8 @@ from event_by_event import followed
 CLOSE = vi.Adaptive(rtol=1e-12)
 
 
-class Books(eqx.Module):
-    """A body, and what has been done to it."""
+class EnergyState(eqx.Module):
+    """A body, with the work of the drive and the heat of friction."""
 
     Y: jax.Array
     V: jax.Array
@@ -28,7 +28,7 @@ class Books(eqx.Module):
 
 
 def on_a_belt(machine):
-    """Friction on a floor that moves at the machine's `speed`, by phase."""
+    """Return friction on a floor that moves at the machine's `speed`, in the phase clock."""
     return vi.DryFriction(
         machine.level,
         static_ratio=machine.ratio,
@@ -39,7 +39,7 @@ def on_a_belt(machine):
 
 
 class Rubbing(vi.AbstractMachine):
-    """x'' + x = A cos ωt - friction; by phase."""
+    """x'' + x = A cos ωt - friction, in the phase clock."""
 
     amplitude: jax.Array
     frequency: jax.Array
@@ -57,7 +57,7 @@ class Rubbing(vi.AbstractMachine):
     def field(self, s, x):
         drive = self.amplitude * jnp.cos(s)
         heat = self.level * jnp.abs(x.V) if self.books else 0.0 * x.V
-        rates = Books(x.V, drive - x.Y, drive * x.V, heat)
+        rates = EnergyState(x.V, drive - x.Y, drive * x.V, heat)
         return jax.tree.map(lambda rate: rate / self.frequency, rates)
 
     def step_limit(self, s, x):
@@ -67,16 +67,16 @@ class Rubbing(vi.AbstractMachine):
 def rubbing(numbers, Y, cycles, **options):
     zero, smooth = jnp.zeros_like(Y), isinstance(options.get("method"), vi.Taylor)
     machine = Rubbing(*numbers, books=not smooth)  # |x'| has no series
-    return vi.simulate(machine, Books(Y, zero, zero, zero), cycles, **options)
+    return vi.simulate(machine, EnergyState(Y, zero, zero, zero), cycles, **options)
 
 
 def stops_in_a_cycle(V):
-    """How often a body comes to stand in a periodic motion, from its velocity at samples."""
+    """Count the stops of a periodic motion from its velocity at samples."""
     stands = np.asarray(V)[1:] == 0
     return int((stands & ~np.roll(stands, 1)).sum())
 
 
-def test_den_hartog():
+def test_amplitudes_match_den_hartog():
     ratios, shares = (0.6, 0.75, 0.9, 1.2, 1.6, 2.5), (0.3, 0.7, 0.97, 1.05, 1.2)
     cases = [(r, share, share * den_hartog(r, 0.0)[1]) for r in ratios for share in shares]
 
@@ -99,8 +99,8 @@ def test_den_hartog():
             assert stops == 2
 
 
-def test_friction_that_holds_everything():
-    """More of it while it sticks than while it slides: off it goes at another force."""
+def test_static_friction_holds_the_body():
+    """Static friction holds the first and the third case, but not the second."""
     cases = jnp.array([(0.6, 1.0, 0.05), (0.3, 1.5, 0.0), (0.3, 1.7, 0.0)])
     run = jax.vmap(lambda x: rubbing((0.5, 0.7, x[0], x[1]), x[2], 1))(cases)
     assert bool(run.successful.all())
@@ -108,8 +108,8 @@ def test_friction_that_holds_everything():
     assert float(run.y_max[1, 0]) > 0.01 and float(run.y_max[2, 0]) == 0
 
 
-def integrated(A, w, f, ratio, Y0, duration):
-    """The body after a while and how often its friction changed, by SciPy's DOP853."""
+def run_scipy(A, w, f, ratio, Y0, duration):
+    """Return the body after a duration, and the changes of friction, from SciPy's DOP853."""
 
     def pull(t, x):
         return A * np.cos(w * t) - x[0]
@@ -133,7 +133,7 @@ def integrated(A, w, f, ratio, Y0, duration):
     return x, len(met)
 
 
-def drawn(number):
+def random_cases(number):
     draw = np.random.default_rng(0).uniform
     numbers = np.stack([draw(0.5, 2, number), draw(0.2, 1.8, number), draw(0.05, 0.8, number),
                         draw(1, 1.5, number)])  # fmt: skip
@@ -141,8 +141,8 @@ def drawn(number):
 
 
 @pytest.mark.slow
-def test_sticking_and_sliding_beside_scipy():
-    numbers, starts = drawn(40)
+def test_sticking_and_sliding_match_scipy():
+    numbers, starts = random_cases(40)
     runs = [
         vi.jit(jax.vmap(lambda p, y, m=m: rubbing(tuple(p), y, 8, method=m), in_axes=(1, 0)))(
             jnp.asarray(numbers), jnp.asarray(starts)
@@ -152,7 +152,7 @@ def test_sticking_and_sliding_beside_scipy():
     assert all(bool(run.successful.all()) for run in runs)
     several = 0
     for i in range(40):
-        wanted, changes = integrated(*numbers[:, i], starts[i], 16 * np.pi / numbers[1, i])
+        wanted, changes = run_scipy(*numbers[:, i], starts[i], 16 * np.pi / numbers[1, i])
         for run, allowed in zip(runs, (1e-8, 1e-7, 1e-8), strict=True):
             found = [run.last.Y[i], run.last.V[i]]
             np.testing.assert_allclose(found, wanted, atol=allowed)
@@ -165,7 +165,7 @@ def test_sticking_and_sliding_beside_scipy():
 
 
 class OnABelt(vi.AbstractMachine):
-    """A body on a spring, on a belt that moves on; a cycle ends where it comes along x = level."""
+    """A body on a spring and on a moving belt. A cycle ends where it rises through x = level."""
 
     speed: jax.Array
     level: jax.Array
@@ -180,15 +180,15 @@ class OnABelt(vi.AbstractMachine):
 
     def field(self, s, x):
         zero = jnp.zeros_like(s)
-        return Books(x.V, -x.Y, zero, zero)
+        return EnergyState(x.V, -x.Y, zero, zero)
 
 
 @pytest.mark.parametrize("method", [CLOSE, vi.FixedStep(steps_per_cycle=64), vi.Taylor()],
                          ids="aft")  # fmt: skip
 def test_a_body_on_a_belt(method):
-    """It sticks until the spring pulls it off, and slides until it is as fast as the belt again."""
+    """The body sticks until the spring pulls it off, and slides until it is as fast as the belt."""
     v, f, ratio = 0.3, 0.5, 1.6
-    start = Books(*map(jnp.asarray, (0.0, v, 0.0, 0.0)))
+    start = EnergyState(*map(jnp.asarray, (0.0, v, 0.0, 0.0)))
     run = vi.simulate(OnABelt(*map(jnp.asarray, (v, f, ratio))), start, 6, method=method)
     drop = f * (ratio - 1)
     period = 2 * drop / v + 2 * (np.pi - np.arctan(drop / v))
@@ -199,7 +199,7 @@ def test_a_body_on_a_belt(method):
 
 @pytest.mark.slow
 def test_derivatives_through_sticking():
-    numbers, starts = drawn(40)
+    numbers, starts = random_cases(40)
 
     def last(x):
         run = rubbing(tuple(x[:4]), x[4], 3, method=vi.FixedStep(steps_per_cycle=48))
@@ -214,21 +214,21 @@ def test_derivatives_through_sticking():
     [({"level": -0.1}, "`level`"), ({"level": float("nan")}, "`level`"),
      ({"static_ratio": 0.9}, "`static_ratio`")],
 )  # fmt: skip
-def test_wrong_numbers_are_named(arguments, told):
+def test_wrong_arguments_raise(arguments, told):
     with pytest.raises(ValueError, match=told):
         vi.DryFriction(**{"level": 1.0, **arguments}, on="V")
 
 
-def falling(speed):
-    """Friction of the belt that `belts` has, for SciPy."""
+def belt_friction(speed):
+    """Return the friction of `belts.Belt`, for SciPy."""
     return 0.5 + 0.5 * np.exp(-2 * speed)
 
 
 def slip(speed, until):
-    """A slip by SciPy, from where it begins."""
+    """Return time and state at the event `until` of a slip, from SciPy."""
 
     def field(t, x):
-        return [x[1], -x[0] - 0.1 * x[1] + falling(speed - x[1])]
+        return [x[1], -x[0] - 0.1 * x[1] + belt_friction(speed - x[1])]
 
     until.terminal, until.direction = True, 1
     start = [1.0 - 0.1 * speed, speed - 1e-13]
@@ -241,7 +241,7 @@ def furthest_back(t, x):
 
 
 def test_sticking_and_slipping_where_friction_falls_with_the_speed():
-    """One slip from the force that friction holds to the belt's speed, then sticking at it."""
+    """A cycle is one slip, from static friction to the belt's speed, and then sticking."""
     speed = 1.5
     start = vi.OscillatorState(jnp.asarray(0.5 - 0.1 * speed), jnp.asarray(speed))
     run = vi.simulate(Belt(), start, 4, method=CLOSE)
@@ -252,11 +252,11 @@ def test_sticking_and_slipping_where_friction_falls_with_the_speed():
     assert float(run.y_min[-1]) == pytest.approx(back, abs=1e-8)
     np.testing.assert_allclose(
         run.duration[1:], run.duration[-1], atol=1e-9
-    )  # it forgets its start
+    )  # independent of the start
 
 
 class Shaken(vi.AbstractMachine):
-    """A body on a surface that moves with a speed of time, and the component w."""
+    """A body on a surface whose speed depends on time and on the component w."""
 
     surface: Any = eqx.field(static=True)
     cycle: Any = 1.0
@@ -273,12 +273,12 @@ class Shaken(vi.AbstractMachine):
 
 
 def test_surfaces_whose_speed_jumps():
-    """The body was carried along at once, in silence. Friction is 0.1, and never holds it."""
+    """Friction is 0.1 and never holds the body, even where the speed of the surface jumps."""
     start = vi.State(x=0.0, v=0.0, w=1.0)
     run = vi.simulate(Shaken(lambda t, w: w), start, 3, samples=2)
     assert run.samples.state.v == pytest.approx(np.array([0, 1, 2, 1, 0, 1, 2]) / 20, abs=1e-15)
     run = vi.simulate(Shaken(lambda t, w: 2 * t - 1), start, 2)
-    assert float(run.sections.v[1]) == pytest.approx(0.1 - 2 / 21, abs=1e-12)  # back to t = 10/21
+    assert float(run.sections.v[1]) == pytest.approx(0.1 - 2 / 21, abs=1e-12)  # turns at t = 10/21
     with pytest.raises(ValueError, match=r"jumps by 2 at t = 0\.5\. Let it jump where"):
         vi.simulate(Shaken(lambda t, w: jnp.where(t < 0.5, 1.0, -1.0)), start, 1)
     with pytest.warns(UserWarning, match="within a thousandth of a cycle, at t = 0.5,"):

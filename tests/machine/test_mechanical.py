@@ -1,4 +1,4 @@
-"""Machines of masses beside SciPy from event to event, the paper's own, and closed forms."""
+"""`Mechanical` machines, compared with SciPy from event to event, `Scene` and closed forms."""
 
 import dataclasses
 
@@ -71,7 +71,7 @@ class SliderCrank(vi.Mechanical):
 
 
 class Buffered(SliderCrank):
-    """With its exact crank, and a buffer on the left."""
+    """The same machine with an exact crank, and a buffer on the left."""
 
     def slide(self, phi):
         return self.a * (jnp.cos(phi) + 3 * (jnp.sqrt(1 - (jnp.sin(phi) / 3) ** 2) - 1))
@@ -107,8 +107,8 @@ def test_two_bodies_and_a_wall():
     np.testing.assert_allclose([z.left, z.right, z.v.left, z.v.right], wanted, atol=2e-9)
 
 
-def test_pictures_show_a_coordinate_by_its_name():
-    """With its own stops and impacts, or none; a component that no contact limits, too."""
+def test_plots_show_a_coordinate_by_name():
+    """Plots show stops and impacts of the coordinate, if it has any."""
 
     class Measured(Pair):
         units = property(lambda self: {"left": "mm", "right": "mm"})
@@ -123,7 +123,7 @@ def test_pictures_show_a_coordinate_by_its_name():
         assert len(ax.lines) == lines and ax.get_ylabel() == f"{name} (mm)"
         assert ax.lines[0].get_ydata().max() == pytest.approx(float(highest))
     vi.plot_phase_portrait(run, machine, coordinate="left", ax=axes[2])
-    assert axes[2].get_ylabel() == "v.left"  # in no unit of a length
+    assert axes[2].get_ylabel() == "v.left"  # not in a unit of length
     assert "  last cycle: right in [" in str(run) and "] mm\n" in str(run)
     assert run.to_xarray()["y_max"].attrs["units"] == "mm"
     with pytest.raises(ValueError, match="`coordinate` must be a number or a component"):
@@ -132,7 +132,7 @@ def test_pictures_show_a_coordinate_by_its_name():
 
 
 def test_an_unbalanced_motor_on_a_structure():
-    """Impacts jerk the shaft, since the masses say so; what they take is the energy lost."""
+    """Impacts change the speed of the shaft through the mass matrix."""
     machine = Rotor()
     run = vi.simulate(machine, machine.at(v=dict(phi=1.3)), 1)
     z = run.last
@@ -147,7 +147,7 @@ def test_an_unbalanced_motor_on_a_structure():
     [(SliderCrank, "cosine"), pytest.param(Buffered, "slider", marks=pytest.mark.slow)],
 )
 def test_the_machine_of_the_paper(kind, crank):
-    """Beside `Scene` in its own units, in both clocks: states, energy of impacts, events."""
+    """Compare states, impact energies and events with `Scene` in both clocks."""
     parameters, machine = vi.Parameters(control=1.1), kind()
     scene, omega = parameters.scene(crank=crank), float(parameters.natural_frequency)
     if kind is Buffered:
@@ -172,8 +172,8 @@ def test_the_machine_of_the_paper(kind, crank):
 
 
 @pytest.mark.slow
-def test_a_motor_counts_its_turns_in_every_verb():
-    """From rest, and on its orbit, whose multipliers are those of the phase clock."""
+def test_turns_of_a_motor_are_its_cycles():
+    """Start from rest, and compare the multipliers of an orbit with those in the phase clock."""
     parameters, machine = vi.Parameters(control=1.1), SliderCrank()
     scene, omega = parameters.scene(drive="motor"), float(parameters.natural_frequency)
     rest = vi.simulate(machine, machine.at(), 4)
@@ -196,7 +196,7 @@ def test_a_motor_counts_its_turns_in_every_verb():
 
 
 class Table(vi.Mechanical):
-    """A ball on a shaken table, as `BouncingBall`, seen from the ground."""
+    """The machine of `BouncingBall` in the frame of the ground: a ball on a shaken table."""
 
     q = ("table", "ball")
     mass = (3.0,)
@@ -216,7 +216,7 @@ class Table(vi.Mechanical):
 
 
 def test_a_ball_on_a_table_whose_motion_is_prescribed():
-    """Bounces, and rest on the table, which throws it up again."""
+    """The ball bounces, rests on the table and leaves it again, as in `BouncingBall`."""
 
     def both(shaking):
         ours = Table(shaking=shaking)
@@ -234,7 +234,7 @@ def test_a_ball_on_a_table_whose_motion_is_prescribed():
     assert bool(good.all()) and int(rests.max()) > 3
     np.testing.assert_allclose(apart, 0, atol=1e-8)
     np.testing.assert_allclose(lost, 0, atol=1e-8)
-    # What rests on the table moves along with it, for any stroke.
+    # A resting ball moves with the table, so its derivative is that of the table.
     ball = lambda x: vi.simulate(Table(shaking=x), Table(shaking=x).at(ball=1 - x), 12).last.ball
     assert float(jax.jacfwd(ball)(0.9)) == pytest.approx(-1.0, abs=1e-8)
     with pytest.raises(ValueError, match="'table' is not one of the coordinates ball"):
@@ -249,12 +249,12 @@ def test_an_orbit_on_a_table_whose_motion_is_prescribed():
     found, other = (np.sort(np.abs(x.multipliers))[::-1] for x in (orbit, wanted))
     np.testing.assert_allclose(found[:2], other, atol=1e-7)
     np.testing.assert_allclose(other.prod(), 0.5**2, rtol=1e-7)
-    # Errors in the place of the table fade so, by definition.
+    # Errors in the position of the table decay at this rate by definition.
     np.testing.assert_allclose(found[2:], np.exp(-2 * np.pi), rtol=1e-2)
 
 
 class Pendulums(vi.Mechanical):
-    """A pendulum that hangs on another one, whose bob strikes a wall."""
+    """A double pendulum whose lower bob strikes a wall."""
 
     q = ("a", "b")
     m: float = 0.7
@@ -273,8 +273,7 @@ class Pendulums(vi.Mechanical):
 
 
 def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
-    """Energy is kept in flight and by impacts that lose none, and what they lose is written down;
-    in an impact the velocity of the gap alone is reversed, in the measure of the masses."""
+    """Flights and elastic impacts conserve energy; `impact_energy` is the loss in other impacts."""
     machine = Pendulums()
 
     def energy(z):
@@ -282,7 +281,7 @@ def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
         kinetic += machine.m * jnp.cos(z.a - z.b) * z.v.a * z.v.b
         return kinetic - (1 + machine.m) * jnp.cos(z.a) - machine.m * jnp.cos(z.b)
 
-    start = machine.at(a=-1, b=-0.4)  # an integer is a number
+    start = machine.at(a=-1, b=-0.4)  # integers are accepted
     run = vi.simulate(machine, start, 20, method=CLOSE)
     assert int(run.impacts.sum()) > 6
     np.testing.assert_allclose(jax.vmap(energy)(run.sections), energy(start), atol=1e-9)
@@ -300,8 +299,8 @@ def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
 
 @pytest.mark.slow
 def test_a_mass_matrix_of_three():
-    """A row of three bodies by its matrix, and by the coordinates in which it is diagonal, two of
-    them in an array."""
+    """Three bodies have the same motion in absolute coordinates, two of them in an array, and in
+    relative coordinates with a full mass matrix."""
 
     class Row(vi.Mechanical):
         q = ("s", "x[2]")
@@ -316,7 +315,7 @@ def test_a_mass_matrix_of_three():
             return dict(s=jnp.cos(t) - q.s, x=0.5 * jnp.sin(t) * jnp.arange(2) - q.x)
 
     class Relative(vi.Mechanical):
-        """The same by x, y - x, z - y."""
+        """The same bodies in the coordinates x, y - x, z - y."""
 
         q = ("x", "r", "s")
         mass = ((6.0, 5.0, 3.0), (5.0, 5.0, 3.0), (3.0, 3.0, 3.0))
@@ -341,9 +340,7 @@ def test_a_mass_matrix_of_three():
     np.testing.assert_allclose(one.impact_energy, two.impact_energy, atol=1e-9)
 
 
-def test_masses_of_an_array_that_depend_on_it():
-    """A spring of masses m(x) in an array and by names."""
-
+def test_masses_that_depend_on_coordinates_are_the_same_in_an_array():
     class Names(vi.Mechanical):
         q = ("x", "y")
         cycle = 1.0
@@ -368,7 +365,7 @@ def test_masses_of_an_array_that_depend_on_it():
     np.testing.assert_allclose(other.v.a, [one.v.x, one.v.y], rtol=1e-14)
 
 
-def test_a_gap_written_twice_is_one_coordinate():
+def test_equal_gap_functions_share_a_coordinate():
     class Between(Pair):
         share: float = 0.5
 
@@ -382,7 +379,7 @@ def test_a_gap_written_twice_is_one_coordinate():
     assert [x.coordinate for x in Between()._stops] == [0, 0, 1]
 
 
-def test_wrong_masses_and_names_are_told():
+def test_wrong_masses_and_names_raise():
     class Wrong(Pair):
         mass = (1.0, 2.0, 3.0)
 

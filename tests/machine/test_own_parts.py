@@ -1,4 +1,4 @@
-"""Parts of a machine that stand in a file of one's own: a drive, a contact law, a friction law."""
+"""User-defined parts of a machine: a drive, a contact law and a friction law."""
 
 from typing import ClassVar
 
@@ -18,19 +18,19 @@ REACH, XI = 1.3, 0.05
 
 
 class ClockworkState(vi.MotorState):
-    """By crank angle, with what is left of the winding."""
+    """State in the phase clock, with the rest of the winding."""
 
     wound: jax.Array
 
 
 class TimedClockworkState(ClockworkState):
-    """By time."""
+    """State in the time clock."""
 
     phase: jax.Array
 
 
 class Clockwork(vi.AbstractDrive):
-    """A wound spring that turns the crank, braked by a fan: W' = q T - b W + e U_φ (Y - U),
+    """A wound spring turns the crank, and a fan brakes it: W' = q T - b W + e U_φ (Y - U),
     T' = -W."""
 
     stiffness: jax.Array = eqx.field(converter=jnp.asarray)
@@ -65,7 +65,7 @@ def clockwork(**options):
 
 
 def wound_down(turns):
-    """The same by SciPy, by time, impact by impact: the state after so many turns."""
+    """Return the state after some turns from SciPy, in time and from impact to impact."""
 
     def field(_, x):
         Y, V, W, T, phase = x
@@ -80,7 +80,7 @@ def wound_down(turns):
 
 
 @pytest.mark.parametrize("clock", ["phase", "time"])
-def test_a_drive_of_ones_own(clock):
+def test_own_drive_matches_scipy(clock):
     scene = clockwork()
     start = scene.start(Y=0.3, wound=380.0)
     assert float(start.W) == 1 and isinstance(start, ClockworkState)
@@ -91,7 +91,7 @@ def test_a_drive_of_ones_own(clock):
     vi.plot_sketch(scene, start)
 
 
-def test_what_such_a_drive_has_is_told():
+def test_wrong_starts_and_drives_raise():
     with pytest.raises(ValueError, match=r"`M` must be left out: only a `DCMotor`"):
         clockwork().start(M=1.0)
     with pytest.raises(ValueError, match=r"`torque` must be left out: a state has Y, V, W, wound"):
@@ -110,7 +110,7 @@ class Hardening(vi.AbstractContactLaw):
 
 
 @pytest.mark.parametrize("cubic", [0.0, 3e4])
-def test_a_contact_law_of_ones_own_keeps_energy(cubic):
+def test_own_contact_law_conserves_energy(cubic):
     law = Hardening(cubic=cubic)
     speed, length = jnp.asarray(2.0), jnp.asarray(1.0)
     stop = vi.SoftStop(0.2, 100.0, law=law)
@@ -122,7 +122,7 @@ def test_a_contact_law_of_ones_own_keeps_energy(cubic):
     assert float(thrown(steeper, speed, length).y_max[0]) - 0.2 < depth
 
 
-def test_laws_that_cannot_be_are_refused():
+def test_wrong_contact_laws_raise():
     law = Hardening(cubic=1.0)
     with pytest.raises(ValueError, match="`restitution` must be given without `damping`"):
         vi.SoftStop(0.2, 100.0, law=law, restitution=0.5)
@@ -133,7 +133,7 @@ def test_laws_that_cannot_be_are_refused():
 
 
 def pressed(varies):
-    """x'' = -x - friction under a load that varies, μ (1 + c cos 2s); by time."""
+    """Return x'' = -x - friction with the limit μ (1 + c cos 2s), in time."""
 
     def load(machine, s, x):
         return 1 + machine.numbers["varies"] * jnp.cos(2 * s)
@@ -143,7 +143,7 @@ def pressed(varies):
 
 @pytest.mark.parametrize("varies", [-0.5, 0.8])
 def test_friction_follows_its_load(varies):
-    """From 1 at rest x = μ (1 - (c/3) cos 2s) + A cos s until it stops, half a turn later."""
+    """From rest at 1, x = μ (1 - (c/3) cos 2s) + A cos s until the body stops at s = π."""
     start = vi.OscillatorState(jnp.asarray(1.0), jnp.asarray(0.0))
     run = vi.simulate(pressed(varies), start, 1, method=CLOSE, event_log=2)
     assert float(run.event_log.phase[0, 0]) == pytest.approx(np.pi, rel=1e-9)
@@ -152,8 +152,8 @@ def test_friction_follows_its_load(varies):
     assert float(run.event_log.value[0, 0]) == 1.0  # pulled harder than friction holds
 
 
-def test_friction_that_holds_lets_go_as_its_load_falls():
-    """Pulled with 0.12 where friction holds from 0.02 to 0.18."""
+def test_friction_releases_the_body_as_its_load_falls():
+    """The pull is 0.12; the limit of friction varies from 0.02 to 0.18."""
     start = vi.OscillatorState(jnp.asarray(-0.12), jnp.asarray(0.0))
     run = vi.simulate(pressed(0.8), start, 1, method=CLOSE, event_log=1)
     # 0.1 (1 + 0.8 cos 2s) = 0.12

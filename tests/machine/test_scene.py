@@ -1,4 +1,4 @@
-"""Scenes and parameters: groups, kinematics, and errors that say what is wrong."""
+"""Scenes and parameters: dimensionless groups, kinematics, units and errors."""
 
 import warnings
 
@@ -48,7 +48,7 @@ def test_slider_crank_kinematics(ratio):
     )
     np.testing.assert_allclose(slide.U_phi, jax.vmap(jax.grad(U))(phase), atol=1e-12)
     np.testing.assert_allclose(slide.U_phiphi, jax.vmap(jax.grad(jax.grad(U)))(phase), atol=1e-11)
-    if ratio < 1e-3:  # a long rod is the first approximation
+    if ratio < 1e-3:  # a long rod approaches the cosine crank
         np.testing.assert_allclose(slide.U, np.cos(phase), atol=2e-9)
 
 
@@ -90,7 +90,7 @@ def test_errors_name_argument_requirement_and_value(make, message):
 
 
 @pytest.mark.parametrize("value", ["0.9", None, True, 1j])
-def test_numbers_are_numbers(value):
+def test_values_that_are_not_real_numbers_raise(value):
     with pytest.raises(TypeError, match=r"`frequency_ratio` must be a real number, but"):
         vi.IdealDrive(value)
 
@@ -115,7 +115,7 @@ def test_parameters_take_quantities_with_units():
         vi.Parameters(restitution=0.5 * unit.m)
 
 
-def test_a_length_of_a_thousand_crank_radii_is_warned_of():
+def test_length_of_a_thousand_crank_radii_warns():
     for numbers in ({"gap": 80}, {"gap": -80}, {"rod_length": 120.0}, {"gap": [0.08, 80.0]}):
         ((name, value),) = numbers.items()
         with pytest.warns(UserWarning, match=f"`{name}` is .* times the crank radius") as told:

@@ -1,4 +1,4 @@
-"""Motions that slide along a switch's surface, by Filippov's rule."""
+"""Motions that slide along the surface of a switch, by Filippov's convention."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ class Oscillator(vi.AbstractMachine):
 
 
 def test_an_oscillator_with_friction_sticks():
-    """From (12, 6) it turns at √205 - 1 and ends, 14 half turns later, at 15 - √205."""
+    """From (12, 6) the body turns at √205 - 1, and ends 14 half turns later at 15 - √205."""
     start = vi.OscillatorState(jnp.array(12.0), jnp.array(6.0))
     run = vi.simulate(Oscillator(), start, 9, event_log=8)
     assert bool(run.successful)
@@ -45,7 +45,7 @@ def place(machine, s, z):
 
 
 class Relay(vi.AbstractMachine):
-    """x' = a sin s - m, y' = m with m = sgn x: on x = 0 it slides while |a sin s| < 1."""
+    """x' = a sin s - m, y' = m with m = sgn x; the motion slides on x = 0 while |a sin s| < 1."""
 
     amplitude: Any = 0.5
     events = vi.Switch(place, slides=True)
@@ -60,18 +60,18 @@ def at(x, y):
 
 
 @pytest.mark.slow
-def test_it_slides_as_the_mean_that_stays_on_the_surface():
+def test_sliding_follows_the_mean_rate_on_the_surface():
     def last(amplitude, x):
         run = vi.simulate(Relay(amplitude), at(x, 0.0), 1, event_log=8)
         return (run.last.x, run.last.y), (run.event_log, run.successful)
 
     (x, y), (log, good) = vi.jit(last)(0.5, 0.2)
     assert bool(good) and abs(float(x)) < 1e-12
-    # It comes to the surface where .2 + .5 (1 - cos s) = s.
+    # The motion reaches the surface where .2 + .5 (1 - cos s) = s.
     met = float(log.phase[0, 0])
     assert 0.2 + 0.5 * (1 - np.cos(met)) == pytest.approx(met, abs=1e-9)
     assert float(y) == pytest.approx(met + 0.5 * (np.cos(met) - 1), abs=1e-8)
-    # Derivatives by both numbers, through the event after which one of them is forgotten.
+    # Derivatives with respect to both numbers, through the event at which sliding begins.
     slope = jax.jacfwd(lambda p: jnp.stack(last(*p)[0]))(jnp.array([0.5, 0.2]))
     h = 1e-4
     for j in range(2):
@@ -80,7 +80,7 @@ def test_it_slides_as_the_mean_that_stays_on_the_surface():
         np.testing.assert_allclose(slope[:, j], (ahead - behind) / (2 * h), atol=1e-7)
 
 
-def test_it_leaves_where_one_side_points_away():
+def test_sliding_ends_where_one_side_points_away():
     a = 1.5
     method = vi.FixedStep(steps_per_cycle=48)
     run = vi.simulate(Relay(a), at(-1e-3, 0.0), 1, event_log=12, method=method)

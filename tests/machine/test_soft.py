@@ -1,4 +1,4 @@
-"""Compliant stops: restitution in closed form, SciPy beside every law, the rigid limit."""
+"""Compliant stops: restitution in closed form, every law against SciPy, the rigid limit."""
 
 import equinox as eqx
 import jax
@@ -26,8 +26,8 @@ def test_restitution_does_not_depend_on_the_speed(exponent, restitution):
     np.testing.assert_allclose(found, restitution, atol=1e-9)
 
 
-def test_a_body_that_leaves_where_its_motion_begins_does_not_touch():
-    """At the place of the stop: out it flies freely, in it is thrown back."""
+def test_start_on_the_stop_touches_only_inwards():
+    """Outwards the body flies freely; inwards the stop throws it back."""
     stop = vi.SoftStop(0.0, 100.0, restitution=0.5)
     run = jax.vmap(lambda v: thrown(stop, v, jnp.asarray(1.0), event_log=2))(jnp.array([-1.0, 1.0]))
     np.testing.assert_allclose(run.last.Y[0], -1.0, rtol=1e-14)
@@ -48,7 +48,7 @@ LAWS = [
 
 
 def force(depth, rate, stiffness, *, damping=0.0, exponent=1.0, law="power", prestress=0.0):
-    """The laws, written out again."""
+    """Return the contact force, written independently of the package."""
     depth = max(depth, 0.0)
     spring = stiffness * depth**exponent
     if law == "power":
@@ -65,33 +65,33 @@ class Contact:
         self.gap, self.stiffness, self.sign, self.law = gap, stiffness, sign, law
         self.adhesive, self.mode, self.changes = adhesive, "apart", 0
 
-    def seen(self, x):
+    def motion(self, x):
         return self.sign * x[0] - self.gap, self.sign * x[1]
 
     def push(self, x):
         touching = self.mode == "touching"
-        return -self.sign * force(*self.seen(x), self.stiffness, **self.law) if touching else 0.0
+        return -self.sign * force(*self.motion(x), self.stiffness, **self.law) if touching else 0.0
 
     def ends(self, t, x):
-        depth = self.seen(x)[0]
+        depth = self.motion(x)[0]
         if self.mode == "apart":
             return depth
         if self.adhesive or (self.mode == "touching" and depth < 1e-9):
             return -depth
-        pushes = force(*self.seen(x), self.stiffness, **self.law)
+        pushes = force(*self.motion(x), self.stiffness, **self.law)
         return max(-pushes if self.mode == "touching" else pushes, -depth)
 
     def change(self, x):
         self.changes += 1
-        inside = self.seen(x)[0] > 1e-9
+        inside = self.motion(x)[0] > 1e-9
         if self.mode == "apart" or (self.mode == "released" and inside):
             self.mode = "touching"
         else:
             self.mode = "released" if inside else "apart"
 
 
-def integrated(rate, x, contact, duration, max_step):
-    """The state after a duration, by SciPy's DOP853."""
+def integrate_with_scipy(rate, x, contact, duration, max_step):
+    """Return the state after a duration from SciPy's DOP853."""
 
     def jump(t, x):
         contact.change(x)
@@ -105,7 +105,7 @@ def integrated(rate, x, contact, duration, max_step):
     quick([*((x, False) for x in LAWS), *((LAWS[i], True) for i in (1, 2, 4))], (LAWS[6], False)),
     ids=str,
 )
-def test_a_law_beside_scipy(law, adhesive):
+def test_laws_match_scipy(law, adhesive):
     side = "left" if "prestress" in law else "right"
     sign = 1 if side == "right" else -1
     stop = vi.SoftStop(0.5, 100.0, adhesive=adhesive, side=side, **law)
@@ -114,7 +114,7 @@ def test_a_law_beside_scipy(law, adhesive):
     assert bool(run.successful.all())
     for i, v in enumerate(speeds):
         contact = Contact(0.5, 100.0, sign, adhesive, law)
-        wanted = integrated(
+        wanted = integrate_with_scipy(
             lambda t, x, c=contact: [x[1], c.push(x)], [0.0, sign * v], contact, 0.5 / v + 3.0,
             0.02 / max(1.0, v),
         )  # fmt: skip
@@ -144,8 +144,8 @@ def scene_of(stiffness, **options):
     )
 
 
-def test_a_stiff_stop_is_a_rigid_one():
-    """The time in contact falls with K^-½, and so does what it makes of the motion."""
+def test_stiff_stop_approaches_a_rigid_one():
+    """The time in contact falls as K^-½, and so does the difference between the motions."""
     rigid = vi.Scene(
         oscillator=vi.Oscillator(0.0), drive=vi.IdealDrive(0.9), stops=(vi.RigidStop(0.7, 0.5),)
     )
@@ -161,7 +161,7 @@ def test_a_stiff_stop_is_a_rigid_one():
     away = np.hypot(found.Y - limit.last.Y, found.V - limit.last.V)
     slope = np.diff(np.log10(away))
     np.testing.assert_allclose(slope[1:], -0.5, atol=0.02)
-    # Many lanes are the one, taken one after the other.
+    # Lanes of a batch equal single lanes.
     for i in (0, 4):
         alone = last(jnp.asarray(stiffness[i]))
         np.testing.assert_allclose([alone.Y, alone.V], [found.Y[i], found.V[i]], atol=1e-9)
@@ -204,12 +204,12 @@ def test_derivatives_through_a_contact(options, method):
         ({"coordinate": -1}, "`coordinate`"),
     ],
 )
-def test_wrong_arguments_are_named(arguments, told):
+def test_wrong_arguments_raise_with_their_names(arguments, told):
     with pytest.raises(ValueError, match=told):
         vi.SoftStop(**{"gap": 1.0, "stiffness": 10.0, **arguments})
 
 
-def test_a_scene_takes_no_other_kinds_among_its_compliant_stops():
+def test_scene_raises_for_stops_of_the_wrong_kind():
     with pytest.raises(TypeError, match="`soft_stops`"):
         vi.Scene(vi.Oscillator(), vi.IdealDrive(1.0), soft_stops=(vi.RigidStop(1.0, 0.5),))
     with pytest.raises(TypeError, match="`stops`"):
@@ -219,7 +219,7 @@ def test_a_scene_takes_no_other_kinds_among_its_compliant_stops():
         vi.simulate(scene, scene.start(), 1, method=vi.ExactFlight())
 
 
-def test_a_force_without_a_series_is_refused_by_taylor():
+def test_taylor_raises_for_a_force_without_a_series():
     machine = scene_of(100.0, exponent=1.5)
     with pytest.raises(ValueError, match="no power series"):
         vi.simulate(machine, machine.start(), 1, method=vi.Taylor())
@@ -229,9 +229,9 @@ def test_a_force_without_a_series_is_refused_by_taylor():
 
 
 @pytest.mark.parametrize(("prestress", "exponent"), [(None, 1.5), (0.2, 0.5)])
-def test_how_a_motion_changes_where_it_begins_to_graze(prestress, exponent):
-    """By the depth to the power 3/2 where the force begins from zero (Kundu et al., Physica D 241,
-    2012), and by its root where the stop is prestressed."""
+def test_change_of_a_motion_is_a_power_of_the_grazing_depth(prestress, exponent):
+    """The power is 3/2 if the force begins at zero (Kundu et al., Physica D 241, 2012), and 1/2 if
+    the stop is prestressed."""
     law = {"damping": 0.3, "prestress": prestress}
     free = vi.Scene(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.7))
     start, method = free.start(V=-1.0), vi.Adaptive(rtol=1e-13, atol=1e-15)
@@ -250,10 +250,10 @@ def test_how_a_motion_changes_where_it_begins_to_graze(prestress, exponent):
 
 
 class Buffers(vi.Mechanical):
-    """Two bodies with a buffer between them, in SI units: newtons by metre, and by metre a second.
+    """Two bodies with a buffer between them, in SI units: N/m and N s/m.
 
-    Body `a` comes at 2 m/s, and what is left is the closed form of a damped swing of half a
-    period: the relative speed times exp(-πξ/√(1 - ξ²)), ξ = c/(2√(K m)) by the reduced mass m."""
+    Body `a` arrives at 2 m/s. Half a damped period multiplies the relative speed by
+    exp(-πξ/√(1 - ξ²)), with ξ = c/(2√(K m)) and the reduced mass m."""
 
     q = ("a", "b")
     light: float = 1.0
@@ -277,7 +277,7 @@ class Buffers(vi.Mechanical):
 
 
 @pytest.mark.parametrize("by_share", [False, True])
-def test_a_buffer_between_bodies_is_a_force(by_share):
+def test_buffer_between_bodies_matches_closed_form(by_share):
     masses = jnp.asarray([[1.0, 3.0], [0.2, 0.1], [40.0, 7.0], [1.0, 1.0]])
 
     def left(pair):

@@ -1,4 +1,4 @@
-"""Numbers are told in the units of their machine, which states them; nothing is the paper's."""
+"""Numbers are printed in the units that their machine defines."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,7 @@ from vi_jax.machine.numbers import leaf_names, unit_of
 
 M = vi.machines
 
-# Of each machine: what the position is called, and the units of position, velocity and exponents,
-# as its class says.
+# Machine, label of the position, and units of position, velocity and exponents.
 MACHINES = {
     "paper": (vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05), "Y", "a", "a ω", "ω"),
     "ball": (M.BouncingBall(), "height", "g/ω²", "g/ω", "ω"),
@@ -35,7 +34,7 @@ def test_every_number_has_a_unit(case):
         assert unit_of(units, name) == unit
     for name in (*leaf_names(machine), *leaf_names(start), "time", "energy", "power"):
         assert unit_of(units, name)
-    # The components that are position and velocity are in the units of these.
+    # The components for position and velocity have these units.
     names = leaf_names(start)
     probe = jax.tree.unflatten(jax.tree.structure(start), list(jnp.arange(float(len(names)))))
     assert unit_of(units, names[int(machine.position(probe))]) == position
@@ -43,7 +42,7 @@ def test_every_number_has_a_unit(case):
 
 
 @pytest.mark.slow
-def test_a_machine_that_states_nothing_is_told_without_units():
+def test_machine_without_units_uses_those_of_its_labels():
     class Own(vi.AbstractMachine):
         gap: float = 0.5
 
