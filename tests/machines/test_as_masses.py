@@ -1,5 +1,5 @@
-"""Ready machines beside the same machines by their masses and forces, in other coordinates: the
-momentum and the energy of an impact follow from the masses."""
+"""Ready machines, compared with `Mechanical` ones in other coordinates, where the momentum and the
+energy of an impact follow from the masses."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ M, LANES, CYCLES = vi.machines, 24, 4
 
 
 class Masses(vi.Mechanical):
-    """The machine with the numbers of the ready machine `of`."""
+    """A machine with the parameters of the ready machine `of`."""
 
     of: Any
 
@@ -41,16 +41,16 @@ class Box(Masses):
     def contacts(self):
         return self.walls(self.of.half_gap, lambda q: q.ball - q.box)
 
-    def begun(self, x):
+    def from_ready(self, x):
         v = dict(box=x.v.box, ball=x.v.box + x.v.place)
         return self.at(box=x.box, ball=x.box + x.place, v=v)
 
-    def seen(self, z):
+    def view(self, z):
         return z.ball - z.box, z.box, z.v.ball - z.v.box, z.v.box
 
 
 class ShakenBox(Box):
-    """In a box that moves as sin t."""
+    """A ball in a box that moves as sin t."""
 
     mass: ClassVar = (1.0,)
 
@@ -60,14 +60,14 @@ class ShakenBox(Box):
     def force(self, t, q, v):
         return dict(ball=0.0)
 
-    def begun(self, x):
+    def from_ready(self, x):
         return self.at(ball=x.place, v=dict(ball=1.0 + x.v.place))
 
-    def seen(self, z):
-        return super().seen(z)[::2]
+    def view(self, z):
+        return super().view(z)[::2]
 
 
-# The ranges of its numbers and of its start.
+# Ready machine, class with masses, ranges of parameters and of starts.
 HITS = {"restitution": (0.3, 0.9)}
 CASES = {
     "pair": (M.ImpactPair(), ShakenBox, {**HITS, "half_gap": (0.6, 2)},
@@ -83,7 +83,7 @@ CASES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_a_machine_is_that_of_its_masses(name):
+def test_ready_machine_equals_machine_with_masses(name):
     ready, kind, *ranges = CASES[name]
     draw = np.random.default_rng(5).uniform
     drawn = jax.tree.map(
@@ -95,16 +95,16 @@ def test_a_machine_is_that_of_its_masses(name):
         start, other = machine.at(**begin), kind(machine)
         runs = [
             vi.simulate(x, at, CYCLES, method=vi.Adaptive(rtol=1e-12))
-            for x, at in ((machine, start), (other, other.begun(start)))
+            for x, at in ((machine, start), (other, other.from_ready(start)))
         ]
-        ours = jnp.stack(jax.tree.leaves(runs[0].sections)), jnp.stack(other.seen(runs[1].sections))
+        ours = jnp.stack(jax.tree.leaves(runs[0].sections)), jnp.stack(other.view(runs[1].sections))
         return ours, [x.impact_energy for x in runs], [x.impacts for x in runs], runs
 
     states, energies, impacts, runs = vi.jit(jax.vmap(both))(*drawn)
     assert all(bool(run.successful.all()) for run in runs)
     for a, b in (states, energies):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-8)
-    few = np.maximum(*impacts) < 20  # of a chatter the last ones are of rounding
+    few = np.maximum(*impacts) < 20  # rounding decides the last of a chatter
     np.testing.assert_array_equal(impacts[0][few], impacts[1][few])
     np.testing.assert_allclose(*(run.duration for run in runs), rtol=1e-8)
     assert int(impacts[0].sum()) > LANES

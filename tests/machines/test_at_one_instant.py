@@ -1,4 +1,4 @@
-"""Contacts that are met at one instant: the one that closes fastest first, equal ones together."""
+"""Simultaneous impacts: the fastest approach is resolved first, equal ones together."""
 
 import warnings
 from typing import Any
@@ -14,7 +14,7 @@ from chain import Chain, dropped, passed, row
 
 
 class Cradle(Chain):
-    """Newton's: three equal masses, each on its own spring; they touch at the springs' rest."""
+    """Newton's cradle: three equal masses on springs, which touch where the springs are at rest."""
 
     springs: Any = (1.0, 1.0, 1.0)
     length: Any = 2 * np.pi
@@ -29,9 +29,9 @@ def energy(z, springs=(1.0, 1.0, 1.0)):
 
 
 @pytest.mark.slow
-# With 16 samples the balls meet where an interval ends.
+# With 16 samples the balls meet at the end of an interval.
 @pytest.mark.parametrize(("rests", "samples"), [(True, 16), (False, 0)])
-def test_a_blow_passes_through_balls_that_touch(rests, samples):
+def test_impact_passes_through_touching_balls(rests, samples):
     start = Cradle().balls((-1, 0, 0), (0, 0, 0))
     run = vi.simulate(Cradle(), start, 3, rests=rests, samples=samples, impact_log=6)
     assert bool(run.successful)
@@ -42,7 +42,7 @@ def test_a_blow_passes_through_balls_that_touch(rests, samples):
     np.testing.assert_allclose(jax.vmap(energy)(run.sections), 0.5, rtol=1e-8)
 
 
-def flown(machine, x, v, cycles=1, **options):
+def simulate_impacts(machine, x, v, cycles=1, **options):
     run = vi.simulate(machine, machine.balls(x, v), cycles, impact_log=160, **options)
     assert bool(run.successful), run.result
     stops = np.asarray(run.impact_log.stop)
@@ -59,10 +59,10 @@ def flown(machine, x, v, cycles=1, **options):
     ],
 )
 def test_newtons_cradle(k, masses, speeds):
-    """One ball upon others that touch: of five with k = .9 the first keeps .0435250820. Two upon a
-    pair that touches, from both sides: blows that feel each other through others come together."""
+    """One ball hits touching balls: of five with k = .9 the first keeps .0435250820. Two balls hit
+    a touching pair from both sides: impacts coupled by other contacts are resolved together."""
     places = -0.5 * np.array(speeds)
-    run, stops = flown(Chain(k, masses), places, speeds)
+    run, stops = simulate_impacts(Chain(k, masses), places, speeds)
     wanted, struck = passed(speeds, k, np.array(masses))
     np.testing.assert_allclose(row(run.last)[1], wanted, atol=1e-12)
     assert stops.tolist() == struck
@@ -76,16 +76,16 @@ def test_newtons_cradle(k, masses, speeds):
 
 @pytest.mark.slow
 def test_a_light_ball_between_a_wall_and_a_heavy_one():
-    """Galperin's count of the digits of pi, all blows in one instant."""
+    """Galperin's billiard counts the digits of pi, with all impacts at one instant."""
     ratio, impacts = 10_000.0, 314
-    run, _ = flown(Chain(1.0, (ratio, 1.0), 0.0), (-0.5, 0), (1, 0), max_impacts=400)
+    run, _ = simulate_impacts(Chain(1.0, (ratio, 1.0), 0.0), (-0.5, 0), (1, 0), max_impacts=400)
     assert int(run.impacts[0]) == impacts
     energy = 0.5 * (ratio * run.last.v.a**2 + run.last.v.b**2)
     assert float(energy) == pytest.approx(0.5 * ratio, rel=1e-12)
 
 
 class Shaken(Chain):
-    """Balls on springs, one above the other on a table that is shaken, seen from it."""
+    """Two balls on springs, stacked on a shaken table, in the frame of the table."""
 
     springs: Any = (0.5, 1.0)
 
@@ -95,15 +95,15 @@ class Shaken(Chain):
 
 
 @pytest.mark.slow
-def test_a_stack_is_let_go_of_as_one():
-    """Its bodies part by what grows with the third power of the time; beside SciPy."""
+def test_stack_is_released_as_one():
+    """The distance of the bodies grows with the third power of time. Compare with SciPy."""
     masses = 0.78, 2.46
 
     def run(springs):
         machine = Shaken(0.0, masses, 0.0, length=5.0, springs=springs)
         return vi.simulate(machine, machine.start(), 1)
 
-    with warnings.catch_warnings():  # the field jumps where its cycle begins again
+    with warnings.catch_warnings():  # the field jumps between cycles
         warnings.simplefilter("ignore")
         springs = jnp.array([(0.5, 1.0), (0.0, 1.0), (0.2, 0.7)])
         runs = jax.vmap(lambda x: run(tuple(x)))(springs)
@@ -120,23 +120,23 @@ def test_a_stack_is_let_go_of_as_one():
 
 
 @pytest.mark.slow
-def test_without_an_end_a_sequence_goes_to_its_limit():
-    """Five balls that touch, without restitution, share the momentum."""
-    run, _ = flown(Chain(0.0, (1.0,) * 5), (-0.5, 0, 0, 0, 0), (1, 0, 0, 0, 0))
+def test_endless_sequence_of_impacts_goes_to_its_limit():
+    """Five touching balls without restitution share the momentum."""
+    run, _ = simulate_impacts(Chain(0.0, (1.0,) * 5), (-0.5, 0, 0, 0, 0), (1, 0, 0, 0, 0))
     np.testing.assert_allclose(row(run.last)[1], 0.2, atol=1e-12)
     assert float(run.impact_energy[0]) == pytest.approx(0.4, abs=1e-12)
 
 
 def test_two_balls_before_a_wall():
-    """Equal balls at speeds 2 and 0, .01 apart, and .01 before a wall: 0 and -2 after .015."""
+    """Equal balls with speeds 2 and 0 and two gaps of .01 have speeds 0 and -2 after .015."""
     machine = Chain(1.0, (1.0, 1.0), 0.01, length=0.015)
-    run, stops = flown(machine, (-0.01, 0), (2, 0))
+    run, stops = simulate_impacts(machine, (-0.01, 0), (2, 0))
     assert stops.tolist() == [0, 1, 0]
     np.testing.assert_allclose(row(run.last), [(0, 0), (-2, 0)], atol=1e-12)
 
 
 def test_two_balls_bounce_to_rest_one_above_the_other():
-    """Of masses 1 and 2: as by flights in closed form, until they lie on each other."""
+    """Compare masses 1 and 2 with closed-form flights, until both lie on each other."""
     masses, k = (1.0, 2.0), 0.8
     machine = Chain(k, masses, 0.0, pressed=1.0, length=2.0)
     run = vi.simulate(machine, machine.balls((-1, -0.5), (0, 0)), 8, impact_log=20)
@@ -153,7 +153,7 @@ def test_two_balls_bounce_to_rest_one_above_the_other():
 
 @pytest.mark.slow
 def test_energy_never_grows():
-    """On springs of their own, from starts some of which touch."""
+    """Balls have different springs, and some touch at the start."""
     springs = jnp.array([1.0, 1.7, 0.6])
     starts = jnp.sort(jax.random.uniform(jax.random.key(0), (64, 3), minval=-1, maxval=1), axis=1)
     starts = starts.at[:16, 2].set(starts[:16, 1]).at[8:24, 1].set(starts[8:24, 0])
@@ -173,7 +173,7 @@ def test_energy_never_grows():
 
 
 class Rod(vi.Mechanical):
-    """A rod of unit mass that falls flat on feet at `feet` along it (inertia .3)."""
+    """A rod of mass 1 and inertia .3 that falls flat on feet at the positions `feet`."""
 
     restitution: Any
     feet: Any
@@ -192,8 +192,8 @@ class Rod(vi.Mechanical):
 
 @pytest.mark.slow
 def test_a_rod_lands_flat_on_its_feet():
-    """Where the far foot would have to pull, only the near one strikes; laws that would gain energy
-    together do not."""
+    """If the far foot would have to pull, only the near one has an impact. Laws that would gain
+    energy together gain none."""
     turns = -1.5 * 0.5 / 0.3 / (1 + 1 / 1.2)
     several = [
         (jnp.array(places), jnp.array(laws), wanted)
@@ -220,8 +220,8 @@ def test_a_rod_lands_flat_on_its_feet():
             np.testing.assert_allclose((v, turn), wanted, atol=1e-12)
 
 
-def test_blows_that_act_on_each_other_by_friction():
-    """The faster one first: b from 2 to -1 takes .9 off a, then a from .1 to -.05 adds .045."""
+def test_impacts_coupled_by_friction():
+    """The faster impact is first: b from 2 to -1 takes .9 off a; a from .1 to -.05 gives b .045."""
     rough = dict(restitution=0.5, friction=0.3)
     a = vi.RigidStop(1.0, on="a", along="b", **rough)
     b = vi.RigidStop(2.0, on="b", along="a", **rough)

@@ -1,4 +1,4 @@
-"""What a machine of one's own may be: two bodies with three contacts, states of any kind."""
+"""User-defined machines: two bodies with three contacts, states of any kind."""
 
 from typing import Any
 
@@ -20,9 +20,9 @@ CLOSE = vi.Adaptive(rtol=1e-12)
 PI = np.pi
 
 
-def flown(gap, k, force, ratio, x, duration):
-    """State, impacts and energy lost in them by SciPy's DOP853, the laws written out again; `None`
-    for a motion with impacts too weak to be distinguished from rest."""
+def integrate_with_scipy(gap, k, force, ratio, x, duration):
+    """Return state, impacts and lost energy from SciPy's DOP853, with laws written independently,
+    or `None` for a motion with impacts too weak to be distinguished from rest."""
 
     def rate(t, x):
         spring = 0.5 * (x[0] - x[2])
@@ -53,7 +53,7 @@ def flown(gap, k, force, ratio, x, duration):
     return None if t < duration - 1e-12 else (x, [met.count(i) for i in range(3)], lost)
 
 
-def drawn(number):
+def random_cases(number):
     draw = np.random.default_rng(1).uniform
     numbers = np.stack([draw(0.3, 1, number), draw(0.3, 0.9, number), draw(0.3, 1.2, number),
                         draw(0.4, 2, number)])  # fmt: skip
@@ -67,8 +67,7 @@ def lane(numbers, start, cycles=4, **options):
     return vi.simulate(machine, machine.at(x=x, y=y, v=dict(x=u, y=v)), cycles, **options)
 
 
-def places(z):
-    """As SciPy has them."""
+def list_components(z):
     return [z.x, z.v.x, z.y, z.v.y]
 
 
@@ -79,14 +78,14 @@ METHODS = {
 
 @pytest.mark.slow
 def test_two_bodies_with_three_contacts():
-    numbers, starts = drawn(100)
+    numbers, starts = random_cases(100)
     runs = [
         vi.jit(jax.vmap(lambda p, x, m=m: lane(p, x, method=m, impact_log=40), in_axes=1))(
             jnp.asarray(numbers), jnp.asarray(starts)
         )
         for m in METHODS.values()
     ]
-    # No turn of one coordinate hides that of another, which a step may end at.
+    # A turning point of one coordinate must not hide that of the other at the end of a step.
     plain = vi.jit(
         jax.vmap(
             lambda p, x: lane(p, x, method=vi.Taylor(20, rtol=1e-12), record="sections"), in_axes=1
@@ -94,19 +93,19 @@ def test_two_bodies_with_three_contacts():
     )(jnp.asarray(numbers), jnp.asarray(starts))
     compared, several = 0, np.zeros(3, int)
     for i in range(100):
-        wanted = flown(*numbers[:, i], starts[:, i], 8 * PI)
+        wanted = integrate_with_scipy(*numbers[:, i], starts[:, i], 8 * PI)
         if wanted is None:
             continue
         x, impacts, lost = wanted
         for run in runs:
             assert bool(run.successful[i])
-            found = [leaf[i, -1] for leaf in places(run.sections)]
+            found = [leaf[i, -1] for leaf in list_components(run.sections)]
             np.testing.assert_allclose(found, x, atol=2e-7)
             stop = np.asarray(run.impact_log.stop[i])
             assert [int((stop == j).sum()) for j in range(3)] == impacts
             assert float(run.impact_energy[i].sum()) == pytest.approx(lost, abs=1e-7)
         for run in (runs[0], plain):
-            found = [leaf[i, -1] for leaf in places(run.sections)]
+            found = [leaf[i, -1] for leaf in list_components(run.sections)]
             np.testing.assert_allclose(found, x, atol=1e-8)
         assert int(plain.impacts[i].sum()) == sum(impacts)
         compared, several = compared + 1, several + impacts
@@ -115,8 +114,8 @@ def test_two_bodies_with_three_contacts():
 
 @pytest.mark.slow
 def test_derivatives_of_two_bodies():
-    """By all their numbers and their start, through impacts of all three kinds."""
-    numbers, starts = drawn(100)
+    """Derivatives with respect to all parameters and the start, through all three contacts."""
+    numbers, starts = random_cases(100)
     log = vi.jit(jax.vmap(lambda p, x: lane(p, x, 2, impact_log=16).impact_log.stop, in_axes=1))(
         jnp.asarray(numbers), jnp.asarray(starts)
     )
@@ -132,7 +131,7 @@ def test_derivatives_of_two_bodies():
 
 
 class Own(vi.AbstractMachine):
-    """A body on a spring before a wall, in a state that is a mapping."""
+    """A body on a spring before a stop; its state is a dictionary."""
 
     amplitude: Any = 2.0
 
@@ -160,7 +159,7 @@ class Own(vi.AbstractMachine):
 
 
 @pytest.mark.slow
-def test_a_state_of_any_kind():
+def test_state_can_be_a_dictionary():
     machine = Own()
     run = vi.simulate(machine, machine.start(), 5, samples=8)
     plain = vi.machines.Duffing(
@@ -178,7 +177,7 @@ def test_a_state_of_any_kind():
 
 @pytest.mark.slow
 def test_bodies_that_push_each_other_onto_walls():
-    """Without rebound impacts go to and fro between two contacts, ever weaker, until both hold."""
+    """Without restitution, ever weaker impacts alternate between two contacts until both close."""
     draw = np.random.default_rng(7).uniform
     first, speeds = draw(-0.2, 0.2, 64), draw(-1, 1, (2, 64))
     starts = map(jnp.asarray, (first, speeds[0], 0.5 * first - 0.1, speeds[1]))
@@ -213,7 +212,7 @@ class Filter(vi.AbstractMachine):
 
 @pytest.mark.slow
 def test_a_machine_without_stops_needs_no_position():
-    """It runs with every verb, and its extremes are those of the first number of its state."""
+    """The extremes are those of the first number of the state."""
     machine = Filter(jnp.asarray(1.0))
     orbit = vi.find_orbit(machine, machine.start())
     run = vi.simulate(machine, orbit.state, 1)
@@ -230,7 +229,7 @@ def test_a_machine_without_stops_needs_no_position():
 
 
 class Apart(TwoBodies):
-    """Only the second has a stop that it comes to."""
+    """Only the second body reaches its stop."""
 
     @property
     def contacts(self):

@@ -1,4 +1,4 @@
-"""Ten thousand random machines of each kind: all end, none passes its stop, gains at a contact or
+"""Ten thousand random machines of each kind: none passes its stop, gains energy at a contact or
 fails without a reason."""
 
 import jax
@@ -14,7 +14,7 @@ from differences import quick
 LANES, CYCLES = 10_000, 12
 M = vi.machines
 
-# Ranges of the numbers drawn, and of the start's. A rotor of more coupling often stalls.
+# Ranges of random parameters and starts. A rotor with more coupling often stalls.
 PAPER = {"oscillator.damping_ratio": (0.0, 0.5), "stops.0.gap": (-1.0, 3.0),
          "stops.0.restitution": (0.0, 1.0)}  # fmt: skip
 BELOW = {"Y": (-3.0, -1.0), "V": (-3.0, 3.0)}
@@ -50,8 +50,8 @@ KINDS = {
 }  # fmt: skip
 
 
-def crowd(name, lanes):
-    """A machine, and so many sets of its numbers and starts."""
+def random_lanes(name, lanes):
+    """Return a machine, and random parameters and starts."""
     machine, numbers, begin = KINDS[name]
     rng = np.random.default_rng(sum(map(ord, name)))
     return machine, *(
@@ -61,8 +61,8 @@ def crowd(name, lanes):
 
 
 @pytest.mark.parametrize("name", quick(KINDS, "motor"))
-def test_a_crowd(name):
-    machine, drawn, starts = crowd(name, LANES)
+def test_random_machines(name):
+    machine, drawn, starts = random_lanes(name, LANES)
 
     def one(drawn, starts):
         scene = with_leaves(machine, drawn)
@@ -82,5 +82,5 @@ def test_a_crowd(name):
     assert (np.asarray(depth / size)[good] < 1e-12).all()
     assert (np.asarray(run.impact_energy)[good] >= 0).all()
     assert int(np.asarray(run.impacts)[good].sum()) > LANES
-    # Each that failed has its reason, and what came before it.
+    # Each failed lane has a reason.
     assert (np.asarray(run.result.number)[~good] > 0).all()

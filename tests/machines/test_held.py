@@ -1,5 +1,4 @@
-"""Bodies that rest on several contacts, on a curved one, on one whose place is no number of the
-state or moves along with it, or are moved while they rest."""
+"""Bodies that rest on several, curved or moving contacts, or that are displaced at rest."""
 
 from typing import Any
 
@@ -14,14 +13,14 @@ from chain import Chain, row
 
 
 class Stack(Chain):
-    """Two equal bodies, one against the other and that one against a wall at y = 0."""
+    """Two equal bodies: a against b, and b against a wall at y = 0."""
 
     restitution: Any = 0.3
     weights: tuple[float, ...] = (1.0, 1.0)
     wall: float | None = 0.0
     length: Any = 2 * np.pi
     forces: Any = None
-    """Constant ones on both, and the strength of one on the first that goes by cos s."""
+    """Constant forces on both bodies, and the amplitude of a force cos s on the first."""
 
     def force(self, t, q, v):
         first, second, turning = self.forces
@@ -30,7 +29,7 @@ class Stack(Chain):
 
 @pytest.mark.slow
 def test_a_stack_pressed_on_a_wall_stays_there():
-    """Whichever of them is pressed; and the outer body leaves where its own force turns."""
+    """Both bodies or one of them are pressed. The outer body leaves when its own force turns."""
 
     def run(forces):
         stack = Stack(forces=forces)
@@ -52,7 +51,7 @@ def test_a_stack_pressed_on_a_wall_stays_there():
 
 
 class Thrown(Stack):
-    """The first one twice as heavy, both thrown off the wall by one and the same acceleration."""
+    """A stack with a heavier first body. Both bodies have the same acceleration off the wall."""
 
     weights: tuple[float, ...] = (2.0, 1.0)
 
@@ -63,7 +62,7 @@ class Thrown(Stack):
 
 @pytest.mark.slow
 def test_a_stack_is_thrown_off_as_one_and_comes_back():
-    """As one body, which leaves where 1 + 2 cos s = 0, flies, and bounces to rest or goes on."""
+    """Both bodies leave together at 1 + 2 cos s = 0, fly, and come back to the wall."""
     run = vi.simulate(Thrown(), Thrown().start(), 3, event_log=12, max_impacts=2000)
     assert bool(run.successful)
     leaves = run.event_log.phase[0][run.event_log.kind[0] == 2]
@@ -77,8 +76,8 @@ def test_a_stack_is_thrown_off_as_one_and_comes_back():
     assert int(run.impacts.sum()) > 2 and float(run.sections.b.max()) <= 1e-12
 
 
-class Put(vi.AbstractMachine):
-    """A body pressed on a stop with unit force, that is moved as each cycle begins."""
+class Displaced(vi.AbstractMachine):
+    """A body pressed on a stop with unit force. Each new cycle displaces or kicks it."""
 
     by: Any
     kick: Any
@@ -96,16 +95,16 @@ class Put(vi.AbstractMachine):
         return vi.OscillatorState(state.Y - self.by, state.V - self.kick)
 
 
-def test_a_body_that_is_moved_while_it_rests_is_free_again():
+def test_body_displaced_at_rest_is_free_again():
     start = vi.OscillatorState(jnp.array(0.5), jnp.array(0.0))
 
     def run(by, kick):
-        return vi.simulate(Put(by, kick), start, 4, impact_log=2)
+        return vi.simulate(Displaced(by, kick), start, 4, impact_log=2)
 
     runs = jax.vmap(run)(jnp.array([0.0, 0.2, 0.0]), jnp.array([0.0, 0.0, 0.3]))
     assert bool(runs.successful.all())
     assert runs.impacts.tolist() == [[0] * 4, [0, 1, 1, 1], [0, 1, 1, 1]]
-    # It falls back, √0.4 long, or flies for twice its speed.
+    # The body falls back for √0.4, or flies for twice its speed.
     np.testing.assert_allclose(runs.impact_log.phase[1, 1:, 0], np.sqrt(0.4), rtol=1e-8)
     np.testing.assert_allclose(runs.impact_log.phase[2, 1:, 0], 0.6, rtol=1e-8)
     np.testing.assert_allclose(runs.sections.Y[:, 1:], np.array([[0.5], [0.3], [0.5]]) * np.ones(4))
@@ -126,7 +125,7 @@ class Dome(vi.Mechanical):
 
 @pytest.mark.slow
 def test_a_particle_slides_off_a_dome():
-    """It leaves where cos θ = (2 + v²)/3, from an angle where it had v²/2 + cos θ of energy."""
+    """The particle leaves where cos θ is the square of its speed. Compare with SciPy."""
     angles, speed = jnp.linspace(0.05, 0.5, 16), 0.1
 
     def run(angle):
@@ -154,7 +153,7 @@ def test_a_particle_slides_off_a_dome():
         begin = float(angle), speed
         truth = solve_ivp(rate, (0, 2), begin, events=leaves, rtol=1e-11, atol=1e-12)
         np.testing.assert_allclose(phase, truth.t_events[0][0], atol=1e-8)
-    # Through the release: beside differences.
+    # Compare derivatives through the release with differences.
     slope = jax.vmap(jax.jacfwd(lambda angle: run(angle).last.x))(angles)
     h = 1e-5
     apart = jax.vmap(lambda angle: run(angle).last.x)(jnp.stack([angles + h, angles - h]).ravel())
@@ -162,7 +161,7 @@ def test_a_particle_slides_off_a_dome():
 
 
 class Pressed(vi.Mechanical):
-    """Two balls of a radius, driven and pressed together."""
+    """Two driven balls with a radius, pressed against each other."""
 
     radius: Any = 0.25
     q = ("x", "y")
@@ -181,7 +180,7 @@ class Pressed(vi.Mechanical):
 
 
 def middle(cycles):
-    """Of both balls: no impact between them moves it."""
+    """Return position and speed of the midpoint, which impacts between the balls do not change."""
 
     def rate(t, c):
         return c[1], 0.15 * np.cos(t) + 0.05 * np.sin(t) - 0.2 * c[0]
@@ -200,7 +199,7 @@ def test_balls_with_a_radius_rest_on_one_another():
         [run.last.x, run.last.y], [place - radius, place + radius], rtol=1e-8
     )
     np.testing.assert_allclose([run.last.v.x, run.last.v.y], speed, rtol=1e-8)
-    # On from there, whatever rounding made of their distance.
+    # Continue from there, with the rounding error of their distance.
     for cycles in (4, 5, 6):
         run = vi.simulate(balls, run.last, 1)
         place, _ = middle(cycles)
@@ -216,12 +215,12 @@ def test_derivatives_of_balls_that_rest_on_one_another():
         last = vi.simulate(balls, balls.start(), 3).last
         return jnp.stack([last.x, last.v.x, last.y, last.v.y])
 
-    # Of the middle nothing depends on the radius. What is left is the chatter completed at once.
+    # The midpoint does not depend on the radius. The error is that of the completed chatter.
     np.testing.assert_allclose(jax.jacfwd(places)(0.25), [-1, 0, 1, 0], atol=1e-9)
 
 
 class Lying(vi.Mechanical):
-    """A body that lies on another, which would fall faster, on a floor that a third one tilts."""
+    """A body b lies on a body a, and a lies on a floor whose height depends on x."""
 
     q, mass, cycle = ("a", "b", "x"), (1.0, 0.6, 0.8), 2 * jnp.pi
     contacts = (
@@ -237,7 +236,7 @@ class Lying(vi.Mechanical):
 
 
 @pytest.mark.slow
-def test_a_motion_with_several_rests_goes_on_from_any_section():
+def test_motion_with_several_rests_continues_from_any_section():
     one = lambda push, z, settle: vi.simulate(Lying(push=push), z, 6, settle=settle)
     run = vi.jit(jax.vmap(one, in_axes=(0, 0, None)))
     push = jnp.linspace(0.5, 2.0, 24)

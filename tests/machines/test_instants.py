@@ -1,4 +1,4 @@
-"""Events that come together, that do not happen, and what rests or sticks as a force jumps."""
+"""Simultaneous events, events that do not happen, and bodies at rest when a force jumps."""
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,12 @@ import vi_jax as vi
 State = vi.OscillatorState
 
 
-def begins(Y, V):
+def start_at(Y, V):
     return State(jnp.asarray(float(Y)), jnp.asarray(float(V)))
 
 
 class Glider(vi.AbstractMachine):
-    """A body that nothing pulls."""
+    """A body without forces."""
 
     events: tuple = ()
     contacts: tuple = ()
@@ -35,7 +35,7 @@ def same(machine, s, state):
 def test_a_cycle_ends_at_the_instant_of_an_impact():
     ends = (vi.Reset(lambda m, s, x: s - 1.0, same, ends_cycle=True),)
     machine = Glider(contacts=(vi.RigidStop(1.0, 0.5),), events=ends)
-    run = vi.simulate(machine, begins(0, 1), 1)
+    run = vi.simulate(machine, start_at(0, 1), 1)
     assert float(run.duration[0]) == pytest.approx(1.0, abs=1e-12)
     assert float(run.last.V) == pytest.approx(-0.5)
 
@@ -51,9 +51,9 @@ def test_an_event_that_does_not_happen_leaves_no_trace():
     assert float(slope) == pytest.approx(4.0, abs=1e-14)
 
 
-def test_a_reset_asks_when_its_guard_rises():
-    """A clock hand that passes 1 in each turn of four and is let through before 5 only: never
-    again within that turn, as soon as both hold, and once in each later turn."""
+def test_reset_checks_its_condition_when_its_guard_rises():
+    """A hand passes 1 at s = 1, before the condition s > 1.5 holds. If it turns, it passes again at
+    5 and 9. A guard with both conditions rises at 1.5."""
 
     def counted(machine, s, state):
         return {"count": state.count + 1}
@@ -80,16 +80,16 @@ def test_a_reset_asks_when_its_guard_rises():
         return vi.simulate(Hand(), start, 1).last
 
     found = jax.vmap(last)(jnp.array([0.0, 1.0]))
-    np.testing.assert_array_equal(found.count, [0, 2])  # at 1 not, at 5 and 9
+    np.testing.assert_array_equal(found.count, [0, 2])  # not at 1, but at 5 and 9
     np.testing.assert_allclose(found.both, [1.5, 9.0], rtol=1e-12)
     np.testing.assert_allclose(found.place, [10.0, 2.0], rtol=1e-12)
 
 
-def test_nor_does_it_end_a_cycle():
+def test_event_that_does_not_happen_ends_no_cycle():
     third = vi.Reset(
         lambda m, s, x: jnp.sin(x.Y), same, when=lambda m, s, x: x.Y > 7, ends_cycle=True
     )
-    run = vi.simulate(Glider(events=(third,)), begins(1, 1), 1)
+    run = vi.simulate(Glider(events=(third,)), start_at(1, 1), 1)
     assert float(run.duration[0]) == pytest.approx(4 * jnp.pi - 1, abs=1e-9)
 
 
@@ -103,14 +103,14 @@ class Pressed(Glider):
         return {"Y": state.V, "V": state.force, "force": 0.0}
 
 
-def test_a_body_is_let_go_of_as_its_force_jumps():
+def test_jump_of_its_force_releases_a_body():
     run = vi.simulate(Pressed(), vi.State(Y=0.0, V=0.0, force=-1.0), 1, event_log=4)
     assert float(run.last.Y) == pytest.approx(0.5 * 2**2, abs=1e-12)
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["reset", "release"]
 
 
 class Lever(vi.Mechanical):
-    """A body on the left stop, pulled away from it once another one has hit its own stop."""
+    """Body y rests on the left stop, until an impact of body x reverses its force."""
 
     q = ("x", "y")
     mass = (1.0, 1.0)
@@ -126,7 +126,7 @@ class Lever(vi.Mechanical):
 
 
 @pytest.mark.slow
-def test_a_body_is_let_go_of_by_the_impact_of_another():
+def test_impact_of_another_body_releases_a_body():
     run = vi.simulate(Lever(), Lever().at(v=dict(x=0.5)), 1, event_log=4)
     assert [vi.EVENTS[int(k)] for k in run.event_log.kind[0, :2]] == ["impact", "release"]
     assert float(run.last.y) == pytest.approx(0.5 * 2**2, abs=1e-12)
@@ -134,7 +134,7 @@ def test_a_body_is_let_go_of_by_the_impact_of_another():
 
 
 class Pulled(vi.Mechanical):
-    """A block on a floor that is pulled harder from t = 1 on."""
+    """A block on a floor. The pull on it jumps at t = 1."""
 
     slope: jax.Array | float = 0.0
     q = ("x", "y")
@@ -148,17 +148,17 @@ class Pulled(vi.Mechanical):
 
 
 @pytest.mark.slow
-def test_friction_lets_go_as_the_pull_jumps():
-    """Whether the pull then grows or falls: u = ∫(pull - 1) ds over two."""
+def test_friction_releases_a_block_as_the_pull_jumps():
+    """The pull then stays, grows or falls: u = ∫(pull - 1) ds over 2."""
     slopes = jnp.array([0.0, 0.1, -0.1])
     run = jax.vmap(lambda slope: vi.simulate(Pulled(slope=slope), Pulled().at(), 1))(slopes)
     np.testing.assert_allclose(run.last.v.x, 2.0 + 2 * slopes, atol=1e-12)
 
 
-def test_a_reset_onto_the_surface_of_another_is_no_event_there():
-    """From Y = 1 back to -1, which is the surface of one that only happens from above."""
+def test_reset_onto_the_guard_of_another_does_not_trigger_it():
+    """A reset moves Y from 1 to -1, where the guard of the other reset is zero."""
     back = vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: State(x.Y - 2, x.V))
     below = vi.Reset(lambda m, s, x: -1 - x.Y, faster)
-    run = vi.simulate(Glider(events=(back, below)), begins(0, 1), 1, event_log=4)
+    run = vi.simulate(Glider(events=(back, below)), start_at(0, 1), 1, event_log=4)
     assert run.event_log.number[0].tolist() == [0, 0, -1, -1]
     assert (float(run.last.Y), float(run.last.V)) == pytest.approx((0.0, 1.0), abs=1e-12)

@@ -22,7 +22,7 @@ def bounces(restitution):
     """The branch of one bounce a cycle, found from its closed form."""
     w, e = PI * sigma(restitution), restitution
     table = 1.3 * w
-    # The ball leaves where it meets: a flight of 2π needs the table's speed Γ sin s to be w.
+    # Impacts repeat at one phase: a flight of 2π needs the table's speed Γ sin s to be w.
     at = PI - np.arcsin(w / table)
     left, since = e * (PI + w), 2 * PI - at
     ball = BALL(acceleration=table, restitution=e)
@@ -37,7 +37,7 @@ def bounces(restitution):
 
 
 @pytest.mark.slow
-def test_a_bounce_is_born_and_doubles_where_its_closed_form_does(bounces, restitution):
+def test_fold_and_period_doubling_of_a_bounce_match_closed_forms(bounces, restitution):
     e, born = restitution, PI * sigma(restitution)
     (fold,) = (p for p in bounces.special if p.kind == "fold")
     (doubling,) = (p for p in bounces.special if p.kind == "period-doubling")
@@ -48,7 +48,7 @@ def test_a_bounce_is_born_and_doubles_where_its_closed_form_does(bounces, restit
 
 
 @pytest.mark.slow
-def test_a_bounce_of_twice_the_period(bounces):
+def test_switch_to_a_bounce_of_twice_the_period(bounces):
     doubling = next(p for p in bounces.special if p.kind == "period-doubling")
     twice = doubling.switch()
     assert int(twice.cycles) == 2 and int(twice.impacts) == 2 and "2 cycles" in str(twice)
@@ -63,10 +63,10 @@ def symmetric(restitution):
     a, b, c = PI**2 / 4 + sigma(e) ** 2, -PI * half, half**2 - 1
     w = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
     pair = PAIR(half_gap=half, restitution=e)
-    # It meets the left wall where that is at sin s = λ - πw/2, and flies to the right at speed w.
+    # The ball meets the left wall at sin s = λ - πw/2, and flies to the right at speed w.
     at = np.mod(np.arctan2(half - PI * w / 2, sigma(e) * w), 2 * PI)
     place, speed = -half + np.sin(at) + w * (2 * PI - at), w
-    if at < PI:  # by the section it is on its way back
+    if at < PI:  # at the section the ball flies back
         place, speed = half - np.sin(at) - w * (PI - at), -w
     orbit = vi.find_orbit(pair, pair.at(place=place, v={"place": speed - 1}), throw=True)
     np.testing.assert_allclose(orbit.impact_speed, 2 * w / (1 + e), atol=1e-10)
@@ -74,7 +74,7 @@ def symmetric(restitution):
 
 
 @pytest.mark.slow
-def test_an_impact_pair_folds_and_loses_its_symmetry(symmetric, restitution):
+def test_fold_and_symmetry_breaking_of_an_impact_pair_match_closed_forms(symmetric, restitution):
     special = {p.kind: p.parameter for p in symmetric.special}
     s = sigma(restitution)
     assert special["fold"] == pytest.approx(np.sqrt(1 + PI**2 / (4 * s * s)), abs=1e-9)

@@ -1,4 +1,4 @@
-"""What impacts act on, where that is no constant; and pictures of several coordinates."""
+"""Masses that depend on time, and plots of several coordinates."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 
 class Growing(vi.AbstractMachine):
-    """A body that nothing pulls, whose mass changes: m(s) V is constant."""
+    """A free body with a mass that depends on time: m(s) V is constant."""
 
     contacts: tuple = (vi.RigidStop(1.0, 0.5),)
     cycle: float = 2 * np.pi
@@ -54,7 +54,7 @@ def test_a_mass_may_be_a_function():
 
 
 class Bodies(vi.Mechanical):
-    """Two bodies that nothing pulls, between stops of their own."""
+    """Two free bodies, each with a stop."""
 
     q = ("x", "y")
     mass = (1.0, 1.0)
@@ -65,7 +65,7 @@ class Bodies(vi.Mechanical):
         return dict(x=0.0, y=0.0)
 
 
-def test_pictures_show_a_coordinate_with_its_own_stops_and_impacts():
+def test_plots_show_a_coordinate_with_its_own_stops_and_impacts():
     machine = Bodies()
     start = machine.at(v=dict(x=0.7, y=-1.1))
     run = vi.simulate(machine, start, 1, samples=30, impact_log=4, rests=False)

@@ -1,4 +1,4 @@
-"""A machine whose cycles are counted by an event: the relief valve."""
+"""The relief valve, a machine whose cycles end with an event."""
 
 import equinox as eqx
 import jax
@@ -27,13 +27,13 @@ def lanes(flow_rates, starts, cycles, **options):
     [(vi.Adaptive(), "motion"), (vi.FixedStep(), "sections"), (vi.Taylor(rtol=1e-10), "sections")],
     ids="aft",
 )
-def test_no_cycle_is_passed_by(method, record):
-    """Where the section is a turning point as well, one event must not hide the other."""
+def test_no_cycle_is_missed(method, record):
+    """The section is also a turning point. One event must not hide the other."""
     q = np.linspace(1.6, 5.4, 12)
     start = {"lift": np.ones(12), "speed": np.zeros(12), "pressure": np.full(12, 12.0)}
     run = lanes(q, start, 40, settle=60, method=method, record=record)
     assert bool(run.successful.all())
-    # Here it is one impact in each cycle, and each cycle like the one before.
+    # Here each cycle has one impact and equals the one before.
     assert (run.impacts == 1).all()
     np.testing.assert_allclose(run.sections.speed[:, 1:], 0, atol=1e-9)
     if record == "motion":
@@ -42,7 +42,7 @@ def test_no_cycle_is_passed_by(method, record):
 
 @pytest.mark.slow
 def test_a_first_cycle_shorter_than_a_step():
-    """From the lowest point, on the section too, up to a top close by."""
+    """The start is a lowest point on the section, close to the next maximum."""
     valve, steps = VALVE(flow_rate=1.6), 6
     for method in (vi.FixedStep(steps_per_cycle=steps), vi.Taylor(20, steps_per_cycle=steps)):
         run = vi.simulate(valve, valve.start(lift=1.0, pressure=12.0), 2, method=method)
@@ -50,7 +50,7 @@ def test_a_first_cycle_shorter_than_a_step():
 
 
 def test_a_closed_valve_rests_on_its_seat():
-    """Pressed on until the pressure has risen to the spring's: δ = p0 + β q t."""
+    """The valve stays closed until the pressure p0 + β q t exceeds the preload δ of the spring."""
     valve = VALVE(flow_rate=0.5).observed_every(0.05)
     run = vi.simulate(valve, valve.start(lift=0.0, pressure=4.0), 20, method=CLOSE)
     closed = np.asarray(run.sections.lift) == 0
@@ -78,7 +78,7 @@ def test_a_valve_observed_at_equal_times():
 
 @pytest.mark.slow
 def test_derivatives_of_returns():
-    """Of state, count of returns being fixed: dt*/dq is in them."""
+    """Derivatives at a fixed number of returns include dt*/dq."""
 
     def last(q):
         valve = eqx.tree_at(lambda m: m.flow_rate, VALVE(), q[0])
@@ -88,7 +88,7 @@ def test_derivatives_of_returns():
     check_derivatives(last, [4.0], step=1e-6, impacts=0)
 
 
-def test_a_pressure_that_is_not_positive_is_refused():
+def test_pressure_that_is_not_positive_raises():
     with pytest.raises(ValueError, match=r"`pressure` must be finite and in \(0, inf\)"):
         vi.simulate(VALVE(), VALVE().start(pressure=0.0), 1)
     run = vi.jit(lambda p: vi.simulate(VALVE(), VALVE().start(pressure=p), 1))(-1.0)

@@ -1,4 +1,4 @@
-"""Jumps of the state by rules of one's own, modes that impacts change, cycles that events end."""
+"""User-defined resets, modes that impacts change, and cycles that events end."""
 
 import warnings
 
@@ -13,7 +13,7 @@ from scipy.optimize import brentq, fsolve
 from resets import A, Excited, StickSlip, ThreeStates, Walker, legs
 
 CLOSE = vi.Adaptive(rtol=1e-12)
-# Of the walker on a slope of 0.009: by SciPy at 1e-13.
+# Reference for the walker on a slope of 0.009, from SciPy at 1e-13.
 STANCE, TURNING, STEP = 0.20031090054, -0.19983247300, 3.88246375285
 PAIR = -0.19009984 + 0.55759878j
 
@@ -24,7 +24,7 @@ def walk():
 
 
 @pytest.mark.slow
-def test_a_walker_walks(walk):
+def test_orbit_of_the_walker_matches_scipy(walk):
     assert bool(walk.successful)
     np.testing.assert_allclose(
         [walk.state.stance, walk.state.turning, walk.duration], [STANCE, TURNING, STEP], atol=1e-10
@@ -40,7 +40,7 @@ def test_a_walker_walks(walk):
 
 
 class Strike(vi.AbstractEvent):
-    """The same event as a kind of its own."""
+    """The event of `Walker`, as a subclass of `AbstractEvent`."""
 
     def guard(self, machine, s, x):
         return x.between - 2 * x.stance
@@ -61,19 +61,19 @@ class OwnWalker(Walker):
         return (Strike(ends_cycle=True, name="strike"),)
 
 
-def test_a_kind_of_event_of_ones_own(walk):
+def test_own_class_of_events(walk):
     own = vi.find_orbit(OwnWalker(0.009), legs(0.2003, -0.1998))
     np.testing.assert_allclose(own.state.stance, walk.state.stance, atol=1e-14)
     np.testing.assert_allclose(own.multipliers, walk.multipliers, atol=1e-12)
     run = vi.simulate(own.machine, own.state, 1, event_log=1)
     assert "reset (strike) at 3.88246" in str(run.event_log)
-    # The leg turns as fast before as after, but for the cosine.
+    # The impact multiplies the rate of the leg by the cosine.
     turning = float(own.state.turning) / np.cos(2 * STANCE)
     assert float(run.event_log.value[0, 0]) == pytest.approx(turning, abs=1e-9)
 
 
 @pytest.mark.slow
-def test_at_equal_times_exponents_are_those_of_the_multipliers():
+def test_exponents_match_the_multipliers():
     start = tuple(map(jnp.asarray, (1.0, 0.7955, 0.2343)))
     orbit = vi.find_orbit(ThreeStates(1.8), start, throw=True)
     found = vi.lyapunov(orbit.machine, orbit.state, 200, settle=50, progress=False).exponents
@@ -86,7 +86,7 @@ def sliding(q, v):
 
 
 @pytest.mark.slow
-def test_a_branch_ends_where_the_guard_of_a_reset_is_touched():
+def test_branch_ends_where_the_guard_of_a_reset_grazes():
     run = vi.simulate(StickSlip(0.4), sliding(0.1, 0.0), 1, settle=400, method=CLOSE)
     orbit = vi.find_orbit(StickSlip(0.5), run.last)
     branch = vi.continue_orbit(orbit, parameter="voltage", bounds=(0.45, 0.7))
@@ -100,7 +100,7 @@ def test_a_branch_ends_where_the_guard_of_a_reset_is_touched():
 
 @pytest.mark.slow
 def test_a_cycle_that_an_impact_ends():
-    """x = e^(0.1 t)(cos w t + B sin w t) from the stop to the stop."""
+    """Compare with x = e^(0.1 t)(cos w t + B sin w t) from impact to impact."""
     k, a = 0.6, 0.1
     w = np.sqrt(1 - a * a)
 
@@ -169,15 +169,15 @@ class Thrown(vi.AbstractMachine):
         return vi.OscillatorState(x.V, 0 * x.V)
 
 
-def test_a_reset_beyond_a_stop_ends_the_lane():
+def test_reset_beyond_a_stop_fails_the_lane():
     start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.0))
     run = vi.simulate(Thrown(), start, 2)
     assert bool(run.result == vi.RESULTS.bad_reset)
     assert np.isfinite(run.sections.Y[0]) and not np.isfinite(run.last.Y)
 
 
-def three(b):
-    """A cycle of `ThreeStates` by the matrix exponential: after its reset, and its length."""
+def solve_three_states(b):
+    """Return state after the reset and duration of a `ThreeStates` cycle."""
 
     def left(u):
         x = expm(A * u[2]) @ np.array([1.0, u[0], u[1]])
@@ -193,6 +193,6 @@ def cycle():
 
 
 @pytest.mark.slow
-def test_a_cycle_of_three_states_is_that_of_matrix_exponentials(cycle):
+def test_cycle_of_three_states_matches_matrix_exponentials(cycle):
     found = [cycle.state[1], cycle.state[2], cycle.duration]
-    np.testing.assert_allclose(found, three(1.8), atol=1e-10)
+    np.testing.assert_allclose(found, solve_three_states(1.8), atol=1e-10)

@@ -1,4 +1,4 @@
-"""Structures of many degrees of freedom beside matrix exponentials, and what they refuse."""
+"""Structures of many degrees of freedom, compared with matrix exponentials, and their errors."""
 
 import contextlib
 import dataclasses
@@ -15,8 +15,8 @@ from structures import KINDS, machine_and_truth
 
 
 def check_cycle_by_cycle(machine, truth, start, cycles, tolerance=1e-11, **options):
-    """Each cycle from the reference's state: equal states and impacts. Returns all impacts, and how
-    often a contact rested as a cycle ended."""
+    """Compare states and impacts after each cycle from the reference's state. Return the number of
+    impacts, and of contacts at rest as cycles end."""
     (x, v), resting, impacts, rests = start, (), 0, 0
     for _ in range(cycles):
         state = machine.start(displacement=x, velocity=v)
@@ -31,8 +31,8 @@ def check_cycle_by_cycle(machine, truth, start, cycles, tolerance=1e-11, **optio
 
 
 @pytest.mark.slow
-def test_rest_beside_matrix_exponentials():
-    """What comes to rest on a stop is held, the others moving on, until its force turns."""
+def test_rest_matches_matrix_exponentials():
+    """A coordinate rests on its stop, and the others move, until its force changes sign."""
     rested = 0
     for kind, seed in (("proportional", 5), ("general", 1), ("rigid", 1), ("undamped", 5)):
         machine, truth, start = machine_and_truth(seed, 2, kind, (0.0, 0.0, 0.0), 0.5)
@@ -43,8 +43,8 @@ def test_rest_beside_matrix_exponentials():
 
 
 @pytest.mark.slow
-def test_machines_of_all_kinds():
-    """Damped in any way, and with a motion as a rigid body; a seed that chatters is left out."""
+def test_structures_of_all_kinds_match_matrix_exponentials():
+    """Structures with any damping or with rigid-body motion. Seeds that chatter are left out."""
     compared = impacts = 0
     for kind in KINDS:
         for seed in range(400, 403):
@@ -63,7 +63,7 @@ def oscillator(**changes):
     return vi.machines.Structure(**given)
 
 
-def test_of_one_degree_it_is_the_oscillator():
+def test_structure_of_one_degree_equals_the_oscillator():
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.6, gap=0.7, damping_ratio=0.05)
     wanted = vi.simulate(scene, scene.start(Y=0.1), 20)
     run = vi.simulate(machine := oscillator(), machine.start(displacement=0.1), 20)
@@ -71,12 +71,12 @@ def test_of_one_degree_it_is_the_oscillator():
     np.testing.assert_allclose(run.last.velocity, wanted.last.V, rtol=0, atol=1e-11)
     np.testing.assert_array_equal(run.impacts, wanted.impacts)
     np.testing.assert_allclose(run.y_min, wanted.y_min, rtol=0, atol=1e-11)
-    # ½ M (1 - k²) V², in units of the stiffness: the mass that is hit is 2.
+    # ½ M (1 - k²) V² with a mass of 2; the scene's unit of energy is that of the stiffness.
     np.testing.assert_allclose(run.impact_energy, 2 * wanted.impact_energy, rtol=1e-9)
 
 
 def test_undamped_in_resonance_and_with_a_constant_force():
-    """x = sin(s)·s/2 + 3(1 - cos s), and a rigid body under a constant force: s²/2."""
+    """Compare with sin(s)·s/2 + 3(1 - cos s), and with s²/2 of a rigid body at constant force."""
     machine = vi.machines.Structure(
         mass=[1.0, 1.0], stiffness=[1.0, 0.0], force=[1.0, 0.0], static_force=[3.0, 1.0]
     )
@@ -87,7 +87,7 @@ def test_undamped_in_resonance_and_with_a_constant_force():
 
 
 def test_energy_and_momentum_of_an_impact():
-    """A blow takes ½ (1 - k²) m (c·v)², with m = 1/(cᵀM⁻¹c), and acts along c alone."""
+    """An impact loses ½ (1 - k²) m (c·v)², with m = 1/(cᵀM⁻¹c); its impulse is along c."""
     machine, _, _ = machine_and_truth(4, 4, "general")
     stop, body = machine.contacts[2], machine.coordinates[1]
     v = jnp.asarray([0.3, -0.2, 0.5, 0.1])
@@ -101,9 +101,9 @@ def test_energy_and_momentum_of_an_impact():
 
 
 @pytest.mark.slow
-def test_derivatives_by_matrices():
-    """By mass, damping, stiffness, gap, frequency, force and start, where frequencies coincide:
-    beside differences."""
+def test_derivatives_with_respect_to_matrices():
+    """Compare derivatives with respect to matrices, gap, frequency, force, start and contact row
+    with differences, where natural frequencies coincide."""
     n = 3
     base = 1.5 * np.eye(n)
     change = np.array([[0.3, 0.2, 0.1], [0.2, -0.1, 0.4], [0.1, 0.4, 0.2]])
@@ -130,7 +130,7 @@ def test_derivatives_by_matrices():
     def energy(stiff):
         return jax.grad(lambda x: jnp.sum(last(p.at[jnp.array([0, 4])].set(x)) ** 2))(stiff)
 
-    # Of second order, by stiffness and frequency.
+    # Second derivatives with respect to stiffness and frequency.
     at = p[jnp.array([0, 4])]
     second = jax.jacfwd(energy)(at)
     differences = [(energy(at + e) - energy(at - e)) / 2e-5 for e in 1e-5 * jnp.eye(2)]
@@ -197,12 +197,12 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("changes", "words"), WRONG.values(), ids=WRONG)
-def test_what_is_no_structure(changes, words):
+def test_wrong_matrices_raise(changes, words):
     with pytest.raises(ValueError, match=words):
         vi.machines.Structure(**{"mass": EYE, "stiffness": EYE, **changes})
 
 
-def test_what_else_is_refused():
+def test_wrong_starts_contacts_and_modes_raise():
     machine = oscillator()
     with pytest.raises(TypeError, match="`contacts` must hold `RigidStop`s"):
         oscillator(contacts=(1.0,))
@@ -224,7 +224,7 @@ def test_what_else_is_refused():
         vi.simulate(scene, scene.start(), 1)
 
 
-def test_a_traced_mass_that_is_not_definite_ends_its_lane():
+def test_traced_mass_that_is_not_definite_fails_its_lane():
     def last(mass):
         machine = oscillator(mass=mass[None, None] * jnp.ones((1, 1)))
         return vi.simulate(machine, machine.start(), 1, record="sections", rests=False)
@@ -234,7 +234,7 @@ def test_a_traced_mass_that_is_not_definite_ends_its_lane():
 
 
 class Hardening(vi.machines.Structure):
-    """With a force that is not linear, so that it does not move in modes."""
+    """A structure with a nonlinear force, so it is not solved in modes."""
 
     cubic: jax.Array = dataclasses.field(kw_only=True, default_factory=lambda: jnp.zeros(()))
 
@@ -246,8 +246,8 @@ class Hardening(vi.machines.Structure):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-def test_rules_of_its_own_are_vector_code():
-    """A mass matrix and the shortest period are worked out once, not in each step."""
+def test_own_field_is_vector_code():
+    """The mass matrix and the shortest period are computed once, not in each step."""
     M = jnp.asarray([[1.0, 0.2], [0.2, 2.0]])
     K = jnp.asarray([[2.0, -1.0], [-1.0, 1.5]])
     numbers = {"mass": M, "damping": 0.1 * K, "stiffness": K, "force": jnp.asarray([1.0, 0.0]),
@@ -268,8 +268,8 @@ def test_rules_of_its_own_are_vector_code():
 
 
 @pytest.mark.slow
-def test_what_is_said_to_be_clear_is():
-    """No stop is met within the length given, from any state, by a fine sampling of the flight."""
+def test_no_stop_is_met_within_the_clear_length():
+    """Sample flights from random states finely, over the length that `clear` returns."""
     random = np.random.default_rng(0)
     machine, *_ = machine_and_truth(0, 4, "proportional")
     way = machine.prepared_modes()

@@ -1,4 +1,4 @@
-"""A motor with an unbalance: the averaged Sommerfeld response, and the same motor by its angle."""
+"""The unbalanced motor, compared with its averaged response and with its angle as the clock."""
 
 from typing import ClassVar
 
@@ -12,8 +12,8 @@ ROTOR = vi.machines.UnbalancedRotor
 
 
 class ByAngle(vi.AbstractMachine):
-    """The same motor, with its angle as the independent variable: a driven machine, whose section
-    is no event. Its shaft has the momentum P = W - ε V sin φ, which impacts keep."""
+    """The same motor with its angle as the clock, so its section needs no event. Impacts conserve
+    the momentum P = W - ε V sin φ of the shaft."""
 
     of: ROTOR
     state: ClassVar = ("Y", "V", "P")
@@ -43,23 +43,22 @@ class ByAngle(vi.AbstractMachine):
     def mirrored(self, z):
         return z.replace(Y=-z.Y, V=-z.V)
 
-    def begun(self, z):
+    def convert_start(self, z):
         return vi.State(Y=z.Y, V=z.v.Y, P=z.v.phi)
 
 
-def both(rotor, cycles=400):
-    """Its settled orbit, and that of the machine by its angle."""
+def find_both_orbits(rotor, cycles=400):
+    """Return the settled orbit, and that of the machine with its angle as the clock."""
     settled = vi.simulate(rotor, rotor.start(), 1, settle=cycles).last
     other = ByAngle(rotor)
-    return vi.find_orbit(rotor, settled), vi.find_orbit(other, other.begun(settled))
+    return vi.find_orbit(rotor, settled), vi.find_orbit(other, other.convert_start(settled))
 
 
 @pytest.mark.slow
-def test_the_sommerfeld_response_is_that_of_averaging_to_its_order():
-    """Mean speed and amplitude beside the averaged ones, as ε and the motor's strength fall
-    together, which leaves the averaged response as it is."""
+def test_sommerfeld_response_converges_to_the_averaged_one():
+    """ε and the motor's strength fall together, which leaves the averaged response unchanged."""
     couplings = jnp.asarray([0.005, 0.0025, 0.00125, 0.000625])
-    # On the rising side, near the peak, and beyond it.
+    # Below, near and beyond the peak.
     for zeta in (0.85, 0.98, 1.15):
         rotor = ROTOR(strength=0.2, coupling=0.02)
         kappa = rotor.averaged_control(zeta)
@@ -79,7 +78,7 @@ def test_the_sommerfeld_response_is_that_of_averaging_to_its_order():
 
 
 @pytest.mark.slow
-def test_random_motors_are_those_by_their_angle():
+def test_random_motors_equal_those_with_their_angle_as_the_clock():
     draw = np.random.default_rng(5).uniform
     ranges = {"strength": (0.05, 1), "control": (0.6, 1.8), "no_load_speed": (0.8, 1.2),
               "coupling": (0.01, 0.3), "damping_ratio": (0.01, 0.2), "gap": (1, 2.5),
@@ -93,11 +92,11 @@ def test_random_motors_are_those_by_their_angle():
         rotor = ROTOR(two_sided=True, **numbers)
         start, other, method = rotor.start(**begin), ByAngle(rotor), vi.Adaptive(rtol=1e-12)
         one = vi.simulate(rotor, start, 4, method=method)
-        return one, vi.simulate(other, other.begun(start), 4, method=method)
+        return one, vi.simulate(other, other.convert_start(start), 4, method=method)
 
     one, other = vi.jit(jax.vmap(runs))(numbers, begin)
     assert bool(one.successful.all()) and bool(other.successful.all())
-    for a, b in zip(jax.tree.leaves(ByAngle(ROTOR()).begun(one.sections)),
+    for a, b in zip(jax.tree.leaves(ByAngle(ROTOR()).convert_start(one.sections)),
                     jax.tree.leaves(other.sections), strict=True):  # fmt: skip
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-8)
     np.testing.assert_allclose(one.duration, other.duration, rtol=1e-8)
@@ -116,13 +115,12 @@ def test_a_start_from_rest_passes_the_resonance_and_a_stalled_motor_ends_no_cycl
 
 
 @pytest.mark.slow
-def test_branches_pass_the_begin_of_a_turn():
-    """An impact may pass the section, at which nothing happens, and motions lose their symmetry
-    where they do by the angle."""
+def test_branches_pass_the_begin_of_a_cycle():
+    """An impact passes the section without effect. Symmetry breaks at one gap in both clocks."""
     rotor, bounds = ROTOR(gap=1.0, two_sided=True), (0.7, 1.4)
     one, other = (
         vi.continue_orbit(orbit, parameter=name, bounds=bounds)
-        for orbit, name in zip(both(rotor), ("gap", "of.gap"), strict=True)
+        for orbit, name in zip(find_both_orbits(rotor), ("gap", "of.gap"), strict=True)
     )
     assert one.ends == other.ends == ("bounds", "bounds")
     late, early = (one.at(gap)[0] for gap in (0.75, 0.8))
@@ -131,7 +129,7 @@ def test_branches_pass_the_begin_of_a_turn():
     assert here.kind == there.kind == "symmetry-breaking"
     assert here.parameter == pytest.approx(there.parameter, rel=1e-8)
     a, b = here.orbit, there.orbit
-    state = ByAngle(rotor).begun(a.state)
+    state = ByAngle(rotor).convert_start(a.state)
     for x, y in zip(jax.tree.leaves(state), jax.tree.leaves(b.state), strict=True):
         assert float(x) == pytest.approx(float(y), abs=1e-7)
     np.testing.assert_allclose(np.abs(a.multipliers)[:3], np.abs(b.multipliers), atol=1e-6)
@@ -139,10 +137,10 @@ def test_branches_pass_the_begin_of_a_turn():
 
 @pytest.mark.slow
 def test_a_body_pressed_on_comes_to_rest_and_leaves():
-    """The unbalance presses the body on while W² cos φ exceeds the gap, also as a turn begins."""
+    """The unbalance presses the body on while W² cos φ exceeds the gap, also as a cycle begins."""
     rotor = ROTOR(control=1.2, strength=2.0, gap=0.4, restitution=0.1, coupling=0.1,
                   damping_ratio=0.6)  # fmt: skip
-    one, other = both(rotor)
+    one, other = find_both_orbits(rotor)
     assert int(one.rests) == int(other.rests) == 1
     assert float(one.clearance) == pytest.approx(float(other.clearance), abs=1e-7)
     assert float(one.duration) == pytest.approx(float(other.duration), abs=1e-8)

@@ -1,4 +1,4 @@
-"""Every verb and every plot on machines of every kind, what one verb says beside another."""
+"""Every function and plot on every kind of machine, with results compared between functions."""
 
 import warnings
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ M = vi.machines
 
 
 class Case(NamedTuple):
-    """A machine with a stable motion of one cycle, and what a parameter does to it."""
+    """A machine with a stable orbit of one cycle, and the special points in a parameter."""
 
     machine: Any
     place: str
@@ -29,7 +29,7 @@ class Case(NamedTuple):
     special: tuple[str, ...]
     """Kinds of the special points along the branch."""
     curved: str
-    """Which of the special points is followed in another parameter."""
+    """Kind of the special point that is followed in a second parameter."""
     second: str
     ends: tuple[float, float]
 
@@ -76,8 +76,7 @@ def branch(case, orbit):
 
 
 @pytest.fixture(autouse=True)
-def _drawn():
-    """Every picture can be drawn, and is closed."""
+def _draw_and_close_figures():
     yield
     for number in plt.get_fignums():
         plt.figure(number).canvas.draw()
@@ -96,7 +95,7 @@ def test_simulate(case, orbit):
     assert bool(run.successful)
     assert max(float(x.max()) for x in jax.tree.leaves(run.errors.sections)) < 1e-5
     for found, wanted in zip(*map(jax.tree.leaves, (run.sections, orbit.state)), strict=True):
-        # Multipliers of the motion are below 1 and errors fade.
+        # The multipliers are below 1, so errors decay.
         np.testing.assert_allclose(found, np.broadcast_to(wanted, 4), atol=1e-5)
     np.testing.assert_array_equal(run.impacts, int(orbit.impacts))
     np.testing.assert_allclose(run.y_max[1:], orbit.y_max, atol=1e-5)
@@ -106,7 +105,7 @@ def test_simulate(case, orbit):
         vi.plot_history(run, machine=case.machine)
         vi.plot_phase_portrait(run, case.machine)
         assert len(vi.animate(run, case.machine, seconds=0.3, fps=10)) == 3
-    else:  # between its sections only a machine observed at equal times is seen
+    else:  # only machines observed at equal times have samples
         with pytest.raises(ValueError, match="samples"):
             vi.plot_history(run, machine=case.machine)
 
@@ -122,10 +121,10 @@ def test_lyapunov(case, orbit):
     spectrum = vi.lyapunov(case.machine, orbit.state, cycles=200)
     with np.errstate(divide="ignore"):
         logs = np.log(np.abs(np.asarray(orbit.multipliers)))
-    if section_in(case.machine, orbit.state) is not None:  # and one along the motion
+    if section_in(case.machine, orbit.state) is not None:  # the exponent along the motion is zero
         logs[logs.argmin()] = 0.0
     logs = np.sort(logs)[::-1]
-    alive = logs > -20  # what is forgotten at once is so to rounding
+    alive = logs > -20  # others are zero up to rounding
     rates = np.asarray(spectrum.exponents) * float(orbit.duration)
     np.testing.assert_allclose(rates[alive], logs[alive], atol=1e-3)
     assert (rates[~alive] < -10).all()
@@ -204,7 +203,7 @@ def test_basins(case, orbit):
         for name in (case.place, case.speed)
     }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # starts beyond a stop are no lanes
+        warnings.simplefilter("ignore")  # starts beyond a stop fail
         found = vi.basins(case.machine, ends, start=orbit.state, resolution=4, settle=300)
     assert found.attractors and found.attractors[0].period == 1
     sections = found.attractors[0].sections
@@ -219,7 +218,7 @@ def test_suggest_method(case):
     assert found.reached and found.error <= 1e-4
 
 
-def test_closed_form_orbits_are_the_papers(case):
-    # Where annotations are checked these refuse it, else `closed_form_orbits` itself.
+def test_closed_form_orbits_need_a_scene(case):
+    # Checked annotations raise, or else `closed_form_orbits` itself.
     with pytest.raises((TypeError, ValueError), match="scene"):
         vi.closed_form_orbits(case.machine)

@@ -1,4 +1,4 @@
-"""The woodpecker toy: its known cycle, its picture and its words."""
+"""The woodpecker toy: its known cycle, its multipliers, its range and its sketch."""
 
 import equinox as eqx
 import jax
@@ -13,9 +13,9 @@ matplotlib.use("Agg")
 WOODPECKER = vi.machines.Woodpecker
 CLOSE = vi.Adaptive(rtol=1e-12)
 
-# Of Glocker's numbers, by an integration from event to event in more than double precision's worth
-# of digits that are kept here: where the cycle begins, how long it takes, how far it goes down.
-# In its impacts it loses LOST of the energy of its weight, by SciPy's DOP853 at 1e-13.
+# The cycle for Glocker's parameters, integrated from event to event with more digits than are kept
+# here: velocities at its start, period and descent. Impacts dissipate LOST of the energy of the
+# weight, by SciPy's DOP853 at 1e-13.
 SPEED, BIRD_RATE, PERIOD, DROP = -0.33947862236, -7.46209464263, 0.14597606514, 19.4453792847e-3
 LOST = 1.245143533e-4
 MULTIPLIER = -0.8391556
@@ -26,19 +26,19 @@ EVENTS = (
     ("impact", 0, 0.1214251), ("rest", 0, 0.1214251),
 )  # fmt: skip
 
-# Lanes: the cycle, and starts beside it, by which its map is seen.
+# Lanes: the cycle, and nearby starts for differences of its map.
 STEP = 1e-5
-BESIDE = ((0, 0), (STEP, 0), (-STEP, 0), (0, 30 * STEP), (0, -30 * STEP))
+OFFSETS = ((0, 0), (STEP, 0), (-STEP, 0), (0, 30 * STEP), (0, -30 * STEP))
 
 
 @pytest.fixture(scope="module")
 def run():
     toy = WOODPECKER(friction=0.3)
     one = vi.jit(jax.vmap(lambda x: vi.simulate(toy, x, method=CLOSE, event_log=16)))
-    v = [dict(height=SPEED + a, bird_angle=BIRD_RATE + b) for a, b in BESIDE]
+    v = [dict(height=SPEED + a, bird_angle=BIRD_RATE + b) for a, b in OFFSETS]
     starts = [toy.at(**vars(toy.start()) | {"v": x}) for x in v]
     found = one(jax.tree.map(lambda *x: jnp.stack(x), *starts))
-    # From where its sleeve lies on the pole, with the velocity that rounding has left, it goes on.
+    # The motion continues with its sleeve on the pole, except for the velocity left by rounding.
     assert bool(found.successful.all()) and bool(one(found.last).successful.all())
     return found
 
@@ -70,22 +70,22 @@ def test_the_known_cycle(run):
 
 
 @pytest.mark.slow
-def test_its_multipliers(run):
-    """By differences of the map of the two numbers that a start on the lower edge has."""
+def test_multipliers_of_the_cycle(run):
+    """Differences of the map of the two free numbers of a start on the lower edge."""
     ends = np.stack([run.last.v.height, run.last.v.bird_angle], -1)
     slopes = [(ends[i] - ends[i + 1]) / (2 * h) for i, h in ((1, STEP), (3, 30 * STEP))]
     found = np.sort(np.linalg.eigvals(np.transpose(slopes)).real)
     np.testing.assert_allclose(found, [MULTIPLIER, 0], atol=1e-5)
 
 
-def test_its_range():
+def test_range_of_the_sleeve_radius():
     toy = eqx.tree_at(lambda m: m.sleeve_radius, WOODPECKER(), jnp.asarray(0.002))
     assert not bool(is_in_range(toy, toy.start()))
     assert bool(is_in_range(WOODPECKER(), WOODPECKER().start()))
 
 
-def test_its_picture():
-    """Sleeve and beak touch the pole where the machine says so."""
+def test_sketch_touches_the_pole_at_contacts():
+    """Sleeve and beak touch the pole at the angles where the machine has contact."""
     toy = WOODPECKER()
     half = float(toy.pole_radius)
 
@@ -104,12 +104,12 @@ def test_its_picture():
     assert min(np.abs(x[:, 0]).min() for x in walls(shut)) == pytest.approx(half, rel=0.02)
     beaks = [next(x for x in y if len(x) == 4)[0, 0] for y in (open_, shut)]
     assert beaks[0] == pytest.approx(half + float(toy.reach))
-    # The bird turns by an angle that its linear gap takes to be small.
+    # The gap of the beak is linear in the bird's angle.
     assert beaks[1] == pytest.approx(half, rel=0.1)
     matplotlib.pyplot.close("all")
 
 
-def test_its_height_is_zero_as_a_cycle_begins_but_goes_on_at_equal_times():
+def test_height_restarts_with_each_cycle_but_not_at_equal_times():
     toy, state = WOODPECKER(), WOODPECKER().at(height=-0.02)
     assert float(toy.renewed(state).height) == 0.0
     by_time = toy.observed_every(0.1)

@@ -1,4 +1,4 @@
-"""Numbers that no ready machine can have are named."""
+"""Invalid parameters of ready machines raise an error that names them."""
 
 import pytest
 import vi_jax as vi
@@ -24,6 +24,6 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("make", "name", "value"), WRONG)
-def test_wrong_numbers_are_named(make, name, value):
+def test_wrong_parameters_raise_with_their_names(make, name, value):
     with pytest.raises((ValueError, TypeError), match=f"`{name}`"):
         make(**{name: value})
