@@ -3,6 +3,7 @@
 from ._lane import has_fixed_cycle as has_fixed_cycle
 from ._own import average_names as average_names
 from ._own import check_parts as check_parts
+from ._own import depends_on_time as depends_on_time
 from ._own import has_averages as has_averages
 from ._own import has_quantities as has_quantities
 from ._own import quantities_on as quantities_on

@@ -191,7 +191,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     try:
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
-        restarts = not ticks and _depends_on_time(machine, zero, state)
+        restarts = not ticks and depends_on_time(field_in, machine, state)
+        restarts = restarts and not depends_on_time(_guards, machine, state)  # of a timer
         backward, cycle, fields, below = np.zeros(0), 0.0, (), ()
         with jax.ensure_compile_time_eval():
             masses = np.asarray(_masses(machine, state))
@@ -315,16 +316,12 @@ def _guards(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -
     return [jnp.asarray(x, s.dtype) for x in found]
 
 
-def _depends_on_time(machine: AbstractMachine, zero: Any, start: State) -> bool:
-    """Return whether the field may depend on time, but no guard does, which could be a timer's."""
-
-    def depends(function: Callable[..., Any]) -> bool:
-        of_time = lambda s, x: function(machine, s, x, begin_modes(machine, s, x))
-        traced = jax.make_jaxpr(of_time)(zero, start).jaxpr
-        sources = [True] + [False] * len(jtu.tree_leaves(start))
-        return any(dependent_results(traced, sources, smooth=False))
-
-    return depends(field_in) and not depends(_guards)
+def depends_on_time(function: Callable[..., Any], machine: AbstractMachine, state: State) -> bool:
+    """Return whether `function(machine, s, state, modes)` may depend on `s`."""
+    of_time = lambda s, x: function(machine, s, x, begin_modes(machine, s, x))
+    traced = jax.make_jaxpr(of_time)(np.zeros(()), state).jaxpr
+    sources = [True] + [False] * len(jtu.tree_leaves(state))
+    return any(dependent_results(traced, sources, smooth=False))
 
 
 def _masses(machine: AbstractMachine, start: State) -> Any:

@@ -321,7 +321,7 @@ def failed_derivatives(run: Run) -> Run:
     found = _marked(run.successful, numbers)
     if run.outcome is not None:
         own = {name: getattr(numbers, name) for name in ("outcome_phase", "outcome_state")}
-        found = dataclasses.replace(found, **_marked(~run.failed, own))
+        found = dataclasses.replace(found, **_marked(run.outcome >= 0, own))
     return eqx.combine(found, rest)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._programs import compiled
-from .._types import Scalar, State
+from .._types import Scalar, Scalars, State
 from ..flow import (
     AbstractMethod,
     Adaptive,
@@ -25,6 +25,7 @@ from ..flow import (
     SmoothMachine,
     check_parts,
     chosen,
+    depends_on_time,
     simulate,
     simulate_pool,
     sizes_on_host,
@@ -199,6 +200,11 @@ def problem_of(
             f"{len(orbit.impact_stop)}: find it with a larger `impact_log`."
         )
     found, autonomous = events_in(orbit), is_autonomous(machine, without_modes(orbit.state))
+    if autonomous and depends_on_time(_ends, machine, without_modes(orbit.state)):
+        raise ValueError(
+            "Argument `orbit` must not have cycles that end at a given time: leave out "
+            "`ends_cycle` if it happens at `t - cycle`, or make the clock a component of the state."
+        )
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
     places, events = [place for place, _ in found], tuple(event for _, event in found)
     needed = longest_leg(places, events, period, cycles)
@@ -219,6 +225,12 @@ def problem_of(
     states = states[:-1] if found else states
     x = problem.pack(np.asarray(places), states, [leaf(machine, parameter)], period)
     return sized(problem, x), np.asarray(x)
+
+
+def _ends(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Scalar]:
+    """Return the guards of the events that end a cycle."""
+    numbers = [n for n, event in enumerate(events_of(machine)[:-1]) if event.ends_cycle]
+    return [guard_of(machine, n, s, state, modes) for n in numbers]
 
 
 def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:

@@ -276,9 +276,11 @@ class Orbit(Summarized):
         if cycles is None:
             cycles = int(self.cycles)
         if is_autonomous(machine, self.state):
-            # Its cycles may differ in length: the whole motion is one interval.
-            machine = machine.observed_every(self.duration * (cycles / self.cycles))
-            samples, cycles = samples * cycles, 1
+            # Its cycles may differ in length: an interval is a period, or the whole motion.
+            period = int(self.cycles)
+            each = period if cycles % period == 0 else cycles
+            machine = machine.observed_every(self.duration * (each / period))
+            samples, impact_log, cycles = samples * each, impact_log * each, cycles // each
         return simulate(
             machine, self.state, cycles, method=self.method, samples=samples,
             impact_log=impact_log,

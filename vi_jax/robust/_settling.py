@@ -21,6 +21,7 @@ from ..machine import (
     AbstractMachine,
     angles_in,
     begun,
+    components,
     in_rows,
     is_autonomous,
     modes_of,
@@ -277,6 +278,13 @@ def settling_on(
     if isinstance(motion, Orbit):
         if not bool(one_orbit(name, motion).stable):
             raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
+        numbers, of_orbit = components(machine), components(motion.machine)
+        for other in numbers.keys() & of_orbit.keys():
+            if not np.allclose(numbers[other], of_orbit[other], rtol=1e-9, atol=0.0):
+                raise ValueError(
+                    f"Argument `{name}` must be an orbit of this machine, but its {other} is "
+                    f"{of_orbit[other]:g}, not {numbers[other]:g}."
+                )
         rows = np.asarray(in_rows(motion.sections))[: int(motion.cycles)]
         return Settling(the_map, like, rows, settle, tolerance), rows[cycle % len(rows)]
     start = in_row(like)

@@ -33,9 +33,11 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    Mechanical,
     Stated,
     Summarized,
     attributes,
+    components,
     cycle_time,
     in_rows,
     in_unit,
@@ -156,8 +158,8 @@ def lyapunov(
     - `machine`, `start`: as for `simulate`; runs in the phase clock.
     - `cycles`: the number of observed drive cycles, at least 8; static.
     - `settle`: the number of drive cycles before that.
-    - `number`: the number of exponents, greatest first; all by default. Each costs about as much as
-      the simulation itself.
+    - `number`: the number of exponents, greatest first; all by default, but none of coordinates
+      with given motion (`prescribed`). Each costs about as much as the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
     - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
@@ -182,11 +184,11 @@ def lyapunov(
     if rests is not None:
         carried = dataclasses.replace(carried, rests=flag("rests", rests))
     start = map_state(carried.machine, start, "start")
-    states = raveled(start)[0].size
+    states = int(_is_free(machine, start).sum())
     number = states if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
-            f"Argument `number` must be at most {states}, the states of this machine, but got "
+            f"Argument `number` must be at most {states}, the free states of the machine, but got "
             f"{number}."
         )
     if cycles > 2 * _AT_ONCE and is_outermost(carried, start, settle):
@@ -230,8 +232,19 @@ def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
     modes = modes_of(before.last)
     # In general position: directions of single components would never change if a component does
     # not act on the others, and could miss the greatest exponent.
-    frame = np.linalg.qr(np.random.default_rng(0).normal(size=(x.size, x.size)))[0][:, :number]
+    free, frame = _is_free(machine, start), np.zeros((x.size, number))
+    drawn = np.random.default_rng(0).normal(size=(free.sum(), free.sum()))
+    frame[free] = np.linalg.qr(drawn)[0][:, :number]
     return (x, modes), jnp.asarray(frame, x.dtype), before.result
+
+
+def _is_free(machine: AbstractMachine, start: State) -> np.ndarray:
+    """Return flags of the components of a state that are not of coordinates with given motion."""
+    names = [name.removeprefix("v.").split("[")[0] for name in components(without_modes(start))]
+    given = set()
+    if isinstance(machine, Mechanical):
+        given = {*machine.q_names} - {*machine.free_names}
+    return np.array([name not in given for name in names])
 
 
 @compiled
