@@ -62,7 +62,7 @@ def test_a_branch_with_constant_extremes_is_drawn_by_its_minimum(branch):
     """The maximum varies by rounding only, and must not be chosen."""
     noisy = [{"y_min": -1.3, "y_max": 1.3 + i % 2 * 1e-15} for i in range(len(branch.steps))]
     steps = [
-        step._replace(seen=step.seen._replace(**at))
+        step._replace(observed=step.observed._replace(**at))
         for step, at in zip(branch.steps, noisy, strict=True)
     ]
     drawn = vi.plot_branch(dataclasses.replace(branch, steps=steps), ax=_axes())

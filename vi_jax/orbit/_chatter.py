@@ -6,7 +6,7 @@ body is put on its stop without rebound: the error of the state is of third orde
 The body rests if its chatter ends before its release from the stop. Near that limit the hops are a
 map with a saddle. Its variables are τ, the time left until the release, and ξ = u/(β τ²), with the
 speed u of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest,
-those above it escape (`escape`).
+those above it escape (`escape_margin`).
 """
 
 from functools import partial
@@ -47,62 +47,62 @@ _OVER = 0.1
 _ESCAPES = 0.1
 
 
-class Hops(NamedTuple):
+class Chatter(NamedTuple):
     """The state of a chatter just after an impact."""
 
     s: Scalar
     u: Vector
-    passed: Integrals
-    over: Flag
+    integrals: Integrals
+    is_over: Flag
     """True if there is no next impact, or if it comes too late."""
 
 
-def hopped(free: Flight, number: int, begin: Hops, *, until: Scalar, steps: Scalar) -> Hops:
+def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps: Scalar) -> Chatter:
     """Return the first impact of a chatter with a slow rebound, or the last one before the clock
     `until`; `free` is the flight with the body free, `begin` the first impact."""
     stop = stops_of(free.machine)[number]
-    averages = tuple(name for name in begin.passed if name != TIME)
+    averages = tuple(name for name in begin.integrals if name != TIME)
 
     def rates(s: Scalar, u: Vector) -> Rates:
         return _rates(free, stop, s, u)
 
-    def going(carry: tuple[Hops, Scalar, int]) -> Flag:
+    def continues(carry: tuple[Chatter, Scalar, int]) -> Flag:
         hops, fastest, count = carry
         here = rates(hops.s, hops.u)
         least = _ROUNDINGS * jnp.finfo(here.v.dtype).eps / _LANDED * jnp.abs(stop.place * here.a)
         fast = (-here.v > _SLOW * fastest) & (here.v**2 > least)
-        return ~hops.over & (fast | (here.a < 0)) & (count < _HOPS)
+        return ~hops.is_over & (fast | (here.a < 0)) & (count < _HOPS)
 
-    def hop(carry: tuple[Hops, Scalar, int]) -> tuple[Hops, Scalar, int]:
+    def hop(carry: tuple[Chatter, Scalar, int]) -> tuple[Chatter, Scalar, int]:
         hops, fastest, count = carry
         first = _duration(free, stop, hops.s, hops.u)
 
-        def off(carry):
+        def inexact(carry):
             length, move, count = carry
             close = jnp.abs(move) <= _CLOSE * jnp.abs(length)
-            return ~hops.over & ~close & (count < _CORRECTIONS)
+            return ~hops.is_over & ~close & (count < _CORRECTIONS)
 
-        def corrected(carry):
+        def correct(carry):
             length, _, count = carry
-            there, _, _ = free.fly(hops.s, hops.s + length, hops.u, steps)
-            here = rates(hops.s + length, there)
+            arrival, _, _ = free.fly(hops.s, hops.s + length, hops.u, steps)
+            here = rates(hops.s + length, arrival)
             move = here.x / jnp.where(here.v == 0, 1.0, here.v)
             return length - move, move, count + 1
 
-        length, *_ = jax.lax.while_loop(off, corrected, (first, jnp.full_like(first, jnp.inf), 0))
-        u, more, _ = free.fly(hops.s, hops.s + length, hops.u, steps, averages)
-        passed = {name: x + more[name] for name, x in hops.passed.items()}
+        length, *_ = jax.lax.while_loop(inexact, correct, (first, jnp.full_like(first, jnp.inf), 0))
+        u, added, _ = free.fly(hops.s, hops.s + length, hops.u, steps, averages)
+        integrals = {name: x + added[name] for name, x in hops.integrals.items()}
         s, here = hops.s + length, rates(hops.s + length, u)
         height = jnp.abs(length * rates(hops.s, hops.u).v)
         lands = (length > 0) & (here.v > 0) & (jnp.abs(here.x) < _LANDED * height) & (s < until)
         rebound, _ = stop.after(free.machine, s, free.unravel(u), *free.modes)
-        new = Hops(s, ravel_pytree(rebound)[0], passed, ~lands)
-        old = hops._replace(over=~lands)
-        new = jax.tree.map(lambda a, b: jnp.where(lands, a, b), new, old)
-        return new, jnp.maximum(fastest, -rates(new.s, new.u).v), count + 1
+        impact = Chatter(s, ravel_pytree(rebound)[0], integrals, ~lands)
+        unchanged = hops._replace(is_over=~lands)
+        impact = jax.tree.map(lambda a, b: jnp.where(lands, a, b), impact, unchanged)
+        return impact, jnp.maximum(fastest, -rates(impact.s, impact.u).v), count + 1
 
     first = jnp.maximum(-rates(begin.s, begin.u).v, 0.0)
-    return jax.lax.while_loop(going, hop, (begin, first, 0))[0]
+    return jax.lax.while_loop(continues, hop, (begin, first, 0))[0]
 
 
 def _rates(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Rates:
@@ -117,22 +117,22 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
     here, body = _rates(free, stop, s, u), free.machine.coordinates[stop.coordinate]
     rise = stop.sign * force_rate(free.smooth, body.position, free.smooth, s, free.unravel(u))
     root = jnp.sqrt(jnp.maximum(0.25 * here.a**2 - 2 * rise * here.v / 3, 0.0))
-    slower, faster = root - 0.5 * here.a, root + 0.5 * here.a
-    pressed = -2 * here.v / jnp.where(faster > 0, faster, 1.0)
-    drawn = 3 * slower / jnp.where(rise > 0, rise, 1.0)
-    return stop_gradient(jnp.where(here.a > 0, pressed, drawn))
+    minus, plus = root - 0.5 * here.a, root + 0.5 * here.a
+    if_pressed = -2 * here.v / jnp.where(plus > 0, plus, 1.0)
+    if_pulled = 3 * minus / jnp.where(rise > 0, rise, 1.0)
+    return stop_gradient(jnp.where(here.a > 0, if_pressed, if_pulled))
 
 
-def remaining(free: Flight, number: int, hops: Hops) -> Scalar:
+def remaining(free: Flight, number: int, hops: Chatter) -> Scalar:
     """Estimate the remaining time of a chatter; infinite if the force pulls the body off."""
     stop = stops_of(free.machine)[number]
     here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
     share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))
-    slows = (1 - share) * here.a
-    return jnp.where(slows > 0, -2 * here.v / jnp.where(slows > 0, slows, 1.0), jnp.inf)
+    slowing = (1 - share) * here.a
+    return jnp.where(slowing > 0, -2 * here.v / jnp.where(slowing > 0, slowing, 1.0), jnp.inf)
 
 
-def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scalar:
+def escape_margin(held: Flight, number: int, hops: Chatter, s: Scalar, u: Vector) -> Scalar:
     """Return how far the last impact of a chatter is above the stable manifold of the hops.
 
     This is ((ξ/ξ of the manifold)^(5/6) - 1) τ^(5/3), negative if the body comes to rest. Close to
@@ -150,46 +150,46 @@ def escape(held: Flight, number: int, hops: Hops, s: Scalar, u: Vector) -> Scala
     def force(s, state):
         return force_on(held, number, s, state)
 
-    def along(function):
+    def time_derivative(function):
         def rate(s, state):
             return jax.jvp(function, (s, state), (jnp.ones_like(s), field(s, state)))[1]
 
         return rate
 
-    first = along(force)
-    second = along(first)
-    beta, mu, nu = -first(s, state), second(s, state), -along(second)(s, state)
-    left, free = s - hops.s, held.releasing(stop.coordinate)
+    first = time_derivative(force)
+    second = time_derivative(first)
+    beta, mu, nu = -first(s, state), second(s, state), -time_derivative(second)(s, state)
+    time_left, free = s - hops.s, held.with_released(stop.coordinate)
     speed = -_rates(free, stop, hops.s, hops.u).v
     # Derivative with respect to the speed y' from the stop, along the change by an impact.
     push = push_of(body, state)
 
-    def leaves(state: State) -> Scalar:
+    def speed_from_stop(state: State) -> Scalar:
         return -_rates(free, stop, s, ravel_pytree(state)[0]).v
 
-    unit = jax.jvp(leaves, (state,), (push,))[1]
+    unit = jax.jvp(speed_from_stop, (state,), (push,))[1]
     push = jax.tree.map(lambda x: x / unit, push)
     c = jax.jvp(lambda x: force(s, x), (state,), (push,))[1]
     bend = jax.jvp(lambda x: free.smooth.field(s, x), (state,), (push,))[1]
     p = jax.jvp(lambda x: force(s, x), (state,), (bend,))[1] + c**2
-    after = stop.approach(-body.velocity(held.unravel(hops.u)))
-    share, slope = jax.jvp(stop.share, (after,), (jnp.ones_like(after),))
-    before = after / jnp.where(share > 0, share, 1.0)
-    share, slope = jax.jvp(stop.share, (before,), (jnp.ones_like(after),))
-    k, k1 = share - slope * before, slope * jnp.abs(unit)
-    limit = _manifold(k, left, mu / beta, nu / beta, c, p, beta * k1)
+    speed_after = stop.approach(-body.velocity(held.unravel(hops.u)))
+    share, slope = jax.jvp(stop.share, (speed_after,), (jnp.ones_like(speed_after),))
+    speed_before = speed_after / jnp.where(share > 0, share, 1.0)
+    share, slope = jax.jvp(stop.share, (speed_before,), (jnp.ones_like(speed_after),))
+    k, k1 = share - slope * speed_before, slope * jnp.abs(unit)
+    limit = _manifold(k, time_left, mu / beta, nu / beta, c, p, beta * k1)
     height = speed / (beta * limit)
     safe = jnp.where((share > 0) & (height > 0), height, 1.0) ** (5 / 6)
-    above = safe - jnp.sign(left) * (left**2) ** (5 / 6)
+    margin = safe - jnp.sign(time_left) * (time_left**2) ** (5 / 6)
     # Far from the limit, as with a nearly constant force, the manifold is not known.
-    over = remaining(free, number, hops) < _OVER * left
-    above = jnp.where(over, -jnp.abs(above), above)
-    above = jnp.where(hops.over, jnp.maximum(above, _ESCAPES * safe), above)
-    return jnp.where(share > 0, above, -jnp.inf)
+    ends_before = remaining(free, number, hops) < _OVER * time_left
+    margin = jnp.where(ends_before, -jnp.abs(margin), margin)
+    margin = jnp.where(hops.is_over, jnp.maximum(margin, _ESCAPES * safe), margin)
+    return jnp.where(share > 0, margin, -jnp.inf)
 
 
 def _manifold(
-    k: Scalar, left: Scalar, M: Scalar, N: Scalar, c: Scalar, p: Scalar, k1: Scalar
+    k: Scalar, time_left: Scalar, M: Scalar, N: Scalar, c: Scalar, p: Scalar, k1: Scalar
 ) -> Scalar:
     """Return ξ on the stable manifold of the hops.
 
@@ -200,11 +200,11 @@ def _manifold(
     """
     s = 1 - stop_gradient(k) ** 0.6
 
-    def corrected(_, s):
-        off, slope = (3 - s) * (1 - s) ** 2 - k * (3 - 2 * s), 3 * s**2 - 10 * s + 7
-        return s + off / (slope - 2 * k)
+    def newton(_, s):
+        residual, slope = (3 - s) * (1 - s) ** 2 - k * (3 - 2 * s), 3 * s**2 - 10 * s + 7
+        return s + residual / (slope - 2 * k)
 
-    s = jax.lax.fori_loop(0, 6, corrected, s)
+    s = jax.lax.fori_loop(0, 6, newton, s)
     G = 8 * s**4 - 49 * s**3 + 119 * s**2 - 140 * s + 70
     A = (
         45 * (s - 1) * (s - 2) ** 2 * M**2 + 18 * G * M * c + 48 * G * N
@@ -212,5 +212,5 @@ def _manifold(
         + 16 * s**2 * (16 * s**2 - 63 * s + 63) * p
         - 160 * (2 * s - 3) ** 4 * k1 / ((s - 1) * (s - 3))
     ) / (960 * (4 * s**4 - 24 * s**3 + 57 * s**2 - 66 * s + 33))  # fmt: skip
-    more = left * (3 * M + c) / 8 + left**2 * A
-    return s * (3 - s) / 6 * (1 + jnp.maximum(more, -0.9))
+    correction = time_left * (3 * M + c) / 8 + time_left**2 * A
+    return s * (3 - s) / 6 * (1 + jnp.maximum(correction, -0.9))

@@ -11,7 +11,7 @@ import numpy as np
 from .._checks import flag, given_number, instance_of, interval, one_of, short, tuple_of_names
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf, may_rest
-from ._conditions import Special, as_held, exchange_at, is_defective, names_of, rates_at
+from ._conditions import Special, hold_values, is_defective, known_names, rates_at, replacement_at
 from ._follow import both_ways, check_walk, rescaled
 from ._motion_table import MotionTable
 from ._problem import (
@@ -19,14 +19,14 @@ from ._problem import (
     cycles_to_fly,
     problem_of,
     resting_problem_of,
-    sized,
     steps_of,
+    with_sizes,
 )
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._solution import Step, advance, tangent_at
 from ._special_table import Intervals, SpecialTable, lost_at
-from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, one
+from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, with_article
 from .curve import Boundary, Branch
 from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
 from .special import Point
@@ -110,7 +110,7 @@ def continue_orbit(
     sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
     problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
     start, before = _first_point(problem, x, orbit), problem.scale
-    problem = sized(problem, start.x, start.seen.largest)
+    problem = with_sizes(problem, start.x, start.observed.largest)
     (start,) = rescaled([start], before, problem.scale)
     start = advance(problem, start.x, start.tangent, 0.0)
     return both_ways(
@@ -180,7 +180,7 @@ def _freed(
             raise ValueError(
                 f"Argument `fixed` must name what the orbit has, but its {name} is {target:g}."
             )
-    wide = dataclasses.replace(problem, conditions=as_held(targets, multipliers))
+    wide = dataclasses.replace(problem, conditions=hold_values(targets, multipliers))
     wide = _widened(wide, x, tuple(free), ranges := [*ranges, bounds])
     return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
 
@@ -196,7 +196,7 @@ def _widened(
 
 def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
     """Check names of quantities of a motion; an error lists the known names."""
-    known = names_of(problem)
+    known = known_names(problem)
     return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
 
 
@@ -338,13 +338,14 @@ def _check_point(point: Point) -> None:
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
             "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "
-            f"bifurcation at which something is touched, but is {one(point.kind)}. {_INSTEAD}"
+            "bifurcation at which something is touched, but is "
+            f"{with_article(point.kind)}. {_INSTEAD}"
         )
     vanishes = point.kind in SLIDING and change_at(point.problem, point.step) is not None
     if point.kind in TOUCHING and not (point.touches or vanishes):
         raise ValueError(
             "Argument `point` must be a grazing or a sliding bifurcation at which something is "
-            f"touched, but is {one(point.kind)}: {point.detail}. {_INSTEAD}"
+            f"touched, but is {with_article(point.kind)}: {point.detail}. {_INSTEAD}"
         )
 
 
@@ -377,14 +378,14 @@ def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Sh
     problem = _widened(old, start, (parameter,), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)
-    exchange = None
+    replacement = None
     if point.kind in (SYMMETRY, CROSSING):
-        exchange = exchange_at(problem, x)
-        if exchange is None:
+        replacement = replacement_at(problem, x)
+        if replacement is None:
             raise ValueError(
                 "Argument `parameter` must keep the symmetry, or other property, by which the "
                 f"branches cross, but they separate when {parameter} changes."
             )
     double = point.kind == FOLD and not is_defective(point.problem, point.step, 1.0)
-    condition = Special(point.kind, impact, exchange, double=double)
+    condition = Special(point.kind, impact, replacement, double=double)
     return dataclasses.replace(problem, conditions=(condition,)), x

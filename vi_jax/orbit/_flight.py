@@ -41,16 +41,16 @@ class Event(NamedTuple):
     use: str = ""
     """For a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` at a rest's end."""
 
-    def called(self, machine: AbstractMachine) -> str:
+    def name_on(self, machine: AbstractMachine) -> str:
         """Return its name for messages: its own, its side, or its kind and its index there."""
         event, events = self.of(machine), events_of(machine)
         if isinstance(event, RigidStop | SoftStop):
             soft = "soft " if isinstance(event, SoftStop) else ""
             return event.name or f"{event.side} {soft}stop"
-        place = sum(other.word == event.word for other in events[: self.number])
-        return event.name or f"{event.word} {place}"
+        index = sum(other.word == event.word for other in events[: self.number])
+        return event.name or f"{event.word} {index}"
 
-    def later(self, cycles: int) -> "Event":
+    def shifted(self, cycles: int) -> "Event":
         return self if self.cycle is None else self._replace(cycle=self.cycle + cycles)
 
     def of(self, machine: AbstractMachine) -> AbstractEvent:
@@ -74,7 +74,7 @@ def guard_at(before: "Flight", event: Event, s: Scalar, state: State) -> Scalar:
 def force_on(flight: "Flight", number: int, s: Scalar, state: State) -> Scalar:
     """Return the acceleration d²/ds² of the resting body towards its stop, if it were free."""
     stop = stops_of(flight.machine)[number]
-    field = flight.releasing(stop.coordinate).smooth.field
+    field = flight.with_released(stop.coordinate).smooth.field
     return guard_rates(field, partial(stop.guard, flight.machine), s, state).a
 
 
@@ -101,34 +101,34 @@ class Flight(eqx.Module):
         """The machine in its modes, with its resting bodies held."""
         return SmoothMachine(self.machine, self.modes, self.contact)
 
-    def holding(self, contact: Scalars) -> "Flight":
+    def with_contact(self, contact: Scalars) -> "Flight":
         return Flight(self.machine, self.modes, self.method, self.like, contact)
 
-    def releasing(self, coordinate: int) -> "Flight":
+    def with_released(self, coordinate: int) -> "Flight":
         others = (0.0 * x if k == coordinate else x for k, x in enumerate(self.contact))
-        return self.holding(tuple(others) if len(self.contact) > 1 else ())
+        return self.with_contact(tuple(others) if len(self.contact) > 1 else ())
 
     def unravel(self, u: Vector) -> State:
         return ravel_pytree(self.like)[1](u)
 
     def step(
-        self, s0: Scalar, s1: Scalar, u: Vector, passed: Integrals
+        self, s0: Scalar, s1: Scalar, u: Vector, integrals: Integrals
     ) -> tuple[Vector, Integrals]:
         """Return the state, and the time and integrals passed, after one step of the method."""
         smooth, state = self.smooth, self.unravel(u)
-        beside = carried(smooth, s0, state, passed)
-        new, after = _stepped_once(self.method, smooth, s0, s1, state, beside)
+        before = carried(smooth, s0, state, integrals)
+        new, after = _take_step(self.method, smooth, s0, s1, state, before)
         for number, stop in enumerate(stops_of(self.machine) if self.contact else ()):
             # A closed form of the flight leaves out the force that holds the body.
             rests = self.contact[stop.coordinate] == 1.0 + number
-            put = on_stop(self.machine, number, new)
-            new = jax.tree.map(partial(jnp.where, rests), put, new)
-        return ravel_pytree(new)[0], elapsed(passed, after, s1 - s0)
+            on_the_stop = on_stop(self.machine, number, new)
+            new = jax.tree.map(partial(jnp.where, rests), on_the_stop, new)
+        return ravel_pytree(new)[0], elapsed(integrals, after, s1 - s0)
 
     def once(self, function: Callable[["Flight", Any], Any], inputs: object) -> Any:
         """Compute a function of the flight and one lane's inputs as vector code (`lanes.once`)."""
         numbers, rest = eqx.partition(self, eqx.is_array)
-        return lanes.once(partial(_of_flight, rest, function), (numbers, inputs))
+        return lanes.once(partial(_call_with_flight, rest, function), (numbers, inputs))
 
     def fly(
         self, s0: Scalar, s1: Scalar, u: Vector, steps: int | Scalar,
@@ -139,33 +139,33 @@ class Flight(eqx.Module):
         Without rows one program serves any number of steps."""
         form = prepared(self.machine)
         if form.machine is not self.machine:
-            inward = form.inward(self.like)
-            inner = Flight(form.machine, self.modes, self.method, inward, self.contact)
+            inner_like = form.inward(self.like)
+            inner = Flight(form.machine, self.modes, self.method, inner_like, self.contact)
 
             def outward(u: Vector) -> Vector:
                 return ravel_pytree(form.outward(inner.unravel(u)))[0]
 
             start = ravel_pytree(form.inward(self.unravel(u)))[0]
-            u, passed, (clock, states) = inner.fly(s0, s1, start, steps, averages, rows=rows)
-            return outward(u), passed, (clock, jax.vmap(outward)(states))
+            u, integrals, (clock, states) = inner.fly(s0, s1, start, steps, averages, rows=rows)
+            return outward(u), integrals, (clock, jax.vmap(outward)(states))
         numbers, rest = eqx.partition(self, eqx.is_array)
-        (u, passed), path = lanes.run(
+        (u, integrals), path = lanes.run(
             partial(_begin, averages), partial(_step, rest), _end,
             (numbers, s0, (s1 - s0) / steps, u, jnp.asarray(steps, s0.dtype)), rows=rows,
         )  # fmt: skip
-        return u, passed, path
+        return u, integrals, path
 
 
 @eqx.filter_jit
-def _stepped_once(
+def _take_step(
     method: AbstractMethod, smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State,
-    beside: Integrals,
+    before: Integrals,
 ) -> tuple[State, Integrals]:  # fmt: skip
     # Six programs of an orbit's equations take such steps: one trace saves a sixth of their time.
-    return method.step(smooth, s0, s1, state, beside)[:2]
+    return method.step(smooth, s0, s1, state, before)[:2]
 
 
-def _of_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:
+def _call_with_flight(rest: Flight, function: Callable[[Flight, Any], Any], inputs: Any) -> Any:
     return function(eqx.combine(inputs[0], rest), inputs[1])
 
 
@@ -176,11 +176,11 @@ def _begin(averages: tuple[str, ...], inputs: Any) -> tuple[Any, lanes.Emitted]:
 
 
 def _step(rest: Flight, inputs: Any, carry: Any) -> tuple[Any, lanes.Emitted]:
-    (numbers, s0, h, _, steps), (u, passed, i) = inputs, carry
+    (numbers, s0, h, _, steps), (u, integrals, i) = inputs, carry
     s = s0 + i * h
-    u, passed = eqx.combine(numbers, rest).step(s, s + h, u, passed)
+    u, integrals = eqx.combine(numbers, rest).step(s, s + h, u, integrals)
     i = i + 1
-    return (u, passed, i), lanes.Emitted(i < steps, True, (s0 + i * h, u))
+    return (u, integrals, i), lanes.Emitted(i < steps, True, (s0 + i * h, u))
 
 
 def _end(inputs: Any, carry: Any) -> Any:

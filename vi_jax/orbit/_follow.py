@@ -20,10 +20,10 @@ from .._checks import count, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from ._problem import COARSE, finer, grown, sized_by_motion
+from ._problem import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
 from ._shooting import Shooting
-from ._solution import Step, advance, distance_along, located, on_host, step_error
-from ._surgery import halves_apart
+from ._solution import Step, advance, distance_along, locate_zero, on_host, step_error
+from ._surgery import half_difference
 from .special import Point
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
@@ -40,7 +40,7 @@ SAME_CURVE = 0.9
 # A step with a tangent that turns by less than 26° (as the walk requires) stays within half that
 # angle of its first tangent. A step with a smaller cosine than this has reached another curve,
 # beyond a jump of the equations, or another part. Steps up to the second number are rounding.
-_ASIDE, _TINY = 0.9, 1e-6
+_LEAST_COSINE, _TINY = 0.9, 1e-6
 
 # A walk stalls if its steps must be shorter than this share of the longest. The shortest
 # steps that the branches of the tests need are 2e-3 of it.
@@ -55,14 +55,14 @@ _SHORT, _NOISE = 1e-4, 1e-3
 
 # A warning is given for points whose states change by more than this with twice the steps, if more
 # are not allowed. For a motor whose crank slowed to a fifth, with its first steps, it was 0.07.
-_WRONG = 1e-8
+_WARN_ABOVE = 1e-8
 
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
-_BEGINS = 1e-7
+_ZERO_AT_START = 1e-7
 
 # A walk that stalls this close to a bound (in the parameter's scale) is extended to it: a few times
 # the rest that its shortest steps leave.
-_STALLED_AT = 1e-6
+_NEAR_BOUND = 1e-6
 
 # A parameter this close to its bound (in its scale) is at it, to rounding: a choice, below the
 # corrector's tolerance.
@@ -88,7 +88,7 @@ class Event(NamedTuple):
     ending: Callable[[Step], Ending | None]
     """Return how the curve ends at the zero of the test; `None` if it does not end."""
     locate: Callable[[Step, Step], Step | None] | None = None
-    """Locate the event between two points; by default as the zero of a smooth test (`located`)."""
+    """Locate the event between two points; by default a zero of its test (`locate_zero`)."""
     noise: float = 0.0
     """A negative value of at most this modulus is zero to rounding."""
 
@@ -102,34 +102,34 @@ class Table(abc.ABC):
     def __init__(self, problem: Shooting, bounds: Sequence[tuple[float, float]]):
         self.problem, self.bounds = problem, bounds
         self.closing = Closing(self)
-        # The equations and ends of the last search by `where`, and the points that it found.
-        self._searched: tuple[Any, ...] = (None, None, None)
-        self._found: dict[float, Step] = {}
+        # The equations and ends of the last search by `locate_zero`, and the points that it found.
+        self._search: tuple[Any, ...] = (None, None, None)
+        self._known_points: dict[float, Step] = {}
 
     @property
     def scale(self) -> np.ndarray:
         return self.problem.scale
 
     @abc.abstractmethod
-    def ends(self, here: Step, new: Step) -> list[Event]:
+    def event_rows(self, here: Step, new: Step) -> list[Event]:
         """Return the rows for a step between two points."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
         """Return the point at this length along the tangent."""
         new = advance(self.problem, x, tangent, length)
-        gone = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
-        aside = gone > _TINY and not abs(length) >= _ASIDE * gone
-        return new._replace(good=np.asarray(False)) if aside else new
+        distance = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
+        deviates = distance > _TINY and not abs(length) >= _LEAST_COSINE * distance
+        return new._replace(good=np.asarray(False)) if deviates else new
 
-    def where(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
+    def locate_zero(self, here: Step, new: Step, test: Callable[[Step], float]) -> Step | None:
         """Return the point between two at which a test is zero; points found for another test
         between the same two are used again."""
         ends = self.problem, here, new
-        if any(a is not b for a, b in zip(ends, self._searched, strict=True)):
-            self._searched, self._found = ends, {}
-        return located(*ends, test, self._found)
+        if any(a is not b for a, b in zip(ends, self._search, strict=True)):
+            self._search, self._known_points = ends, {}
+        return locate_zero(*ends, test, self._known_points)
 
-    def on_bounds(self, step: Step) -> Step:
+    def snap_to_bounds(self, step: Step) -> Step:
         """Return a point with its parameters on their bounds if they are there to rounding: beyond
         a bound, a number may be out of its range."""
         x = np.array(step.x)
@@ -138,15 +138,15 @@ class Table(abc.ABC):
                 x[i] = bound if abs(x[i] - bound) < _ON_BOUND * self.scale[i] else x[i]
         return step._replace(x=x)
 
-    def images(self, step: Step) -> np.ndarray:
+    def image_difference(self, step: Step) -> np.ndarray:
         """Return the difference of a motion from its own image; empty if it cannot be symmetric."""
-        return halves_apart(self.problem, step, mirrored=True) if self.symmetric else np.zeros(0)
+        return half_difference(self.problem, step, mirrored=True) if self.symmetric else np.zeros(0)
 
-    def passed(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
+    def points_between(self, here: Step, last: Step) -> list[tuple[Point, Step]]:
         """Return the events between two points that do not end the curve, in order."""
         return []
 
-    def stalled(self, steps: list[Step]) -> Ending:
+    def stall_end(self, steps: list[Step]) -> Ending:
         """Return how a curve ends if the corrector cannot follow it further."""
         return Ending(steps[-1], STALLED)
 
@@ -177,11 +177,11 @@ def both_ways(
     **Raises:** on Ctrl-C `Interrupted`, with the result so far.
     """
     tables = table(), table()
-    start = tables[0].on_bounds(start)
+    start = tables[0].snap_to_bounds(start)
     ahead = _Walk(tables[0], start)
     back = _Walk(tables[1], start._replace(tangent=-start.tangent))
 
-    def found() -> Any:
+    def make_result() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
         sizes = jnp.maximum(back.table.problem.sizes, ahead.table.problem.sizes)
         problem = dataclasses.replace(problem, sizes=sizes)
@@ -196,22 +196,22 @@ def both_ways(
             ends=(back.end, ahead.end), special=special,
         )  # fmt: skip
 
-    def kept() -> Interrupted:
-        return Interrupted(f"walk along the {what}", found())
+    def interrupted() -> Interrupted:
+        return Interrupted(f"walk along the {what}", make_result())
 
-    with at_work(what, kept, progress=progress, unit="point") as tell:
-        ahead.end = ahead.follow(tell, **settings)
-        back.end = CLOSED if ahead.end == CLOSED else back.follow(tell, **settings)
-    return found()
+    with at_work(what, interrupted, progress=progress, unit="point") as report:
+        ahead.end = ahead.walk(report, **settings)
+        back.end = CLOSED if ahead.end == CLOSED else back.walk(report, **settings)
+    return make_result()
 
 
 class _Walk:
     def __init__(self, table: Table, start: Step):
         self.table, self.steps, self.end = table, [start], INTERRUPTED
         self.special: list[Point] = []
-        self._vain, self._worst = 0.0, (0.0, 0.0)  # error that more steps leave; largest, and where
+        self._noise, self._worst = 0.0, (0.0, 0.0)  # error left by more steps; largest, and where
 
-    def follow(self, tell: ReportProgress, *, step: float, max_step: float, max_points: int) -> str:
+    def walk(self, report: ReportProgress, *, step: float, max_step: float, max_points: int) -> str:
         """Walk on in the direction of the first point's tangent; return the reason to end."""
         length, failed, steady, end, points = step, 0, 0, "max_points", 1
         while points < max_points:
@@ -219,28 +219,28 @@ class _Walk:
             new = self.table.advance(here.x, here.tangent, length)
             turn = float(np.dot(np.asarray(new.tangent), np.asarray(here.tangent)))
             good = bool(new.good) and turn >= SAME_CURVE
-            if good and self._made_finer(new):
+            if good and self._refine_steps(new):
                 length, failed, steady = step, 0, 0
                 continue
-            ending = self._first(here, new) if good else Ending(here, SHORTER)
+            ending = self._first_ending(here, new) if good else Ending(here, SHORTER)
             if ending is not None and ending.reason == SHORTER:
                 # The further off a solution is, the longer each trial takes.
                 length, failed, steady = length * (0.4 if failed < 2 else 0.1), failed + 1, _STEADY
                 if length >= _SHORTEST * max_step:
                     continue
-                ending = self._stalled(here)
+                ending = self._stalled_ending(here)
             elif ending is None or ending.last is not here:
                 last = new if ending is None else ending.until or ending.last
-                for point, at in self.table.passed(here, last):
-                    self._note(at, point)
+                for point, at in self.table.points_between(here, last):
+                    self._append(at, point)
             if ending is not None:
-                last = None if ending.last is here else self.table.on_bounds(ending.last)
-                self._note(last, ending.point)
+                last = None if ending.last is here else self.table.snap_to_bounds(ending.last)
+                self._append(last, ending.point)
                 end = ending.reason
                 break
-            self._note(new)
+            self._append(new)
             self._resize(new)
-            tell(1)
+            report(1)
             failed, steady, points = 0, max(0, steady - 1), points + 1
             if turn > 0.99 and int(new.iterations) <= 6 and not steady:
                 length = min(1.4 * length, max_step)
@@ -249,37 +249,37 @@ class _Walk:
         self._warn()
         return end
 
-    def _note(self, step: Step | None, point: Point | None = None) -> None:
+    def _append(self, step: Step | None, point: Point | None = None) -> None:
         """Add a point of the curve, and its special point if there is one."""
         self.steps += [] if step is None else [step]
         if point is not None:
             self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
 
-    def _first(self, here: Step, new: Step) -> Ending | None:
+    def _first_ending(self, here: Step, new: Step) -> Ending | None:
         """Return the first event between two points.
 
         An event is located if its test has changed sign, and then again up to the first event.
         Beyond it the curve is not one of the machine's: a test may have changed sign twice there.
         """
-        rows = [(row, row.test(here)) for row in self.table.ends(here, new)]
+        rows = [(row, row.test(here)) for row in self.table.event_rows(here, new)]
         for row, begin in rows:
-            ending = row.ending(here) if _falls(row, begin, new) else None
+            ending = row.ending(here) if _falls_from_zero(row, begin, new) else None
             if ending is not None:
                 return ending
         rows = [(row, begin) for row, begin in rows if begin > 0]
         first, end = None, new
         while True:
             share = 0.0 if first is None else _NOISE
-            found = (
+            passed_rows = (
                 i for i, (r, begin) in enumerate(rows) if r.test(end) <= -share * begin - r.noise
             )
-            changed = next(found, None)
-            if changed is None:
+            index = next(passed_rows, None)
+            if index is None:
                 return first
-            row, _ = rows.pop(changed)
-            locate = row.locate or partial(self.table.where, test=row.test)
-            at = locate(here, end)
-            ending = None if at is None else row.ending(at)
+            row, _ = rows.pop(index)
+            locate = row.locate or partial(self.table.locate_zero, test=row.test)
+            zero = locate(here, end)
+            ending = None if zero is None else row.ending(zero)
             if ending is None:
                 continue
             # Later events, and those that coincide with the first one, are not located.
@@ -289,61 +289,61 @@ class _Walk:
             if first.reason == SHORTER or not bool(end.good):
                 return first
 
-    def _stalled(self, last: Step) -> Ending:
+    def _stalled_ending(self, last: Step) -> Ending:
         """Return how the curve ends if the corrector fails: at a bound right ahead beyond which the
         machine has another form, as with a restitution of 0 or 1, or as the table defines."""
         table, axes = self.table, np.eye(len(last.x))
         for i, ends in enumerate(table.bounds, -len(table.bounds)):
             for bound in ends:
                 length = (bound - float(last.x[i])) / table.scale[i]
-                if abs(length) < _STALLED_AT:
+                if abs(length) < _NEAR_BOUND:
                     at = advance(table.problem, last.x, axes[i], length)
                     if bool(at.good):
                         return Ending(at, BOUNDS)
-        return table.stalled(self.steps)
+        return table.stall_end(self.steps)
 
-    def _made_finer(self, new: Step) -> bool:
+    def _refine_steps(self, new: Step) -> bool:
         """Refine the steps of the flights if they depend on the motion; return True if changed."""
         table = self.table
-        if not sized_by_motion(table.problem):
+        if not steps_depend_on_motion(table.problem):
             return False
-        off = step_error(table.problem, new.x)
-        if off > max(COARSE, 10 * self._vain):  # otherwise rounding
-            better = finer(table.problem, new.x, off)
-            if better is not None:
-                table.problem = better
+        error = step_error(table.problem, new.x)
+        if error > max(COARSE, 10 * self._noise):  # otherwise rounding
+            refined = with_finer_steps(table.problem, new.x, error)
+            if refined is not None:
+                table.problem = refined
                 return True
-            self._vain = off
-        self._worst = max(self._worst, (off, float(new.x[-1])))
+            self._noise = error
+        self._worst = max(self._worst, (error, float(new.x[-1])))
         return False
 
     def _resize(self, new: Step) -> None:
         """Adopt the sizes of a motion that has become twice as large as before."""
         table, before = self.table, self.table.scale
-        larger = grown(table.problem, new.seen.largest)
-        if larger is None:
+        resized = with_grown_sizes(table.problem, new.observed.largest)
+        if resized is None:
             return
-        table.problem = larger
+        table.problem = resized
         self.steps = rescaled(self.steps, before, table.scale)
-        table.closing.begin(self.steps[:-1])
+        table.closing.restart(self.steps[:-1])
 
     def _warn(self) -> None:
-        off, value = self._worst
-        if off > _WRONG:
+        error, value = self._worst
+        if error > _WARN_ABOVE:
             problem = self.table.problem
             warn(
                 f"The flights of this curve have {problem.steps} steps each, but at "
                 f"{problem.parameters[-1]} = {value:.6g} twice as many change its states by "
-                f"{off:.1g}: follow it by a `method` of more steps a cycle."
+                f"{error:.1g}: follow it by a `method` of more steps a cycle."
             )
 
 
-def _falls(row: Event, begin: float, new: Step) -> bool:
+def _falls_from_zero(row: Event, begin: float, new: Step) -> bool:
     """Return whether a test is zero at a point, to rounding, and falls from there."""
     if begin > row.noise:
         return False
     end = row.test(new)
-    return abs(begin) <= _BEGINS * abs(end) and end < -row.noise
+    return abs(begin) <= _ZERO_AT_START * abs(end) and end < -row.noise
 
 
 def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[Step]:
@@ -356,25 +356,25 @@ def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[S
     return [step._replace(tangent=tangent(step)) for step in steps]
 
 
-def bounds_of(table: Table) -> list[Event]:
+def bound_rows(table: Table) -> list[Event]:
     """Return the rows of a table that end a curve at the bounds of its parameters."""
 
     def row(i: int, bound: float, sense: float) -> Event:
-        def left(step: Step) -> float:
+        def distance(step: Step) -> float:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
 
         def ending(at: Step) -> Ending:
-            return Ending(at, BOUNDS if abs(left(at)) < _STALLED_AT else SHORTER)
+            return Ending(at, BOUNDS if abs(distance(at)) < _NEAR_BOUND else SHORTER)
 
-        return Event(left, ending)
+        return Event(distance, ending)
 
-    places = enumerate(table.bounds, -len(table.bounds))
-    return [row(i, *at) for i, (low, high) in places for at in ((low, 1.0), (high, -1.0))]
+    intervals = enumerate(table.bounds, -len(table.bounds))
+    return [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
 
 
 # A motion within this distance (scaled), in a direction within the second number, is the same one
 # again: choices, ten thousand times the corrector's error, far below the distance of two passages.
-_AGAIN, _ALONG = 1e-7, 1e-2
+_SAME_MOTION, _SAME_TANGENT = 1e-7, 1e-2
 
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
 _NEAR = 2.0
@@ -391,79 +391,79 @@ class Closing:
 
     def __init__(self, table: Table):
         self.table = table
-        self.begin([])
+        self.restart([])
 
-    def begin(self, points: list[Step]) -> None:
+    def restart(self, points: list[Step]) -> None:
         """Set these points as those that the curve has passed."""
         self.points: list[Step] = list(points)
-        self.begins, self.cycle = [], 0.0
+        self.starts, self.cycle = [], 0.0
         if points:
-            self._begin_at(points[0])
+            self._store_start(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
         """Return the rows for a step between two points, one for each earlier place near it."""
         if not self.points:
-            self._begin_at(here)
+            self._store_start(here)
         if not self.points or self.points[-1] is not here:
             self.points.append(here)
         near = _NEAR * float(np.linalg.norm((new.x - here.x) / self.table.scale))
-        xs = self._turned(np.stack([step.x for step in self.points]), new)
-        apart = np.linalg.norm((xs - new.x) / self.table.scale, axis=1)
-        if apart.max() <= near:
+        xs = self._shift_turns(np.stack([step.x for step in self.points]), new)
+        distances = np.linalg.norm((xs - new.x) / self.table.scale, axis=1)
+        if distances.max() <= near:
             return
-        away = int(np.flatnonzero(apart > near)[-1])  # all later points are near
-        met = [self.points[i] for i in np.flatnonzero(apart[: away + 1] <= near) if i]
+        last_away = int(np.flatnonzero(distances > near)[-1])  # all later points are near
+        close = [self.points[i] for i in np.flatnonzero(distances[: last_away + 1] <= near) if i]
         places: list[tuple[np.ndarray, np.ndarray, float, Step | None]] = [
             *((x, t, self.cycle, None if i else self.points[0])
-              for i, (x, t) in enumerate(self.begins)),
-            *((np.asarray(step.x), np.asarray(step.tangent), self._cycle(step), step)
-              for step in met),
+              for i, (x, t) in enumerate(self.starts)),
+            *((np.asarray(step.x), np.asarray(step.tangent), self._cycle_length(step), step)
+              for step in close),
         ]  # fmt: skip
-        for begin, tangent, cycle, known in places:
-            begin = self._some_cycles_later(begin, cycle, here)
-            if min(self._distance(step, begin) for step in (here, new)) > near:
+        for start, tangent, cycle, point in places:
+            start = self._shift_cycles(start, cycle, here)
+            if min(self._distance(step, start) for step in (here, new)) > near:
                 continue
 
-            def before(step: Step, begin=begin, tangent=tangent) -> float:
-                return float(np.dot(tangent, (begin - step.x) / self.table.scale))
+            def plane_distance(step: Step, start=start, tangent=tangent) -> float:
+                return float(np.dot(tangent, (start - step.x) / self.table.scale))
 
-            def ending(at: Step, begin=begin, tangent=tangent, known=known) -> Ending | None:
-                same = self._distance(at, begin) < _AGAIN
-                if not same or np.linalg.norm(at.tangent - tangent) >= _ALONG:
+            def ending(at: Step, start=start, tangent=tangent, point=point) -> Ending | None:
+                same = self._distance(at, start) < _SAME_MOTION
+                if not same or np.linalg.norm(at.tangent - tangent) >= _SAME_TANGENT:
                     return None
-                return Ending(at if known is None else known._replace(tangent=at.tangent), CLOSED)
+                return Ending(at if point is None else point._replace(tangent=at.tangent), CLOSED)
 
-            yield Event(before, ending)
+            yield Event(plane_distance, ending)
 
-    def _distance(self, step: Step, begin: np.ndarray) -> float:
-        return float(np.linalg.norm((step.x - begin) / self.table.scale))
+    def _distance(self, step: Step, x: np.ndarray) -> float:
+        return float(np.linalg.norm((step.x - x) / self.table.scale))
 
-    def _begin_at(self, first: Step) -> None:
+    def _store_start(self, first: Step) -> None:
         """Store unknowns and tangent of the first motion and of its other representations."""
-        self.cycle = self._cycle(first)
+        self.cycle = self._cycle_length(first)
         scale = self.table.scale
-        found = _others_with_rates(self.table.problem, first.x, first.tangent * scale)
+        found = _starts_with_rates(self.table.problem, first.x, first.tangent * scale)
         others = ((other, rate / scale) for other, rate in found)
-        self.begins = [
+        self.starts = [
             (first.x, np.asarray(first.tangent)),
-            *(other for other in others if self._distance(first, other[0]) > _AGAIN),
+            *(other for other in others if self._distance(first, other[0]) > _SAME_MOTION),
         ]
 
-    def _cycle(self, step: Step) -> float:
+    def _cycle_length(self, step: Step) -> float:
         """Return the length of a cycle by the clock if motions may be counted from any, else 0."""
         problem = self.table.problem
         if not problem.events or problem.autonomous:
             return 0.0
         return float(problem.period(jnp.asarray(step.x))) / problem.cycles
 
-    def _some_cycles_later(self, begin: np.ndarray, cycle: float, here: Step) -> np.ndarray:
+    def _shift_cycles(self, x: np.ndarray, cycle: float, here: Step) -> np.ndarray:
         """Shift a motion by cycles and turns so that it is nearest to another one."""
-        begin = self._turned(begin, here)
+        x = self._shift_turns(x, here)
         if cycle:
-            begin[: self.table.problem.legs] += cycle * np.round((here.x[0] - begin[0]) / cycle)
-        return begin
+            x[: self.table.problem.legs] += cycle * np.round((here.x[0] - x[0]) / cycle)
+        return x
 
-    def _turned(self, xs: np.ndarray, here: Step) -> np.ndarray:
+    def _shift_turns(self, xs: np.ndarray, here: Step) -> np.ndarray:
         """Shift the angles of motions by the turns that bring them nearest to another one."""
         problem, xs = self.table.problem, xs.copy()
         angles = problem.angles
@@ -475,12 +475,12 @@ class Closing:
 
 
 @on_host
-def _others_with_rates(problem: Shooting, x, along):
+def _starts_with_rates(problem: Shooting, x, along):
     """Return the motion's other representations, each with its derivative along a direction."""
-    return list(zip(*jax.jvp(partial(_observed_otherwise, problem), (x,), (along,)), strict=True))
+    return list(zip(*jax.jvp(partial(_other_starts, problem), (x,), (along,)), strict=True))
 
 
-def _observed_otherwise(problem: Shooting, x: Vector) -> list[Vector]:
+def _other_starts(problem: Shooting, x: Vector) -> list[Vector]:
     """Return the same motion from other events, or without events from its other sections."""
     if problem.autonomous and not problem.omits_sections:
         return []

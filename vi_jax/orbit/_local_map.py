@@ -20,9 +20,9 @@ from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from ._flight import Event, Flight
 from ._shooting import Shooting
 from ._solution import on_host, since_section, tangent_at
-from ._surgery import of_least_period, with_sections, without_events
-from ._turns import Path, turning
-from ._words import one
+from ._surgery import with_least_period, with_sections, without_events
+from ._turns import Path, turning_points
+from ._words import with_article
 from .special import Point
 
 # A field that differs by less than this share of its size is continuous at a switch: a choice.
@@ -214,7 +214,7 @@ def _rooms(problem: Shooting, x):
         flight = problem.flight(machine, leg)
         _, _, path = flight.fly(s0, s1, after, problem.steps, rows=problem.steps)
         h = (s1 - s0) / problem.steps
-        _, rooms = turning(Path(flight, path[0], path[1], h, not problem.events))
+        _, rooms = turning_points(Path(flight, path[0], path[1], h, not problem.events))
         return jnp.stack([room for room, _ in rooms]), jnp.stack([s for _, s in rooms])
 
     ends = problem.ends(clock, problem.period(x))
@@ -292,7 +292,7 @@ def touch_at(
     elif event.holds_mode:
         kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
     else:
-        called = Event(number).called(problem.machine)
+        called = Event(number).name_on(problem.machine)
         raise ValueError(
             "Argument `point` must be the grazing of a stop or a switch, but it touches the "
             f"{called}, whose jump does not vanish with the speed."
@@ -384,7 +384,7 @@ class Graze(NamedTuple):
 def graze_at(point: Point) -> Graze:
     """Return the local map of a special point that is a grazing of a stop or a switch."""
     problem, x, number, clock = _without_touch(point)
-    problem, x = of_least_period(problem, x)
+    problem, x = with_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
     if abs(tangent[-1]) < _STEEP:
         raise ValueError(
@@ -393,7 +393,7 @@ def graze_at(point: Point) -> Graze:
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(x))
-    places = touched(problem, x, number, clock, point.step.seen.length)
+    places = touched(problem, x, number, clock, point.step.observed.length)
     touches = [touch_at(problem, x, along, *place) for place in places]
     touches.sort(key=lambda touch: touch.clock % period)
     touches = touches[-1:] + touches[:-1]  # the section follows the first touch
@@ -419,7 +419,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
     if point.kind != "grazing" or not point.touches:
         raise ValueError(
             "Argument `point` must be a grazing at which something is touched, but is "
-            f"{one(point.kind)}: {point.detail}."
+            f"{with_article(point.kind)}: {point.detail}."
         )
     if point.problem.landings:
         raise ValueError(
@@ -428,7 +428,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
         )
     old, x, i = point.problem, np.asarray(point.step.x), point.impact
     if i is None:
-        nearest = point.step.seen.nearest
+        nearest = point.step.observed.nearest
         clock = since_section(old, x, float(nearest.clock))
         return *with_sections(old, x), int(nearest.event), clock
     if old.events[i].cycle is not None:

@@ -17,7 +17,7 @@
 | the curve closes | distance to the plane across an earlier point | `closed` |
 
 Folds, branch points, doublings, tori, extremes and zeros of watched functions do not end the branch
-(`MotionTable.passed`).
+(`MotionTable.points_between`).
 """
 
 import dataclasses
@@ -34,20 +34,20 @@ from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, jumps_on_section, section_in
-from ._conditions import HeldMultiplier, alone, rates_at
+from ._conditions import HeldMultiplier, in_one_parameter, rates_at
 from ._flight import LANDS, LEAVES, section_of
 from ._flight import Event as MotionEvent
-from ._follow import Ending, Event, Table, bounds_of
+from ._follow import Ending, Event, Table, bound_rows
 from ._shooting import ROUNDING, Shooting, Unknowns
-from ._sliding import SLIDING, change_at, refined
-from ._solution import BESIDE, Step, advance, crossing, distance_along, observe, on_host, orbit_of
+from ._sliding import SLIDING, change_at, locate_change
+from ._solution import SPACING, Step, advance, crossing, distance_along, observe, on_host, orbit_of
 from ._surgery import (
     ALIKE,
     ROUNDED,
-    halves_apart,
+    half_difference,
+    locate_origin,
     may_be_symmetric,
     may_repeat,
-    origin,
     without_events,
 )
 from ._words import (
@@ -80,14 +80,14 @@ _SHORT = 0.999
 _BEFORE_POLE = 1 - 1e-6
 
 # An autonomous motion with this share of another's size is an equilibrium.
-_STILL = 1e-6
+_AT_REST = 1e-6
 
 # A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
 
 # The motion of half the period is sought if the halves of the period differ by at most so many
 # times `ALIKE`: for a motion with twelve impacts in 32π the corrector fails from four times on.
-_ALMOST = 10.0
+_ALMOST_ALIKE = 10.0
 
 # A branch ends at this multiple of its first duration; the steps are then as much longer. For a
 # rimless wheel near its homoclinic motion the multiplier is then correct to 2e-12.
@@ -98,13 +98,13 @@ _BRIEF = 1e-3
 
 # A multiplier passes if it is this close to the zero of its test. Otherwise that is a pole of the
 # determinant, or a real pair μ, 1/μ.
-_PASSES = 1e-5
+_AT_ZERO = 1e-5
 
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
-_HALVES = 17
+_MOST_HALVINGS = 17
 
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
-_SAME_WAY = 0.99
+_SAME_DIRECTION = 0.99
 
 # A quantity passes zero if it is less than this share of its neighbours; otherwise it jumps.
 _ZERO = 1e-6
@@ -118,7 +118,7 @@ _CHANGES = 1e-9
 # on both sides: a choice, far above the rest at a place that is located to rounding.
 _CORNER = 1e-4
 
-Passed = list[tuple[Point, Step]]
+Located = list[tuple[Point, Step]]
 
 
 class MotionTable(Table):
@@ -133,182 +133,182 @@ class MotionTable(Table):
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.size, self.duration = 0.0, 0.0  # those of the first motion
-        self._known: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
+        self._last_numbers: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
         new = super().advance(x, tangent, length)
         if not self.problem.autonomous or not bool(new.good):
             return new
         self.size = self.size or _size_of(self.problem, x)
-        return new._replace(good=np.asarray(_size_of(self.problem, new.x) > _STILL * self.size))
+        return new._replace(good=np.asarray(_size_of(self.problem, new.x) > _AT_REST * self.size))
 
-    def ends(self, here: Step, new: Step) -> list[Event]:
-        rows = bounds_of(self)
+    def event_rows(self, here: Step, new: Step) -> list[Event]:
+        rows = bound_rows(self)
         if self.problem.autonomous:
-            self.duration = self.duration or float(here.seen.duration)
-            left = lambda step: _LONG - float(step.seen.duration) / self.duration
-            rows.append(Event(left, lambda at: Ending(at, "long")))
+            self.duration = self.duration or float(here.observed.duration)
+            remaining = lambda step: _LONG - float(step.observed.duration) / self.duration
+            rows.append(Event(remaining, lambda at: Ending(at, "long")))
         for held in self.problem.conditions:
             if isinstance(held, HeldMultiplier):
-                ahead = lambda step, held=held: -held.dominance_margin(step.seen)
-                rows.append(Event(ahead, lambda at: Ending(at, "multiplier")))
-        rows += self._lost(here)
+                margin = lambda step, held=held: -held.dominance_margin(step.observed)
+                rows.append(Event(margin, lambda at: Ending(at, "multiplier")))
+        rows += self._lost_rows(here)
         return [*rows, *self._origin_events(here), *self.closing.rows(here, new)]
 
-    def _on_the_way(self, here: Step, last: Step, share: float) -> Step:
+    def _partway(self, here: Step, last: Step, share: float) -> Step:
         return self.advance(here.x, here.tangent, share * distance_along(self.problem, here, last))
 
     def _point(self, kind: str, step: Step, *args: Any, **more: Any) -> Point:
         return point_at(self.problem, step, kind, *args, **more)
 
-    def _named(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
+    def _end_with(self, kind: str, at: Step, detail: str, impact: int | None = None) -> Ending:
         return Ending(at, kind, self._point(kind, at, detail, impact))
 
-    def _divided(self, at: Step) -> Ending:
+    def _divided_rest(self, at: Step) -> Ending:
         """Return the end at which the force on a body falls to zero within its rest."""
-        place = place_in_words(self.problem, at, float(at.seen.pull.clock))
+        place = place_in_words(self.problem, at, float(at.observed.pull.clock))
         detail = f"a rest on a stop is divided {place}, where the force on the body falls to zero"
-        return self._named(REST, at, detail)
+        return self._end_with(REST, at, detail)
 
-    def _merged(self, at: Step, release: int) -> Point:
+    def _merged_rests(self, at: Step, release: int) -> Point:
         """Return the point at which two rests merge, of the motion without the flight between."""
         both = [release, (release + 1) % self.problem.legs]
         clock = float(self.problem.values(at.x)[0][release])
         place = place_in_words(self.problem, at, clock)
         detail = f"two rests on a stop become one: the body no longer leaves it {place}"
-        old, at = alone(self.problem, at)
+        old, at = in_one_parameter(self.problem, at)
         new, x = without_events(old, at.x, both)
         at = advance(new, x, np.eye(x.size)[-1], 0.0)
         return point_at(new, at, REST, detail, is_origin=True)
 
-    def _lost(self, here: Step) -> Iterator[Event]:
+    def _lost_rows(self, here: Step) -> Iterator[Event]:
         """Yield the rows of lost events, of touches, and of changes in the order of events."""
         for i, event in enumerate(self.problem.events):
-            falls = lambda step, i=i: float(step.seen.approach[i])
+            approach = lambda step, i=i: float(step.observed.approach[i])
             if event.cycle is not None and not self.problem.conditions:
-                shrinks = lambda at: self._named(HOPF, at, DETAILS[HOPF], 0)
-                yield Event(falls, shrinks, partial(_hopf_between, self.problem))
-            yield Event(falls, partial(self._ended, here, impact=i))
+                hopf_ending = lambda at: self._end_with(HOPF, at, DETAILS[HOPF], 0)
+                yield Event(approach, hopf_ending, partial(_hopf_between, self.problem))
+            yield Event(approach, partial(self._ending, here, impact=i))
         # Ignore rounding for events that always coincide.
-        together = ROUNDING * self.problem.radian
-        off = 0.0 if here.seen.order_margin > together else together
+        rounding = ROUNDING * self.problem.radian
+        slack = 0.0 if here.observed.order_margin > rounding else rounding
         for i, event in enumerate(self.problem.landings):
             detail = "a rest on a stop is lost: its chatter lasts until the release"
-            lost = partial(self._named, REST, detail=detail, impact=event)
-            yield Event(lambda step, i=i: -float(step.seen.escape[i]), lost)
+            rest_ending = partial(self._end_with, REST, detail=detail, impact=event)
+            yield Event(lambda step, i=i: -float(step.observed.escape_margin[i]), rest_ending)
         if self.problem.rests:
-            yield Event(least_hold_force, self._divided)
-        anew = lambda _: "a switch goes into another mode: the motion sticks or slips anew"
+            yield Event(least_hold_force, self._divided_rest)
+        new_mode = lambda _: "a switch goes into another mode: the motion sticks or slips anew"
         coincidence = partial(coincidence_in_words, self.problem)
-        ended = partial(self._ended, here)
-        yield Event(room, ended)
-        yield Event(lambda step: float(step.seen.order), partial(ended, other=anew))
+        ended = partial(self._ending, here)
+        yield Event(relative_clearance, ended)
+        yield Event(lambda step: float(step.observed.modes_agree), partial(ended, text=new_mode))
         yield Event(
-            lambda step: float(step.seen.order_margin) + off, partial(ended, other=coincidence)
+            lambda step: float(step.observed.order_margin) + slack, partial(ended, text=coincidence)
         )
 
-    def _ended(
+    def _ending(
         self, here: Step, at: Step, *, impact: int | None = None,
-        other: Callable[[Step], str] | None = None,
+        text: Callable[[Step], str] | None = None,
     ) -> Ending:  # fmt: skip
         """Return the end at a lost event, a touch, or a change in the order of events."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
-            return Ending(at, REST, self._merged(at, flight))
+            return Ending(at, REST, self._merged_rests(at, flight))
         change = change_at(self.problem, at)
         if change is not None:
-            at = refined(self.problem, at, change)
+            at = locate_change(self.problem, at, change)
         if change is not None and change.kind is not None:
-            name = MotionEvent(change.number).called(self.problem.machine)
+            switch_name = MotionEvent(change.number).name_on(self.problem.machine)
             place = place_in_words(self.problem, at, change.clock)
-            detail = SLIDING[change.kind][change.exists].format(name=name, place=place)
-            return self._named(change.kind, at, detail, impact)
-        if other is not None:
-            return self._named(GRAZING, at, other(at))
+            detail = SLIDING[change.kind][change.exists].format(name=switch_name, place=place)
+            return self._end_with(change.kind, at, detail, impact)
+        if text is not None:
+            return self._end_with(GRAZING, at, text(at))
         detail = grazing_in_words(self.problem, at, impact)
         if impact is None:
-            return self._named(GRAZING, at, detail)
+            return self._end_with(GRAZING, at, detail)
         # A multiplier goes to infinity there and returns from the other side. Its sign is that of
         # rounding, and the tests for bifurcations may have changed sign twice.
-        short = self._on_the_way(here, at, _BEFORE_POLE)
-        short = short if bool(short.good) else at
-        M, values = short.seen.monodromy, short.seen.multipliers
-        at = at._replace(seen=at.seen._replace(monodromy=M, multipliers=values))
-        return self._named(GRAZING, at, detail, impact)._replace(until=short)
+        before_pole = self._partway(here, at, _BEFORE_POLE)
+        before_pole = before_pole if bool(before_pole.good) else at
+        M, values = before_pole.observed.monodromy, before_pole.observed.multipliers
+        at = at._replace(observed=at.observed._replace(monodromy=M, multipliers=values))
+        return self._end_with(GRAZING, at, detail, impact)._replace(until=before_pole)
 
     def _origin_events(self, here: Step) -> Iterator[Event]:
         """Yield the rows of places where both halves of the period become equal, or images of each
         other. Beyond, the same motions repeat, half a period later or mirrored."""
-        for kind, apart in ((DOUBLING, self._halves), (SYMMETRY, self.images)):
-            begin = apart(here)
+        for kind, differ in ((DOUBLING, self._half_difference), (SYMMETRY, self.image_difference)):
+            begin = differ(here)
             if np.linalg.norm(begin) < ROUNDED:
                 continue
 
-            def ending(at: Step, kind=kind, apart=apart) -> Ending | None:
+            def ending(at: Step, kind=kind, differ=differ) -> Ending | None:
                 if kind == DOUBLING:
-                    sprung = self._find_origin(at)
-                    if sprung is None:
+                    found = self._find_origin(at)
+                    if found is None:
                         return None
-                    at, point = sprung
-                elif np.linalg.norm(apart(at)) > ALIKE:
+                    at, point = found
+                elif np.linalg.norm(differ(at)) > ALIKE:
                     return None
                 else:
                     at = self._crossing(here, at, FOLD)
                     point = self._point(kind, at, "the branch begins at a symmetric motion")
                 # Tests change sign twice there: locate earlier events from a point just before.
-                return Ending(at, kind, point, self._on_the_way(here, at, _SHORT))
+                return Ending(at, kind, point, self._partway(here, at, _SHORT))
 
-            along = lambda step, begin=begin, apart=apart: float(np.dot(begin, apart(step)))
-            yield Event(along, ending)
+            product = lambda step, begin=begin, differ=differ: float(np.dot(begin, differ(step)))
+            yield Event(product, ending)
 
-    def stalled(self, steps: list[Step]) -> Ending:
+    def stall_end(self, steps: list[Step]) -> Ending:
         """Return the end at the motion of half the period, if the branch begins at it close by."""
-        apart = np.linalg.norm(self._halves(steps[-1]))
-        sprung = self._find_origin(steps[-1]) if apart > ROUNDED else None
-        return super().stalled(steps) if sprung is None else Ending(sprung[0], DOUBLING, sprung[1])
+        size = np.linalg.norm(self._half_difference(steps[-1]))
+        found = self._find_origin(steps[-1]) if size > ROUNDED else None
+        return super().stall_end(steps) if found is None else Ending(found[0], DOUBLING, found[1])
 
     def _find_origin(self, at: Step) -> tuple[Step, Point] | None:
         """Return the step where the branch begins at a motion of half the period, and that one."""
-        apart, before = np.linalg.norm(self._halves(at)), alone(self.problem, at)
-        if apart > _ALMOST * ALIKE:
+        size, start = np.linalg.norm(self._half_difference(at)), in_one_parameter(self.problem, at)
+        if size > _ALMOST_ALIKE * ALIKE:
             return None
-        begins, half, step = origin(*before)
-        if apart > ALIKE and begins is before[1]:
+        begins, half, step = locate_origin(*start)
+        if size > ALIKE and begins is start[1]:
             return None
         at = at if self.problem.conditions else begins
         detail = "the branch begins at a motion of half the period"
         point = point_at(half, step, DOUBLING, detail, is_origin=True)
         return at, dataclasses.replace(point, further=further_of(self.problem, at))
 
-    def passed(self, here: Step, last: Step) -> Passed:
+    def points_between(self, here: Step, last: Step) -> Located:
         """Return bifurcations, extrema and zeros of watched functions between two points,
         sorted."""
-        found = [*self._bifurcations(here, last, _HALVES), *self._zeros(here, last)]
+        found = [*self._bifurcations(here, last, _MOST_HALVINGS), *self._zeros(here, last)]
         return sorted(found, key=lambda f: distance_along(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
         """Yield local extrema of quantities, and zeros of watched functions."""
-        known, before = self._known
-        before = before if np.array_equal(known, here.x) else self._numbers(here)
-        self._known = last.x, self._numbers(last)
+        known_x, before = self._last_numbers
+        before = before if np.array_equal(known_x, here.x) else self._numbers(here)
+        self._last_numbers = last.x, self._numbers(last)
         for (kind, name), (value, begin) in before.items():
-            other, end = self._known[1][kind, name]
+            other, end = self._last_numbers[1][kind, name]
             steep, least = max(abs(begin), abs(end)), _CHANGES * max(abs(value), abs(other))
             if not begin * end < 0 or (kind == EXTREMUM and steep <= least):
                 continue
-            at = self.where(here, last, lambda step, k=(kind, name): self._numbers(step)[k][1])
+            at = self.locate_zero(here, last, lambda s, k=(kind, name): self._numbers(s)[k][1])
             if at is None:
                 continue
-            value_there, rate = self._numbers(at)[kind, name]
+            value_at_zero, rate = self._numbers(at)[kind, name]
             if kind == WATCHED:
-                real, detail = abs(value_there) <= _ZERO * steep, f"{name} passes zero"
+                is_real, detail = abs(value_at_zero) <= _ZERO * steep, f"{name} passes zero"
             else:
-                sense, most = (1, "largest") if begin > 0 else (-1, "least")
+                sense, extreme = (1, "largest") if begin > 0 else (-1, "least")
                 # Otherwise it has a pole, as a multiplier at a grazing.
-                real = sense * value_there >= max(sense * value, sense * other) - least
+                is_real = sense * value_at_zero >= max(sense * value, sense * other) - least
                 corner = ", with a corner" if abs(rate) > _CORNER * steep else ""
-                detail = f"{name} = {value_there:.10g} is the {most} nearby{corner}"
-            if real:
+                detail = f"{name} = {value_at_zero:.10g} is the {extreme} nearby{corner}"
+            if is_real:
                 yield self._point(kind, at, detail, quantity=name), at
 
     def _numbers(self, step: Step) -> dict[tuple[str, str], tuple[float, float]]:
@@ -319,74 +319,74 @@ class MotionTable(Table):
             values, rates = rates_at(self.problem, self.extrema, step.x, direction)
             found = {(EXTREMUM, n): (float(values[n]), float(rates[n])) for n in self.extrema}
         if self.watched:
-            orbit = orbit_of(*alone(self.problem, step))
+            orbit = orbit_of(*in_one_parameter(self.problem, step))
             values = {name: float(function(orbit)) for name, function in self.watched.items()}
             found |= {(WATCHED, name): (x, x) for name, x in values.items()}
         return found
 
-    def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Passed:
+    def _bifurcations(self, here: Step, last: Step, halves_left: int) -> Located:
         """Return the bifurcations between two points, from the tests that change sign.
 
         The multipliers outside the unit circle are counted. If the bifurcations do not explain the
         change of their number, the step is halved: two that cross together leave no sign change.
         """
         held = bool(self.problem.conditions)
-        kinds, found, crossed = _changed(here, last, held=held), [], 0
-        apart = self._turn_apart(here, last) if TURNS in kinds and not held else ()
-        if apart:
-            return self._within((here, *apart, last), halves_left)
+        kinds, found, explained = _changed_tests(here, last, held=held), [], 0
+        sides = self._separate_turn(here, last) if TURNS in kinds and not held else ()
+        if sides:
+            return self._split_bifurcations((here, *sides, last), halves_left)
         for kind in kinds:
             at = self._bifurcation(kind, here, last)
-            found, crossed = [*found, *at], crossed + len(at) * _CROSS[kind]
-        before, after = _outside(here), _outside(last)
+            found, explained = [*found, *at], explained + len(at) * _CROSSING_MULTIPLIERS[kind]
+        before, after = _outside_count(here), _outside_count(last)
         if before is None or after is None:
             return found
-        more = abs(after - before)
-        if more <= crossed and (crossed - more) % 2 == 0:
+        change = abs(after - before)
+        if change <= explained and (explained - change) % 2 == 0:
             return found
-        middle = self._on_the_way(here, last, 0.5) if halves_left else None
+        middle = self._partway(here, last, 0.5) if halves_left else None
         if middle is None or not bool(middle.good):
-            return self._twice(here, last) or found
-        return self._within((here, middle, last), halves_left - 1)
+            return self._double_bifurcation(here, last) or found
+        return self._split_bifurcations((here, middle, last), halves_left - 1)
 
-    def _within(self, steps: tuple[Step, ...], halves_left: int) -> Passed:
+    def _split_bifurcations(self, steps: tuple[Step, ...], halves_left: int) -> Located:
         """Return the bifurcations in several parts of a step."""
         parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(steps))
         return list(itertools.chain.from_iterable(parts))
 
-    def _turn_apart(self, here: Step, last: Step) -> tuple[Step, ...]:
+    def _separate_turn(self, here: Step, last: Step) -> tuple[Step, ...]:
         """Return two points around the place where the branch turns back between two others, if a
         multiplier passes 1 there: the place is a fold, and a branch point lies within the same
-        step. If they are closer to each other than `BESIDE`, they count as one branch point."""
-        at = self.where(here, last, lambda step: tests_of(step)[TURNS])
+        step. If they are closer to each other than `SPACING`, they count as one branch point."""
+        at = self.locate_zero(here, last, lambda step: bifurcation_tests(step)[TURNS])
         if at is None:
             return ()
         root, length = (distance_along(self.problem, here, step) for step in (at, last))
-        if not BESIDE < root < length - BESIDE:
+        if not SPACING < root < length - SPACING:
             return ()
-        sides = [self.advance(here.x, here.tangent, root + x) for x in (-BESIDE, BESIDE)]
-        passes = [tests_of(step)[CROSSING] for step in sides]
+        sides = [self.advance(here.x, here.tangent, root + x) for x in (-SPACING, SPACING)]
+        passes = [bifurcation_tests(step)[CROSSING] for step in sides]
         # A point on the crossing branch has another tangent.
-        alike = np.dot(sides[0].tangent, sides[1].tangent) > _SAME_WAY
-        real = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
-        return tuple(sides) if real else ()
+        alike = np.dot(sides[0].tangent, sides[1].tangent) > _SAME_DIRECTION
+        is_fold = alike and all(bool(step.good) for step in sides) and passes[0] * passes[1] < 0
+        return tuple(sides) if is_fold else ()
 
-    def _twice(self, here: Step, last: Step) -> Passed:
+    def _double_bifurcation(self, here: Step, last: Step) -> Located:
         """Return the place between two close points where multipliers cross the circle together."""
-        outside = _outside(here)
-        at = self.where(here, last, lambda step: 1.0 if _outside(step) == outside else -1.0)
+        outside = _outside_count(here)
+        at = self.locate_zero(here, last, lambda s: 1.0 if _outside_count(s) == outside else -1.0)
         if at is None:
             return []
         if float(here.tangent[-1]) * float(last.tangent[-1]) < 0:  # other branches cross as well
             at = self._crossing(here, at, FOLD)
-        for kind, off in _offs(at).items():
-            if np.sum(np.abs(off) < 10 * _PASSES) > (2 if kind == TORUS else 1):
+        for kind, distances in _distances_from_circle(at).items():
+            if np.sum(np.abs(distances) < 10 * _AT_ZERO) > (2 if kind == TORUS else 1):
                 return [(self._point(kind, at, f"{DETAILS[kind]}; twice, at once"), at)]
         return []
 
-    def _bifurcation(self, kind: str, here: Step, last: Step) -> Passed:
+    def _bifurcation(self, kind: str, here: Step, last: Step) -> Located:
         """Return the bifurcation between two points at which a test changes its sign, if any."""
-        at = self.where(here, last, lambda step: tests_of(step)[kind])
+        at = self.locate_zero(here, last, lambda step: bifurcation_tests(step)[kind])
         if at is None:
             return []
         held = bool(self.problem.conditions)
@@ -394,13 +394,13 @@ class MotionTable(Table):
             return []  # rounding: the tangent is ill-defined close to a crossing of branches
         if kind in (FOLD, TURNS, CROSSING) and self._shrinks_to_rest(here, at, last):
             return []  # a multiplier is 1 there to rounding
-        if kind in (FOLD, TURNS, CROSSING) and self._springs(here, at):
+        if kind in (FOLD, TURNS, CROSSING) and self._begins_at(here, at):
             return []  # both tests are zero there
         if held and kind == TURNS:
             return [(self._point(TURN, at, DETAILS[TURN]), at)]
         if kind == TURNS or (kind == CROSSING and (self.symmetric or not held)):
             at = self._crossing(here, at, kind)
-        if np.abs(_offs(at)[kind]).min(initial=np.inf) >= _PASSES:
+        if np.abs(_distances_from_circle(at)[kind]).min(initial=np.inf) >= _AT_ZERO:
             return []
         detail = DETAILS[kind]
         if kind == TURNS:
@@ -414,32 +414,32 @@ class MotionTable(Table):
     def _shrinks_to_rest(self, here: Step, at: Step, last: Step) -> bool:
         if not self.problem.autonomous:
             return False
-        size, *beside = (_size_of(self.problem, step.x) for step in (at, here, last))
-        return size < _SHRINKS * max(beside)
+        size, *neighbours = (_size_of(self.problem, step.x) for step in (at, here, last))
+        return size < _SHRINKS * max(neighbours)
 
-    def _springs(self, here: Step, at: Step) -> bool:
+    def _begins_at(self, here: Step, at: Step) -> bool:
         """Return whether the branch begins there: halves of a period are equal, or images."""
-        apart, images = self._halves(at), self.images(at)
-        if apart.size and np.linalg.norm(apart) < ALIKE:
+        halves, images = self._half_difference(at), self.image_difference(at)
+        if halves.size and np.linalg.norm(halves) < ALIKE:
             return True
-        before = np.linalg.norm(self.images(here))
+        before = np.linalg.norm(self.image_difference(here))
         return bool(images.size and np.linalg.norm(images) < ALIKE and before > ROUNDED)
 
     def _crossing(self, here: Step, at: Step, kind: str) -> Step:
         def admits(step: Step, length: float) -> bool:
             # So close to the crossing the corrector may find the other branch.
-            return not self.symmetric or (kind == FOLD) != (self._asymmetry(step) < ALIKE * BESIDE)
+            return not self.symmetric or (kind == FOLD) != (self._asymmetry(step) < ALIKE * SPACING)
 
         root = distance_along(self.problem, here, at)
-        tested = lambda step: tests_of(step)[kind]
-        return crossing(self.problem, self.advance, here, root, tested, admits) or at
+        test = lambda step: bifurcation_tests(step)[kind]
+        return crossing(self.problem, self.advance, here, root, test, admits) or at
 
-    def _halves(self, step: Step) -> np.ndarray:
+    def _half_difference(self, step: Step) -> np.ndarray:
         """Return the difference of the period's halves; empty if they cannot be equal."""
-        return halves_apart(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
+        return half_difference(self.problem, step) if may_repeat(self.problem) else np.zeros(0)
 
     def _asymmetry(self, step: Step) -> float:
-        return float(np.linalg.norm(self.images(step)))
+        return float(np.linalg.norm(self.image_difference(step)))
 
 
 def _brief_flight(problem: Shooting, at: Step) -> int | None:
@@ -453,25 +453,25 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
     return first if lands and lengths[first] < _BRIEF * problem.radian else None
 
 
-def room(step: Step) -> float:
+def relative_clearance(step: Step) -> float:
     """Return the clearance as a share of its size; 1 for motions without a turn."""
-    return float(np.clip(step.seen.nearest.room / step.seen.nearest.unit, -1.0, 1.0))
+    return float(np.clip(step.observed.nearest.margin / step.observed.nearest.unit, -1.0, 1.0))
 
 
 def least_hold_force(step: Step) -> float:
     """Return the least force on a body within its rest, relative to the motion's; at most 1."""
-    unit = step.seen.length * (2 * np.pi / float(step.seen.duration)) ** 2
-    return float(np.clip(step.seen.pull.room / unit, -1.0, 1.0))
+    unit = step.observed.length * (2 * np.pi / float(step.observed.duration)) ** 2
+    return float(np.clip(step.observed.pull.margin / unit, -1.0, 1.0))
 
 
 # The number of multipliers that cross the unit circle at a change of sign of each test.
-_CROSS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
+_CROSSING_MULTIPLIERS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
 
 
-def tests_of(step: Step) -> dict[str, float]:
+def bifurcation_tests(step: Step) -> dict[str, float]:
     """Functions that change sign at the bifurcations."""
-    M, identity = step.seen.monodromy, np.eye(step.seen.monodromy.shape[0])
-    values = step.seen.multipliers
+    M, identity = step.observed.monodromy, np.eye(step.observed.monodromy.shape[0])
+    values = step.observed.multipliers
     with np.errstate(invalid="ignore"):  # without an answer of the corrector these are NaN
         doubling, crosses = np.linalg.det(M + identity), np.linalg.det(M - identity)
     pairs = [1 - a * b for a, b in itertools.combinations(values, 2)]
@@ -485,14 +485,14 @@ def tests_of(step: Step) -> dict[str, float]:
     }
 
 
-def _changed(here: Step, last: Step, *, held: bool) -> list[str]:
+def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:
     """Return the tests that change sign from one step to another.
 
     At a fold the parameter turns back as a multiplier passes 1. If only the parameter turns back,
     the multiplier touches 1, and the branch leaves another one to both sides. If quantities of the
     motion are `held`, the two are independent.
     """
-    before, after = tests_of(here), tests_of(last)
+    before, after = bifurcation_tests(here), bifurcation_tests(last)
     changed = [kind for kind in before if before[kind] * after[kind] < 0]
     # Without damping a pair stays on the unit circle, to rounding of either sign.
     if TORUS in changed and max(abs(before[TORUS]), abs(after[TORUS])) < NEUTRAL:
@@ -500,24 +500,24 @@ def _changed(here: Step, last: Step, *, held: bool) -> list[str]:
     if held and FOLD in changed:
         changed.remove(FOLD)
     elif FOLD in changed:
-        gone = (CROSSING, TURNS) if CROSSING in changed else (FOLD,)
-        changed = [kind for kind in changed if kind not in gone]
+        dropped = (CROSSING, TURNS) if CROSSING in changed else (FOLD,)
+        changed = [kind for kind in changed if kind not in dropped]
     return changed
 
 
-def _offs(step: Step) -> dict[str, np.ndarray]:
+def _distances_from_circle(step: Step) -> dict[str, np.ndarray]:
     """Return the distances of the multipliers from the crossing of each kind."""
-    values = step.seen.multipliers
+    values = step.observed.multipliers
     one, complex_ones = values - 1, np.abs(values[np.abs(values.imag) > 1e-9])
     return {
         DOUBLING: values + 1, TORUS: complex_ones - 1, FOLD: one, TURNS: one, CROSSING: one,
     }  # fmt: skip
 
 
-def _outside(step: Step) -> int | None:
+def _outside_count(step: Step) -> int | None:
     """Return the number of multipliers outside the unit circle; `None` if unknown or one is on
     it."""
-    sizes = np.abs(step.seen.multipliers)
+    sizes = np.abs(step.observed.multipliers)
     if not np.isfinite(sizes).all() or (np.abs(sizes - 1) < NEUTRAL).any():
         return None
     return int(np.sum(sizes > 1))
@@ -548,12 +548,12 @@ _ONE = 1e-6
 
 
 def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
-    moving = problem.flight(machine, 0).smooth
-    return ravel_pytree(moving.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
+    smooth = problem.flight(machine, 0).smooth
+    return ravel_pytree(smooth.field(jnp.zeros((), u.dtype), problem.unravel(u)))[0]
 
 
 @on_host
-def _leaving(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
+def _section_rate(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
     """Return the rate of a motion on its section, and its period."""
     machine = problem.at(x)
     u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
@@ -562,7 +562,7 @@ def _leaving(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
 
 def _size_of(problem: Shooting, x: Unknowns) -> float:
     """Return the distance that an autonomous motion would move in its period at its first rate."""
-    rate, period = _leaving(problem, x)
+    rate, period = _section_rate(problem, x)
     return float(np.linalg.norm(rate) * period)
 
 
@@ -572,19 +572,19 @@ def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     machine = problem.machine
     if problem.events != (section_of(machine, 0),) or jumps_on_section(machine):
         return None
-    rates = [_leaving(problem, step.x)[0] for step in (here, new)]
+    rates = [_section_rate(problem, step.x)[0] for step in (here, new)]
     if np.dot(*rates) >= 0:
         return None  # beyond an equilibrium the motion is reversed
     size, other = np.linalg.norm(rates, axis=1)
     guess = here.x + size / (size + other) * (new.x - here.x)
-    found = _imaginary(problem, guess)
+    found = _hopf_equilibrium(problem, guess)
     if found is None or np.linalg.norm(found[0] - guess) > np.linalg.norm(new.x - here.x):
         return None
-    return _about(problem, here, *found)
+    return _motion_about(problem, here, *found)
 
 
 @on_host
-def _linear(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
+def _linearise(problem: Shooting, x: Vector) -> tuple[Array, Scalar, Vector]:
     """Return the field's derivative in the state of `x`, the section there and its derivative."""
     machine, u = problem.at(x), problem.parts(x)[1][0]
     section, slope = jax.value_and_grad(lambda u: section_in(machine, problem.unravel(u)))(u)
@@ -598,35 +598,35 @@ def _residual(problem: Shooting, y: Vector, scale: Vector, like: Array) -> tuple
     phase."""
     n = problem.states
 
-    def missing(y):
-        at, (c, d) = y * scale, y[n + 2 :].reshape(2, n)
-        u, turn, (a, b) = at[:n], at[n + 1], at[n + 2 :].reshape(2, n)
-        field = partial(_rate, problem, problem.at(at[: n + 1]))
+    def residual(y):
+        unknowns, (c, d) = y * scale, y[n + 2 :].reshape(2, n)
+        u, omega, (a, b) = unknowns[:n], unknowns[n + 1], unknowns[n + 2 :].reshape(2, n)
+        field = partial(_rate, problem, problem.at(unknowns[: n + 1]))
         matrix = jax.jacfwd(field)(u)
-        rates = jnp.stack([field(u), matrix @ a + turn * b, matrix @ b - turn * a])
-        sized = jnp.stack([like[0] @ c + like[1] @ d - 1, like[0] @ d - like[1] @ c])
-        return jnp.concatenate([(rates / (scale[:n] * scale[n + 1])).ravel(), sized])
+        rates = jnp.stack([field(u), matrix @ a + omega * b, matrix @ b - omega * a])
+        normalisation = jnp.stack([like[0] @ c + like[1] @ d - 1, like[0] @ d - like[1] @ c])
+        return jnp.concatenate([(rates / (scale[:n] * scale[n + 1])).ravel(), normalisation])
 
-    return missing(y), jax.jacfwd(missing)(y)
+    return residual(y), jax.jacfwd(residual)(y)
 
 
-def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _hopf_equilibrium(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the equilibrium near a guess with imaginary eigenvalues, and an eigenvector."""
-    n, turn, matrix = problem.states, 2 * np.pi / guess[0], _linear(problem, guess)[0]
+    n, omega, matrix = problem.states, 2 * np.pi / guess[0], _linearise(problem, guess)[0]
     if not np.isfinite(matrix).all():
         return None
     sizes = problem.scale[1 : n + 1]
-    scale = np.concatenate([problem.scale[1:], [turn], sizes, sizes])
+    scale = np.concatenate([problem.scale[1:], [omega], sizes, sizes])
     values, vectors = np.linalg.eig(matrix * sizes / sizes[:, None])
-    first = vectors[:, np.argmin(np.abs(values - 1j * turn))]
-    like = np.stack([np.real(first), np.imag(first)])
+    nearest = vectors[:, np.argmin(np.abs(values - 1j * omega))]
+    like = np.stack([np.real(nearest), np.imag(nearest)])
     y, size = np.concatenate([guess[1:] / scale[: n + 1], [1.0], like.ravel()]), np.inf
     for _ in range(20):
-        missing, jacobian = _residual(problem, y, scale, like)
-        if not (np.isfinite(missing).all() and np.isfinite(jacobian).all()):
+        residual, jacobian = _residual(problem, y, scale, like)
+        if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
             return None
-        move = np.linalg.lstsq(jacobian, missing)[0]  # the smallest if a component is neutral
-        y, size = y - move, np.abs(move).max()
+        step = np.linalg.lstsq(jacobian, residual)[0]  # the smallest if a component is neutral
+        y, size = y - step, np.abs(step).max()
         if size <= 1e-14:
             break
     if not size < _VANISHES or abs(y[n + 1] - 1) >= _ALIKE_PERIOD:
@@ -636,16 +636,16 @@ def _imaginary(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.append(2 * np.pi / y[n + 1], y[: n + 1]), vector / np.linalg.norm(vector)
 
 
-def _about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
+def _motion_about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
     """Return a tiny motion about an equilibrium, where it passes the section."""
-    _, section, slope = _linear(problem, x)
-    seen, steep = slope @ vector, np.linalg.norm(slope)
-    apart = np.linalg.norm(here.x[1:-1] - x[1:-1])
-    if abs(seen) <= _VANISHES * steep or abs(section) > _VANISHES * steep * apart:
+    _, section, slope = _linearise(problem, x)
+    section_part, steep = slope @ vector, np.linalg.norm(slope)
+    distance = np.linalg.norm(here.x[1:-1] - x[1:-1])
+    if abs(section_part) <= _VANISHES * steep or abs(section) > _VANISHES * steep * distance:
         return None  # the motion does not cross the section
     # The phase of the linear motion in which the section rises through zero.
-    way = (vector * (-1j * np.conj(seen))).real
-    way = np.concatenate([[0.0], way / np.linalg.norm(way), [0.0]])
-    x = x + _TINY * apart * way
-    found = here._replace(x=x, tangent=-way, seen=observe(problem, x))
-    return found if np.abs(found.seen.multipliers - 1).min() < _ONE else None
+    direction = (vector * (-1j * np.conj(section_part))).real
+    direction = np.concatenate([[0.0], direction / np.linalg.norm(direction), [0.0]])
+    x = x + _TINY * distance * direction
+    found = here._replace(x=x, tangent=-direction, observed=observe(problem, x))
+    return found if np.abs(found.observed.multipliers - 1).min() < _ONE else None

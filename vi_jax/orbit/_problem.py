@@ -74,7 +74,7 @@ def has_fixed_steps(method: AbstractMethod) -> bool:
 
 
 def fixed_step_method(
-    asked: MethodLike, found_with: AbstractMethod, machine: AbstractMachine
+    given: MethodLike, orbit_method: AbstractMethod, machine: AbstractMachine
 ) -> AbstractMethod:
     """Choose a method of fixed steps for the branch of an orbit.
 
@@ -85,11 +85,11 @@ def fixed_step_method(
 
     **Raises:** `ValueError` if the argument is explicit and sizes its steps by a tolerance.
     """
-    method = found_with if asked is None else asked
+    method = orbit_method if given is None else given
     if isinstance(method, Adaptive) and method.solver.implicit:
         return ImplicitSteps(method.solver, 20)
-    if asked is not None:
-        method = chosen(machine, asked)
+    if given is not None:
+        method = chosen(machine, given)
         if not has_fixed_steps(method):
             raise ValueError(
                 "Argument `method` must be of fixed steps to follow an orbit, as `FixedStep(...)`, "
@@ -98,8 +98,8 @@ def fixed_step_method(
             )
         method.check(machine)
         return method
-    if has_fixed_steps(found_with):
-        return found_with
+    if has_fixed_steps(orbit_method):
+        return orbit_method
     return chosen(machine, None, FixedStep(steps_per_cycle=20))
 
 
@@ -108,7 +108,7 @@ def steps_of(
 ) -> int:
     """Return the steps of a flight over so many cycles, for the most demanding of the machines."""
     # Turning points are sought between steps: this needs more steps than the flight itself.
-    fewest = (ceil(1.02 * float(_fewest(method, machine, like))) for machine in machines)
+    fewest = (ceil(1.02 * float(_fewest_steps(method, machine, like))) for machine in machines)
     return max(method.steps_per_cycle, 16, *fewest) * cycles
 
 
@@ -129,7 +129,7 @@ def cycles_to_fly(problem: Shooting, x: Unknowns) -> int:
 
 
 @compiled
-def _fewest(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
+def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State) -> Scalar | float:
     return machine.cycle / method.longest(machine, jnp.zeros(()), like)
 
 
@@ -163,22 +163,22 @@ Modes = tuple[tuple[float, ...], ...]
 
 
 def check_parameter(
-    machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], whose: str,
+    machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], owner: str,
     argument: str = "bounds",
 ) -> None:  # fmt: skip
     """Check that an interval of a parameter contains its value and that the machine is valid at
-    both ends, else raise `ValueError`; `whose` names the owner of the value in the message."""
+    both ends, else raise `ValueError`; `owner` names the owner of the value in the message."""
     low, high = interval
     if not low <= value <= high:
         raise ValueError(
-            f"Argument `{argument}` must hold the {whose}'s {name} = {value:g}, but is "
+            f"Argument `{argument}` must hold the {owner}'s {name} = {value:g}, but is "
             f"({low:g}, {high:g})."
         )
     for end in interval:
-        there = with_leaf(machine, name, end)
+        changed = with_leaf(machine, name, end)
         try:
-            check_again(there)
-            check_parts(there)
+            check_again(changed)
+            check_parts(changed)
         except ValueError as error:
             raise ValueError(
                 f"Argument `{argument}` must leave the machine valid, but at {name} = {end:g}: "
@@ -191,7 +191,7 @@ def problem_of(
 ) -> tuple[Shooting, np.ndarray]:
     """Return the equations of an orbit from impact to impact, and its values of the unknowns."""
     machine = orbit.machine
-    carried = fixed_step_method(method, orbit.method, machine)
+    stepper = fixed_step_method(method, orbit.method, machine)
     corners = [with_leaf(machine, parameter, end) for end in bounds]
     cycles = int(orbit.cycles)
     if int(np.sum(np.asarray(orbit.impact_stop) >= 0)) != int(orbit.impacts):
@@ -206,25 +206,25 @@ def problem_of(
             "`ends_cycle` if it happens at `t - cycle`, or make the clock a component of the state."
         )
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
-    places, events = [place for place, _ in found], tuple(event for _, event in found)
-    needed = longest_leg(places, events, period, cycles)
-    steps = steps_of(carried, corners, without_modes(orbit.state), needed)
+    clocks, events = [place for place, _ in found], tuple(event for _, event in found)
+    cycles_needed = longest_leg(clocks, events, period, cycles)
+    steps = steps_of(stepper, corners, without_modes(orbit.state), cycles_needed)
     blank = Shooting(
-        machine, carried, without_modes(orbit.state), cycles, (), (), steps, (parameter,)
+        machine, stepper, without_modes(orbit.state), cycles, (), (), steps, (parameter,)
     )
-    states, modes = _followed(blank, orbit.state, found, period)
+    states, modes = _follow_events(blank, orbit.state, found, period)
     _check_instants(blank, found, states, modes)
-    while sized_by_motion(blank) and 2 * blank.steps <= _MOST:
+    while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
         before = states
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
-        states, modes = _followed(blank, orbit.state, found, period)
+        states, modes = _follow_events(blank, orbit.state, found, period)
         if np.max(np.abs(states - before) / _sizes(blank, states)) < _SETTLED:
             break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
-    x = problem.pack(np.asarray(places), states, [leaf(machine, parameter)], period)
-    return sized(problem, x), np.asarray(x)
+    x = problem.pack(np.asarray(clocks), states, [leaf(machine, parameter)], period)
+    return with_sizes(problem, x), np.asarray(x)
 
 
 def _ends(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Scalar]:
@@ -233,17 +233,17 @@ def _ends(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> 
     return [guard_of(machine, n, s, state, modes) for n in numbers]
 
 
-def sized(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
+def with_sizes(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None) -> Shooting:
     """Set the sizes of the clock (a cycle is 2π) and of the components of the state."""
     _, states, period = problem.values(x)
     sizes = _sizes(problem, states)
     if largest is not None and np.isfinite(largest).all():
         sizes = _sizes(problem, largest, _NOTHING)
-    turn = period / problem.cycles / (2 * np.pi)
-    return dataclasses.replace(problem, sizes=jnp.append(turn, sizes))
+    radian = period / problem.cycles / (2 * np.pi)
+    return dataclasses.replace(problem, sizes=jnp.append(radian, sizes))
 
 
-def grown(problem: Shooting, largest: np.ndarray) -> Shooting | None:
+def with_grown_sizes(problem: Shooting, largest: np.ndarray) -> Shooting | None:
     """Return the equations with the sizes of a motion that has doubled, else `None`."""
     before, now = np.asarray(problem.sizes), 0.5 * np.asarray(largest)
     if not (now > 2 * before[1:]).any():
@@ -256,13 +256,13 @@ def _sizes(problem: Shooting, states: np.ndarray, small: float = _SMALL) -> np.n
     """Return half the largest modulus of each component of some states, (…, states). A component
     that is a small share of the others gets the size that its rates give it, else that of the
     largest of all, at most 1: it may be larger elsewhere."""
-    most = np.abs(np.atleast_2d(states)).max(axis=0)
-    largest = most.max() if most.max() > _REST else 1.0
-    if (most > small * largest).all():
-        return 0.5 * most
-    usual = sizes_on_host(problem.machine, problem.like, states)
-    usual = np.where(usual == 1, min(largest, 1.0), usual)
-    return 0.5 * np.where(most > small * usual, most, usual)
+    maxima = np.abs(np.atleast_2d(states)).max(axis=0)
+    largest = maxima.max() if maxima.max() > _REST else 1.0
+    if (maxima > small * largest).all():
+        return 0.5 * maxima
+    expected = sizes_on_host(problem.machine, problem.like, states)
+    expected = np.where(expected == 1, min(largest, 1.0), expected)
+    return 0.5 * np.where(maxima > small * expected, maxima, expected)
 
 
 def _check_instants(
@@ -270,65 +270,65 @@ def _check_instants(
 ) -> None:
     """Raise `ValueError` for an event that another event or the restart of the clock triggers: its
     guard is not zero there, so that the equations cannot contain it."""
-    machine, last = blank.machine, 0.0
+    machine, previous = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
-        if abs(place - last) <= _SAME_INSTANT and event.cycle is None:
+        if abs(place - previous) <= _SAME_INSTANT and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
             if abs(float(guard_at(before, event, jnp.asarray(place), state))) > _OFF_ZERO:
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
-                    f"{event.called(machine)} does, with another event or as a cycle begins. "
+                    f"{event.name_on(machine)} does, with another event or as a cycle begins. "
                     "Combine simultaneous events in one, and begin cycles where no guard jumps."
                 )
-        last = place
+        previous = place
 
 
-def sized_by_motion(problem: Shooting) -> bool:
+def steps_depend_on_motion(problem: Shooting) -> bool:
     """Return whether the number of steps depends on the motion, as its pace may be slow."""
     machine = problem.machine
     paced = machine.pace(jnp.zeros(()), problem.like) is not None
     return paced or not scales_known(machine) or isinstance(problem.method, ImplicitSteps)
 
 
-def finer(problem: Shooting, x: Unknowns, off: float) -> Shooting | None:
-    """Return the equations with the steps and the tolerance that a solution needs; `off` is its
+def with_finer_steps(problem: Shooting, x: Unknowns, error: float) -> Shooting | None:
+    """Return the equations with the steps and the tolerance that a solution needs; `error` is its
     present `step_error`. `None` if more steps change nothing or are not allowed."""
-    more = None
+    refined = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
         problem = dataclasses.replace(problem, method=method, steps=steps)
-        before, off = off, step_error(problem, x)
-        if not off < 0.5 * before:  # rounding
+        before, error = error, step_error(problem, x)
+        if not error < 0.5 * before:  # rounding
             break
-        more = problem
-        if off < _SETTLED:
+        refined = problem
+        if error < _SETTLED:
             break
-    return more
+    return refined
 
 
-def _followed(
+def _follow_events(
     blank: Shooting, state: State, found: list[Placed], period: float
 ) -> tuple[np.ndarray, Modes]:
     """Return the states just before each event and at the end of one period, and the modes."""
     machine = blank.machine
-    own, state = modes_of(state), without_modes(state)
-    modes = begin_modes(machine, jnp.zeros(()), state, own)
+    machine_modes, state = modes_of(state), without_modes(state)
+    modes = begin_modes(machine, jnp.zeros(()), state, machine_modes)
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
     # With clocks and steps as arguments, all flights share one program.
-    carried = partial(_carry, dataclasses.replace(blank, steps=1), float(blank.steps))
+    fly = partial(_fly, dataclasses.replace(blank, steps=1), float(blank.steps))
     for place, event in found:
         if place > s:
-            u = carried(modes, s, place, u)
+            u = fly(modes, s, place, u)
         states.append(np.asarray(u))
-        here = blank.unravel(jnp.asarray(u))
+        after = blank.unravel(jnp.asarray(u))
         if (place, event.cycle) != (0.0, 0):  # the orbit's state is after that one
-            here, modes = after_event(machine, event.number, jnp.asarray(place), here, modes)
+            after, modes = after_event(machine, event.number, jnp.asarray(place), after, modes)
         in_flight.append(tuple(float(m) for m in modes))
-        u, s = ravel_pytree(here)[0], place
-    states.append(np.asarray(carried(modes, s, period, u)))
+        u, s = ravel_pytree(after)[0], place
+    states.append(np.asarray(fly(modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
     if first is not None and (jumps_on_section(machine) or first != section_of(machine, 0)):
         states[0] = states[-1]
@@ -344,11 +344,11 @@ def events_in(orbit: Orbit) -> list[Placed]:
     found = [(float(s), Event(int(i))) for s, i in zip(clock, stops, strict=True) if i >= 0]
     begins = float(machine.cycle) * np.arange(cycles)
     ends = any(stop.ends_cycle for stop in stops_of(machine))
-    others = bool(switches_of(machine) or others_of(machine) or ends)
-    if others or (autonomous and cycles > 1):
-        begins, listed = _listed_events(orbit)
-        found = listed if others else found
-    if counts_turns(machine) and found and not renews(machine) and _repeats(orbit):
+    has_other_events = bool(switches_of(machine) or others_of(machine) or ends)
+    if has_other_events or (autonomous and cycles > 1):
+        begins, other_events = _listed_events(orbit)
+        found = other_events if has_other_events else found
+    if counts_turns(machine) and found and not renews(machine) and _repeats_each_turn(orbit):
         return found  # these may pass sections, at which nothing happens
     if section_in(machine, without_modes(orbit.state)) is not None or renews(machine):
         found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
@@ -361,28 +361,28 @@ def events_in(orbit: Orbit) -> list[Placed]:
 _AROUND, _LATER, _DIFFERS = 7, 0.37, 1e-8
 
 
-def _repeats(orbit: Orbit) -> bool:
+def _repeats_each_turn(orbit: Orbit) -> bool:
     """Return whether a machine with turns is the same a turn earlier and later, at any time."""
-    around = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
+    angles = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
     turns = 2 * np.pi * np.array([0.0, -1.0, 1.0, 0.0])[:, None]
     clocks = np.array([0.0, 0.0, 0.0, _LATER * float(orbit.duration)])[:, None]
     machine, state = orbit.machine, without_modes(orbit.state)
-    found = _around(machine, state, modes_of(orbit.state), clocks, around + turns)
-    here, *others = np.asarray(found)
+    values = _rates_at(machine, state, modes_of(orbit.state), clocks, angles + turns)
+    here, *others = np.asarray(values)
     return bool((np.abs(others - here) <= _DIFFERS * np.abs(here).max(axis=0)).all())
 
 
 @compiled
-def _around(machine: AbstractMachine, state: State, own: Any, clocks: Any, angles: Any) -> Any:
+def _rates_at(machine: AbstractMachine, state: State, given: Any, clocks: Any, angles: Any) -> Any:
     """Return rates and guards of a machine at these clocks and angles beyond the state's."""
     turn = counter_of(machine)
     assert isinstance(turn, Turn)
 
     def at(s, angle):
-        there = with_component(turn.name, state, component(turn.name, state) + angle)
-        modes = begin_modes(machine, s, there, own)
-        rates = SmoothMachine(machine, modes, ()).field(s, there)
-        guards = [guard_of(machine, n, s, there, modes) for n in range(section_number(machine))]
+        turned = with_component(turn.name, state, component(turn.name, state) + angle)
+        modes = begin_modes(machine, s, turned, given)
+        rates = SmoothMachine(machine, modes, ()).field(s, turned)
+        guards = [guard_of(machine, n, s, turned, modes) for n in range(section_number(machine))]
         return jnp.stack([*raveled(rates)[0], *guards])
 
     return jnp.vectorize(at, signature="(),()->(n)")(clocks, angles)
@@ -397,7 +397,7 @@ def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
         raise ValueError(
             f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
         )
-    begins = _begins(run, machine, is_autonomous(machine, without_modes(orbit.state)))
+    begins = _cycle_begins(run, machine, is_autonomous(machine, without_modes(orbit.state)))
     found, events = [], events_of(machine)
     for n, s, kind, i in logged_events(machine, run):
         if kind in (EventKind.rest, EventKind.release):
@@ -424,7 +424,7 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
 
 
 @on_host
-def _carry(blank: Shooting, steps, modes, s0, s1, u):
+def _fly(blank: Shooting, steps, modes, s0, s1, u):
     """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
     return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
 
@@ -439,9 +439,7 @@ _EARLIER = 1e-7
 # A hop longer than a fifth of a cycle, the longest step of a simulation, is not part of a chatter.
 _SHORT = 5
 
-_INSTEAD = (
-    "Find such motions value by value: `find_orbit` with another parameter, from this motion."
-)
+_ADVICE = "Find such motions value by value: `find_orbit` with another parameter, from this motion."
 
 # A body this close to its stop (relative to the motion, see `distance`) is on it: a choice.
 _ON = 1e-9
@@ -453,17 +451,17 @@ def resting_problem_of(
     """Return the equations of a motion that rests on stops, and its values of the unknowns. Bodies
     must chatter one at a time, and no switch may change with their hops."""
     machine, state, cycles = orbit.machine, without_modes(orbit.state), int(orbit.cycles)
-    flying = fixed_step_method(method, orbit.method, machine)
+    stepper = fixed_step_method(method, orbit.method, machine)
     autonomous = is_autonomous(machine, state)
-    followed = not autonomous or (counts_turns(machine) and _repeats(orbit))
-    if not followed or renews(machine) or has_contact_friction(machine):
+    is_supported = not autonomous or (counts_turns(machine) and _repeats_each_turn(orbit))
+    if not is_supported or renews(machine) or has_contact_friction(machine):
         raise ValueError(
             f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has `renewed`, "
             "friction on a stop or cycles that another event than a turn ends, and cannot be "
-            f"followed. {_INSTEAD}"
+            f"followed. {_ADVICE}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
-    begins = _begins(run, machine, autonomous)
+    begins = _cycle_begins(run, machine, autonomous)
     log = [(begins[n] + s, kind, number) for n, s, kind, number in logged_events(machine, run)]
     events = _grouped(log, begins[-1] / cycles, begins[-1])
     if autonomous and events == []:
@@ -472,28 +470,28 @@ def resting_problem_of(
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
             "in whose last hops no switch changes, but several bodies chatter together or a switch "
-            f"changes. {_INSTEAD}"
+            f"changes. {_ADVICE}"
         )
     corners = [with_leaf(machine, parameter, end) for end in bounds]
-    order, steps = tuple(event for _, event in events), steps_of(flying, corners, state, cycles)
+    order, steps = tuple(event for _, event in events), steps_of(stepper, corners, state, cycles)
     problem = Shooting(
-        machine, flying, state, cycles, order, ((),) * max(1, len(events)), steps, (parameter,),
+        machine, stepper, state, cycles, order, ((),) * max(1, len(events)), steps, (parameter,),
         held=_contact(machine, state, order),
     )  # fmt: skip
     clock = np.array([place for place, _ in events])
-    rows = _before(problem, orbit, run, clock - _EARLIER * begins[-1] / cycles, begins)
-    modes = _modes(problem, orbit.state, clock, rows, begins[-1])
+    rows = _states_at(problem, orbit, run, clock - _EARLIER * begins[-1] / cycles, begins)
+    modes = _modes_in_legs(problem, orbit.state, clock, rows, begins[-1])
     problem = dataclasses.replace(problem, modes=modes)
     rows = rows if events else np.asarray(raveled(orbit.state)[0])
     x = np.asarray(problem.pack(clock, rows, [leaf(machine, parameter)], begins[-1]))
-    problem = sized(problem, x)
-    off = step_error(problem, x) if sized_by_motion(problem) else 0.0
-    if off > COARSE:
-        problem = finer(problem, x, off) or problem
+    problem = with_sizes(problem, x)
+    error = step_error(problem, x) if steps_depend_on_motion(problem) else 0.0
+    if error > COARSE:
+        problem = with_finer_steps(problem, x, error) or problem
     return problem, x
 
 
-def _begins(run: Run, machine: AbstractMachine, autonomous: bool) -> np.ndarray:
+def _cycle_begins(run: Run, machine: AbstractMachine, autonomous: bool) -> np.ndarray:
     """Return the clocks at which the cycles of a run begin, and that at its end."""
     n = len(np.asarray(run.impacts))
     if not autonomous:
@@ -502,26 +500,26 @@ def _begins(run: Run, machine: AbstractMachine, autonomous: bool) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.asarray(run.duration))])
 
 
-def _before(
+def _states_at(
     problem: Shooting, orbit: Orbit, run: Run, clocks: np.ndarray, begins: np.ndarray
 ) -> np.ndarray:
     """Return the states of a motion at some clocks since its section, (clocks, states)."""
     sections, found = np.asarray(in_rows(orbit.sections, 1)), []
     for clock in clocks % begins[-1]:
         n = int(np.searchsorted(begins, clock, side="right")) - 1
-        row, own = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
+        row, modes = jnp.asarray(sections[n]), tuple(mode[n] for mode in run.modes)
         place = jnp.asarray(clock - begins[n])
         u = np.asarray(
-            _state_at(orbit.machine, orbit.method, without_modes(orbit.state), row, own, place)
+            _state_at(orbit.machine, orbit.method, without_modes(orbit.state), row, modes, place)
         )
         if problem.omits_sections:
-            u = problem.in_turn(n, u)
+            u = problem.within_turn(n, u)
         found.append(u)
     return np.reshape(found, (len(clocks), sections.shape[1]))
 
 
 @compiled
-def _state_at(machine, method, like, row, own, clock):
+def _state_at(machine, method, like, row, modes, clock):
     """Return the state at a clock in the cycle that begins with these components and modes."""
     unravel = ravel_pytree(like)[1]
     options = RunOptions(method=method, record="sections", rests=True)
@@ -529,11 +527,11 @@ def _state_at(machine, method, like, row, own, clock):
         machine = machine.observed_every(clock)
     else:
         options = dataclasses.replace(options, until=clock)
-    start = lambda u: (machine, with_modes(unravel(u), own))
+    start = lambda u: (machine, with_modes(unravel(u), modes))
     return in_rows(simulate_pool(start, row[None], 1, options).sections, 2)[0, -1]
 
 
-def _modes(
+def _modes_in_legs(
     problem: Shooting, state: Any, clocks: np.ndarray, rows: np.ndarray, period: float
 ) -> Modes:
     """Return the machine's modes in each leg, from the first state and each event's."""
@@ -559,8 +557,8 @@ def _contact(machine: AbstractMachine, state: Any, events: tuple[Event, ...]) ->
     for i, stop in enumerate(stops):
         position = machine.coordinates[stop.coordinate].position
         place, unit = position(state), float(size_of(position, state, sizes))
-        on = abs(float(stop.beyond(place))) < _ON * (unit + abs(float(place)))
-        if on and stop.coordinate not in moves:
+        on_stop = abs(float(stop.beyond(place))) < _ON * (unit + abs(float(place)))
+        if on_stop and stop.coordinate not in moves:
             contact[stop.coordinate] = 1.0 + i
     return tuple(contact)
 
@@ -579,10 +577,10 @@ def _grouped(log: list[tuple[float, int, int]], cycle: float, period: float) -> 
     if first is None:
         rests = any(kind == EventKind.rest for _, kind, _ in log)
         return None if rests else [(clock, Event(number)) for clock, _, number in log]
-    later = [(clock + period, kind, number) for clock, kind, number in log[:first]]
-    log, found = log[first:] + later, []
-    first_of = {n: kind for _, kind, n in reversed(log) if kind != EventKind.impact}
-    resting = {n for n, kind in first_of.items() if kind == EventKind.release}
+    shifted = [(clock + period, kind, number) for clock, kind, number in log[:first]]
+    log, found = log[first:] + shifted, []
+    first_kinds = {n: kind for _, kind, n in reversed(log) if kind != EventKind.impact}
+    resting = {n for n, kind in first_kinds.items() if kind == EventKind.release}
     for clock, kind, number in log:
         if kind not in (EventKind.rest, EventKind.release):
             found.append((clock, Event(number)))

@@ -44,7 +44,7 @@ from ..machine import (
     with_component,
     with_leaf,
 )
-from ._chatter import Hops, escape, hopped, remaining
+from ._chatter import Chatter, escape_margin, last_hop, remaining
 from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
 from ._turns import Nearest, Path, pull_of, turns_of
 from .results import multipliers_of
@@ -74,10 +74,10 @@ class Observed(NamedTuple):
     """Smallest position of the first coordinate over the period."""
     y_max: Scalar
     nearest: Nearest
-    """Over all turning points; its `room` is the clearance."""
+    """Over all turning points; its `margin` is the clearance."""
     pull: Nearest
-    """The least extremum of the force on a resting body; its `room` is that force."""
-    order: Scalar
+    """The least extremum of the force on a resting body; its `margin` is that force."""
+    modes_agree: Scalar
     """1 if each event puts its switch into the mode of its leg, else -1."""
     order_margin: Scalar
     """Margin until the order of events changes: the least time between consecutive events, or the
@@ -89,7 +89,7 @@ class Observed(NamedTuple):
     """The machine's averages over the period."""
     largest: Float[Array, " states"]
     """The largest modulus of each component of the state over the period; NaN if unknown."""
-    escape: Float[Array, " landings"] | None = None
+    escape_margin: Float[Array, " landings"] | None = None
     """χ of each chatter that ends in a rest; negative while the chatter ends before the release."""
 
     @property
@@ -100,7 +100,7 @@ class Observed(NamedTuple):
 
     def admissible(self, events: Sequence[int]) -> bool:
         """Return whether it stays inside the stops and approaches these events; host-side."""
-        inside = self.nearest.room >= -ROUNDING * self.nearest.unit
+        inside = self.nearest.margin >= -ROUNDING * self.nearest.unit
         slowest = np.asarray(self.approach / self.units)[list(events)].min(initial=0.0)
         return bool(inside and slowest >= -ROUNDING)
 
@@ -203,7 +203,7 @@ class Shooting(eqx.Module):
         assert isinstance(counter, Turn)
         return counter
 
-    def in_turn(self, number: int, states: np.ndarray) -> np.ndarray:
+    def within_turn(self, number: int, states: np.ndarray) -> np.ndarray:
         """Return states, the last axis, with the angle that turns within turn number `number`."""
         begin, turns = float(self.turn.start), 2 * np.pi * number
         inside = begin + turns + np.mod(states - begin, 2 * np.pi)
@@ -235,12 +235,12 @@ class Shooting(eqx.Module):
         """`Flight.contact` of each coordinate in each leg; empty without rests."""
         if not self.landings:
             return (self.held,) * self.legs
-        held, found = list(self.held) or [0.0] * len(self.machine.coordinates), []
+        contact, found = list(self.held) or [0.0] * len(self.machine.coordinates), []
         for event in 2 * self.events:
             if event.use:
                 stop = stops_of(self.machine)[event.number]
-                held[stop.coordinate] = 1.0 + event.number if event.use == LANDS else 0.0
-            found.append(tuple(held))
+                contact[stop.coordinate] = 1.0 + event.number if event.use == LANDS else 0.0
+            found.append(tuple(contact))
         return tuple(found[self.legs :])
 
     def at(self, x: Unknowns) -> AbstractMachine:
@@ -261,8 +261,8 @@ class Shooting(eqx.Module):
         x = np.asarray(x)
         end = x.size - len(self.parameters)
         machine = self._with_parameters([np.asarray(value) for value in x[end:]])
-        alone: Any = {"parameters": (), "conditions": (), "widths": ()}
-        return dataclasses.replace(self, machine=machine, **alone), x[:end]
+        cleared: Any = {"parameters": (), "conditions": (), "widths": ()}
+        return dataclasses.replace(self, machine=machine, **cleared), x[:end]
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
         """Return the machines at the ends of these intervals of the parameters."""
@@ -330,7 +330,7 @@ class Shooting(eqx.Module):
         modes = jnp.asarray(self.modes, jnp.result_type(float))[leg]
         return tuple(modes[j] for j in range(len(self.modes[0])))
 
-    def _each(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
+    def _for_event(self, leg: Leg, function: Callable[..., Any], *inputs: Any) -> Any:
         """Return `function(event, *inputs)` for the event that begins a leg, maybe traced."""
         kinds = sorted(set(self.events))
         which = jnp.asarray([kinds.index(event) for event in self.events])[leg]
@@ -339,14 +339,14 @@ class Shooting(eqx.Module):
     def after(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Vector:
         """Return R(u), the state after the event that begins a leg."""
 
-        def new(event, s, u):
+        def jumped(event, s, u):
             if event.use == LEAVES:
                 return u
             before, state = self.flight(machine, leg - 1), self.unravel(u)
-            new = after_event(machine, event.number, s, state, before.modes, before.contact)[0]
-            return ravel_pytree(new)[0]
+            jumped = after_event(machine, event.number, s, state, before.modes, before.contact)[0]
+            return ravel_pytree(jumped)[0]
 
-        return self._each(leg, new, s, u) if self.events else u
+        return self._for_event(leg, jumped, s, u) if self.events else u
 
     def guard(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return g(s, u), which is zero and rising at the event that begins a leg."""
@@ -356,7 +356,7 @@ class Shooting(eqx.Module):
         def value(event, s, u):
             return guard_at(before, event, s, self.unravel(u))
 
-        return self._each(leg, value, s, u)
+        return self._for_event(leg, value, s, u)
 
     def ends(self, clock: Float[Array, " legs"], period: Scalar) -> Float[Array, " legs"]:
         return jnp.concatenate([clock[1:], clock[:1] + period])
@@ -384,32 +384,32 @@ class Shooting(eqx.Module):
         angle = lambda u: component(turn.name, self.unravel(u))
 
         def follow(leg, s0, s1, u):
-            begin = self.hopped(machine, leg, s0, s1, self.after(machine, leg, s0, u))
+            begin = self.chatter_end(machine, leg, s0, s1, self.after(machine, leg, s0, u))
             end, _, (s, path) = self.fly_leg(machine, leg, begin, s1, rows=self.steps)
             return angle(end), jnp.append(s0, s), jax.vmap(angle)(jnp.concatenate([u[None], path]))
 
         ends = self.ends(clock, self.period(x))
-        arrived, s, angles = jax.vmap(follow)(jnp.arange(self.legs), clock, ends, states)
-        turns = jnp.round((arrived - jnp.roll(angles[:, 0], -1)) / (2 * np.pi))  # less at the next
+        final, s, angles = jax.vmap(follow)(jnp.arange(self.legs), clock, ends, states)
+        turns = jnp.round((final - jnp.roll(angles[:, 0], -1)) / (2 * np.pi))  # less at the next
         turns = jnp.cumsum(turns) - turns
-        passed = (angles + 2 * np.pi * turns[:, None]).ravel()
+        all_angles = (angles + 2 * np.pi * turns[:, None]).ravel()
         first = jnp.ceil((angles[0, 0] - turn.start) / (2 * np.pi))
 
-        def passing(number):
+        def section_passage(number):
             goal = turn.start + 2 * np.pi * number
-            row = jnp.maximum(jnp.sum(passed <= goal) - 1, 0)
+            row = jnp.maximum(jnp.sum(all_angles <= goal) - 1, 0)
             leg = row // s.shape[1]
 
-            def nearer(_, place):
+            def newton(_, place):
                 place = stop_gradient(place)  # the last step has the derivative
                 state = self.state_at(x, leg, place)
                 rate = component(turn.name, self.flight(machine, leg).smooth.field(place, state))
                 return place + (goal - 2 * np.pi * turns[leg] - component(turn.name, state)) / rate
 
-            return leg, jax.lax.fori_loop(0, _PASSING, nearer, s.ravel()[row])
+            return leg, jax.lax.fori_loop(0, _PASSING, newton, s.ravel()[row])
 
         numbers = jnp.arange(self.cycles, dtype=x.dtype)
-        return jax.vmap(passing)(first + jnp.mod(numbers - first, self.cycles))
+        return jax.vmap(section_passage)(first + jnp.mod(numbers - first, self.cycles))
 
     def on_sections(self, x: Vector, sections: tuple[Array, Array]) -> State:
         """Return the states on the `sections`, leaves (cycles,)."""
@@ -422,32 +422,32 @@ class Shooting(eqx.Module):
     def flight(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """Return the flight of a leg; after the hops of the chatter, if the leg begins with one."""
         flight = Flight(machine, self.modes_in(leg), self.method, self.like)
-        return flight.holding(self._contact(self.contacts, leg)) if self.rests else flight
+        return flight.with_contact(self._contact(self.contacts, leg)) if self.rests else flight
 
     def flight_after_event(self, machine: AbstractMachine, leg: Leg) -> Flight:
         """Return the flight of a leg just after the event that begins it."""
         if not self.landings:
             return self.flight(machine, leg)
         first = [self.contacts[i - (i in self.landings)] for i in range(self.legs)]
-        return self.flight(machine, leg).holding(self._contact(first, leg))
+        return self.flight(machine, leg).with_contact(self._contact(first, leg))
 
     def _contact(self, contacts: Sequence[tuple[float, ...]], leg: Leg) -> tuple[Array, ...]:
         return tuple(jnp.asarray(contacts, jnp.result_type(float))[leg])
 
     def fly_leg(
-        self, machine: AbstractMachine, leg: Leg, begin: Hops, s: Scalar,
+        self, machine: AbstractMachine, leg: Leg, begin: Chatter, s: Scalar,
         averages: tuple[str, ...] = (), *, steps: int | Scalar | None = None, rows: int = 0,
     ) -> Any:  # fmt: skip
         """Integrate the flight of a leg after its chatter, to clock `s`; see `Flight.fly`."""
         steps = self.steps if steps is None else steps
         flight, u = self.flight(machine, leg), begin.u
         for number, lands in self._landing(leg):
-            put = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
-            u = jnp.where(lands, put, u)
-        end, passed, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
+            state_on_stop = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
+            u = jnp.where(lands, state_on_stop, u)
+        end, integrals, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
-            passed = {name: x + begin.passed[name] for name, x in passed.items()}
-        return end, passed, path
+            integrals = {name: x + begin.integrals[name] for name, x in integrals.items()}
+        return end, integrals, path
 
     def _landing(self, leg: Leg) -> list[tuple[int, Array]]:
         """Return the stops on which bodies come to rest, and whether one does in a leg."""
@@ -455,48 +455,48 @@ class Shooting(eqx.Module):
         numbers = numbers or [int(x) - 1 for x in self.held]
         return [(n, jnp.asarray(numbers)[leg] == n) for n in sorted(set(numbers) - {-1})]
 
-    def hopped(
+    def chatter_end(
         self, machine: AbstractMachine, leg: Leg, s: Scalar, until: Scalar, u: Vector,
         averages: tuple[str, ...] = (), *, steps: int | Scalar | None = None,
-    ) -> Hops:  # fmt: skip
+    ) -> Chatter:  # fmt: skip
         """Return the last impact before `until` of the chatter that begins a leg, or the begin."""
-        hops = Hops(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
+        hops = Chatter(s, u, dict.fromkeys((TIME, *averages), jnp.zeros_like(s)), s > until)
         for number, lands in self._landing(leg) if self.events else ():
             free, begin = (
                 self.flight_after_event(machine, leg),
-                hops._replace(over=~lands | hops.over),
+                hops._replace(is_over=~lands | hops.is_over),
             )
             share = _HOP * (self.steps if steps is None else steps) / self.cycles
             each = jnp.maximum(2.0, jnp.ceil(share))
-            last = hopped(free, number, begin, until=until, steps=each)
-            hops = last._replace(over=jnp.where(lands, last.over, hops.over))
+            last = last_hop(free, number, begin, until=until, steps=each)
+            hops = last._replace(is_over=jnp.where(lands, last.is_over, hops.is_over))
         return hops
 
     def residual(self, x: Vector) -> Vector:
         """Return the left sides of the motion's equations, then those of the conditions."""
-        missing, chatters = self._arrivals(x)
+        residual, chatters = self._shoot(x)
         if not self.conditions:
-            return missing
-        seen = self.observe(x) if any(c.observes for c in self.conditions) else None
+            return residual
+        observed = self.observe(x) if any(c.observes for c in self.conditions) else None
         for condition in self.conditions:
-            missing = condition.exchanged(self, x, missing)
-        more = [condition.missing(self, x, seen, chatters) for condition in self.conditions]
-        return jnp.concatenate([missing, jnp.stack(more)])
+            residual = condition.replace_equations(self, x, residual)
+        added = [condition.residual(self, x, observed, chatters) for condition in self.conditions]
+        return jnp.concatenate([residual, jnp.stack(added)])
 
     def motion_residual(self, x: Vector, steps: Scalar | None = None) -> Vector:
         """Return the left sides of the motion's own equations, zero for a periodic motion: the
         difference from the end of each leg to the begin of the next, then the guards. `steps` is
         the number of steps of a flight, if not `self.steps`."""
-        return self._arrivals(x, steps)[0]
+        return self._shoot(x, steps)[0]
 
-    def _arrivals(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Hops]:
-        """Return the same, and the end of the chatter with which each leg begins."""
+    def _shoot(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Chatter]:
+        """Return the `motion_residual`, and the end of the chatter that begins each leg."""
         machine = self.at(x)
         clock, states = self.parts(x)
 
-        def arrive(leg, s0, s1, u):
+        def end_of_leg(leg, s0, s1, u):
             after = self.after(machine, leg, s0, u)
-            begin = self.hopped(machine, leg, s0, s1, after, steps=steps)
+            begin = self.chatter_end(machine, leg, s0, s1, after, steps=steps)
             end, _, _ = self.fly_leg(machine, leg, begin, s1, steps=steps)
             if not self.events:
                 return end, jnp.zeros((0,), x.dtype), begin
@@ -504,10 +504,10 @@ class Shooting(eqx.Module):
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
-        arrived, away, begins = jax.vmap(arrive)(legs, clock, ends, states)
-        after = jnp.roll(states, -1, axis=0)
-        arrived = nearest_images(self.angles, arrived, after)
-        return jnp.concatenate([(arrived - after).ravel(), away.ravel()]), begins
+        ends_of_legs, guards, chatters = jax.vmap(end_of_leg)(legs, clock, ends, states)
+        next_states = jnp.roll(states, -1, axis=0)
+        ends_of_legs = nearest_images(self.angles, ends_of_legs, next_states)
+        return jnp.concatenate([(ends_of_legs - next_states).ravel(), guards.ravel()]), chatters
 
     def observe(self, x: Vector) -> Observed:
         """Compute multipliers, extremes and the distances to grazing of a solution `x`.
@@ -517,47 +517,47 @@ class Shooting(eqx.Module):
         """
         machine = self.at(x)
         clock, states = self.parts(x)
-        averages = average_names(machine, self.unravel(states[0]))
+        names = average_names(machine, self.unravel(states[0]))
 
         def follow(leg, s0, s1, u):
             def end(u):
-                begin = self.hopped(machine, leg, s0, s1, u, averages)
-                end, passed, path = self.fly_leg(machine, leg, begin, s1, averages, rows=self.steps)
-                return end, (passed, path, begin)
+                begin = self.chatter_end(machine, leg, s0, s1, u, names)
+                end, integrals, path = self.fly_leg(machine, leg, begin, s1, names, rows=self.steps)
+                return end, (integrals, path, begin)
 
             after = self.after(machine, leg, s0, u)
-            carried, (passed, path, begin) = jax.jacfwd(end, has_aux=True)(after)
-            approach, order = jnp.zeros((2, 0), x.dtype), jnp.ones((), x.dtype)
+            matrix, (integrals, path, begin) = jax.jacfwd(end, has_aux=True)(after)
+            approach, agree = jnp.zeros((2, 0), x.dtype), jnp.ones((), x.dtype)
             if self.events:
                 saltation, *rises = self.saltation(machine, leg, s0, u)
-                carried, approach = carried @ saltation, jnp.stack(rises)[:, None]
-                order = self._order(machine, leg, s0, u)
-            places = [machine.position(self.unravel(x)) for x in (u, after)]
+                matrix, approach = matrix @ saltation, jnp.stack(rises)[:, None]
+                agree = self._modes_agree(machine, leg, s0, u)
+            positions = [machine.position(self.unravel(x)) for x in (u, after)]
             h = (s1 - begin.s) / self.steps
             flight = self.flight(machine, leg)
             turns = turns_of(Path(flight, path[0], path[1], h, not self.events))
             sizes = self._guard_sizes(flight, s0, after)
             largest = jnp.max(jnp.abs(path[1]), axis=0)
-            return carried, passed, approach, order, turns, places, largest, begin, sizes
+            return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
 
         legs = jnp.arange(len(states))
         ends = self.ends(clock, self.period(x))
         found = jax.vmap(follow)(legs, clock, ends, states)
-        carried, passed, approach, order, turns, places, largest, begin, sizes = found
+        matrix, integrals, approach, agree, turns, positions, largest, begin, sizes = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
         for leg in range(len(states)):
-            monodromy = carried[leg] @ monodromy
+            monodromy = matrix[leg] @ monodromy
         period = ends[-1] - clock[0]
         last = {i: jax.tree.map(lambda a, i=i: a[i], begin) for i in self.landings}
-        escapes = (self._escape(machine, i, last[i], clock, states, period) for i in last)
-        left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
-        Y = jnp.concatenate(places)
+        escapes = (self._escape_margin(machine, i, last[i], clock, states, period) for i in last)
+        times_left = (self._time_left(machine, i, last[i], ends[i]) for i in last)
+        Y = jnp.concatenate(positions)
         low, high, nearest, pull = turns
-        i, j = jnp.argmin(nearest.room), jnp.argmin(pull.room)
+        i, j = jnp.argmin(nearest.margin), jnp.argmin(pull.margin)
         nearest = jax.tree.map(lambda x: x[i], nearest)
         order_of_events = self._order_margin(machine, clock, ends - clock, states, sizes)
-        integrals = jax.tree.map(jnp.sum, passed)
-        time = integrals.pop(TIME)
+        totals = jax.tree.map(jnp.sum, integrals)
+        time = totals.pop(TIME)
         timed = self.autonomous or machine.pace(clock[0], self.unravel(states[0])) is not None
         return Observed(
             multipliers=multipliers_of(monodromy),
@@ -568,25 +568,25 @@ class Shooting(eqx.Module):
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
             nearest=nearest._replace(unit=sizes[i, nearest.event.astype(int)]),
             pull=jax.tree.map(lambda x: x[j], pull),
-            order=jnp.min(order),
-            order_margin=reduce(jnp.minimum, left, order_of_events),
+            modes_agree=jnp.min(agree),
+            order_margin=reduce(jnp.minimum, times_left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
-            averages=means(integrals, time),
+            averages=means(totals, time),
             largest=jnp.max(largest, axis=0),
-            escape=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
+            escape_margin=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
 
     def _guard_sizes(self, flight: Flight, s: Scalar, u: Vector) -> Vector:
-        """Return the size of the guard of each of the machine's events, or 1: what the sizes of the
-        state's components and of the clock change it by. One more entry is of no event."""
+        """Return the change of each event's guard over the sizes of state and clock, or 1. One more
+        entry belongs to no event."""
 
         def guards(s, u):
-            at = s, self.unravel(u), flight.modes, flight.contact
+            arguments = s, self.unravel(u), flight.modes, flight.contact
             numbers = range(len(events_of(flight.machine)))
-            return jnp.stack([*(guard_of(flight.machine, n, *at) for n in numbers), u[0]])
+            return jnp.stack([*(guard_of(flight.machine, n, *arguments) for n in numbers), u[0]])
 
-        gained, slopes = jax.jacrev(guards, argnums=(0, 1))(s, u)
-        sizes = jnp.abs(slopes) @ self.sizes[1:] + jnp.abs(gained) * self.sizes[0]
+        s_slope, slopes = jax.jacrev(guards, argnums=(0, 1))(s, u)
+        sizes = jnp.abs(slopes) @ self.sizes[1:] + jnp.abs(s_slope) * self.sizes[0]
         return stop_gradient(jnp.where((sizes > 0) & jnp.isfinite(sizes), sizes, 1.0))
 
     def _order_margin(
@@ -596,40 +596,40 @@ class Shooting(eqx.Module):
         for i, event in enumerate(self.events):
             least, state = jnp.minimum(least, lengths[i]), self.unravel(states[i])
             before, contact = (
-                tuple(jnp.asarray(mode, clock.dtype) for mode in each[i - 1])
-                for each in (self.modes, self.contacts)
+                tuple(jnp.asarray(mode, clock.dtype) for mode in per_leg[i - 1])
+                for per_leg in (self.modes, self.contacts)
             )
             for number, other in enumerate(events_of(machine)):
-                met = number in (event.number, section_number(machine))
-                if met or 1.0 + number in self.contacts[i - 1]:
+                is_excluded = number in (event.number, section_number(machine))
+                if is_excluded or 1.0 + number in self.contacts[i - 1]:
                     continue
-                room = -guard_of(machine, number, clock[i], state, before, contact)
-                room = room / sizes[i - 1, number] * self.sizes[0]
+                margin = -guard_of(machine, number, clock[i], state, before, contact)
+                margin = margin / sizes[i - 1, number] * self.sizes[0]
                 if other.from_below:  # if it is beyond zero, it must come from below again first
-                    room = jnp.where(room > 0, room, jnp.inf)
-                least = jnp.minimum(least, room)
+                    margin = jnp.where(margin > 0, margin, jnp.inf)
+                least = jnp.minimum(least, margin)
         return least
 
-    def _time_left(self, machine: AbstractMachine, i: int, last: Hops, until: Scalar) -> Scalar:
+    def _time_left(self, machine: AbstractMachine, i: int, last: Chatter, until: Scalar) -> Scalar:
         """Return the time from the end of a chatter to the next event other than its release."""
         landing = self.events[i]
         if self.events[(i + 1) % self.legs] == landing._replace(use=LEAVES):
             return jnp.full_like(until, jnp.inf)
         return until - last.s - remaining(self.flight_after_event(machine, i), landing.number, last)
 
-    def _escape(
-        self, machine: AbstractMachine, i: int, last: Hops, clock: Array, states: Array,
+    def _escape_margin(
+        self, machine: AbstractMachine, i: int, last: Chatter, clock: Array, states: Array,
         period: Scalar,
     ) -> Scalar:  # fmt: skip
-        """Return χ of the chatter that begins with event number i (see `_chatter.escape`)."""
+        """Return χ of the chatter that begins with event number i; see `escape_margin`."""
         landing, later = self.events[i], (*range(i + 1, self.legs), *range(i))
         j = next(j for j in later if self.events[j] == landing._replace(use=LEAVES))
         s = clock[j] + (period if j < i else 0.0)
         if j != (i + 1) % self.legs:  # another event comes before the chatter is over
-            last = last._replace(over=jnp.zeros_like(last.over))
-        return escape(self.flight(machine, j - 1), landing.number, last, s, states[j])
+            last = last._replace(is_over=jnp.zeros_like(last.is_over))
+        return escape_margin(self.flight(machine, j - 1), landing.number, last, s, states[j])
 
-    def rest_lost(self, x: Vector, landing: int | None, chatters: Hops) -> Scalar:
+    def rest_margin(self, x: Vector, landing: int | None, chatters: Chatter) -> Scalar:
         """Return χ of the chatter that begins with the event `landing`. If that is `None`, return
         the least force on a body within its rest. Both are zero where a rest is lost. `chatters`
         holds the last impact of the chatter of each leg."""
@@ -637,14 +637,14 @@ class Shooting(eqx.Module):
         ends, least = self.ends(clock, period), jnp.asarray(jnp.inf, x.dtype)
         last = lambda i: jax.tree.map(lambda a: a[i], chatters)
         if landing is not None:
-            return self._escape(machine, landing, last(landing), clock, states, period)
+            return self._escape_margin(machine, landing, last(landing), clock, states, period)
         for i, contact in enumerate(self.contacts):
             if any(contact):
                 begin = last(i)
                 path = self.fly_leg(machine, i, begin, ends[i], rows=self.steps)[2]
                 h, flight = (ends[i] - begin.s) / self.steps, self.flight(machine, i)
                 pull = pull_of(Path(flight, path[0], path[1], h, not self.events))
-                least = jnp.minimum(least, pull.room)
+                least = jnp.minimum(least, pull.margin)
         return least
 
     def saltation(
@@ -672,31 +672,31 @@ class Shooting(eqx.Module):
             return ravel_pytree(jump_of(machine, event.number, s, state, modes))[0]
 
         def reset(u):
-            return self._each(leg, jumped, u)
+            return self._for_event(leg, jumped, u)
 
         jacobian = jax.jacfwd(reset)(u)
         before, after = field(old, u), field(new, reset(u))
         if self.autonomous:
             # The clock restarts there, so a perturbation along the motion vanishes.
-            goes_on = [float(i > 0 and not event.of(machine).ends_cycle)
-                       for i, event in enumerate(self.events)]  # fmt: skip
-            after = jnp.asarray(goes_on, u.dtype)[leg] * after
-        gained, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
-        rate = gained + jnp.dot(slope, before)
+            clock_continues = [float(i > 0 and not event.of(machine).ends_cycle)
+                               for i, event in enumerate(self.events)]  # fmt: skip
+            after = jnp.asarray(clock_continues, u.dtype)[leg] * after
+        s_slope, slope = jax.grad(lambda s, u: self.guard(machine, leg, s, u), argnums=(0, 1))(s, u)
+        rate = s_slope + jnp.dot(slope, before)
 
-        def met(event, u, rate):
+        def approach_speed(event, u, rate):
             if event.use == LEAVES:
                 return rate
             return event.of(machine).speed(machine, self.unravel(u), rate)
 
-        approach = self._each(leg, met, u, rate)
-        unit = (jnp.abs(slope) @ self.sizes[1:]) / self.sizes[0] + jnp.abs(gained)
+        approach = self._for_event(leg, approach_speed, u, rate)
+        unit = (jnp.abs(slope) @ self.sizes[1:]) / self.sizes[0] + jnp.abs(s_slope)
         return jacobian + jnp.outer(after - jacobian @ before, slope) / rate, approach, unit
 
-    def _order(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
+    def _modes_agree(self, machine: AbstractMachine, leg: Leg, s: Scalar, u: Vector) -> Scalar:
         """Return 1 if the event that begins a leg puts its switch into the leg's mode, else -1."""
 
-        def order(event, s, u):
+        def agrees(event, s, u):
             if not event.of(machine).holds_mode:
                 return jnp.ones_like(s)
             j, before = mode_number(machine, event.number), self.flight(machine, leg - 1)
@@ -705,7 +705,7 @@ class Shooting(eqx.Module):
             wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 
-        return self._each(leg, order, s, u)
+        return self._for_event(leg, agrees, s, u)
 
     def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
         """Return the state at clock `s`, which lies in leg number `leg`."""
@@ -713,10 +713,10 @@ class Shooting(eqx.Module):
         clock, states = self.parts(x)
         s0, s1 = clock[leg], self.ends(clock, self.period(x))[leg]
         u = self.after(machine, leg, s0, states[leg])
-        begin = self.hopped(machine, leg, s0, s1, u)
+        begin = self.chatter_end(machine, leg, s0, s1, u)
         end = self.fly_leg(machine, leg, begin, s)[0]
         if self.landings:
-            last = self.hopped(machine, leg, s0, s, u)
-            within = self.flight_after_event(machine, leg).fly(last.s, s, last.u, self.steps)[0]
-            end = jnp.where(s < begin.s, within, end)
+            last = self.chatter_end(machine, leg, s0, s, u)
+            in_chatter = self.flight_after_event(machine, leg).fly(last.s, s, last.u, self.steps)[0]
+            end = jnp.where(s < begin.s, in_chatter, end)
         return self.unravel(end)

@@ -29,7 +29,7 @@ from ..machine import (
 )
 from ._flight import Event, Flight
 from ._shooting import Leg, Shooting
-from ._solution import Step, observe, on_host, state_at, zero_near
+from ._solution import Step, find_zero_near, observe, on_host, state_at
 from ._surgery import without_events
 
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
@@ -57,8 +57,8 @@ SLIDING = {
 
 # A part of a motion this brief, as a share of its period, vanishes; if nothing else is found, also
 # a nearly brief one, as a corrector may not get closer. A guard this small is zero. Choices:
-# special points are located far closer (see `refined`).
-_BRIEF, _NEARLY, _ZERO = 1e-4, 1e-2, 1e-6
+# special points are located far closer (see `locate_change`).
+_BRIEF, _NEARLY_BRIEF, _ZERO = 1e-4, 1e-2, 1e-6
 
 
 class Change(NamedTuple):
@@ -96,7 +96,7 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
         _vanishing(problem, at, _BRIEF)
         or _touching(problem, at)
         or _beginning(problem, at)
-        or _vanishing(problem, at, _NEARLY)
+        or _vanishing(problem, at, _NEARLY_BRIEF)
     )
     return found if found is not None and found.kind is not None else None
 
@@ -121,18 +121,18 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
 
 def _touching(problem: Shooting, at: Step) -> Change | None:
     """Return a flight's touch of a switch's surface, or a body at the limit of being held."""
-    nearest, number = at.seen.nearest, int(at.seen.nearest.event)
+    nearest, number = at.observed.nearest, int(at.observed.nearest.event)
     if not holds(Event(number).of(problem.machine)):
         return None
     leg, place = map(float, problem.leg_at(at.x, float(nearest.clock)))
     leg, mode = int(leg), _mode(problem, int(leg), number)
-    if abs(float(nearest.room)) > _ZERO * nearest.unit:
+    if abs(float(nearest.margin)) > _ZERO * nearest.unit:
         return None
-    force, _, away = holding_force(problem, at, leg, number, place)
+    excess, _, next_mode = excess_force(problem, at, leg, number, place)
     if not mode:
-        return Change(number, place, (0.0, away, 0.0), False)
+        return Change(number, place, (0.0, next_mode, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
-    is_held = force < _ZERO * nearest.unit / problem.radian
+    is_held = excess < _ZERO * nearest.unit / problem.radian
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
@@ -144,8 +144,8 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
             continue
         before, after = (_mode(problem, leg, event.number) for leg in (i - 1, i))
         if before:
-            force, rate, _ = holding_force(problem, at, i, event.number, float(clock[i]))
-            share = abs(force) / at.seen.units[i]
+            excess, rate, _ = excess_force(problem, at, i, event.number, float(clock[i]))
+            share = abs(excess) / at.observed.units[i]
             found.append((share, rate, event.number, float(clock[i]), before, after))
     if not found:
         return None
@@ -157,7 +157,7 @@ def _beginning(problem: Shooting, at: Step) -> Change | None:
     return Change(number, place, (before, -before, 0.0), after != 0)
 
 
-def holding(
+def excess_rates(
     problem: Shooting, machine: AbstractMachine, leg: Leg, number: int, s: Scalar, state: State
 ) -> Rates:
     """Return how far the driving force of a switch exceeds the holding force, with its rates."""
@@ -173,34 +173,34 @@ def holding(
 
 
 @on_host
-def _held_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
+def _excess_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     machine, states = problem.at(x), problem.parts(x)[1]
     # At an event the state just before it; otherwise the leg is integrated.
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
-    force, modes = holding(problem, machine, leg, number, s, state), problem.modes_in(leg)
+    excess, modes = excess_rates(problem, machine, leg, number, s, state), problem.modes_in(leg)
     contact = problem.flight(machine, leg).contact
     new = after_event(machine, number, s, state, modes, contact)[1]
-    return force.x, force.v, new[mode_number(machine, number)]
+    return excess.x, excess.v, new[mode_number(machine, number)]
 
 
-def holding_force(
+def excess_force(
     problem: Shooting, at: Step, leg: int, number: int, s: float
 ) -> tuple[float, float, float]:
     """Return the excess force off a switch's surface, its rate, and the switch's next mode."""
-    begins = bool(s == problem.values(at.x)[0][leg])
-    force, rate, mode = _held_at(problem, at.x, np.asarray(leg), number, s, begins)
-    return float(force), float(rate), float(mode)
+    at_event = bool(s == problem.values(at.x)[0][leg])
+    excess, rate, mode = _excess_at(problem, at.x, np.asarray(leg), number, s, at_event)
+    return float(excess), float(rate), float(mode)
 
 
 # Events that are closer than this where they vanish are located well enough: a choice.
 _CLOSE = 1e-8
 
 
-def refined(problem: Shooting, at: Step, change: Change) -> Step:
+def locate_change(problem: Shooting, at: Step, change: Change) -> Step:
     """Locate the special point at which a part of the motion vanishes, from one close to it."""
     clock = problem.values(at.x)[0]
-    close = abs(float(at.seen.order_margin)) < _CLOSE * problem.radian
-    if not change.exists or problem.conditions or close:
+    is_close = abs(float(at.observed.order_margin)) < _CLOSE * problem.radian
+    if not change.exists or problem.conditions or is_close:
         return at
     first = int(np.argmin(np.abs(clock - change.clock)))
     if first + 1 == problem.legs:  # the part contains the begin of the period
@@ -209,11 +209,11 @@ def refined(problem: Shooting, at: Step, change: Change) -> Step:
 
     def test(step: Step) -> float:
         if event is None:
-            return float(step.seen.nearest.room)
+            return float(step.observed.nearest.margin)
         place = float(new.values(step.x)[0][event])
-        return holding_force(new, step, event, change.number, place)[0]
+        return excess_force(new, step, event, change.number, place)[0]
 
-    found = zero_near(new, x, test)
+    found = find_zero_near(new, x, test)
     return at if found is None else _with_part(problem, at, new, found, first, event is None)
 
 
@@ -223,24 +223,24 @@ def without_part(
     """Return the equations and unknowns of a motion without the vanishing part, and its event at
     which the switch is at the limit of being held; `None` if its surface is touched."""
     first = int(np.argmin(np.abs(problem.values(at.x)[0] - change.clock)))
-    alike = change.modes[0] == change.modes[2]
+    same_mode = change.modes[0] == change.modes[2]
     if not change.exists:
-        return problem, np.asarray(at.x), None if alike else first
+        return problem, np.asarray(at.x), None if same_mode else first
     both = [first, (first + 1) % problem.legs]
-    new, x = without_events(problem, np.asarray(at.x), both if alike else [first])
-    return new, x, None if alike else first % new.legs
+    new, x = without_events(problem, np.asarray(at.x), both if same_mode else [first])
+    return new, x, None if same_mode else first % new.legs
 
 
 def _with_part(
-    problem: Shooting, at: Step, new: Shooting, step: Step, first: int, alike: bool
+    problem: Shooting, at: Step, new: Shooting, step: Step, first: int, same_mode: bool
 ) -> Step:
     """Insert a part of no length, from event `first` on, into the solution `step` of `new` without
-    it. `alike` is true if both events of the part were left out."""
+    it. `same_mode` is true if both events of the part were left out."""
     clock, states, period = new.values(step.x)
     if not new.events:
         clock, states = np.zeros(0), np.zeros((0, problem.states))
-    if alike:
-        place, before = float(step.seen.nearest.clock), problem.values(at.x)[0][first]
+    if same_mode:
+        place, before = float(step.observed.nearest.clock), problem.values(at.x)[0][first]
         place = place + period * np.round((before - place) / period)
         state = state_at(new, step.x, np.asarray(max(0, first - 1)), place)
         extra = np.stack([state] * 2)
@@ -248,5 +248,5 @@ def _with_part(
         place, extra = clock[first], states[first][None]
     clock = np.insert(clock, first, [place] * len(extra))
     states = np.insert(states, [first] * len(extra), extra, axis=0)
-    whole = np.asarray(problem.pack(clock, states, step.x, period))
-    return at._replace(x=whole, seen=observe(problem, whole))
+    x = np.asarray(problem.pack(clock, states, step.x, period))
+    return at._replace(x=x, observed=observe(problem, x))

@@ -48,7 +48,7 @@ class Step(NamedTuple):
     """Number of corrections."""
     good: Flag
     """True if the corrector converged."""
-    seen: Any
+    observed: Any
     """Observations of the solution, an `Observed` of host arrays."""
 
 
@@ -63,12 +63,12 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
     program = compiled(function)
 
     @functools.wraps(function)
-    def called(*args: Any) -> Any:
+    def call(*args: Any) -> Any:
         numbers = (float, np.ndarray, np.generic)
         args = tuple(np.asarray(a) if isinstance(a, numbers) else a for a in args)
         return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program(*args))
 
-    return called
+    return call
 
 
 def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Array]:
@@ -85,7 +85,7 @@ def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Arr
 
 
 @on_host
-def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
+def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, length: Scalar) -> Step:
     """Advance as `advance` does, without observations, by Newton's method on the equations and the
     plane. The parameter is one of the unknowns, so the Jacobian is not close to singular at a fold.
     """
@@ -95,25 +95,25 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
     def newton(carry):
         y, before, count, *_ = carry
-        jacobian, missing, _ = _jacobian(equations, y)
-        both = jnp.stack([missing, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
+        jacobian, residual, _ = _jacobian(equations, y)
+        right_sides = jnp.stack([residual, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
         if problem.is_double:
-            move, along = smallest_solution(jacobian, both, _DOUBLE).T
+            move, along = smallest_solution(jacobian, right_sides, _DOUBLE).T
         else:
-            move, along = jnp.linalg.solve(jacobian, both).T
+            move, along = jnp.linalg.solve(jacobian, right_sides).T
         size = jnp.max(jnp.abs(move))
         # One correction more than needed: the tangent is then that of the solution. Where the curve
         # is steep, rounding may keep all corrections above the tolerance.
         done = (before <= _TOLERANCE) | ((before <= _ROUNDED) & (size >= before))
         return y - move, size, count + 1, along, done
 
-    def going(carry):
+    def continues(carry):
         _, size, count, _, done = carry
         return ~done & (size < 10.0) & (count < 13)
 
     y0 = x / scale + length * tangent
     start = (y0, jnp.ones((), x.dtype), jnp.zeros((), jnp.int32), y0, jnp.zeros((), bool))
-    y, size, count, along, _ = jax.lax.while_loop(going, newton, start)
+    y, size, count, along, _ = jax.lax.while_loop(continues, newton, start)
     along = along / jnp.linalg.norm(along)
     good = (size <= _ROUNDED) & jnp.all(jnp.isfinite(along))
     return Step(y * scale, along, size, count, good, None)
@@ -121,8 +121,8 @@ def _advanced(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, leng
 
 def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) -> Step:
     """Return the solution on the plane across a unit tangent, at `length` from `x` (scaled)."""
-    step = _advanced(problem, x, tangent, problem.scale, float(length))
-    return step._replace(seen=observe(problem, step.x))
+    step = _advance(problem, x, tangent, problem.scale, float(length))
+    return step._replace(observed=observe(problem, step.x))
 
 
 # These programs take the equations of the motion alone, so that a branch and all its curves share
@@ -130,13 +130,13 @@ def advance(problem: Shooting, x: Unknowns, tangent: Unknowns, length: float) ->
 
 
 @on_host
-def _observed(motion: Shooting, x):
+def _observe(motion: Shooting, x):
     return motion.observe(x)
 
 
 def observe(problem: Shooting, x: Unknowns) -> Any:
     """Return the observations of a solution (`Observed`), host-side."""
-    return _observed(*problem.motion_at(x))
+    return _observe(*problem.motion_at(x))
 
 
 @on_host
@@ -186,7 +186,7 @@ def jacobian_at(problem: Shooting, x: Unknowns) -> np.ndarray:
 
 
 # Distances, as shares of the step, to retry before a place without a solution: choices.
-_SHORT_OF = (1e-6, 1e-5, 1e-4, 1e-3)
+_RETRIES = (1e-6, 1e-5, 1e-4, 1e-3)
 
 # A test is zero below this share of its largest value, and a place is known to this distance in
 # scaled unknowns, or to that of the last correction. Choices: closer, rounding would be resolved.
@@ -197,14 +197,14 @@ _ZERO, _PLACED = 1e-13, 1e-13
 _TRIALS = 5
 
 # Distance of samples from a point where branches cross, in scaled unknowns: a choice.
-BESIDE = 1e-3
+SPACING = 1e-3
 
 # At most so many times that distance on each side.
-MOST = 8
+MOST_SAMPLES = 8
 
 # A neighbour lies on the crossing curve if its tangent deviates from the median one by more than
 # this multiple of the median deviation: a choice; equal distances give 3 at most.
-_ASTRAY = 10.0
+_OUTLIER = 10.0
 
 # A zero near a solution is at most this far from it (in the parameter's scale): a choice.
 _CLOSE = 1e-2
@@ -214,11 +214,11 @@ class NoValueError(ArithmeticError):
     """A test has no value, because the corrector did not converge."""
 
 
-class _CloseError(ArithmeticError):
+class _TooCloseError(ArithmeticError):
     """The corrector has failed so often that no closer place can be reached."""
 
 
-def located(
+def locate_zero(
     problem: Shooting, here: Step, new: Step, test: Callable[[Step], float],
     known: dict[float, Step] | None = None,
 ) -> Step | None:  # fmt: skip
@@ -226,36 +226,36 @@ def located(
     sign between them is zero, or `None`. `new` may lie on either side of `here`. Points between
     them, by their distance from `here`, are taken from `known` and added to it."""
     length = distance_along(problem, here, new)
-    at = {} if known is None else known
-    at |= {0.0: here, length: new}
-    silent: list[float] = []
+    points = {} if known is None else known
+    points |= {0.0: here, length: new}
+    failed: list[float] = []
     tested: dict[float, float] = {}
     bracket: dict[bool, float] = {}
 
-    def reached(s: float) -> Step:
+    def solve_at(s: float) -> Step:
         """Return the solution there; if none, as at crossing branches, the one just before it."""
         step = advance(problem, here.x, here.tangent, s)
-        for short in _SHORT_OF:
+        for short in _RETRIES:
             if bool(step.good):
                 break
-            if short == _SHORT_OF[0]:
-                silent.append(s)
+            if short == _RETRIES[0]:
+                failed.append(s)
             step = advance(problem, here.x, here.tangent, s - short * length)
         return step
 
     def value(s: float) -> float:
-        if s not in at:
-            if len(silent) >= _TRIALS:
-                raise _CloseError
-            at[s] = reached(s)
+        if s not in points:
+            if len(failed) >= _TRIALS:
+                raise _TooCloseError
+            points[s] = solve_at(s)
         if s not in tested:
-            tested[s] = test(at[s])
+            tested[s] = test(points[s])
         found = tested[s]
         if np.isnan(found):
             raise NoValueError
         bracket[found > 0] = s
-        unsure = max(min(_ROUNDED, float(at[end].size)) for end in bracket.values())
-        close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= unsure
+        resolution = max(min(_ROUNDED, float(points[end].size)) for end in bracket.values())
+        close = len(bracket) == 2 and abs(bracket[True] - bracket[False]) <= resolution
         return 0.0 if close or abs(found) <= _ZERO * max(map(abs, tested.values())) else found
 
     from scipy.optimize import brentq  # slow to load
@@ -265,26 +265,26 @@ def located(
     try:
         if not value(0.0) * value(length) <= 0:
             return None
-        ends = _known_bracket([s for s, step in at.items() if bool(step.good)], length, value)
+        ends = _known_bracket([s for s, step in points.items() if bool(step.good)], length, value)
         root = float(brentq(value, *ends, full_output=True, disp=False, **options)[0])
         value(root)
     except NoValueError:
         return None
-    except _CloseError:
-        root = silent[-1]
+    except _TooCloseError:
+        root = failed[-1]
     # At crossing branches, or if a motion shrinks to rest, use a point just before it.
-    for short in _SHORT_OF:
-        if any(bool(at[s].good) for s in tested if abs(s - root) <= short * abs(length)):
+    for short in _RETRIES:
+        if any(bool(points[s].good) for s in tested if abs(s - root) <= short * abs(length)):
             break
-        with contextlib.suppress(NoValueError, _CloseError):
+        with contextlib.suppress(NoValueError, _TooCloseError):
             value(root - short * length)
 
-    def off(s: float) -> tuple[float, bool, float]:
+    def rank(s: float) -> tuple[float, bool, float]:
         """Rank a point by its distance from zero; if the test jumps, prefer the last one before."""
         return abs(tested[s]), bool(tested[s] * tested[0.0] < 0), abs(s - root)
 
-    good = [s for s in tested if bool(at[s].good)]
-    return at[min(good, key=off)] if good else None
+    good = [s for s in tested if bool(points[s].good)]
+    return points[min(good, key=rank)] if good else None
 
 
 def _known_bracket(
@@ -299,7 +299,7 @@ def _known_bracket(
     return places[low], places[high]
 
 
-def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
+def find_zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
     """Return the solution near one at which a test is zero, by the secant method, or `None`."""
     found: list[Step] = []
 
@@ -316,10 +316,10 @@ def zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -
         shift, report = newton(  # pyright: ignore[reportAssignmentType]
             value, 0.0, x1=1e-6, tol=1e-12, full_output=True, disp=False
         )
-        near = report.converged and abs(shift) < _CLOSE and not np.isnan(value(float(shift)))
+        is_near = report.converged and abs(shift) < _CLOSE and not np.isnan(value(float(shift)))
     except NoValueError:
         return None
-    return found[-1] if near else None
+    return found[-1] if is_near else None
 
 
 def crossing(
@@ -338,39 +338,41 @@ def crossing(
     """
     found: dict[float, Step] = {}
 
-    def along(length: float) -> Step | None:
+    def solve_at(length: float) -> Step | None:
         step = advance(here.x, here.tangent, length)
         return step if bool(step.good) and admits(step, length) else None
 
-    for side, wanted in ((-BESIDE, 3), (BESIDE, 6), (-BESIDE, 6)):
-        for n in range(1, MOST + 1):
+    for side, wanted in ((-SPACING, 3), (SPACING, 6), (-SPACING, 6)):
+        for n in range(1, MOST_SAMPLES + 1):
             if len(found) == wanted:
                 break
-            step = None if n * side in found else along(root + n * side)
+            step = None if n * side in found else solve_at(root + n * side)
             if step is not None:
                 found[n * side] = step
     if len(found) < 6:
         return None
     tangents = np.stack([step.tangent for step in found.values()])
-    aside = np.linalg.norm(tangents - np.median(tangents, axis=0), axis=1)
-    along_it = aside <= _ASTRAY * np.median(aside) + 1e-9
-    found = {x: step for (x, step), keep in zip(found.items(), along_it, strict=True) if keep}
-    places, beside = np.array(list(found)), list(found.values())
+    deviations = np.linalg.norm(tangents - np.median(tangents, axis=0), axis=1)
+    on_curve = deviations <= _OUTLIER * np.median(deviations) + 1e-9
+    found = {x: step for (x, step), keep in zip(found.items(), on_curve, strict=True) if keep}
+    places, neighbours = np.array(list(found)), list(found.values())
 
-    def through(values: Any) -> np.polynomial.Polynomial:
+    def polynomial(values: Any) -> np.polynomial.Polynomial:
         return np.polynomial.Polynomial.fit(places, values, len(places) - 1)
 
-    zeros = through([np.asarray(test(step)) for step in beside]).roots()
+    zeros = polynomial([np.asarray(test(step)) for step in neighbours]).roots()
     zeros = zeros[np.abs(zeros.imag) < 1e-12].real
-    if not zeros.size or np.abs(zeros).min() > BESIDE:
+    if not zeros.size or np.abs(zeros).min() > SPACING:
         return None
     place = zeros[np.argmin(np.abs(zeros))]
 
     def interpolated(get: Callable[[Step], Any]) -> np.ndarray:
-        return np.stack([through(x)(place) for x in zip(*map(get, beside), strict=True)])
+        return np.stack([polynomial(x)(place) for x in zip(*map(get, neighbours), strict=True)])
 
     x, tangent = interpolated(lambda step: step.x), interpolated(lambda step: step.tangent)
-    return here._replace(x=x, tangent=tangent / np.linalg.norm(tangent), seen=observe(problem, x))
+    return here._replace(
+        x=x, tangent=tangent / np.linalg.norm(tangent), observed=observe(problem, x)
+    )
 
 
 # Most impacts of a cycle in the list, with hops of a chatter: a choice. Others are only counted.
@@ -393,8 +395,8 @@ class Hits(NamedTuple):
 @compiled
 def _sections(motion: Shooting, x: Array):
     sections = motion.sections(x)
-    off = jnp.max(jnp.abs(motion.motion_residual(x)))
-    return motion.on_sections(x, sections), sections, off
+    residual = jnp.max(jnp.abs(motion.motion_residual(x)))
+    return motion.on_sections(x, sections), sections, residual
 
 
 def sections_at(problem: Shooting, x: Unknowns) -> tuple[State, tuple[Array, Array], Scalar]:
@@ -406,8 +408,8 @@ def sections_at(problem: Shooting, x: Unknowns) -> tuple[State, tuple[Array, Arr
 
 def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
     """Return the states on the sections, leaves (cycles,), and the largest residual component."""
-    states, _, off = sections_at(problem, x)
-    return states, off
+    states, _, residual = sections_at(problem, x)
+    return states, residual
 
 
 def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
@@ -416,7 +418,7 @@ def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     return np.mod(clock - begin, float(problem.period(x)))
 
 
-def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
+def _first_state(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
     sections = sections_of(problem, x)[0] if sections is None else sections
     modes = problem.modes_in(int(sections_at(problem, x)[1][0][0])) if problem.modes[0] else ()
@@ -427,19 +429,19 @@ def _first(problem: Shooting, x: Unknowns, sections: State | None = None) -> Sta
 def hits_of(problem: Shooting, step: Step, state: State | None = None) -> Hits:
     """Return the impacts of a solution; `state`, if known, is its state on the section."""
     if problem.landings:
-        state = _first(problem, step.x) if state is None else state
-        count, *listed = map(np.asarray, _simulated(problem, jnp.asarray(step.x), state))
+        state = _first_state(problem, step.x) if state is None else state
+        count, *listed = map(np.asarray, _simulate_impacts(problem, jnp.asarray(step.x), state))
         clock, speed, stop = (a[listed[2] >= 0] for a in listed)
         return Hits(clock, speed, stop.astype(np.int32), int(count))
     # Along a branch an impact may move past the section; an orbit's clocks lie within its period.
     impacts, clock = np.asarray(problem.impacts, int), problem.values(step.x)[0]
     stops = np.asarray([problem.events[i].number for i in impacts], np.int32)
-    speed = np.asarray(step.seen.approach)[impacts]
+    speed = np.asarray(step.observed.approach)[impacts]
     return Hits(since_section(problem, step.x, clock[impacts]), speed, stops, len(impacts))
 
 
 @compiled
-def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
+def _simulate_impacts(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
     """Return the number of impacts, and their clocks, V⁻ and stops."""
     machine, cycles = problem.at(x), problem.cycles
     run = simulate(machine, state, cycles, method=problem.method, impact_log=_LISTED, rests=True)
@@ -456,28 +458,28 @@ def _simulated(problem: Shooting, x: Array, state: State) -> tuple[Array, ...]:
 def energies_of(problem: Shooting, steps: Sequence[Step]) -> np.ndarray:
     """Return the energy that impacts take in a cycle, averaged over the period, at each step."""
     xs = [jnp.asarray(step.x) for step in steps]
-    states = jax.tree.map(lambda *x: jnp.stack(x), *(_first(problem, x) for x in xs))
-    return np.asarray(_lost(problem, jnp.stack(xs), states))
+    states = jax.tree.map(lambda *x: jnp.stack(x), *(_first_state(problem, x) for x in xs))
+    return np.asarray(_impact_energies(problem, jnp.stack(xs), states))
 
 
 @compiled
-def _lost(problem: Shooting, xs: Array, states: State) -> Array:
-    def one(x, state):
+def _impact_energies(problem: Shooting, xs: Array, states: State) -> Array:
+    def energy(x, state):
         run = simulate(problem.at(x), state, problem.cycles, method=problem.method)
         assert run.impact_energy is not None
         return jnp.mean(run.impact_energy)
 
-    return jax.vmap(one)(xs, states)
+    return jax.vmap(energy)(xs, states)
 
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
-    seen, machine = step.seen, problem.at(step.x)
+    observed, machine = step.observed, problem.at(step.x)
     sections, residual = sections_of(problem, step.x)
-    state = _first(problem, step.x, sections)
-    admissible = seen.admissible(range(len(problem.events)))
+    state = _first_state(problem, step.x, sections)
+    admissible = observed.admissible(range(len(problem.events)))
     hits = hits_of(problem, step, state)
     order = np.argsort(hits.clock)
-    duration = jnp.asarray(seen.duration)
+    duration = jnp.asarray(observed.duration)
     return Orbit(
         machine=machine,
         method=problem.method,
@@ -491,15 +493,15 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         impact_stop=jnp.asarray(hits.stop[order]),
         impacts=jnp.asarray(hits.number, jnp.int32),
         rests=jnp.asarray(len(problem.landings), jnp.int32),
-        y_min=jnp.asarray(seen.y_min),
-        y_max=jnp.asarray(seen.y_max),
-        clearance=jnp.asarray(seen.nearest.room),
-        monodromy=jnp.asarray(seen.monodromy),
-        multipliers=jnp.asarray(seen.multipliers),
+        y_min=jnp.asarray(observed.y_min),
+        y_max=jnp.asarray(observed.y_max),
+        clearance=jnp.asarray(observed.nearest.margin),
+        monodromy=jnp.asarray(observed.monodromy),
+        multipliers=jnp.asarray(observed.multipliers),
         residual=residual,
         error=jnp.asarray(step.size),
         iterations=jnp.asarray(step.iterations, jnp.int32),
         history=jnp.zeros((0,)),
         result=ORBIT_RESULTS.successful if admissible else ORBIT_RESULTS.inadmissible,
-        averages={name: jnp.asarray(x) for name, x in seen.averages.items()},
+        averages={name: jnp.asarray(x) for name, x in observed.averages.items()},
     )

@@ -24,24 +24,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._messages import count_of
-from ._conditions import Special, is_defective, minors
-from ._follow import SAME_CURVE, Ending, Event, Table, bounds_of
+from ._conditions import Special, is_defective, sum_of_minors
+from ._follow import SAME_CURVE, Ending, Event, Table, bound_rows
 from ._local_map import LocalMap, graze_at
-from ._motion_table import least_hold_force, room, tests_of
+from ._motion_table import bifurcation_tests, least_hold_force, relative_clearance
 from ._shooting import ROUNDING, Shooting
 from ._solution import (
-    BESIDE,
-    MOST,
+    MOST_SAMPLES,
+    SPACING,
     Step,
     advance,
     crossing,
     distance_along,
     jacobian_and_rows,
     jacobian_at,
-    located,
+    locate_zero,
     on_host,
 )
-from ._surgery import ALIKE, ROUNDED, halves_apart, may_be_symmetric, repeated, several
+from ._surgery import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
 from ._words import (
     AT_CODIMENSION_TWO,
     CROSSING,
@@ -95,102 +95,102 @@ class SpecialTable(Table):
             problem, [problem.machine, *problem.corners(bounds)]
         )
 
-    def stalled(self, steps: list[Step]) -> Ending:
+    def stall_end(self, steps: list[Step]) -> Ending:
         """Return the end of a stalled curve, perhaps where its motions become symmetric."""
         last = steps[-1]
-        if self.symmetric and np.linalg.norm(self.images(last)) < ALIKE:
+        if self.symmetric and np.linalg.norm(self.image_difference(last)) < ALIKE:
             for here in reversed(steps):
                 root = distance_along(self.problem, here, last)
-                if root > MOST * BESIDE:
-                    at = self._symmetric(here, root, beyond=False)
-                    return super().stalled(steps) if at is None else Ending(at, SYMMETRY)
-        return super().stalled(steps)
+                if root > MOST_SAMPLES * SPACING:
+                    at = self._symmetric_point(here, root, beyond=False)
+                    return super().stall_end(steps) if at is None else Ending(at, SYMMETRY)
+        return super().stall_end(steps)
 
-    def ends(self, here: Step, new: Step) -> list[Event]:
+    def event_rows(self, here: Step, new: Step) -> list[Event]:
         return [
-            *bounds_of(self), *self._grazings(here), *self._resonances(), *self._mirror(here),
-            *self.closing.rows(here, new),
+            *bound_rows(self), *self._grazing_rows(here), *self._resonance_rows(),
+            *self._symmetry_rows(here), *self.closing.rows(here, new),
         ]  # fmt: skip
 
-    def _grazings(self, here: Step) -> Iterator[Event]:
+    def _grazing_rows(self, here: Step) -> Iterator[Event]:
         """Yield the rows of lost impacts other than the grazing one, and of touched stops."""
         kind, grazes = self.condition.kind, self.condition.impact
         if self.problem.rests and (kind != REST or grazes is not None):
             yield Event(least_hold_force, lambda at: Ending(at, REST), noise=ROUNDING)
         for i, event in enumerate(self.problem.landings):
             if kind != REST or event != grazes:
-                lost = lambda step, i=i: -float(step.seen.escape[i])
-                yield Event(lost, lambda at: Ending(at, REST), noise=ROUNDING)
+                ending = lambda step, i=i: -float(step.observed.escape_margin[i])
+                yield Event(ending, lambda at: Ending(at, REST), noise=ROUNDING)
         for i, is_lost in enumerate(lost_at(here)):
             # In a symmetric motion another impact grazes as well, on a soft stop the release.
             if kind == GRAZING and (is_lost or i == grazes):
                 continue
-            test = lambda step, i=i: float(step.seen.approach[i] / step.seen.units[i])
-            lost = partial(self._singular, here, test)
-            yield Event(test, lost, noise=ROUNDING)
+            test = lambda step, i=i: float(step.observed.approach[i] / step.observed.units[i])
+            ending = partial(self._grazing_ending, here, test)
+            yield Event(test, ending, noise=ROUNDING)
         # At a grazing the body turns on the stop, to rounding. Close to a lost impact it turns at a
         # distance of v². This row would locate that end to the root of rounding, so it is the last.
         if kind not in TOUCHING or kind == REST or grazes is not None:
             # The turn of a grazing impact itself is at a distance of rounding.
             slack = 2 * ROUNDING if kind == GRAZING else 0.0
-            near = lambda step: room(step) + slack
-            yield Event(near, lambda at: Ending(at, GRAZING), noise=ROUNDING)
+            clearance = lambda step: relative_clearance(step) + slack
+            yield Event(clearance, lambda at: Ending(at, GRAZING), noise=ROUNDING)
 
-    def _singular(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
+    def _grazing_ending(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
         """Return the end at a grazing impact, where the monodromy matrix has a pole."""
         if self.condition.kind in TOUCHING or at is here:
             return Ending(at, GRAZING)
         root = distance_along(self.problem, here, at)
         found = crossing(self.problem, self.advance, here, root, test) or at
-        gone = {"monodromy": found.seen.monodromy, "multipliers": found.seen.multipliers}
-        gone = {name: np.nan * numbers for name, numbers in gone.items()}
-        return Ending(found._replace(seen=found.seen._replace(**gone)), GRAZING)
+        unknown = {"monodromy": found.observed.monodromy, "multipliers": found.observed.multipliers}
+        unknown = {name: np.nan * numbers for name, numbers in unknown.items()}
+        return Ending(found._replace(observed=found.observed._replace(**unknown)), GRAZING)
 
-    def _resonances(self) -> Iterator[Event]:
+    def _resonance_rows(self) -> Iterator[Event]:
         """Yield the rows of places where a pair of multipliers on the unit circle becomes real.
         Beyond, the product of the two is still 1, but neither has modulus 1."""
         for kind, sign in ((RESONANCE_1, 1), (RESONANCE_2, -1)):
             if self.condition.kind == TORUS:
-                left = lambda step, sign=sign: 1 - sign * cosine_of(step)
-                yield Event(left, lambda at, kind=kind: Ending(at, kind), noise=ROUNDING)
+                margin = lambda step, sign=sign: 1 - sign * cosine_of(step)
+                yield Event(margin, lambda at, kind=kind: Ending(at, kind), noise=ROUNDING)
 
-    def _mirror(self, here: Step) -> Iterator[Event]:
+    def _symmetry_rows(self, here: Step) -> Iterator[Event]:
         """Yield the row of a place where the motion becomes symmetric. Beyond, the same motions
         repeat mirrored, and a grazing of one side is passed through on the other."""
-        begin = self.images(here)
+        begin = self.image_difference(here)
         if np.linalg.norm(begin) < ROUNDED:
             return
 
         def ending(at: Step) -> Ending | None:
-            if np.linalg.norm(self.images(at)) >= ALIKE:
+            if np.linalg.norm(self.image_difference(at)) >= ALIKE:
                 return None
             return Ending(
-                self._symmetric(here, distance_along(self.problem, here, at)) or at, SYMMETRY
+                self._symmetric_point(here, distance_along(self.problem, here, at)) or at, SYMMETRY
             )
 
-        yield Event(lambda step: float(np.dot(begin, self.images(step))), ending)
+        yield Event(lambda step: float(np.dot(begin, self.image_difference(step))), ending)
 
-    def _symmetric(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
+    def _symmetric_point(self, here: Step, root: float, *, beyond: bool = True) -> Step | None:
         """Return the point about so far ahead where the motion is symmetric and the curve of
         symmetric motions crosses this one; `beyond` is true if this one can be followed further."""
-        begin = self.images(here)
+        begin = self.image_difference(here)
 
         def admits(step: Step, length: float) -> bool:
-            other = np.linalg.norm(self.images(step)) < ALIKE * BESIDE
-            return not other and (beyond or length < root)
+            is_symmetric = np.linalg.norm(self.image_difference(step)) < ALIKE * SPACING
+            return not is_symmetric and (beyond or length < root)
 
-        alike = lambda step: float(np.dot(begin, self.images(step)))
-        return crossing(self.problem, self.advance, here, root, alike, admits)
+        overlap = lambda step: float(np.dot(begin, self.image_difference(step)))
+        return crossing(self.problem, self.advance, here, root, overlap, admits)
 
 
 def lost_at(step: Step) -> np.ndarray:
     """Return which events of a motion are lost, to rounding."""
-    return np.abs(np.asarray(step.seen.approach / step.seen.units)) < _SLOW
+    return np.abs(np.asarray(step.observed.approach / step.observed.units)) < _SLOW
 
 
 def cosine_of(step: Step) -> float:
     """Return the cosine of the angle of the pair with product nearest to 1; beyond ±1 if real."""
-    values = step.seen.multipliers
+    values = step.observed.multipliers
     first, second = np.triu_indices(len(values), 1)
     pair = int(np.argmin(np.abs(values[first] * values[second] - 1)))
     return float(0.5 * (values[first[pair]] + values[second[pair]]).real)
@@ -218,7 +218,7 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
     found: list[tuple[float, Point]] = []
     for place, end in ((0, ends[0]), (len(steps) - 1, ends[1])):
         if end == GRAZING and condition.kind not in TOUCHING:
-            impact = _grazes(steps[place])
+            impact = _grazing_impact(steps[place])
             found.append((place, point(GRAZING, steps[place], impact=impact, index=place)))
         if end in (RESONANCE_1, RESONANCE_2, SYMMETRY):
             found.append((place, point(end, steps[place], index=place)))
@@ -226,12 +226,12 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
         for place, step in _zeros(problem, steps, test):
             if kind in _DOUBLE and not is_defective(problem, step, _DOUBLE[kind]):
                 continue
-            symmetric = kind == FOLD and condition.kind in TOUCHING and _symmetric(problem, step)
+            symmetric = kind == FOLD and condition.kind in TOUCHING and _is_symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
         with contextlib.suppress(ValueError):  # without a local map
-            for place, step, what in _resonances(problem, condition.impact, steps):
-                found.append((place, point(RESONANT, step, what, impact=condition.impact)))
+            for place, step, detail_here in _resonant_grazings(problem, condition.impact, steps):
+                found.append((place, point(RESONANT, step, detail_here, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
 
 
@@ -239,24 +239,24 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
 _DOUBLE = {RESONANCE_1: 1.0, RESONANCE_2: -1.0}
 
 
-def _symmetric(problem: Shooting, step: Step) -> bool:
+def _is_symmetric(problem: Shooting, step: Step) -> bool:
     if not may_be_symmetric(problem, [problem.machine, problem.at(step.x)]):
         return False
-    return bool(np.linalg.norm(halves_apart(problem, step, mirrored=True)) < ALIKE)
+    return bool(np.linalg.norm(half_difference(problem, step, mirrored=True)) < ALIKE)
 
 
-def _grazes(step: Step) -> int | None:
+def _grazing_impact(step: Step) -> int | None:
     """Return the impact that grazes at the end of a curve; `None` at a touch."""
-    approach = np.asarray(step.seen.approach / step.seen.units)
+    approach = np.asarray(step.observed.approach / step.observed.units)
     # A lost impact comes with a turn near the stop: at a distance of about v² for a speed v. At a
     # touched stop the impacts keep their speed.
-    touches = max(_SAME_TURN * np.sqrt(abs(room(step))), _ZERO)
+    touches = max(_SAME_TURN * np.sqrt(abs(relative_clearance(step))), _ZERO)
     if approach.size and approach.min() < touches:
         return int(np.argmin(approach))
     return None
 
 
-def _resonances(
+def _resonant_grazings(
     problem: Shooting, impact: int | None, steps: list[Step]
 ) -> Iterator[tuple[float, Step, str]]:
     """Yield the resonant grazings of a curve: the position in steps with a fraction, the point, and
@@ -266,62 +266,62 @@ def _resonances(
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
 
     # Where another impact is lost as well, at an end, the map has a pole: its sign is rounding.
-    usual = lost_at(steps[len(steps) // 2])
-    known = [None if (lost_at(step) & ~usual).any() else local(step) for step in steps]
-    both = problem.states == 2  # folds and doublings begin at the same point
-    for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if both else (1, -1)):
+    usually_lost = lost_at(steps[len(steps) // 2])
+    maps = [None if (lost_at(step) & ~usually_lost).any() else local(step) for step in steps]
+    is_planar = problem.states == 2  # folds and doublings begin at the same point
+    for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if is_planar else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
-        begins = AT_CODIMENSION_TWO[RESONANT] if both else begins
-        what = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
+        begins = AT_CODIMENSION_TWO[RESONANT] if is_planar else begins
+        description = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
         test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
-        values = [np.nan if each is None else each.resonance(n, sign) for each in known]
+        values = [np.nan if each is None else each.resonance(n, sign) for each in maps]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
             if not before * after < 0:
                 continue
-            step = located(problem, steps[i], steps[i + 1], test)
+            step = locate_zero(problem, steps[i], steps[i + 1], test)
             if step is None or not bool(step.good):
                 continue
             small = _ENTRY * max(abs(before), abs(after))
             if abs(test(step)) <= small and (local(step).passages(n) >= small).all():
-                yield _place(problem, i, steps, step), step, what
+                yield _place(problem, i, steps, step), step, description
 
 
 def _place(problem: Shooting, i: int, steps: list[Step], at: Step) -> float:
     """Return the position of a point on a curve: the step before it plus a fraction."""
-    whole, part = ((step.x - steps[i].x) / problem.scale for step in (steps[i + 1], at))
-    return i + float(whole @ part / (whole @ whole))
+    along, from_start = ((step.x - steps[i].x) / problem.scale for step in (steps[i + 1], at))
+    return i + float(along @ from_start / (along @ along))
 
 
 def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
     """Return functions that change sign at the points of each kind, by the curve's kind."""
 
-    def plain(function: Callable[[Step], float]) -> Test:
+    def scalar(function: Callable[[Step], float]) -> Test:
         return lambda step, like: (function(step), None)
 
     fold, doubling = (
-        plain(lambda s, kind=kind: tests_of(s)[kind]) for kind in (CROSSING, DOUBLING)
+        scalar(lambda s, kind=kind: bifurcation_tests(s)[kind]) for kind in (CROSSING, DOUBLING)
     )
     motion = dataclasses.replace(problem, conditions=())
     if condition.kind == TORUS:
-        return {RESONANCE_3: plain(lambda s: cosine_of(s) + 0.5), RESONANCE_4: plain(cosine_of)}
+        return {RESONANCE_3: scalar(lambda s: cosine_of(s) + 0.5), RESONANCE_4: scalar(cosine_of)}
     # The product of all eigenvalues of M ± I but one, if that one is zero.
     sign = 1 if condition.kind == DOUBLING else -1
-    shifted = lambda s: s.seen.monodromy + sign * np.eye(len(s.seen.monodromy))
-    double = plain(lambda s: float(minors(shifted(s))))
+    shifted = lambda s: s.observed.monodromy + sign * np.eye(len(s.observed.monodromy))
+    double = scalar(lambda s: float(sum_of_minors(shifted(s))))
     if condition.kind == FOLD:
-        tests = {CUSP: _cusp(motion, 2 if condition.double else 1), FLIP: doubling}
+        tests = {CUSP: _cusp_test(motion, 2 if condition.double else 1), FLIP: doubling}
         return tests if condition.double else tests | {RESONANCE_1: double}
     if condition.kind == DOUBLING:
-        return {DEGENERATE: _cubic(motion, twice=True), FLIP: fold, RESONANCE_2: double}
+        return {DEGENERATE: _cubic_test(motion, twice=True), FLIP: fold, RESONANCE_2: double}
     if condition.kind == CROSSING:
         return {RESONANCE_1: double}
     if condition.kind == SYMMETRY:
-        return {DEGENERATE_SYMMETRY: _cubic(motion, twice=False), RESONANCE_1: double}
+        return {DEGENERATE_SYMMETRY: _cubic_test(motion, twice=False), RESONANCE_1: double}
     # M has a pole at a grazing impact, but not at a touched stop.
     return {} if condition.impact is not None else {FOLD: fold, DOUBLING: doubling}
 
 
-def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
+def _null_vectors(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     """Return the null vectors l and r of a square matrix.
 
     Their signs are coupled: the adjugate is r lᵀ times det U · det V and a positive number, and it
@@ -335,19 +335,19 @@ def _nulls(matrix: np.ndarray, like: Vectors | None = None) -> Vectors:
     return Vectors(*(np.sign(overlap) * a for a in found))
 
 
-def _cusp(motion: Shooting, many: int) -> Test:
+def _cusp_test(motion: Shooting, dimension: int) -> Test:
     """Return a test for cusps: the signed rate of the parameters along a curve of folds.
 
     With the left null vector l of F_x the parameters change so that l·F_p dp = 0, along the line
     across l·F_p. That line turns slowly, while their direction reverses at a cusp. If there are
-    `many` null vectors, the parameters act on the one that is used.
+    `dimension` null vectors, the parameters act on the one that is used.
     """
 
     def test(step: Step, like: Vectors | None) -> tuple[float, Vectors]:
         jacobian = jacobian_at(motion, step.x)
-        nulls = _nulls(jacobian[:, :-2], like)
-        if many > 1:
-            lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -many:].T
+        nulls = _null_vectors(jacobian[:, :-2], like)
+        if dimension > 1:
+            lefts = np.linalg.svd(jacobian[:, :-2])[0][:, -dimension:].T
             left = np.linalg.svd(lefts @ jacobian[:, -2:])[0][:, 0] @ lefts
             sense = 1.0 if like is None else np.sign(left @ like.left)
             nulls = nulls._replace(left=sense * left)
@@ -359,7 +359,7 @@ def _cusp(motion: Shooting, many: int) -> Test:
 
 
 @on_host
-def _bent(problem: Shooting, x, right, bend):
+def _derivatives_along(problem: Shooting, x, right, bend):
     """Return the equations' second and third derivatives d/dt along x + t right + t² bend/2."""
 
     def along(t):
@@ -373,7 +373,7 @@ def _bent(problem: Shooting, x, right, bend):
     return jax.jvp(second, (zero,), (jnp.ones_like(zero),))
 
 
-def _cubic(motion: Shooting, *, twice: bool) -> Test:
+def _cubic_test(motion: Shooting, *, twice: bool) -> Test:
     """Return the cubic coefficient of the motions that begin at a doubling or a symmetry breaking.
 
     Let F be the equations of the motion gone through twice, or of the symmetric motion, with null
@@ -381,17 +381,17 @@ def _cubic(motion: Shooting, *, twice: bool) -> Test:
     B(r, w))/6, F_x w = -B(r, r) (Kuznetsov, Elements of Applied Bifurcation Theory, 2004, section
     5.4). The quadratic coefficient l·B(r, r)/2 is zero by the symmetry of both halves.
     """
-    whole = several(motion, 2) if twice else motion
+    whole = over_periods(motion, 2) if twice else motion
 
     def test(step: Step, like: Vectors | None) -> tuple[float, None]:
         x = repeated(motion, step.x, whole) if twice else np.asarray(step.x)
         (jacobian, rows), scale = jacobian_and_rows(whole, x), whole.scale
         matrix = jacobian[:, :-2]
-        nulls = _nulls(matrix)
+        nulls = _null_vectors(matrix)
         right = scale * np.append(nulls.right, [0.0, 0.0])
-        second, _ = _bent(whole, x, right, np.zeros_like(x))
+        second, _ = _derivatives_along(whole, x, right, np.zeros_like(x))
         bend = np.linalg.lstsq(matrix, -second / rows)[0]
-        _, third = _bent(whole, x, right, scale * np.append(bend, [0.0, 0.0]))
+        _, third = _derivatives_along(whole, x, right, scale * np.append(bend, [0.0, 0.0]))
         return float(nulls.left @ (third / rows)) / 6, None
 
     return test
@@ -399,33 +399,33 @@ def _cubic(motion: Shooting, *, twice: bool) -> Test:
 
 def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[float, Step]]:
     """Yield the zeros of a test along a curve: position in steps with a fraction, and point."""
-    seen: list[tuple[float, Vectors | None]] = []
+    tested: list[tuple[float, Vectors | None]] = []
     for step in steps:
-        like = seen[-1][1] if seen else None
+        like = tested[-1][1] if tested else None
         # At an end with a lost impact the tests have poles.
-        regular = np.isfinite(step.seen.monodromy).all()
-        seen.append(test(step, like) if regular else (np.nan, like))
+        regular = np.isfinite(step.observed.monodromy).all()
+        tested.append(test(step, like) if regular else (np.nan, like))
     for i, (here, new) in enumerate(itertools.pairwise(steps)):
-        (before, like), (after, _) = seen[i], seen[i + 1]
+        (before, like), (after, _) = tested[i], tested[i + 1]
         if not (before * after < 0 or (after == 0 and before != 0)):
             continue
-        most = max(abs(before), abs(after))
-        at = _zero(problem, here, new, lambda s, like=like: test(s, like)[0], most)
+        scale = max(abs(before), abs(after))
+        at = _zero(problem, here, new, lambda s, like=like: test(s, like)[0], scale)
         if at is not None:
             yield _place(problem, i, steps, at), at
 
 
 def _zero(
-    problem: Shooting, here: Step, new: Step, test: Callable[[Step], float], most: float
+    problem: Shooting, here: Step, new: Step, test: Callable[[Step], float], scale: float
 ) -> Step | None:
-    """Return the point between two where a test, of size `most` there, is zero without a pole."""
-    at = located(problem, here, new, test)
-    if at is None or abs(test(at)) <= _ZERO * most:
+    """Return the point between two where a test, of size `scale` there, is zero without a pole."""
+    at = locate_zero(problem, here, new, test)
+    if at is None or abs(test(at)) <= _ZERO * scale:
         return at
     # At a crossing with another curve the corrector fails.
 
     def admits(step: Step, length: float) -> bool:
-        return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < most
+        return float(step.tangent @ here.tangent) >= SAME_CURVE and abs(test(step)) < scale
 
-    ahead = partial(advance, problem)
-    return crossing(problem, ahead, here, distance_along(problem, here, at), test, admits)
+    advance_here = partial(advance, problem)
+    return crossing(problem, advance_here, here, distance_along(problem, here, at), test, admits)

@@ -1,7 +1,7 @@
 """The equations of a motion without some of its events, or over another number of its cycles;
 motions whose second half equals the first, or its image under the machine's symmetry.
 
-A branch may begin at a motion of half its period (`origin`).
+A branch may begin at a motion of half its period (`locate_origin`).
 """
 
 import dataclasses
@@ -19,13 +19,13 @@ from ._shooting import ROUNDING, Shooting
 from ._solution import (
     Step,
     advance,
+    find_zero_near,
     observe,
     on_host,
     sections_at,
     sections_of,
     state_at,
     tangent_at,
-    zero_near,
 )
 
 # Halves of a period that differ by less than the first are equal, or images of each other; by less
@@ -44,33 +44,33 @@ def may_be_symmetric(problem: Shooting, machines: Iterable[AbstractMachine]) -> 
     if any(machine.mirrored(problem.like) is None for machine in machines):
         return False
     pairs = zip(events[:half], events[half:], strict=True)
-    return all(_are_images(problem.machine, one, other) for one, other in pairs)
+    return all(_are_images(problem.machine, first, second) for first, second in pairs)
 
 
-def _are_images(machine: AbstractMachine, one: Event, other: Event) -> bool:
+def _are_images(machine: AbstractMachine, first: Event, second: Event) -> bool:
     stops = stops_of(machine)
-    if one.use != other.use:
+    if first.use != second.use:
         return False
-    if max(one.number, other.number) < len(stops):  # stops come first among the events
-        left, right = stops[one.number], stops[other.number]
+    if max(first.number, second.number) < len(stops):  # stops come first among the events
+        left, right = stops[first.number], stops[second.number]
         return left.coordinate == right.coordinate and left.sign == -right.sign
-    return one.of(machine).holds_mode and other.of(machine).holds_mode
+    return first.of(machine).holds_mode and second.of(machine).holds_mode
 
 
 def may_repeat(problem: Shooting) -> bool:
     """Return whether the second half of a period with these events can equal the first."""
     events, half = problem.events, len(problem.events) // 2
-    later = tuple(event.later(-(problem.cycles // 2)) for event in events[half:])
+    later = tuple(event.shifted(-(problem.cycles // 2)) for event in events[half:])
     return problem.cycles % 2 == 0 and events[:half] == later
 
 
 @on_host
-def _halves(
+def _differences(
     problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
 ) -> Float[Array, " differences"]:
     """Return the difference of the second half of a period from the first, or from its image;
     smooth along a branch, as the events of both halves are compared."""
-    half, turn = len(problem.events) // 2, 0.5 * problem.period(x)
+    half, half_period = len(problem.events) // 2, 0.5 * problem.period(x)
 
     def image(u):
         if not mirrored:
@@ -79,20 +79,20 @@ def _halves(
 
     clock, states = problem.parts(x)
     if not half:
-        return ravel_pytree(problem.state_at(x, 0, turn))[0] - image(states[0])
-    late, images = clock[half:] - clock[:half] - turn, jax.vmap(image)(states[:half])
-    apart = nearest_images(problem.angles, states[half:], images) - images
-    return jnp.concatenate([late, apart.ravel()])
+        return ravel_pytree(problem.state_at(x, 0, half_period))[0] - image(states[0])
+    delays, images = clock[half:] - clock[:half] - half_period, jax.vmap(image)(states[:half])
+    differences = nearest_images(problem.angles, states[half:], images) - images
+    return jnp.concatenate([delays, differences.ravel()])
 
 
-def halves_apart(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
+def half_difference(problem: Shooting, step: Step, *, mirrored: bool = False) -> np.ndarray:
     """Return the difference of the period's halves, or from the image, in the unknowns' sizes."""
-    return _halves(problem, step.x, mirrored) / problem.half_scale()
+    return _differences(problem, step.x, mirrored) / problem.half_scale()
 
 
-def several(old: Shooting, n: int) -> Shooting:
+def over_periods(old: Shooting, n: int) -> Shooting:
     """Return the equations of a motion that is gone through n times."""
-    events = tuple(event.later(i * old.cycles) for i in range(n) for event in old.events)
+    events = tuple(event.shifted(i * old.cycles) for i in range(n) for event in old.events)
     # With events, `steps` counts those of one leg, which stays as long. Each hop of a chatter takes
     # a part of `steps / cycles`, so that with chatters the steps grow with the cycles.
     steps = old.steps if events and not old.landings else n * old.steps
@@ -104,14 +104,14 @@ def several(old: Shooting, n: int) -> Shooting:
 
 def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndarray:
     """Return the unknowns of a motion that is gone through several times, as those of `new`."""
-    (clock, states, turn), n = problem.values(x), new.cycles // problem.cycles
+    (clock, states, period), n = problem.values(x), new.cycles // problem.cycles
     if problem.events:
-        clock = (clock + turn * np.arange(n)[:, None]).ravel()
+        clock = (clock + period * np.arange(n)[:, None]).ravel()
         states = np.tile(states, (n, 1))
-    return np.asarray(new.pack(clock, states, x, n * turn))
+    return np.asarray(new.pack(clock, states, x, n * period))
 
 
-def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
+def locate_origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
     """Return the point where a branch begins, the problem of the motion of half the period, and the
     point on the latter, on which it is located.
 
@@ -119,39 +119,39 @@ def origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
     halves is a motion of half the period up to a term of second order.
     """
     legs, (clock, states, period) = len(problem.events) // 2, problem.values(at.x)
-    turn = period / 2
+    half_period = period / 2
     half = dataclasses.replace(
         problem, cycles=problem.cycles // 2, events=problem.events[:legs],
         modes=problem.modes[: max(1, legs)],
         steps=problem.steps if legs else problem.steps // 2,
     )  # fmt: skip
     if legs:
-        clock = 0.5 * (clock[:legs] + clock[legs:] - turn)
+        clock = 0.5 * (clock[:legs] + clock[legs:] - half_period)
         first = states[:legs]
         states = 0.5 * (first + nearest_images(problem.angles, states[legs:], first))
     else:
-        states = states + 0.5 * halves_apart(problem, at) * problem.half_scale()
-    mean = np.asarray(half.pack(clock, states, at.x, turn))
+        states = states + 0.5 * half_difference(problem, at) * problem.half_scale()
+    mean = np.asarray(half.pack(clock, states, at.x, half_period))
 
     def doubling(step: Step) -> float:
-        return float(np.linalg.det(step.seen.monodromy + np.eye(problem.states)))
+        return float(np.linalg.det(step.observed.monodromy + np.eye(problem.states)))
 
-    found = zero_near(half, mean, doubling)
+    found = find_zero_near(half, mean, doubling)
     if found is None:
         return at, half, advance(half, mean, np.eye(mean.size)[-1], 0.0)
     x = repeated(half, found.x, problem)
-    return at._replace(x=x, size=found.size, seen=observe(problem, x)), half, found
+    return at._replace(x=x, size=found.size, observed=observe(problem, x)), half, found
 
 
-def admissible_beside(problem: Shooting, x: np.ndarray, distance: float) -> Step | None:
+def admissible_near(problem: Shooting, x: np.ndarray, distance: float) -> Step | None:
     """Return the admissible motion at a distance from a solution, on either side, or `None`."""
     tangent = tangent_at(problem, x)
     for sense in (1.0, -1.0):
         found = advance(problem, x, sense * tangent, distance)
-        seen = found.seen
-        inside = min(seen.nearest.room, seen.pull.room, *seen.approach) > 0
-        together = ROUNDING * problem.radian
-        if bool(found.good) and inside and min(seen.order, seen.order_margin + together) > 0:
+        data = found.observed
+        inside = min(data.nearest.margin, data.pull.margin, *data.approach) > 0
+        slack = ROUNDING * problem.radian
+        if bool(found.good) and inside and min(data.modes_agree, data.order_margin + slack) > 0:
             return found
     return None
 
@@ -165,10 +165,10 @@ def with_sections(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     """Return the equations of a motion with its sections among the events, and their unknowns."""
     if not old.omits_sections:
         return old, x
-    (clock, states, period), (there, sections, _) = old.values(x), sections_at(old, x)
-    ends = old.in_turn(1, np.asarray(in_rows(there)))
-    states, (legs, place) = old.in_turn(0, states), map(np.asarray, sections)
-    clock = np.mod(np.concatenate([place, clock]) - place[0], period)
+    (clock, states, period), (section_states, sections, _) = old.values(x), sections_at(old, x)
+    ends = old.within_turn(1, np.asarray(in_rows(section_states)))
+    states, (legs, section_clock) = old.within_turn(0, states), map(np.asarray, sections)
+    clock = np.mod(np.concatenate([section_clock, clock]) - section_clock[0], period)
     clock[0], order = 0.0, np.argsort(clock, kind="stable")
     events = (*(section_of(old.machine, i) for i in range(old.cycles)), *old.events)
     modes = (*(old.modes[leg] for leg in legs), *old.modes)
@@ -196,24 +196,24 @@ def without_events(
     return new, np.asarray(new.pack(clock, states, x, period))
 
 
-def of_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
+def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
     """Return the equations of the same motion over its least period, and their unknowns."""
     leaves = jax.tree.leaves(sections_of(old, x)[0])
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):
-        turns, rest = divmod(old.cycles, cycles)
-        apart = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
-        if not rest and apart.max() < _SAME and len(old.events) % turns == 0:
+        repetitions, remainder = divmod(old.cycles, cycles)
+        difference = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
+        if not remainder and difference.max() < _SAME and len(old.events) % repetitions == 0:
             break
     else:
         return old, x
-    legs = max(1, len(old.events) // turns)
+    legs = max(1, len(old.events) // repetitions)
     clock, states, period = old.values(x)
     events = tuple(
         e if e.cycle is None else e._replace(cycle=e.cycle % cycles) for e in old.events[:legs]
     )
-    steps = old.steps if events else max(1, old.steps // turns)
+    steps = old.steps if events else max(1, old.steps // repetitions)
     new = dataclasses.replace(
         old, cycles=cycles, events=events, modes=old.modes[:legs], steps=steps
     )
-    return new, np.asarray(new.pack(clock[:legs], states[:legs], x, period / turns))
+    return new, np.asarray(new.pack(clock[:legs], states[:legs], x, period / repetitions))

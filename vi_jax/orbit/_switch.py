@@ -16,7 +16,7 @@ from ..machine import after_event, others_of, with_leaf
 from ._conditions import AbstractCondition, FixedComponent, Special
 from ._flight import Event
 from ._local_map import graze_at
-from ._motion_table import tests_of
+from ._motion_table import bifurcation_tests
 from ._problem import events_in
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
@@ -24,14 +24,14 @@ from ._solution import (
     Step,
     advance,
     jacobian_at,
-    located,
+    locate_zero,
     orbit_of,
     sections_of,
     state_at,
     tangent_at,
 )
 from ._special_table import PERIODS
-from ._surgery import admissible_beside, repeated, several, without_events
+from ._surgery import admissible_near, over_periods, repeated, without_events
 from ._words import (
     CROSSING,
     DOUBLING,
@@ -67,7 +67,7 @@ def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
 
 def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
     """Return the motion gone through n times, and right singular vectors of its Jacobian in x."""
-    new = several(point.problem, n)
+    new = over_periods(point.problem, n)
     x = repeated(point.problem, point.step.x, new)
     return new, x, np.linalg.svd(jacobian_at(new, x)[:, :-1])[2]
 
@@ -99,7 +99,7 @@ def _held_otherwise(point: Point, distance: float) -> Orbit:
     problem, change = point.problem, change_at(point.problem, point.step)
     if change is not None and change.exists and change.modes[0] == change.modes[2]:
         new, start, _ = without_part(problem, point.step, change)
-        found = admissible_beside(new, start, distance)
+        found = admissible_near(new, start, distance)
         if found is not None:
             return orbit_of(new, found)
     other = lambda orbit: len(events_in(orbit)) != len(problem.events)
@@ -111,7 +111,7 @@ def _resting_otherwise(point: Point, distance: float) -> Orbit:
     if not point.is_origin:
         other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
         return _beside(point, distance, "another number of rests", other)
-    found = admissible_beside(point.problem, point.step.x, distance)
+    found = admissible_near(point.problem, point.step.x, distance)
     if found is None:
         raise ValueError(f"No motion with one rest was found at distance {distance:g}.")
     return orbit_of(point.problem, found)
@@ -204,9 +204,9 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
     if point.impact is not None:
         new, start = without_events(old, step.x, point.lost)
     else:
-        nearest = step.seen.nearest
+        nearest = step.observed.nearest
         new, start = _with_touch(old, step.x, int(nearest.event), float(nearest.clock))
-    found = admissible_beside(new, start, distance)
+    found = admissible_near(new, start, distance)
     if found is not None:
         return orbit_of(new, found)
     raise ValueError(
@@ -294,8 +294,8 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
 
     periods = range(1, PERIODS + 1)
     n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * deep(n)), 1)
-    fast = min(point.step.seen.fastest, np.sqrt(2 * touch.rate) * deep(n))
-    long = several(problem, n)
+    fast = min(point.step.observed.fastest, np.sqrt(2 * touch.rate) * deep(n))
+    long = over_periods(problem, n)
     new, x = _with_touch(long, repeated(problem, graze.x, long), touch.number, touch.clock)
     impact = int(np.argmin(np.abs(new.values(x)[0] - touch.clock)))
 
@@ -306,7 +306,11 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
         return two, at, np.nan if at is None else float(at.x[-2] - begin[-2])
 
     (two, at, off), (*_, half) = found(1.0), found(0.5)
-    if at is not None and _HALF[0] < half / off < _HALF[1] and at.seen.admissible(range(new.legs)):
+    if (
+        at is not None
+        and _HALF[0] < half / off < _HALF[1]
+        and at.observed.admissible(range(new.legs))
+    ):
         return point_at(two, at, kind)
     raise ValueError(
         f"No {kind} of a motion with one impact was found at distance {distance:g} from this "
@@ -319,12 +323,12 @@ def _changes(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step |
     speed, a curve in both parameters; the closest one to the resonance, which is about at `x`."""
     begin = advance(two, x, np.eye(len(x))[-2], 0.0)
     heads = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
-    value = lambda step: tests_of(step)[test]
+    value = lambda step: bifurcation_tests(step)[test]
     for i, side in itertools.product(range(_LOOKED), (0, 1)):
         here = heads[side]
         step = advance(two, here.x, here.tangent, _FIRST * distance * 2**i)
         if bool(step.good) and value(here) * value(step) < 0:
-            return located(two, here, step, value)
+            return locate_zero(two, here, step, value)
         heads[side] = step if bool(step.good) else here
     return None
 

@@ -43,7 +43,7 @@ class Path(NamedTuple):
 class Nearest(NamedTuple):
     """The turning point that is nearest to an event which does not happen there."""
 
-    room: Scalar
+    margin: Scalar
     """Distance to the stop at a body's turn; for another event, its guard's distance below zero.
     Negative if the guard is crossed, infinite without such a turn."""
     clock: Scalar
@@ -54,7 +54,7 @@ class Nearest(NamedTuple):
     """The size of that distance along the motion (see `Shooting.observe`)."""
 
 
-class _Found(NamedTuple):
+class _Turns(NamedTuple):
     """The turning points of a function of the state along a flight, one for each step."""
 
     turns: Bool[Array, " steps"]
@@ -69,7 +69,7 @@ class _Found(NamedTuple):
     """True if an event would happen there."""
 
 
-class _Watched(NamedTuple):
+class _Quantity(NamedTuple):
     """A quantity that may turn along a flight, by its number in the machine."""
 
     number: int
@@ -88,13 +88,13 @@ class _Watched(NamedTuple):
     def rates(self, flight: Flight, smooth: SmoothMachine, s: Scalar, u: Vector) -> Rates:
         """Return the value and its first two derivatives with respect to s."""
 
-        def guard(s, state):
+        def value_here(s, state):
             return self.value(flight, s, state)
 
-        return guard_rates(smooth.field, guard, s, flight.unravel(u))
+        return guard_rates(smooth.field, value_here, s, flight.unravel(u))
 
 
-class _Guard(_Watched):
+class _Guard(_Quantity):
     """The guard of an event."""
 
     def value(self, flight, s, state):
@@ -103,12 +103,12 @@ class _Guard(_Watched):
     def happens(self, flight, s, u, length):
         if not events_of(flight.machine)[self.number].from_below:
             return super().happens(flight, s, u, length)
-        there = flight.unravel(_stepped(flight, (s, length, u)))
-        when = happens_at(flight.machine, self.number, s + length, there, flight.modes)
-        return jnp.ones((), bool) if when is None else when
+        state = flight.unravel(_state_after_step(flight, (s, length, u)))
+        condition = happens_at(flight.machine, self.number, s + length, state, flight.modes)
+        return jnp.ones((), bool) if condition is None else condition
 
 
-class _Body(_Watched):
+class _Body(_Quantity):
     """A coordinate; it turns where its velocity is zero."""
 
     def value(self, flight, s, state):
@@ -121,71 +121,71 @@ class _Body(_Watched):
         return super().rate(flight, s, u)
 
 
-class _Pull(_Watched):
+class _Pull(_Quantity):
     """The force that pulls a body off a stop on which it rests."""
 
     def value(self, flight, s, state):
         return -force_on(flight, self.number, s, state)
 
 
-_Room = tuple[Float[Array, " steps"], Float[Array, " steps"]]
-"""`Nearest.room` of one event in each step, infinite without a turn, and the clock of the turn."""
+_Margins = tuple[Float[Array, " steps"], Float[Array, " steps"]]
+"""`Nearest.margin` of one event in each step, infinite without a turn; the clock of the turn."""
 
 
 def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
     """Return the least and the greatest turn of the first coordinate (infinite without a turn), the
     turn nearest to an event, and the result of `pull_of`."""
-    bodies, rooms = turning(path)
+    bodies, margins = turning_points(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
-    return low, high, _least_room(dict(enumerate(rooms)), path.h), pull_of(path)
+    return low, high, _least_margin(dict(enumerate(margins)), path.h), pull_of(path)
 
 
-def _least_room(rooms: dict[int, _Room], h: Scalar) -> Nearest:
+def _least_margin(margins: dict[int, _Margins], h: Scalar) -> Nearest:
     least = Nearest(jnp.full((), jnp.inf, h.dtype), *2 * (jnp.zeros((), h.dtype),))
-    for number, (room, clock) in rooms.items():
-        i = jnp.argmin(room)
-        other = Nearest(room[i], clock[i], jnp.full((), float(number), h.dtype))
-        less = other.room < least.room
-        least = jax.tree.map(lambda a, b, less=less: jnp.where(less, a, b), other, least)
+    for number, (margin, clock) in margins.items():
+        i = jnp.argmin(margin)
+        nearest = Nearest(margin[i], clock[i], jnp.full((), float(number), h.dtype))
+        nearer = nearest.margin < least.margin
+        least = jax.tree.map(lambda a, b, nearer=nearer: jnp.where(nearer, a, b), nearest, least)
     return least
 
 
-def turning(path: Path) -> tuple[list[_Found], list[_Room]]:
+def turning_points(path: Path) -> tuple[list[_Turns], list[_Margins]]:
     """Return the turning points of each coordinate, and the room of each event but the section."""
     flight, machine, begin = path.flight, path.flight.machine, path.places[0]
     found = partial(_turns_in, path)
     bodies = [found(_Body(k)) for k in range(len(machine.coordinates))]
-    rooms = []
+    margins = []
     for stop in stops_of(machine):
-        at = bodies[stop.coordinate]
-        facing = at.turns & (stop.sign * at.before > 0)
+        turn = bodies[stop.coordinate]
+        facing = turn.turns & (stop.sign * turn.before > 0)
         if flight.contact:  # a released body begins to move with velocity zero
             free = flight.contact[stop.coordinate] == 0
-            facing = facing & free & (at.place > begin + _TURNED * path.h)
-        rooms.append((jnp.where(facing, -stop.beyond(at.height), jnp.inf), at.place))
+            facing = facing & free & (turn.place > begin + _TURNED * path.h)
+        margins.append((jnp.where(facing, -stop.beyond(turn.height), jnp.inf), turn.place))
     for number, event in enumerate(events_of(machine)):
         if number < len(stops_of(machine)) or number == section_number(machine):
             continue
         guard = _Guard(number)
-        at = found(guard)
+        turn = found(guard)
         # A body that leaves sticking begins to slide with velocity and acceleration zero.
-        away = at.place > begin + _TURNED * path.h
-        facing = at.turns & (at.before > 0) & away
+        is_later = turn.place > begin + _TURNED * path.h
+        facing = turn.turns & (turn.before > 0) & is_later
         if event.from_below:  # it touches nothing unless it has been below zero
-            along = lambda s, u, guard=guard: guard.value(flight, s, flight.unravel(u))
-            value = jax.vmap(along)(path.places, path.states)
+            guard_value = lambda s, u, guard=guard: guard.value(flight, s, flight.unravel(u))
+            value = jax.vmap(guard_value)(path.places, path.states)
             # Just after the event itself it is zero, to rounding of either sign.
             below = -_ROUNDED * jnp.max(jnp.abs(value))
-            facing = facing & at.happens & (jax.lax.cummin(value) < below)
-        rooms.append((jnp.where(facing, -at.height, jnp.inf), at.place))
-    return bodies, rooms
+            facing = facing & turn.happens & (jax.lax.cummin(value) < below)
+        margins.append((jnp.where(facing, -turn.height, jnp.inf), turn.place))
+    return bodies, margins
 
 
-def _turns_in(path: Path, watched: _Watched) -> _Found:
+def _turns_in(path: Path, watched: _Quantity) -> _Turns:
     flight, places, states, h, closed = path
     # The end of the last step is the next event: its velocity is that of one more step.
-    last = flight.once(_stepped, (places[-1], h, states[-1]))
+    last = flight.once(_state_after_step, (places[-1], h, states[-1]))
     v = jax.vmap(partial(watched.rate, flight))(places, states)
     # A turn on the section itself is at the begin or the end of a closed flight. Its rate there is
     # rounding of either sign, so both must have the same sign.
@@ -195,25 +195,25 @@ def _turns_in(path: Path, watched: _Watched) -> _Found:
 
 
 def pull_of(path: Path) -> Nearest:
-    """Return the least extremum of the force on a resting body, with the force as `room`."""
+    """Return the least extremum of the force on a resting body, with the force as `margin`."""
     flight, forces = path.flight, {}
     for number, stop in enumerate(stops_of(flight.machine) if flight.contact else ()):
-        at = _turns_in(path, _Pull(number))
+        turn = _turns_in(path, _Pull(number))
         rests = flight.contact[stop.coordinate] == 1.0 + number
-        force = jnp.where(at.turns & (at.before > 0) & rests, -at.height, jnp.inf)
-        forces[number] = (force, at.place)
-    return _least_room(forces, path.h)
+        force = jnp.where(turn.turns & (turn.before > 0) & rests, -turn.height, jnp.inf)
+        forces[number] = (force, turn.place)
+    return _least_margin(forces, path.h)
 
 
-def _stepped(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
+def _state_after_step(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> Vector:
     """Return the state after one step from `inputs`: the clock, the step's length and the state."""
     s, h, u = inputs
     return flight.step(s, s + h, u, {})[0]
 
 
 def _turn(
-    watched: _Watched, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
-) -> _Found:
+    watched: _Quantity, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
+) -> _Turns:
     """Return the turning point in a step, if the rate changes its sign (`v0` and `v1` at the ends),
     by Newton's method on the length from the step's start; each trial is a step of the method."""
     h, s, u, v0, v1 = inputs
@@ -221,24 +221,24 @@ def _turn(
     turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))
 
     def at(moved: Flight, s: Scalar, u: Vector, length: Scalar) -> Rates:
-        after = _stepped(moved, (s, length, u))
+        after = _state_after_step(moved, (s, length, u))
         return watched.rates(flight, moved.smooth, s + length, after)
 
-    held = stop_gradient((eqx.filter(flight, eqx.is_array), s, u))
-    still = eqx.combine(held[0], flight)
+    constants = stop_gradient((eqx.filter(flight, eqx.is_array), s, u))
+    constant_flight = eqx.combine(constants[0], flight)
     limit = stop_gradient(h)
 
     def newton(_, length):
-        here = at(still, *held[1:], length)
-        bend = jnp.where(here.a == 0, 1.0, here.a)
-        return jnp.clip(length - here.v / bend, 0.0, limit)
+        here = at(constant_flight, *constants[1:], length)
+        second = jnp.where(here.a == 0, 1.0, here.a)
+        return jnp.clip(length - here.v / second, 0.0, limit)
 
     share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.5)
     length = jax.lax.fori_loop(0, 4, newton, stop_gradient(h * share))
     here = at(flight, s, u, length)
-    bend = jnp.where(here.a == 0, 1.0, here.a)
+    second = jnp.where(here.a == 0, 1.0, here.a)
     # A guard with a kink, as that of dry friction where its force vanishes, may have no turn.
-    met = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * bend)
-    shift = jnp.where(met, here.v, 0.0) / bend
+    has_converged = jnp.abs(here.v) <= jnp.abs(_TURNED * limit * second)
+    shift = jnp.where(has_converged, here.v, 0.0) / second
     happens = watched.happens(flight, s, u, length)
-    return _Found(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0, happens)
+    return _Turns(turns, here.x - 0.5 * here.v * shift, s + length - shift, v0, happens)

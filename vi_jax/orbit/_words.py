@@ -56,7 +56,7 @@ AT_CODIMENSION_TWO = {
 }
 
 
-def one(kind: str) -> str:
+def with_article(kind: str) -> str:
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 
@@ -68,21 +68,21 @@ def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
 
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
     """Describe two consecutive events of a motion that come together, and their place."""
-    lengths, which = problem.lengths(at.x), ""
+    lengths, place_of_both = problem.lengths(at.x), ""
     i = int(np.argmin(lengths))
     if lengths[i] < TOGETHER * problem.radian:
-        names = [problem.events[j % problem.legs].called(problem.machine) for j in (i, i + 1)]
+        names = [problem.events[j % problem.legs].name_on(problem.machine) for j in (i, i + 1)]
         place = place_in_words(problem, at, float(problem.values(at.x)[0][i]))
-        which = f" ({' and '.join(names)}, {place})"
-    return f"two of its events coincide{which}, and change their order beyond"
+        place_of_both = f" ({' and '.join(names)}, {place})"
+    return f"two of its events coincide{place_of_both}, and change their order beyond"
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
     """Describe what a motion touches, or the impact that it loses, and the place in its period."""
     machine = problem.machine
     if impact is None:
-        touched, clock = int(at.seen.nearest.event), float(at.seen.nearest.clock)
-        event, called = Event(touched).of(machine), Event(touched).called(machine)
+        touched, clock = int(at.observed.nearest.event), float(at.observed.nearest.clock)
+        event, called = Event(touched).of(machine), Event(touched).name_on(machine)
         what = f"touches the guard of {called}"
         if isinstance(event, RigidStop | SoftStop):
             what = "touches a stop" if isinstance(event, RigidStop) else f"grazes the {called}"
@@ -90,5 +90,5 @@ def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
     clock = float(problem.values(at.x)[0][impact])
     event, lost = problem.events[impact], problem.events[impact].of(machine)
     soft = isinstance(lost, SoftStop)
-    word = f"contact with the {event.called(machine)}" if soft else lost.word
-    return f"the {lost.name or word} {place_in_words(problem, at, clock)} is lost"
+    noun = f"contact with the {event.name_on(machine)}" if soft else lost.word
+    return f"the {lost.name or noun} {place_in_words(problem, at, clock)} is lost"

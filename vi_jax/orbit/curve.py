@@ -26,7 +26,7 @@ from ..machine import (
 )
 from ._conditions import Special, held_in_words
 from ._shooting import Observed, Shooting
-from ._solution import Hits, Step, energies_of, hits_of, located, orbit_of, sections_of
+from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
 from .results import InWords, Orbit, stability_of
@@ -93,7 +93,7 @@ class Curve(InWords, abc.ABC):
     """The special points, in the curve's order."""
 
     def _each(self, get: Callable[[Observed], Any]) -> np.ndarray:
-        return np.stack([np.asarray(get(step.seen)) for step in self.steps])
+        return np.stack([np.asarray(get(step.observed)) for step in self.steps])
 
     @property
     def scale(self) -> np.ndarray:
@@ -122,18 +122,18 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def y_min(self) -> np.ndarray:
         """Smallest position of the first coordinate, in the machine's unit (for a `Scene` a)."""
-        return self._each(lambda seen: seen.y_min)
+        return self._each(lambda observed: observed.y_min)
 
     @cached_property
     def y_max(self) -> np.ndarray:
         """Largest position over the period, in the same unit."""
-        return self._each(lambda seen: seen.y_max)
+        return self._each(lambda observed: observed.y_max)
 
     @cached_property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers over the period, the largest modulus first; (points, states). NaN at
         an end of a boundary with a lost impact, where some of them have no limit."""
-        return self._each(lambda seen: seen.multipliers)
+        return self._each(lambda observed: observed.multipliers)
 
     @cached_property
     def impact_phase(self) -> np.ndarray:
@@ -146,17 +146,17 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def impact_speed(self) -> np.ndarray:
         """V⁻ of each impact in `impact_phase`, in the machine's unit (for a `Scene` a ω)."""
-        return self._each(lambda seen: seen.approach[list(self.problem.impacts)])
+        return self._each(lambda observed: observed.approach[list(self.problem.impacts)])
 
     @cached_property
     def clearance(self) -> np.ndarray:
         """Smallest distance to a stop at a turn that does not touch it."""
-        return self._each(lambda seen: seen.nearest.room)
+        return self._each(lambda observed: observed.nearest.margin)
 
     @cached_property
     def duration(self) -> np.ndarray:
         """Least period in time."""
-        return self._each(lambda seen: seen.duration)
+        return self._each(lambda observed: observed.duration)
 
     @cached_property
     def frequency_ratio(self) -> np.ndarray:
@@ -170,8 +170,10 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def averages(self) -> dict[str, np.ndarray]:
         """The machine's own averages over the period, by name (see `AbstractMachine.averages`)."""
-        names = self.steps[0].seen.averages
-        return {name: self._each(lambda seen, name=name: seen.averages[name]) for name in names}
+        names = self.steps[0].observed.averages
+        return {
+            name: self._each(lambda observed, name=name: observed.averages[name]) for name in names
+        }
 
     @property
     def cycles(self) -> int:
@@ -186,7 +188,7 @@ class Curve(InWords, abc.ABC):
     @property
     def admissible(self) -> np.ndarray:
         """True at each point if the motion stays inside the gap and approaches each impact."""
-        return np.array([step.seen.admissible(self.problem.impacts) for step in self.steps])
+        return np.array([step.observed.admissible(self.problem.impacts) for step in self.steps])
 
     @property
     def multiplier(self) -> np.ndarray:
@@ -311,7 +313,7 @@ class Curve(InWords, abc.ABC):
                 if i == 0 or new is not None or "closed" not in self.ends:
                     found.append(here)
             elif new is not None and apart(here) * apart(new) < 0:
-                found.append(located(self.problem, here, new, apart))
+                found.append(locate_zero(self.problem, here, new, apart))
         return [orbit_of(self.problem, step) for step in found if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":

@@ -618,7 +618,7 @@ def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
     outcome, aperiodic = scenario_of(local, offsets, found)
     single = len(graze.touches) == 1 and first.kick.order == 0.5
     values = np.linalg.eigvals(local.matrix)
-    names = sorted({Event(touch.number).called(machine) for touch in graze.touches})
+    names = sorted({Event(touch.number).name_on(machine) for touch in graze.touches})
     unchecked = Grazing(
         parameter=graze.problem.parameters[0],
         value=float(graze.x[-1]),

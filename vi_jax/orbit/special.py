@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from .._checks import given_number, one_of
-from ._conditions import alone
+from ._conditions import in_one_parameter
 from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING
 from ._solution import Step, orbit_of
-from ._words import DETAILS, GRAZING, REST, grazing_in_words, one
+from ._words import DETAILS, GRAZING, REST, grazing_in_words, with_article
 from .results import InWords, Orbit
 
 # A grazing is a touch within this share of the motion: a choice.
@@ -87,8 +87,8 @@ class Point(InWords):
         """True if at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
         bifurcation, if the motion without the vanishing part touches a surface."""
         lost = self.kind == REST or (self.impact is not None and self.kind not in SLIDING)
-        seen = self.step.seen
-        return lost or bool(abs(seen.nearest.room) <= _TOUCHES * seen.nearest.unit)
+        observed = self.step.observed
+        return lost or bool(abs(observed.nearest.margin) <= _TOUCHES * observed.nearest.unit)
 
     @property
     def lost(self) -> list[int]:
@@ -96,7 +96,7 @@ class Point(InWords):
         stop is touched that the motion did not hit before."""
         if self.impact is None:
             return []
-        speed = np.abs(np.asarray(self.step.seen.approach / self.step.seen.units))
+        speed = np.abs(np.asarray(self.step.observed.approach / self.step.observed.units))
         others = (i for i in self.problem.impacts if speed[i] < ROUNDING)
         return sorted({self.impact, *others})
 
@@ -137,7 +137,7 @@ class Point(InWords):
             known = ", ".join(kind for curve, kind in BEGINS if curve == self.curve) or "none"
             where = "a branch" if self.curve is None else f"a curve of {self.curve}"
             raise ValueError(
-                f"`switch` has nothing to return at {one(self.kind)} of {where}. At these "
+                f"`switch` has nothing to return at {with_article(self.kind)} of {where}. At these "
                 f"kinds it has: {known}. Elsewhere use `find_orbit`, from a simulated motion."
             )
         begins = found[next(iter(found)) if to is None else one_of("to", to, tuple(found))]
@@ -157,7 +157,7 @@ def point_at(
     if detail is None:
         detail = grazing_in_words(problem, step, impact) if kind == GRAZING else DETAILS[kind]
     further = further_of(problem, step)
-    return Point(kind, detail, *alone(problem, step), impact, further, **more)
+    return Point(kind, detail, *in_one_parameter(problem, step), impact, further, **more)
 
 
 def further_of(problem: Shooting, step: Step) -> dict[str, tuple[float, float]]:
