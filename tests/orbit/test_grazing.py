@@ -10,7 +10,7 @@ import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from vi_jax.orbit._local_map import graze_at
-from vi_jax.orbit.grazing import settled
+from vi_jax.orbit.grazing import find_attractors
 
 from grazings import grazing_of
 
@@ -60,7 +60,7 @@ def test_periods_after_a_grazing(half):
     point, found, _, amplitude = half
     beyond = {4.0e-6: 7, 1.5e-5: 6, 3.5e-5: 0, 8.4e-5: 5}
     offsets = amplitude / (1 + np.array([*beyond])) - amplitude
-    forecast = settled(graze_at(point).map, offsets)
+    forecast = find_attractors(graze_at(point).map, offsets)
     assert forecast.period.tolist() == [*beyond.values()]
     assert found.outcome == vi.SCENARIOS.period_adding_with_chaos
     for offset, period, impacts in zip(offsets, forecast.period, forecast.impacts, strict=True):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from vi_jax.orbit._local_map import LocalMap
-from vi_jax.orbit.grazing import _next_to_each_other, scenario_of, settled, windows
+from vi_jax.orbit.grazing import _are_adjacent, find_attractors, scenario_of, windows
 
 
 def root_map(share):
@@ -27,7 +27,7 @@ def test_thresholds_of_the_root_map(share, outcome, least, most):
     """Thresholds are 1/4 and 2/3 (Nusse, Ott and Yorke 1994)."""
     local = root_map(share)
     offsets = -np.geomspace(1e-7, 1e-3, 1000) * share**2
-    name, aperiodic = scenario_of(local, offsets, settled(local, offsets))
+    name, aperiodic = scenario_of(local, offsets, find_attractors(local, offsets))
     assert name == outcome and least <= aperiodic <= most
 
 
@@ -44,17 +44,17 @@ def test_signs_of_the_entries_decide_the_outcome():
     offsets = -np.geomspace(1e-7, 1e-3, 60) * 0.25
     ones, half = np.ones((1, 1)), np.array([0.5])
     away = LocalMap(np.array([[[0.5]]]), ones, -ones, half, np.ones(1))
-    assert scenario_of(away, offsets, settled(away, offsets))[0] == "nonsmooth_fold"
+    assert scenario_of(away, offsets, find_attractors(away, offsets))[0] == "nonsmooth_fold"
     back = windows(away, 1e-2, 1)
     assert back.exists[0].max() > 0
     turned = LocalMap(np.array([[[-0.5]]]), ones, -ones, half, np.ones(1))  # e₁ > 0 > e₂
-    assert (settled(turned, offsets).period < 0).any()
+    assert (find_attractors(turned, offsets).period < 0).any()
     smooth = LocalMap(np.array([[[-0.5]]]), ones, ones, np.array([1.5]), np.ones(1))
-    assert scenario_of(smooth, offsets, settled(smooth, offsets))[0] == "persistence"
+    assert scenario_of(smooth, offsets, find_attractors(smooth, offsets))[0] == "persistence"
 
 
 def test_period_adding_needs_consecutive_periods():
     """Neither 5 and 7 without 6, as between two stops, nor falling periods are period adding."""
     offsets = np.geomspace(1e-3, 1e-7, 30)
     for kinds, adding in (((5, 6, 7), True), ((5, 7, 9), False), ((7, 6, 5), False)):
-        assert _next_to_each_other(offsets, np.repeat(kinds, 10)) == adding
+        assert _are_adjacent(offsets, np.repeat(kinds, 10)) == adding

@@ -41,8 +41,8 @@ def test_an_amplitude_is_held_by_the_damping(linear, monkeypatch):
     np.testing.assert_array_equal(data[XI], xi)
     assert vi.plot_branch(branch, x=XI, y="multiplier").get_xlabel() == "damping ratio ξ"
     # Another value compiles no other program.
-    traced, plain = [], _conditions.motion_quantity
-    monkeypatch.setattr(_conditions, "motion_quantity", lambda *a: (traced.append(a[-1]), plain(*a))[1])
+    traced, plain = [], _conditions.quantity_at
+    monkeypatch.setattr(_conditions, "quantity_at", lambda *a: (traced.append(a[-1]), plain(*a))[1])
     branch = branch_of_amplitude(linear, 2.9)
     assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
     assert f"held: y_max = 2.9 a; by {XI} in [0.001, " in str(branch)

@@ -43,8 +43,8 @@ def known_names(problem: Shooting) -> tuple[str, ...]:
     return (*names, *(_SECTION + name for name in section_names))
 
 
-def motion_quantity(problem: Shooting, x: Vector, observed: Observed, name: str) -> Scalar:
-    """Return a quantity, of `motion_quantity_names`, of a solution with these observations."""
+def quantity_at(problem: Shooting, x: Vector, observed: Observed, name: str) -> Scalar:
+    """Return a quantity, one of `known_names`, of a solution with these observations."""
     if name in observed.averages:
         return observed.averages[name]
     if name in ("y_min", "y_max", "duration"):
@@ -79,7 +79,7 @@ def rates_at(
 
     def values(x):
         observed = problem.observe(x)
-        return {name: motion_quantity(problem, x, observed, name) for name in names}
+        return {name: quantity_at(problem, x, observed, name) for name in names}
 
     return jax.jvp(values, (x,), (direction,))
 
@@ -106,13 +106,13 @@ class AbstractCondition(eqx.Module):
 
 
 class HeldQuantity(AbstractCondition):
-    """The condition that a quantity (see `motion_quantity_names`) has a given value."""
+    """The condition that a quantity of the motion, one of `known_names`, has a given value."""
 
     name: str = eqx.field(static=True)
     value: Scalar
 
     def residual(self, problem, x, observed, begins):
-        return motion_quantity(problem, x, observed, self.name) - self.value
+        return quantity_at(problem, x, observed, self.name) - self.value
 
 
 class HeldMultiplier(AbstractCondition):
@@ -241,7 +241,7 @@ class Special(AbstractCondition):
     - Fold or branch point: det(M - I) = 0. Period doubling: det(M + I) = 0.
     - Neimark–Sacker bifurcation: det(M₂ - I) = 0, the product of two multipliers is 1.
     - Grazing: V⁻ = 0 of the lost impact, or a clearance of zero.
-    - Lost rest: the chatter takes until the release (`escape`), or the force on the body is zero.
+    - Lost rest: the chatter takes until the release (`escape_margin`), or the force is zero.
     - Sliding: the force at the event of a switch is at the limit of holding it.
     """
 

@@ -107,11 +107,11 @@ def continue_orbit(
         problem, x = resting_problem_of(orbit, parameter, bounds, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
-    sought, watched = _names("extrema", extrema, problem), _watched(watch, orbit)
-    problem, x, ranges = _freed(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    start, before = _first_point(problem, x, orbit), problem.scale
+    sought, watched = _check_names("extrema", extrema, problem), _check_watched(watch, orbit)
+    problem, x, ranges = _extend(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
+    start, old_scale = _first_point(problem, x, orbit), problem.scale
     problem = with_sizes(problem, start.x, start.observed.largest)
-    (start,) = rescaled([start], before, problem.scale)
+    (start,) = rescaled([start], old_scale, problem.scale)
     start = advance(problem, start.x, start.tangent, 0.0)
     return both_ways(
         lambda: MotionTable(problem, ranges, sought, watched),
@@ -140,11 +140,11 @@ def _check_orbit(orbit: Orbit) -> None:
 
 def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
     """Check that these arguments free and hold equally many quantities of the orbit."""
-    for argument, given in (("free", free), ("fixed", fixed)):
-        if not isinstance(given, Mapping):
+    for argument, mapping in (("free", free), ("fixed", fixed)):
+        if not isinstance(mapping, Mapping):
             example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
             raise TypeError(
-                f"Argument `{argument}` must map names, as {example}, but got {given!r}."
+                f"Argument `{argument}` must map names, as {example}, but got {mapping!r}."
             )
     assert isinstance(free, Mapping) and isinstance(fixed, Mapping)
     if len(free) != len(fixed):
@@ -156,51 +156,51 @@ def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
         check_multipliers("orbit", orbit)
 
 
-def _freed(
+def _extend(
     problem: Shooting, x: np.ndarray, free: Mapping[str, tuple[float, float]],
     fixed: Mapping[str, float | None], bounds: tuple[float, float], multipliers: np.ndarray,
 ) -> tuple[Shooting, np.ndarray, list[tuple[float, float]]]:  # fmt: skip
     """Add parameters and as many conditions; return equations, unknowns and intervals."""
     if not free:
-        return _scaled(problem, [bounds]), x, [bounds]
-    machine, values, ranges = problem.machine, [], []
+        return _with_widths(problem, [bounds]), x, [bounds]
+    machine, parameter_values, ranges = problem.machine, [], []
     for name, given in free.items():
         check_leaf(machine, name, argument="free")
         if name == problem.parameters[0]:
             raise ValueError(f"Argument `free` must name others than the parameter, {name}.")
         ranges.append(interval(f"free[{name!r}]", given))
-        values.append(float(leaf(machine, name)))
-        check_parameter(machine, name, values[-1], ranges[-1], "orbit", "free")
-    names = _names("fixed", tuple(fixed), problem)
-    given = {k: at if at is None else given_number(f"fixed[{k!r}]", at) for k, at in fixed.items()}
+        parameter_values.append(float(leaf(machine, name)))
+        check_parameter(machine, name, parameter_values[-1], ranges[-1], "orbit", "free")
+    names = _check_names("fixed", tuple(fixed), problem)
+    given = {k: v if v is None else given_number(f"fixed[{k!r}]", v) for k, v in fixed.items()}
     here, _ = rates_at(problem, names, jnp.asarray(x), jnp.zeros(x.size))
-    targets = {name: float(here[name]) if at is None else at for name, at in given.items()}
+    targets = {name: float(here[name]) if v is None else v for name, v in given.items()}
     for name, target in targets.items():
         if not np.isfinite(target):
             raise ValueError(
                 f"Argument `fixed` must name what the orbit has, but its {name} is {target:g}."
             )
-    wide = dataclasses.replace(problem, conditions=hold_values(targets, multipliers))
-    wide = _widened(wide, x, tuple(free), ranges := [*ranges, bounds])
-    return wide, np.concatenate([x[:-1], values, x[-1:]]), ranges
+    new = dataclasses.replace(problem, conditions=hold_values(targets, multipliers))
+    new = _with_parameters(new, x, tuple(free), ranges := [*ranges, bounds])
+    return new, np.concatenate([x[:-1], parameter_values, x[-1:]]), ranges
 
 
-def _widened(
+def _with_parameters(
     problem: Shooting, x: np.ndarray, names: tuple[str, ...], ranges: Sequence[tuple[float, float]]
 ) -> Shooting:
     """Put these parameters before the equations' own, with steps for all their intervals."""
-    wide = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
-    steps = steps_of(problem.method, wide.corners(ranges), problem.like, cycles_to_fly(problem, x))
-    return _scaled(dataclasses.replace(wide, steps=max(problem.steps, steps)), ranges)
+    new = dataclasses.replace(problem, parameters=(*names, *problem.parameters))
+    steps = steps_of(problem.method, new.corners(ranges), problem.like, cycles_to_fly(problem, x))
+    return _with_widths(dataclasses.replace(new, steps=max(problem.steps, steps)), ranges)
 
 
-def _names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
+def _check_names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
     """Check names of quantities of a motion; an error lists the known names."""
     known = known_names(problem)
     return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
 
 
-def _watched(
+def _check_watched(
     watch: Mapping[str, Callable[[Orbit], float]], orbit: Orbit
 ) -> Mapping[str, Callable[[Orbit], float]]:
     """Check that each function returns a number of the orbit, else raise `TypeError`."""
@@ -216,7 +216,7 @@ def _watched(
     return watch
 
 
-def _scaled(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
+def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
     """Set the sizes of the parameters, half the widths of their intervals."""
     widths = jnp.asarray([0.5 * (high - low) for low, high in ranges])
     return dataclasses.replace(problem, widths=widths)
@@ -225,7 +225,7 @@ def _scaled(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shootin
 def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     """Refine the orbit as a solution of its equations from event to event, at its parameter. At a
     fold it is refined across the branch instead, which needs another compiled program."""
-    start, moved = _refined(problem, x, np.eye(problem.size)[-1])
+    start, distance = _refine(problem, x, np.eye(problem.size)[-1])
     if problem.conditions:
         if bool(start.good):
             return start
@@ -234,35 +234,35 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
             f"{float(start.size):.2g}). Choose values closer to the orbit's, or other free "
             "parameters: an extreme on a stop, say, does not depend on any."
         )
-    if moved > _SAME:
-        start, moved = _refined(problem, x, tangent_at(problem, x))
-    if moved > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
+    if distance > _SAME:
+        start, distance = _refine(problem, x, tangent_at(problem, x))
+    if distance > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
             "of its state is neutral, such as a free position or a counter. Leave such a "
             "component out of the state to follow the orbit."
         )
-    if moved > _SAME:
+    if distance > _SAME:
         raise ValueError(
             "Argument `orbit` could not be refined from impact to impact (last correction "
-            f"{max(moved, float(start.size)):.2g}): branches cross there, its section lies on an "
-            "impact or another event, or it is no orbit of this machine."
+            f"{max(distance, float(start.size)):.2g}): branches cross there, its section lies on "
+            "an impact or another event, or it is no orbit of this machine."
         )
     return start
 
 
-def _refined(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step, float]:
+def _refine(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step, float]:
     """Return the solution in the plane across a tangent at `x`, and its scaled distance from it."""
     start = advance(problem, x, tangent, 0.0)
-    moved = float(np.max(np.abs(start.x - x) / problem.scale))
-    return start, moved if bool(start.good) else np.inf
+    distance = float(np.max(np.abs(start.x - x) / problem.scale))
+    return start, distance if bool(start.good) else np.inf
 
 
 # A curve begins in the plane of constant second parameter if its unit tangent (scaled) has at least
 # this component along that parameter: a choice.
 _STEEP = 1e-3
 
-_INSTEAD = (
+_ADVICE = (
     "Such a point is found value by value of the second parameter: `find_orbit` with another one, "
     "from this motion, and `continue_orbit` from there locates it again."
 )
@@ -327,7 +327,7 @@ def boundary(
     return both_ways(
         lambda: SpecialTable(problem, ranges),
         start,
-        lambda special, **found: Boundary(**found),
+        lambda special, **fields: Boundary(**fields),
         what="boundary", progress=progress, settings=settings,
     )  # fmt: skip
 
@@ -339,13 +339,13 @@ def _check_point(point: Point) -> None:
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
             "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "
             "bifurcation at which something is touched, but is "
-            f"{with_article(point.kind)}. {_INSTEAD}"
+            f"{with_article(point.kind)}. {_ADVICE}"
         )
     vanishes = point.kind in SLIDING and change_at(point.problem, point.step) is not None
     if point.kind in TOUCHING and not (point.touches or vanishes):
         raise ValueError(
             "Argument `point` must be a grazing or a sliding bifurcation at which something is "
-            f"touched, but is {with_article(point.kind)}: {point.detail}. {_INSTEAD}"
+            f"touched, but is {with_article(point.kind)}: {point.detail}. {_ADVICE}"
         )
 
 
@@ -375,7 +375,7 @@ def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Sh
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the vanishing part it could not be solved beyond the point
         old, start, impact = without_part(old, point.step, change)
-    problem = _widened(old, start, (parameter,), bounds)
+    problem = _with_parameters(old, start, (parameter,), bounds)
     values = float(leaf(old.machine, parameter)), point.parameter
     x = np.append(start[:-1], values)
     replacement = None

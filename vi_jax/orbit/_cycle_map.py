@@ -61,12 +61,12 @@ def forward_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
         perturbed = jtu.tree_map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
 
         def columns(*args):
-            moving, still = eqx.partition(args, perturbed)
+            moving, fixed = eqx.partition(args, perturbed)
             flat, unravel = ravel_pytree(moving)
 
             def along(direction):
                 def moved(moving):
-                    return f(*eqx.combine(moving, still))
+                    return f(*eqx.combine(moving, fixed))
 
                 return jax.jvp(moved, (moving,), (unravel(direction),))
 
@@ -87,8 +87,8 @@ def batch_together(out: object, args: object) -> Any:
     than its tangents.
     """
     leaves = [x for x in jtu.tree_leaves(args) if eqx.is_inexact_array(x)]
-    same = sum(jnp.sum(x) for x in leaves) > 0
-    return jtu.tree_map(lambda x: jnp.where(same, x, x), out)
+    flag = sum(jnp.sum(x) for x in leaves) > 0
+    return jtu.tree_map(lambda x: jnp.where(flag, x, x), out)
 
 
 class CycleMap(eqx.Module):
@@ -163,16 +163,16 @@ def cycle_map(
     if section is not None:
         require("section", section)
         machine = at_section(machine, section)
-    usual = preset(machine)
-    if isinstance(usual, FixedStep):  # its errors are too large for an orbit
-        usual = Adaptive(diffrax.Tsit5(), rtol=1e-11)
-    method = chosen(machine, method, usual)
+    default = preset(machine)
+    if isinstance(default, FixedStep):  # its errors are too large for an orbit
+        default = Adaptive(diffrax.Tsit5(), rtol=1e-11)
+    method = chosen(machine, method, default)
     method.check(machine)
     # Tolerances are numbers: another tolerance must not need another compilation.
-    carried: AbstractMethod = jtu.tree_map(
+    traced_method: AbstractMethod = jtu.tree_map(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
     )
-    return CycleMap(machine, carried, count("cycles", cycles, least=1), may_rest(machine))
+    return CycleMap(machine, traced_method, count("cycles", cycles, least=1), may_rest(machine))
 
 
 def map_state(machine: AbstractMachine, state: State, name: str = "state") -> State:

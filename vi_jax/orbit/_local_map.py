@@ -29,7 +29,7 @@ from .special import Point
 _CONTINUOUS = 1e-9
 
 # Error of the place of a touch, as a share of the state: a choice, ten times the promised one.
-_PLACED = 1e-12
+_TOUCH_ERROR = 1e-12
 
 # Duration of the first contact in cycles; each further contact has a quarter of it; most contacts;
 # measured powers that agree within this have converged; steps of a flight. Choices.
@@ -58,39 +58,39 @@ def soft_kick(
 
     def fields(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the field, and the change of the field beyond the surface."""
-        before, after = _fields_beside_surface(problem, x, number, leg, clock, u)
+        before, after = _fields_at_surface(problem, x, number, leg, clock, u)
         return before, after - before
 
-    def greatest(length: float) -> tuple[float, np.ndarray]:
+    def deepest_at(length: float) -> tuple[float, np.ndarray]:
         """Return the root of the depth of a contact of this length, and the state there."""
         y = length * np.sqrt(rate / 8)
         return y, u - gradient / (gradient @ gradient) * y * y
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
-    (field, change), (y, deep) = fields(u), greatest(length)
-    push = fields(deep)[1]
+    (field, change), (y, deepest) = fields(u), deepest_at(length)
+    deep_change = fields(deepest)[1]
     # A stiff stop pushes by rounding, up to the error of the touch's place.
-    known = _PLACED * np.abs(gradient) @ np.abs(u) / y**2
-    rounded = max(_CONTINUOUS * np.abs(field).max(), known * np.abs(push).max())
-    if np.abs(change).max() > rounded:
-        back = rate + float(fast @ change)
-        if back <= 0:
+    place_error = _TOUCH_ERROR * np.abs(gradient) @ np.abs(u) / y**2
+    rounding = max(_CONTINUOUS * np.abs(field).max(), place_error * np.abs(deep_change).max())
+    if np.abs(change).max() > rounding:
+        rate_beyond = rate + float(fast @ change)
+        if rate_beyond <= 0:
             raise ValueError(
                 "Argument `point` must be a grazing at which the motion leaves the surface again, "
                 "but beyond the surface it would stick or continue: d²h/ds² changes from "
-                f"{rate:.3g} to {back:.3g}."
+                f"{rate:.3g} to {rate_beyond:.3g}."
             )
-        return Kick(2 * np.sqrt(2 * rate) / back * change, 0.5)
+        return Kick(2 * np.sqrt(2 * rate) / rate_beyond * change, 0.5)
     for _ in range(_TRIES):
-        if abs(fast @ push) <= _WEAK * rate:
+        if abs(fast @ deep_change) <= _WEAK * rate:
             break
         length /= 4
-        push = fields(greatest(length)[1])[1]
+        deep_change = fields(deepest_at(length)[1])[1]
     measured: list[tuple[float, np.ndarray]] = []
     orders: list[float] = []
     for _ in range(_TRIES):
-        y, deep = greatest(length)
-        measured.append((y, _change_by_contact(problem, x, number, leg, clock, deep, length)))
+        y, deepest = deepest_at(length)
+        measured.append((y, _change_by_contact(problem, x, number, leg, clock, deepest, length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
             order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
@@ -105,15 +105,15 @@ def soft_kick(
     return Kick(second + (second - first) / 3, order)
 
 
-def _modes_beside_switch(problem: Shooting, machine, number, leg, s, u):
+def _modes_around_switch(problem: Shooting, machine, number, leg, s, u):
     before = problem.modes_in(leg)
     return before, after_event(machine, number, s, problem.unravel(u), before)[1]
 
 
 @on_host
-def _fields_beside_surface(problem: Shooting, x, number: int, leg, s, u):
+def _fields_at_surface(problem: Shooting, x, number: int, leg, s, u):
     machine = problem.at(x)
-    modes = _modes_beside_switch(problem, machine, number, leg, s, u)
+    modes = _modes_around_switch(problem, machine, number, leg, s, u)
     flights = [Flight(machine, m, problem.method, problem.like) for m in modes]
     state = problem.unravel(u)
     return jnp.stack([ravel_pytree(flight.smooth.field(s, state))[0] for flight in flights])
@@ -124,7 +124,7 @@ def _fly(problem: Shooting, x, number: int, leg, touching: bool, s0, s1, u):
     """Return the state at `s1` and the guard there, in contact or apart."""
     machine = problem.at(x)
     # The mode must not depend on rounding: at the touch the body just comes in.
-    modes = _modes_beside_switch(problem, machine, number, leg, s0, u)[int(touching)]
+    modes = _modes_around_switch(problem, machine, number, leg, s0, u)[int(touching)]
     end = Flight(machine, modes, problem.method, problem.like).fly(s0, s1, u, _STEPS)[0]
     return end, guard_of(machine, number, s1, problem.unravel(end), modes)
 
@@ -136,40 +136,40 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     unit = problem.radian
 
     def root(function: Any, low: float, high: float) -> float:
-        off = lambda s1: float(function(s1)[1])
-        if off(low) * off(high) > 0:
+        guard = lambda s1: float(function(s1)[1])
+        if guard(low) * guard(high) > 0:
             raise ValueError(
                 "Argument `point` must be a grazing of a stop that is less stiff: a contact so "
                 "brief that it bends the motion little is less deep than rounding. Take a "
                 "`RigidStop`."
             )
-        found: Any = brentq(off, low, high, xtol=1e-15 * unit)
+        found: Any = brentq(guard, low, high, xtol=1e-15 * unit)
         return float(found)
 
-    def apart(s1):
+    def free_flight(s1):
         return _fly(problem, x, number, leg, False, s, s1, deep)
 
-    enters = root(apart, s - length, s)
-    begin = apart(enters)[0]
+    contact_begin = root(free_flight, s - length, s)
+    begin = free_flight(contact_begin)[0]
 
-    def inside(s1):
-        return _fly(problem, x, number, leg, True, enters, s1, begin)
+    def contact_flight(s1):
+        return _fly(problem, x, number, leg, True, contact_begin, s1, begin)
 
-    places = enters + length * np.linspace(0, 1.5, 49)[1:]
-    values = [float(inside(place)[1]) for place in places]
-    below = [i for i, value in enumerate(values) if value < 0]
-    first = below[0] if below else 0
-    out = next((i for i in range(first, len(values)) if values[i] >= 0), None)
-    if out is None:
+    clocks = contact_begin + length * np.linspace(0, 1.5, 49)[1:]
+    values = [float(contact_flight(clock)[1]) for clock in clocks]
+    negative = [i for i, value in enumerate(values) if value < 0]
+    first = negative[0] if negative else 0
+    end_index = next((i for i in range(first, len(values)) if values[i] >= 0), None)
+    if end_index is None:
         raise ValueError(
             "Argument `point` must be a grazing at which the motion leaves the surface again, but "
             "a brief contact does not end."
         )
-    leaves = places[out]
-    if out > 0 and values[out - 1] < 0:
-        leaves = root(inside, places[out - 1], places[out])
-    free = _fly(problem, x, number, leg, False, enters, leaves, begin)[0]
-    return inside(leaves)[0] - free
+    contact_end = clocks[end_index]
+    if end_index > 0 and values[end_index - 1] < 0:
+        contact_end = root(contact_flight, clocks[end_index - 1], clocks[end_index])
+    free_end = _fly(problem, x, number, leg, False, contact_begin, contact_end, begin)[0]
+    return contact_flight(contact_end)[0] - free_end
 
 
 # A turn this near to a stop, as a share of the motion, touches it: as for the special points.
@@ -177,7 +177,7 @@ _TOUCHES = 1e-6
 
 # Touches that are closer than this share of a period are one: the depth between them is then of the
 # order of `_TOUCHES`. A choice.
-_APART = 1e-3
+_SEPARATE = 1e-3
 
 # Speed of approach, as a share of the motion's, at which rebounds are differentiated: laws that
 # depend on the speed are taken at this one. A choice.
@@ -204,7 +204,7 @@ class Touch(NamedTuple):
 
 
 @on_host
-def _rooms(problem: Shooting, x):
+def _turn_margins(problem: Shooting, x):
     """Return distance and clock of each turn; (legs, events, steps) each."""
     machine = problem.at(x)
     clock, states = problem.parts(x)
@@ -214,29 +214,29 @@ def _rooms(problem: Shooting, x):
         flight = problem.flight(machine, leg)
         _, _, path = flight.fly(s0, s1, after, problem.steps, rows=problem.steps)
         h = (s1 - s0) / problem.steps
-        _, rooms = turning_points(Path(flight, path[0], path[1], h, not problem.events))
-        return jnp.stack([room for room, _ in rooms]), jnp.stack([s for _, s in rooms])
+        _, margins = turning_points(Path(flight, path[0], path[1], h, not problem.events))
+        return jnp.stack([margin for margin, _ in margins]), jnp.stack([s for _, s in margins])
 
     ends = problem.ends(clock, problem.period(x))
     return jax.vmap(follow)(jnp.arange(problem.legs), clock, ends, states)
 
 
-def touched(
+def find_touches(
     problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
 ) -> list[tuple[int, int, float]]:
     """Return event, leg and clock of each touch of a motion of extent `length`, each once. The
     known touch may fall on the end of a flight, where no turn is found."""
-    (rooms, places), period = _rooms(problem, x), float(problem.period(x))
-    leg, within = problem.leg_at(x, clock)
-    found = [(number, int(leg), float(within))]
-    for leg, other, step in np.argwhere(np.abs(rooms) <= _TOUCHES * length):
+    (distances, places), period = _turn_margins(problem, x), float(problem.period(x))
+    leg, leg_clock = problem.leg_at(x, clock)
+    found = [(number, int(leg), float(leg_clock))]
+    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES * length):
         place = float(places[leg, other, step])
-        apart = [
+        time_differences = [
             abs((place - known + period / 2) % period - period / 2)
             for event, _, known in found
             if event == other
         ]
-        if min(apart, default=period) > _APART * period:
+        if min(time_differences, default=period) > _SEPARATE * period:
             found.append((int(other), int(leg), place))
     return found
 
@@ -262,7 +262,7 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
 
         return guard_rates(field, guard, s, problem.unravel(u))
 
-    def jumped(u):
+    def after_jump(u):
         state = jump_of(machine, number, s, problem.unravel(u), problem.modes_in(leg))
         return ravel_pytree(state)[0]
 
@@ -270,9 +270,9 @@ def _at_touch(problem: Shooting, x, along, number: int, leg, s):
     fast, rate, kick = jax.grad(lambda u: rates(u).v)(u), rates(u).a, None
     if number < len(stops_of(machine)):
         push = fast / (fast @ fast)
-        unit = jnp.linalg.norm(gradient * problem.sizes[1:]) / problem.sizes[0]
-        after = jax.jvp(jumped, (u - _SLOW * unit * push,), (push,))[1]
-        kick = -jnp.sqrt(2 * rate) * (after - push)
+        speed_unit = jnp.linalg.norm(gradient * problem.sizes[1:]) / problem.sizes[0]
+        push_after = jax.jvp(after_jump, (u - _SLOW * speed_unit * push,), (push,))[1]
+        kick = -jnp.sqrt(2 * rate) * (push_after - push)
     return u, gradient, rate, slope, fast, kick
 
 
@@ -331,7 +331,7 @@ class LocalMap(eqx.Module):
             product = N @ product
         return product
 
-    def later(self, u: np.ndarray, count: int) -> np.ndarray:
+    def later_distances(self, u: np.ndarray, count: int) -> np.ndarray:
         """Return ∂h·Nⁿ·u, n = 1 … count."""
         found, matrix = [], self.matrix
         for _ in range(count):
@@ -342,13 +342,13 @@ class LocalMap(eqx.Module):
     def entries(self, count: int) -> np.ndarray:
         """Return e_n = ∂h·Nⁿ·kick of the first touch, n = 1 … count: the change of the distance n
         periods after a penetration of depth one."""
-        return self.later(self.kicks[0], count)
+        return self.later_distances(self.kicks[0], count)
 
     def passages(self, n: int) -> np.ndarray:
         """Return ∂h (Nʲ - Nⁿ) (I - Nⁿ)⁻¹ kick, j = 1 … n - 1: the distances at the passages between
         the impacts, with one impact of depth one in n periods. They must be positive."""
         power = np.linalg.matrix_power(self.matrix, n)
-        found = self.later(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
+        found = self.later_distances(np.linalg.solve(np.eye(len(power)) - power, self.kicks[0]), n)
         return found[:-1] - found[-1]
 
     def resonance(self, n: int, sign: int) -> float:
@@ -370,7 +370,7 @@ class Section(NamedTuple):
     """The matrix from just after the first touch's kick to the next section."""
 
 
-class Graze(NamedTuple):
+class LocalGrazing(NamedTuple):
     """A grazing with its local map."""
 
     problem: Shooting
@@ -381,7 +381,7 @@ class Graze(NamedTuple):
     section: Section
 
 
-def graze_at(point: Point) -> Graze:
+def graze_at(point: Point) -> LocalGrazing:
     """Return the local map of a special point that is a grazing of a stop or a switch."""
     problem, x, number, clock = _without_touch(point)
     problem, x = with_least_period(problem, x)
@@ -393,13 +393,13 @@ def graze_at(point: Point) -> Graze:
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(x))
-    places = touched(problem, x, number, clock, point.step.observed.length)
+    places = find_touches(problem, x, number, clock, point.step.observed.length)
     touches = [touch_at(problem, x, along, *place) for place in places]
     touches.sort(key=lambda touch: touch.clock % period)
     touches = touches[-1:] + touches[:-1]  # the section follows the first touch
     ends = [
-        touch.clock + (np.mod(then.clock - touch.clock, period) or period)
-        for touch, then in zip(touches, [*touches[1:], touches[0]], strict=True)
+        touch.clock + (np.mod(following.clock - touch.clock, period) or period)
+        for touch, following in zip(touches, [*touches[1:], touches[0]], strict=True)
     ]
     local = LocalMap(
         np.stack([
@@ -411,7 +411,7 @@ def graze_at(point: Point) -> Graze:
         np.array([touch.kick.order for touch in touches]),
         np.array([touch.slope for touch in touches]),
     )  # fmt: skip
-    return Graze(problem, x, touches, local, _section(problem, x, along, touches[0]))
+    return LocalGrazing(problem, x, touches, local, _section(problem, x, along, touches[0]))
 
 
 def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
@@ -436,17 +436,17 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
             "Argument `point` must be a grazing of a stop, but there the section of the machine "
             "is touched: beyond it the motion has another number of cycles."
         )
-    which = [i]
+    removed = [i]
     if old.events[i].of(old.machine).holds_mode:
-        beside = [j % old.legs for j in (i - 1, i + 1)]
-        which += [j for j in beside if old.events[j].number == old.events[i].number][:1]
-    which += [j for j in point.lost if j not in which]
+        neighbours = [j % old.legs for j in (i - 1, i + 1)]
+        removed += [j for j in neighbours if old.events[j].number == old.events[i].number][:1]
+    removed += [j for j in point.lost if j not in removed]
     clock = since_section(old, x, float(old.values(x)[0][i]))
-    return *with_sections(*without_events(old, x, sorted(which))), old.events[i].number, clock
+    return *with_sections(*without_events(old, x, sorted(removed))), old.events[i].number, clock
 
 
 @on_host
-def _carried(problem: Shooting, x, leg, s0, s1):
+def _flight_matrix(problem: Shooting, x, leg, s0, s1):
     machine = problem.at(x)
     u = ravel_pytree(problem.state_at(x, leg, s0))[0]
     flight = problem.flight(machine, leg)
@@ -454,7 +454,7 @@ def _carried(problem: Shooting, x, leg, s0, s1):
 
 
 @on_host
-def _through(problem: Shooting, x, leg):
+def _event_matrix(problem: Shooting, x, leg):
     clock, states = problem.parts(x)
     return problem.saltation(problem.at(x), leg, clock[leg], states[leg])[0]
 
@@ -462,35 +462,35 @@ def _through(problem: Shooting, x, leg):
 def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) -> np.ndarray:
     """Return the matrix that maps a perturbation at clock `s0` in this leg to a later clock."""
     M, (clock, _, period) = np.eye(problem.states), problem.values(x)
-    turn, begin, n = 0.0, s0, leg
+    shift, begin, n = 0.0, s0, leg
     while True:
-        end = (clock[n + 1] if n + 1 < len(clock) else clock[0] + period) + turn
-        last = min(end, s1)
-        if last > begin:
-            M = _carried(problem, x, n, begin - turn, last - turn) @ M
+        end = (clock[n + 1] if n + 1 < len(clock) else clock[0] + period) + shift
+        segment_end = min(end, s1)
+        if segment_end > begin:
+            M = _flight_matrix(problem, x, n, begin - shift, segment_end - shift) @ M
         if s1 <= end:
             return M
         n = (n + 1) % problem.legs
-        turn += period * (n == 0)
+        shift += period * (n == 0)
         begin = end
         if problem.events:
-            M = _through(problem, x, n) @ M
+            M = _event_matrix(problem, x, n) @ M
 
 
 def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) -> Section:
     """Return the smooth motion on its first section."""
     period = float(problem.period(x))
     place = period * (np.floor(touch.clock / period) + 1)
-    leg, within = problem.leg_at(x, place if problem.events else 0.0)
-    state, slope = _placed(problem, x, along, leg, within)
+    leg, leg_clock = problem.leg_at(x, place if problem.events else 0.0)
+    state, slope = _section_state(problem, x, along, leg, leg_clock)
     matrix = transport(problem, x, touch.leg, touch.clock, place)
     if problem.events and problem.events[0].cycle is not None:  # the section is an event
-        matrix = _through(problem, x, 0) @ matrix
+        matrix = _event_matrix(problem, x, 0) @ matrix
     return Section(state, slope, matrix)
 
 
 @on_host
-def _placed(problem: Shooting, x, along, leg, s):
+def _section_state(problem: Shooting, x, along, leg, s):
     """Return the state on the section at clock `s`, and its derivative along the parameter."""
     turns = jnp.round(s / problem.period(x))  # 0 or 1: the section moves with the period
 

@@ -155,7 +155,7 @@ class Shooting(eqx.Module):
     """Names of the machine's parameters that are unknowns."""
     sizes: Any = None
     """Sizes of the clock and of each component of the state along the motion, (1 + states,): the
-    scales of differences between motions (see `sized`)."""
+    scales of differences between motions (see `with_sizes`)."""
     widths: Any = ()
     """The sizes of the parameters, half the widths of their intervals."""
     held: tuple[float, ...] = eqx.field(static=True, default=())

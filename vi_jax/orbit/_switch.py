@@ -58,32 +58,32 @@ _ORBIT = "orbit"
 _SETTLES, _LISTED = 100, 32
 
 
-def _found(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
+def _orbit_at(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
     """Return the motion at a step; raise `ValueError` if the corrector found none there."""
     if not bool(step.good):
         raise ValueError(f"No motion of {what} was found at distance {distance:g}; try another.")
     return orbit_of(problem, step)
 
 
-def _repeated(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
+def _repeat_motion(point: Point, n: int) -> tuple[Shooting, np.ndarray, np.ndarray]:
     """Return the motion gone through n times, and right singular vectors of its Jacobian in x."""
     new = over_periods(point.problem, n)
     x = repeated(point.problem, point.step.x, new)
     return new, x, np.linalg.svd(jacobian_at(new, x)[:, :-1])[2]
 
 
-def _doubled(point: Point, distance: float) -> Orbit:
+def _doubled_orbit(point: Point, distance: float) -> Orbit:
     """Return a motion of twice the period, or of half of it if the branch begins at one."""
     if point.is_origin:
         problem, x = point.problem, point.step.x
         step = advance(problem, x, tangent_at(problem, x), distance)
-        return _found(problem, step, "half the period", distance)
-    new, x, vectors = _repeated(point, 2)
+        return _orbit_at(problem, step, "half the period", distance)
+    new, x, vectors = _repeat_motion(point, 2)
     step = advance(new, x, np.append(vectors[-1], 0.0), distance)
-    return _found(new, step, "twice the period", distance)
+    return _orbit_at(new, step, "twice the period", distance)
 
 
-def _crossed(point: Point, distance: float) -> Orbit:
+def _crossing_orbit(point: Point, distance: float) -> Orbit:
     problem, x = point.problem, point.step.x
     jacobian = jacobian_at(problem, x)
     # The equations have two null vectors here: one leads along this branch, the other off it.
@@ -91,10 +91,10 @@ def _crossed(point: Point, distance: float) -> Orbit:
     along = plane.T @ (plane @ point.step.tangent)
     off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
     step = advance(problem, x, off / np.linalg.norm(off), distance)
-    return _found(problem, step, "the other branch", distance)
+    return _orbit_at(problem, step, "the other branch", distance)
 
 
-def _held_otherwise(point: Point, distance: float) -> Orbit:
+def _orbit_beyond_sliding(point: Point, distance: float) -> Orbit:
     """Return the motion on the other side of a sliding bifurcation."""
     problem, change = point.problem, change_at(point.problem, point.step)
     if change is not None and change.exists and change.modes[0] == change.modes[2]:
@@ -102,22 +102,22 @@ def _held_otherwise(point: Point, distance: float) -> Orbit:
         found = admissible_near(new, start, distance)
         if found is not None:
             return orbit_of(new, found)
-    other = lambda orbit: len(events_in(orbit)) != len(problem.events)
-    return _beside(point, distance, "another number of times of sticking or sliding", other)
+    accepts = lambda orbit: len(events_in(orbit)) != len(problem.events)
+    return _search(point, distance, "another number of times of sticking or sliding", accepts)
 
 
-def _resting_otherwise(point: Point, distance: float) -> Orbit:
+def _orbit_beyond_rest(point: Point, distance: float) -> Orbit:
     """Return the motion with one rest more or less; where two become one, that with one."""
     if not point.is_origin:
-        other = lambda orbit: int(orbit.rests) != len(point.problem.landings)
-        return _beside(point, distance, "another number of rests", other)
+        accepts = lambda orbit: int(orbit.rests) != len(point.problem.landings)
+        return _search(point, distance, "another number of rests", accepts)
     found = admissible_near(point.problem, point.step.x, distance)
     if found is None:
         raise ValueError(f"No motion with one rest was found at distance {distance:g}.")
     return orbit_of(point.problem, found)
 
 
-def _reordered(point: Point, distance: float) -> Orbit:
+def _reordered_orbit(point: Point, distance: float) -> Orbit:
     """Return a motion with other events or another order, near where two events coincide."""
     problem, (clock, _, period) = point.problem, point.problem.values(point.step.x)
     here, begins = list(problem.events), range(len(problem.events))
@@ -127,9 +127,9 @@ def _reordered(point: Point, distance: float) -> Orbit:
         # The same motion may begin whole cycles later, but not at any other of its events.
         n = problem.cycles
         begins = [int(np.sum(clock < i * period / n)) for i in range(n)]
-    turned = [here[i:] + here[:i] for i in begins]
-    other = lambda orbit: [event for _, event in events_in(orbit)] not in turned
-    return _beside(point, distance, "its events in another order", other, list(_swapped(point)))
+    same_orders = [here[i:] + here[:i] for i in begins]
+    accepts = lambda orbit: [event for _, event in events_in(orbit)] not in same_orders
+    return _search(point, distance, "its events in another order", accepts, list(_swapped(point)))
 
 
 def _swapped(point: Point) -> Iterator[State]:
@@ -148,8 +148,8 @@ def _swapped(point: Point) -> Iterator[State]:
         yield state
 
 
-def _beside(
-    point: Point, distance: float, what: str, other: Callable[[Orbit], bool],
+def _search(
+    point: Point, distance: float, what: str, accepts: Callable[[Orbit], bool],
     guesses: Sequence[State] = (),
 ) -> Orbit:  # fmt: skip
     """Return a motion near a point that does not belong to the branch.
@@ -158,15 +158,15 @@ def _beside(
     sought: from the guesses, from points close by on the branch, and from a settled simulation. The
     far side of the point is tried first.
 
-    **Arguments:** `what`, the motion in words; `other`, a function that accepts a motion;
+    **Arguments:** `what`, the motion in words; `accepts`, a test of a motion;
     `guesses`, states on the section.
 
     **Raises:** `ValueError` if none is found.
     """
     problem, step, guesses = point.problem, point.step, list(guesses)
-    for place in (advance(problem, step.x, step.tangent, distance), step):
-        if np.all(np.isfinite(place.x)):
-            guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, place.x)[0]))
+    for near_step in (advance(problem, step.x, step.tangent, distance), step):
+        if np.all(np.isfinite(near_step.x)):
+            guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, near_step.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
     n = problem.cycles
     options: Any = {"method": problem.method}
@@ -177,7 +177,7 @@ def _beside(
             if guess is None:
                 guess = simulate(machine, guesses[-1], n, settle=_SETTLES * n, **options).last
             found = find_orbit(machine, guess, n, impact_log=_LISTED, **options)
-            if bool(found.successful) and other(found):
+            if bool(found.successful) and accepts(found):
                 return found
     raise ValueError(
         f"No motion with {what} was found at distance {distance:g} from this {point.kind}. Try "
@@ -185,7 +185,7 @@ def _beside(
     )
 
 
-def _beyond_grazing(point: Point, distance: float) -> Orbit:
+def _orbit_beyond_grazing(point: Point, distance: float) -> Orbit:
     """Return the motion without the grazing impact, or with the touch as an additional impact."""
     old, step = point.problem, point.step
     if point.impact is not None and old.events[point.impact].use:
@@ -194,7 +194,7 @@ def _beyond_grazing(point: Point, distance: float) -> Orbit:
             "or ends with it: find the motion beyond it with `find_orbit`."
         )
     if point.impact is None and not point.touches:
-        return _reordered(point, distance)
+        return _reordered_orbit(point, distance)
     _check_plain(old)
     if point.impact is not None and old.events[point.impact].cycle is not None:
         raise ValueError(
@@ -252,63 +252,63 @@ def _in_two(
 ) -> tuple[Shooting, np.ndarray]:
     """Return equations and unknowns near a point of a two-parameter boundary, with a condition."""
     ((name, (value, size)),) = point.further.items()
-    two = dataclasses.replace(
+    problem_two = dataclasses.replace(
         problem, parameters=(name, *problem.parameters), conditions=(condition,),
         widths=jnp.insert(problem.widths, 0, size),
     )  # fmt: skip
-    return two, np.insert(x, -1, value)
+    return problem_two, np.insert(x, -1, value)
 
 
-def _of_periods(n: int, point: Point, distance: float) -> Orbit:
+def _orbit_of_periods(n: int, point: Point, distance: float) -> Orbit:
     """Return a motion of n periods near one with multipliers exp(±2πi/n).
 
     The derivative of n periods is the identity in a plane. Each direction in it leads to such
     motions, at some values of both parameters.
     """
-    new, x, vectors = _repeated(point, n)
+    new, x, vectors = _repeat_motion(point, n)
     second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
     row = first[:-1] / new.scale
-    apart = FixedComponent(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
-    two, begin = _in_two(point, new, x, apart)
+    condition = FixedComponent(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
+    two, begin = _in_two(point, new, x, condition)
     step = advance(two, begin + distance * first * two.scale, second, 0.0)
-    return _found(two, step, f"{n} times the period", distance)
+    return _orbit_at(two, step, f"{n} times the period", distance)
 
 
 # The first step along a curve is this share of the distance; each further one is twice as long, so
 # many at most. With half the speed the found point is half as far off, within these bounds. A
 # resonance is zero to this share of the kick. Choices.
-_FIRST, _LOOKED, _HALF, _RESONANT = 1e-3, 16, (0.35, 0.65), 1e-5
+_FIRST, _STEPS, _HALF, _RESONANT = 1e-3, 16, (0.35, 0.65), 1e-5
 
 
-def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
+def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
     """Return a fold or doubling of the motion with one impact, near a resonant grazing."""
     graze, sign = graze_at(dataclasses.replace(point, kind=GRAZING)), -1 if kind == DOUBLING else 1
     problem, local, touch = graze.problem, graze.map, graze.touches[0]
     _check_plain(problem)
     sizes = np.asarray(problem.sizes)[1:]
 
-    def deep(n: int) -> float:
+    def depth(n: int) -> float:
         """Return the depth of an impact that equals its kick's remainder n periods later."""
-        left = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
-        return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(left / sizes))
+        remainder = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
+        return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(remainder / sizes))
 
     periods = range(1, PERIODS + 1)
-    n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * deep(n)), 1)
-    fast = min(point.step.observed.fastest, np.sqrt(2 * touch.rate) * deep(n))
-    long = over_periods(problem, n)
-    new, x = _with_touch(long, repeated(problem, graze.x, long), touch.number, touch.clock)
+    n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * depth(n)), 1)
+    fastest = min(point.step.observed.fastest, np.sqrt(2 * touch.rate) * depth(n))
+    whole = over_periods(problem, n)
+    new, x = _with_touch(whole, repeated(problem, graze.x, whole), touch.number, touch.clock)
     impact = int(np.argmin(np.abs(new.values(x)[0] - touch.clock)))
 
-    def found(share: float) -> tuple[Shooting, Step | None, float]:
-        slow = Special(GRAZING, impact, speed=jnp.asarray(share * distance * fast))
-        two, begin = _in_two(point, new, x, slow)
-        at = _changes(two, begin, distance, CROSSING if kind == FOLD else kind)
+    def locate(share: float) -> tuple[Shooting, Step | None, float]:
+        condition = Special(GRAZING, impact, speed=jnp.asarray(share * distance * fastest))
+        two, begin = _in_two(point, new, x, condition)
+        at = _locate_change(two, begin, distance, CROSSING if kind == FOLD else kind)
         return two, at, np.nan if at is None else float(at.x[-2] - begin[-2])
 
-    (two, at, off), (*_, half) = found(1.0), found(0.5)
+    (two, at, shift), (*_, half) = locate(1.0), locate(0.5)
     if (
         at is not None
-        and _HALF[0] < half / off < _HALF[1]
+        and _HALF[0] < half / shift < _HALF[1]
         and at.observed.admissible(range(new.legs))
     ):
         return point_at(two, at, kind)
@@ -318,30 +318,30 @@ def _beside_resonance(kind: str, point: Point, distance: float) -> Point:
     )
 
 
-def _changes(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step | None:
+def _locate_change(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step | None:
     """Return the point where a test changes sign along the motions with an impact of a given low
     speed, a curve in both parameters; the closest one to the resonance, which is about at `x`."""
     begin = advance(two, x, np.eye(len(x))[-2], 0.0)
-    heads = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
+    ends = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
     value = lambda step: bifurcation_tests(step)[test]
-    for i, side in itertools.product(range(_LOOKED), (0, 1)):
-        here = heads[side]
+    for i, side in itertools.product(range(_STEPS), (0, 1)):
+        here = ends[side]
         step = advance(two, here.x, here.tangent, _FIRST * distance * 2**i)
         if bool(step.good) and value(here) * value(step) < 0:
             return locate_zero(two, here, step, value)
-        heads[side] = step if bool(step.good) else here
+        ends[side] = step if bool(step.good) else here
     return None
 
 
 # Functions for `switch`: by the kind of the boundary (`None` for a branch) and that of the point,
 # then by the kind of the result.
-BEGINS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] = {
-    (None, DOUBLING): {_ORBIT: _doubled},
-    (None, GRAZING): {_ORBIT: _beyond_grazing},
-    (None, CROSSING): {_ORBIT: _crossed},
-    (None, SYMMETRY): {_ORBIT: _crossed},
-    (None, REST): {_ORBIT: _resting_otherwise},
-    **{(None, kind): {_ORBIT: _held_otherwise} for kind in SLIDING},
+STARTS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] = {
+    (None, DOUBLING): {_ORBIT: _doubled_orbit},
+    (None, GRAZING): {_ORBIT: _orbit_beyond_grazing},
+    (None, CROSSING): {_ORBIT: _crossing_orbit},
+    (None, SYMMETRY): {_ORBIT: _crossing_orbit},
+    (None, REST): {_ORBIT: _orbit_beyond_rest},
+    **{(None, kind): {_ORBIT: _orbit_beyond_sliding} for kind in SLIDING},
     **{
         (curve, kind): {to: partial(_as_kind, to)}
         for curve, kind, to in (
@@ -351,7 +351,7 @@ BEGINS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] =
             (GRAZING, FOLD, FOLD), (GRAZING, DOUBLING, DOUBLING), (GRAZING, SYMMETRY, SYMMETRY),
         )
     },
-    (TORUS, RESONANCE_3): {_ORBIT: partial(_of_periods, 3)},
-    (TORUS, RESONANCE_4): {_ORBIT: partial(_of_periods, 4)},
-    (GRAZING, RESONANT): {to: partial(_beside_resonance, to) for to in (FOLD, DOUBLING)},
+    (TORUS, RESONANCE_3): {_ORBIT: partial(_orbit_of_periods, 3)},
+    (TORUS, RESONANCE_4): {_ORBIT: partial(_orbit_of_periods, 4)},
+    (GRAZING, RESONANT): {to: partial(_point_near_resonance, to) for to in (FOLD, DOUBLING)},
 }  # fmt: skip

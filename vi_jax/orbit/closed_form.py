@@ -80,9 +80,9 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
 
     **Raises:** `ValueError` if the scene has no such closed form or `cycles` < 1.
     """
-    lack = lack_of_closed_form(scene)
-    if lack is not None:
-        raise ValueError(f"Argument `scene` must be one with a closed form, a {lack}.")
+    reason = lack_of_closed_form(scene)
+    if reason is not None:
+        raise ValueError(f"Argument `scene` must be one with a closed form, a {reason}.")
     sides = [stop.side for stop in scene.stops]
     if sides != ["right"]:
         raise ValueError(
@@ -123,8 +123,8 @@ def one_impact_orbits(
     # Squarings of the flight over one grid step: over 1, 2, 4, … steps, and last over T. They hold
     # through resonance and critical damping, unlike sines and a steady response.
     doublings = (_POINTS * n - 1).bit_length()
-    whole, flights = _squared(_exponential(rates * (period / 2**doublings)), doublings)
-    v, phase, slack, resolved = _impacts(whole, k, d, period)
+    period_flight, flights = _squared(_exponential(rates * (period / 2**doublings)), doublings)
+    v, phase, slack, resolved = _impacts(period_flight, k, d, period)
 
     # Absent motions are replaced by a harmless one, so that their derivatives cannot be NaN.
     exists = resolved & (v > 64 * jnp.finfo(dtype).eps * (1 + period) * (1 + jnp.abs(d)))
@@ -132,27 +132,27 @@ def one_impact_orbits(
     follow = jax.vmap(lambda v, phase: _follow(rates, flights, period, k, d, v, phase))
     y_min, y_max, clearance = follow(v, phase)
     turn = jnp.mod(section - phase, 2 * pi)
-    on = jax.lax.stop_gradient((turn <= slack) | (turn >= 2 * pi - slack))
-    turn = turn - jax.lax.stop_gradient(jnp.where(on, turn, 0.0))
+    on_section = jax.lax.stop_gradient((turn <= slack) | (turn >= 2 * pi - slack))
+    turn = turn - jax.lax.stop_gradient(jnp.where(on_section, turn, 0.0))
     start = _after_impact(k, d, v, phase)
-    carried = _exponential(rates * (turn / zeta)[:, None, None] / 2**doublings, doublings)
-    there = _dot(carried, start[..., None])[..., 0]
-    nudge = jnp.where(on, _early(whole, k, d, v, period), 0.0)
+    section_flight = _exponential(rates * (turn / zeta)[:, None, None] / 2**doublings, doublings)
+    section_state = _dot(section_flight, start[..., None])[..., 0]
+    nudge = jnp.where(on_section, _shift_before_section(period_flight, k, d, v, period), 0.0)
 
-    multipliers = _multipliers(whole, xi, k, d, v, phase, period)
+    multipliers = _multipliers(period_flight, xi, k, d, v, phase, period)
     admissible = exists & (clearance >= 0)
 
-    def known(x):
+    def nan_if_absent(x):
         return jnp.where(exists, x, jnp.nan)
 
     orbits = ClosedFormOrbits(
-        Y=known(there[:, 0]),
-        V=known(there[:, 1] + nudge),
-        impact_phase=known(section + 2 * pi * n - turn),
-        impact_speed=known(v),
-        y_min=known(y_min),
-        y_max=known(y_max),
-        clearance=known(clearance),
+        Y=nan_if_absent(section_state[:, 0]),
+        V=nan_if_absent(section_state[:, 1] + nudge),
+        impact_phase=nan_if_absent(section + 2 * pi * n - turn),
+        impact_speed=nan_if_absent(v),
+        y_min=nan_if_absent(y_min),
+        y_max=nan_if_absent(y_max),
+        clearance=nan_if_absent(clearance),
         multipliers=jnp.where(exists[:, None], multipliers, jnp.nan),
         admissible=admissible,
         exists=exists,
@@ -243,7 +243,7 @@ def _impacts(
     return v, phase, jax.lax.stop_gradient(jnp.minimum(slack, 1e3 * noise)), resolved
 
 
-def _early(flight, k, d, v, period) -> Float[Array, "2"]:
+def _shift_before_section(flight, k, d, v, period) -> Float[Array, "2"]:
     """Return a change in the last digits of V just after the impact. With it the next impact comes
     before the section on which both fall, instead of where rounding puts it."""
     rounding = 64 * jnp.finfo(v.dtype).eps * (1 + period) * (1 + jnp.abs(d) + v)
@@ -262,15 +262,15 @@ def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Sca
     y, w = states[:, 0], states[:, 1]
     h = period / (y.size - 1)
     # The place of w = 0 in its cell (linear) and Y there (cubic Hermite, fourth order).
-    drop = w[:-1] - w[1:]
-    at = jnp.clip(w[:-1] / jnp.where(drop == 0, 1.0, drop), 0, 1)
-    rise, back = at * at * (3 - 2 * at), at * (1 - at)
-    height = y[:-1] + rise * (y[1:] - y[:-1]) + h * back * ((1 - at) * w[:-1] - at * w[1:])
+    fall = w[:-1] - w[1:]
+    share = jnp.clip(w[:-1] / jnp.where(fall == 0, 1.0, fall), 0, 1)
+    rising, bulge = share * share * (3 - 2 * share), share * (1 - share)
+    height = y[:-1] + rising * (y[1:] - y[:-1]) + h * bulge * ((1 - share) * w[:-1] - share * w[1:])
     has_peak, has_dip = (w[:-1] > 0) & (w[1:] <= 0), (w[:-1] < 0) & (w[1:] >= 0)
 
     def turning(here, sign):
         cell = jnp.argmax(jnp.where(here, sign * height, -jnp.inf))
-        return _turning_point(rates, states[cell], at[cell] * h, h), jnp.any(here)
+        return _turning_point(rates, states[cell], share[cell] * h, h), jnp.any(here)
 
     peak, any_peak = turning(has_peak, 1.0)
     dip, any_dip = turning(has_dip, -1.0)
@@ -282,21 +282,21 @@ def _follow(rates, flights, period, k, d, v, phase) -> tuple[Scalar, Scalar, Sca
 def _turning_point(rates, state, guess, h) -> Scalar:
     """Return Y where its velocity vanishes near `guess` after `state`, by Newton's method."""
 
-    def at(time, rates, state):
+    def motion_at(time, rates, state):
         state = _dot(_exponential(rates * time), state)
-        pull = _dot(rates[1], state)
-        return state[0], state[1], jnp.where(jnp.abs(pull) > 0, pull, 1.0)
+        acceleration = _dot(rates[1], state)
+        return state[0], state[1], jnp.where(jnp.abs(acceleration) > 0, acceleration, 1.0)
 
-    held = jax.lax.stop_gradient((rates, state))
+    constants = jax.lax.stop_gradient((rates, state))
 
     def newton(_, time):
-        _, velocity, pull = at(time, *held)
-        return jnp.clip(time - velocity / pull, 0, jax.lax.stop_gradient(h))
+        _, velocity, acceleration = motion_at(time, *constants)
+        return jnp.clip(time - velocity / acceleration, 0, jax.lax.stop_gradient(h))
 
     time = jax.lax.fori_loop(0, 3, newton, jax.lax.stop_gradient(guess))
-    Y, velocity, pull = at(time, rates, state)
+    Y, velocity, acceleration = motion_at(time, rates, state)
     # To rounding this is Y; the last term makes its first and second derivatives correct too.
-    return Y - 0.5 * velocity * velocity / pull
+    return Y - 0.5 * velocity * velocity / acceleration
 
 
 def _multipliers(flight, xi, k, d, v, phase, period) -> Complex[Array, "2 2"]:

@@ -92,7 +92,7 @@ class Curve(InWords, abc.ABC):
     special: list[Point] = dataclasses.field(init=False)
     """The special points, in the curve's order."""
 
-    def _each(self, get: Callable[[Observed], Any]) -> np.ndarray:
+    def _stack(self, get: Callable[[Observed], Any]) -> np.ndarray:
         return np.stack([np.asarray(get(step.observed)) for step in self.steps])
 
     @property
@@ -122,18 +122,18 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def y_min(self) -> np.ndarray:
         """Smallest position of the first coordinate, in the machine's unit (for a `Scene` a)."""
-        return self._each(lambda observed: observed.y_min)
+        return self._stack(lambda observed: observed.y_min)
 
     @cached_property
     def y_max(self) -> np.ndarray:
         """Largest position over the period, in the same unit."""
-        return self._each(lambda observed: observed.y_max)
+        return self._stack(lambda observed: observed.y_max)
 
     @cached_property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers over the period, the largest modulus first; (points, states). NaN at
         an end of a boundary with a lost impact, where some of them have no limit."""
-        return self._each(lambda observed: observed.multipliers)
+        return self._stack(lambda observed: observed.multipliers)
 
     @cached_property
     def impact_phase(self) -> np.ndarray:
@@ -146,17 +146,17 @@ class Curve(InWords, abc.ABC):
     @cached_property
     def impact_speed(self) -> np.ndarray:
         """V⁻ of each impact in `impact_phase`, in the machine's unit (for a `Scene` a ω)."""
-        return self._each(lambda observed: observed.approach[list(self.problem.impacts)])
+        return self._stack(lambda observed: observed.approach[list(self.problem.impacts)])
 
     @cached_property
     def clearance(self) -> np.ndarray:
         """Smallest distance to a stop at a turn that does not touch it."""
-        return self._each(lambda observed: observed.nearest.margin)
+        return self._stack(lambda observed: observed.nearest.margin)
 
     @cached_property
     def duration(self) -> np.ndarray:
         """Least period in time."""
-        return self._each(lambda observed: observed.duration)
+        return self._stack(lambda observed: observed.duration)
 
     @cached_property
     def frequency_ratio(self) -> np.ndarray:
@@ -172,7 +172,7 @@ class Curve(InWords, abc.ABC):
         """The machine's own averages over the period, by name (see `AbstractMachine.averages`)."""
         names = self.steps[0].observed.averages
         return {
-            name: self._each(lambda observed, name=name: observed.averages[name]) for name in names
+            name: self._stack(lambda observed, name=name: observed.averages[name]) for name in names
         }
 
     @property
@@ -233,8 +233,8 @@ class Curve(InWords, abc.ABC):
         rows = []
         for step in self.steps:
             first = jax.tree.map(lambda x: x[:1], sections_of(self.problem, step.x)[0])
-            own = quantities_on(self.problem.at(step.x), first)
-            rows.append(components(first, 1) | own)
+            quantities = quantities_on(self.problem.at(step.x), first)
+            rows.append(components(first, 1) | quantities)
         return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}
 
     @property
@@ -271,50 +271,50 @@ class Curve(InWords, abc.ABC):
         rows = [_numbers(function(self.orbit(i))) for i in range(len(self.steps))]
         shapes = {name: x.shape for name, x in rows[0].items()}
         for i, row in enumerate(rows):
-            here = {name: x.shape for name, x in row.items()}
-            if here != shapes:
+            shapes_here = {name: x.shape for name, x in row.items()}
+            if shapes_here != shapes:
                 raise TypeError(
                     "Argument `function` must return numbers of the same names and shapes at each "
-                    f"point, but gave {shapes} at point 0 and {here} at point {i}."
+                    f"point, but gave {shapes} at point 0 and {shapes_here} at point {i}."
                 )
         if "parameter" in shapes:
             raise TypeError(
                 "Argument `function` must not return `parameter`, which is a column of the branch."
             )
-        own = self.names[0]
-        data: dict[str, Any] = {name: ("point", self.parameter) for name in (own, "parameter")}
+        first = self.names[0]
+        data: dict[str, Any] = {name: ("point", self.parameter) for name in (first, "parameter")}
         for name, shape in shapes.items():
             axes = (f"{name}_{k}" for k in range(len(shape)))
             data[name] = ("point", *axes), np.stack([row[name] for row in rows])
-        named = {name: name for name in (*shapes, own)} | {"parameter": own}
-        table = xr.Dataset(data, attrs={"parameter": own})
-        return with_units(table, units_of(self.problem.machine), named)
+        quantities = {name: name for name in (*shapes, first)} | {"parameter": first}
+        table = xr.Dataset(data, attrs={"parameter": first})
+        return with_units(table, units_of(self.problem.machine), quantities)
 
     def orbit(self, index: int) -> Orbit:
         """Return the motion at one point; a negative `index` counts from the end."""
-        many = len(self.steps)
-        index = count("index", index, least=-many, most=many - 1)
+        points = len(self.steps)
+        index = count("index", index, least=-points, most=points - 1)
         return orbit_of(self.problem, self.steps[index])
 
     def at(self, value: float) -> list[Orbit]:
         """Solve for the curve's motions at a value of its first parameter; return them in order."""
         value = given_number("value", value)
 
-        def apart(step: Step) -> float:
+        def difference(step: Step) -> float:
             # Points at a value, such as a bound, are at it to rounding.
-            by = float(step.x[-1]) - value
-            return by if abs(by) > _ROUNDING * float(self.scale[-1]) else 0.0
+            offset = float(step.x[-1]) - value
+            return offset if abs(offset) > _ROUNDING * float(self.scale[-1]) else 0.0
 
-        found = []
+        solutions = []
         following: list[Step | None] = [*self.steps[1:], None]
         for i, (here, new) in enumerate(zip(self.steps, following, strict=True)):
-            if not apart(here):
+            if not difference(here):
                 # The last point of a closed branch is its first one.
                 if i == 0 or new is not None or "closed" not in self.ends:
-                    found.append(here)
-            elif new is not None and apart(here) * apart(new) < 0:
-                found.append(locate_zero(self.problem, here, new, apart))
-        return [orbit_of(self.problem, step) for step in found if step is not None]
+                    solutions.append(here)
+            elif new is not None and difference(here) * difference(new) < 0:
+                solutions.append(locate_zero(self.problem, here, new, difference))
+        return [orbit_of(self.problem, step) for step in solutions if step is not None]
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """Return the curve as an `xarray.Dataset` over its points, with the `stability` at each in
@@ -339,16 +339,16 @@ class Curve(InWords, abc.ABC):
             "stability": ("point", in_names(jax.vmap(stability_of)(jnp.asarray(self.multipliers)))),
         }
         data |= special_table(self.special, self.names)
-        about = {"parameter": self.names[0], "period_in_cycles": self.cycles}
-        about |= {"ends": list(self.ends)}
+        attributes = {"parameter": self.names[0], "period_in_cycles": self.cycles}
+        attributes |= {"ends": list(self.ends)}
         if isinstance(self, Boundary):
-            about["kind"] = self.kind
-        found = xr.Dataset(data, attrs=about)
-        own = {name: name for name in (*self.averages, *self.names)}
-        own |= {f"special_{name}": name for name in self.names}
-        own |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
-        own |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
-        return tidy(with_units(found, units_of(self.problem.machine), own), along)
+            attributes["kind"] = self.kind
+        found = xr.Dataset(data, attrs=attributes)
+        quantities = {name: name for name in (*self.averages, *self.names)}
+        quantities |= {f"special_{name}": name for name in self.names}
+        quantities |= dict.fromkeys(("parameter", "special_parameter"), self.names[0])
+        quantities |= dict.fromkeys(("special_y_min", "special_y_max"), "position")
+        return tidy(with_units(found, units_of(self.problem.machine), quantities), along)
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)

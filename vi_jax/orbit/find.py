@@ -45,16 +45,16 @@ from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 
 
-def _missing(
+def _residual(
     arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
 ) -> Float[Array, "arcs states"]:
     """Return F, each arc's end minus the next arc's begin; the first arc follows the last."""
     ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
-    angles, after = (
+    angles, next_starts = (
         angles_in(arc.machine, without_modes(unravel(arcs[0]))),
         jnp.roll(arcs, -1, axis=0),
     )
-    return nearest_images(angles, ends, after) - after
+    return nearest_images(angles, ends, next_starts) - next_starts
 
 
 def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
@@ -71,7 +71,7 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         sections = in_rows(run.sections)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = find_root(
-        root_finder, lambda z: _missing(arc, z * sizes, unravel) / sizes, arcs / sizes
+        root_finder, lambda z: _residual(arc, z * sizes, unravel) / sizes, arcs / sizes
     )
     found = found._replace(x=found.x * sizes)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # all floats, for `jvp`
@@ -86,16 +86,16 @@ def shooting_matrix(jacobians: Float[Array, "arcs states states"]) -> Float[Arra
 
 
 def _start_change(
-    jacobians: Float[Array, "arcs states states"], missing: Vector, sizes: Vector
+    jacobians: Float[Array, "arcs states states"], difference: Vector, sizes: Vector
 ) -> Vector:
-    """Return the smallest change (by `sizes`) of the arcs' starts that changes F by `missing`."""
+    """Return the smallest change of the arcs' starts (by `sizes`) for this `difference` of F."""
     sizes = jnp.tile(sizes, len(jacobians))
     matrix = shooting_matrix(jacobians) * sizes / sizes[:, None]
-    return sizes * smallest_solution(matrix, missing / sizes)
+    return sizes * smallest_solution(matrix, difference / sizes)
 
 
 # Places in a cycle for the section of the search: a choice; each costs a sample of the guess.
-_PLACES = 8
+_SAMPLES = 8
 
 # A motion drifts if no change of the start would reduce F by this share: a choice.
 _DRIFTS = 0.5
@@ -103,16 +103,16 @@ _DRIFTS = 0.5
 
 def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
     """Simulate the motion with its impacts; guess and orbit share a program if equally long."""
-    places = _places(the_map, state)
+    places = _samples_per_cycle(the_map, state)
     return simulate(
         the_map.machine, state, the_map.cycles, method=the_map.method,
         samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
     )  # fmt: skip
 
 
-def _places(the_map: CycleMap, state: State) -> int:
+def _samples_per_cycle(the_map: CycleMap, state: State) -> int:
     """Return the number of samples of the state in a cycle; 1 for an autonomous machine."""
-    return 1 if is_autonomous(the_map.machine, without_modes(state)) else _PLACES
+    return 1 if is_autonomous(the_map.machine, without_modes(state)) else _SAMPLES
 
 
 def move_section(
@@ -128,17 +128,17 @@ def move_section(
         return the_map, guess, jnp.zeros((), jnp.int32)
     run = _run(the_map, guess, impact_log)
     assert run.samples is not None and run.impact_log is not None
-    step, half = machine.cycle / _PLACES, machine.cycle / 2
-    phase = run.impact_log.phase.ravel() - step * jnp.arange(_PLACES)[:, None]
-    apart = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
-    place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(apart), half, apart), axis=1))
-    kept = with_modes(run.samples.state, run.samples.modes)
-    there = jtu.tree_map(lambda x: x[place], kept)
-    lost = ~jnp.all(jnp.isfinite(in_rows(without_modes(there), 0)))
-    place = jnp.where(lost, 0, place)
-    there = jtu.tree_map(lambda a, b: jnp.where(lost, a, b), guess, there)
+    step, half = machine.cycle / _SAMPLES, machine.cycle / 2
+    phase = run.impact_log.phase.ravel() - step * jnp.arange(_SAMPLES)[:, None]
+    time_to_impact = jnp.abs(jnp.mod(phase + half, machine.cycle) - half)
+    place = jnp.argmax(jnp.min(jnp.where(jnp.isnan(time_to_impact), half, time_to_impact), axis=1))
+    sampled = with_modes(run.samples.state, run.samples.modes)
+    start = jtu.tree_map(lambda x: x[place], sampled)
+    failed = ~jnp.all(jnp.isfinite(in_rows(without_modes(start), 0)))
+    place = jnp.where(failed, 0, place)
+    start = jtu.tree_map(lambda a, b: jnp.where(failed, a, b), guess, start)
     moved = machine.observed_later(jnp.asarray(step, phase.dtype) * place)
-    return dataclasses.replace(the_map, machine=moved), there, place
+    return dataclasses.replace(the_map, machine=moved), start, place
 
 
 class Impacts(NamedTuple):
@@ -192,18 +192,18 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
         return jax.jacfwd(states)(x)
 
     @forward_jacobian
-    def seen(arc, state):
+    def observe(arc, state):
         x, _ = raveled(state)
         jacobians = jacobians_from(arc, state) if second else jnp.zeros((0,), x.dtype)
         run = _run(arc, state, impact_log)
         log = run.impact_log
         assert log is not None and run.y_min is not None and run.y_max is not None
-        met = run.sections if run.samples is None else run.samples.state
-        own = run.modes if run.samples is None else run.samples.modes
-        places, modes = in_rows(met)[1:], None
-        places = places.reshape(arc.cycles, _places(arc, state), -1)
-        if own:  # batched as all else, see `forward_jacobian`
-            modes = in_rows(own)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
+        states_met = run.sections if run.samples is None else run.samples.state
+        modes_there = run.modes if run.samples is None else run.samples.modes
+        places, modes = in_rows(states_met)[1:], None
+        places = places.reshape(arc.cycles, _samples_per_cycle(arc, state), -1)
+        if modes_there:  # batched as all else, see `forward_jacobian`
+            modes = in_rows(modes_there)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
         assert run.clearance is not None and run.duration is not None
         rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
         return ObservedArc(
@@ -212,7 +212,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
             {name: mean * run.duration for name, mean in run.averages.items()},
         )  # fmt: skip
 
-    found = seen(arc, state)
+    found = observe(arc, state)
     if second:
         return found
     numbers, rest = eqx.partition((arc, state), eqx.is_array)
@@ -231,28 +231,28 @@ def find_and_observe(
     program computes the derivatives of all observations.
     """
     root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
-    see = lambda x: observe_arc(arc, unravel(x), impact_log, second)
-    return batch_together((root, jax.vmap(see)(root.x)), root.x)
+    observe_from = lambda x: observe_arc(arc, unravel(x), impact_log, second)
+    return batch_together((root, jax.vmap(observe_from)(root.x)), root.x)
 
 
 @find_and_observe.def_jvp
 def _(primals, tangents):
     arc, guess, _, impact_log, second = primals
-    root, seen = find_and_observe(*primals)
+    root, observed = find_and_observe(*primals)
     _, unravel = raveled(guess)
-    still = jtu.tree_map(jnp.zeros_like, (root, seen))
+    zeros = jtu.tree_map(jnp.zeros_like, (root, observed))
     if not jtu.tree_leaves(tangents[0]):
-        return (root, seen), still
-    given = jtu.tree_map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
-    moving, fixed = eqx.partition(arc, given)
-    numbers, as_numbers = ravel_pytree(moving)
+        return (root, observed), zeros
+    is_perturbed = jtu.tree_map(lambda t: t is not None, tangents[0], is_leaf=lambda t: t is None)
+    moving, fixed = eqx.partition(arc, is_perturbed)
+    numbers, unravel_numbers = ravel_pytree(moving)
     count = numbers.size
 
-    def observed(both):
-        moved = eqx.combine(as_numbers(both[:count]), fixed)
-        return observe_arc(moved, unravel(both[count:]), impact_log, second)
+    def observe_moved(joined):
+        moved = eqx.combine(unravel_numbers(joined[:count]), fixed)
+        return observe_arc(moved, unravel(joined[count:]), impact_log, second)
 
-    slopes = jax.vmap(lambda x: jax.jacfwd(observed)(jnp.append(numbers, x)))(root.x)
+    slopes = jax.vmap(lambda x: jax.jacfwd(observe_moved)(jnp.append(numbers, x)))(root.x)
     ends, along = slopes.states[:, -1, -1], ravel_pytree(tangents[0])[0]
     rate = (ends[..., :count] @ along).ravel()
     move = -_start_change(ends[..., count:], rate, row_sizes(arc.machine, guess))
@@ -261,38 +261,38 @@ def _(primals, tangents):
     move = move * jnp.where(root.converged > 0, 1.0, jnp.nan)
 
     def rates(slope):
-        by_starts = jax.vmap(lambda own, x: own @ x)(slope[..., count:], move)
+        by_starts = jax.vmap(lambda jacobian, x: jacobian @ x)(slope[..., count:], move)
         return slope[..., :count] @ along + by_starts
 
-    return (root, seen), (still[0]._replace(x=move), jtu.tree_map(rates, slopes))
+    return (root, observed), (zeros[0]._replace(x=move), jtu.tree_map(rates, slopes))
 
 
 def chain_jacobians(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
     """Return the derivatives of the states after all cycles with respect to the first state: a
     running product of those with respect to the first state of their own arc."""
-    passed, all_of_them = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
-    for own in jacobians:
-        all_of_them.append(own @ passed)
-        passed = all_of_them[-1][-1]
-    return jnp.concatenate(all_of_them)
+    product, chained = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
+    for jacobian in jacobians:
+        chained.append(jacobian @ product)
+        product = chained[-1][-1]
+    return jnp.concatenate(chained)
 
 
 def error_of(
-    angles: np.ndarray | None, seen: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
+    angles: np.ndarray | None, observed: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
 ) -> tuple[Scalar, Flag]:
     """Return the largest component of Newton's next step from the arcs' starts `x`, relative to
     `sizes`, and whether the motion drifts: most of F remains for any change of the starts."""
     after = jnp.roll(x, -1, axis=0)
-    missing = (nearest_images(angles, seen.states[:, -1, -1], after) - after).ravel()
-    step = _start_change(seen.jacobians[:, -1], missing, sizes)
-    left = missing - shooting_matrix(seen.jacobians[:, -1]) @ step
+    residual = (nearest_images(angles, observed.states[:, -1, -1], after) - after).ravel()
+    step = _start_change(observed.jacobians[:, -1], residual, sizes)
+    remainder = residual - shooting_matrix(observed.jacobians[:, -1]) @ step
     sizes = jnp.tile(sizes, len(x))
-    drifts = jnp.linalg.norm(left / sizes) > _DRIFTS * jnp.linalg.norm(missing / sizes)
+    drifts = jnp.linalg.norm(remainder / sizes) > _DRIFTS * jnp.linalg.norm(residual / sizes)
     return jnp.max(jnp.abs(step / sizes)), drifts
 
 
 def order_impacts(
-    seen: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
+    observed: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
     machine: AbstractMachine, place: Int[Array, ""] | None,
 ) -> Impacts:  # fmt: skip
     """Return the impacts of a period in one row, in order from the given section.
@@ -301,16 +301,16 @@ def order_impacts(
     the given section to that of the search, or `None` if the machine is autonomous (cycles of any
     length).
     """
-    phase, cycles = seen.listed.phase, seen.duration.shape[0]
+    phase, cycles = observed.listed.phase, observed.duration.shape[0]
     if place is not None:
         turn = jnp.asarray(machine.cycle, phase.dtype)
-        behind = jnp.arange(cycles)[:, None] + place / _PLACES
-        phase = jnp.mod(phase + turn * behind, turn * least)
+        cycles_before = jnp.arange(cycles)[:, None] + place / _SAMPLES
+        phase = jnp.mod(phase + turn * cycles_before, turn * least)
     else:
-        phase = phase + (jnp.cumsum(seen.duration) - seen.duration)[:, None]
+        phase = phase + (jnp.cumsum(observed.duration) - observed.duration)[:, None]
     phase = jnp.where(hit, phase, jnp.inf).ravel()
     order = jnp.argsort(phase)
-    columns = ((phase, jnp.nan), (seen.listed.speed, jnp.nan), (seen.listed.stop, -1.0))
+    columns = ((phase, jnp.nan), (observed.listed.speed, jnp.nan), (observed.listed.stop, -1.0))
     return Impacts(*(jnp.where(hit.ravel(), a.ravel(), none)[order] for a, none in columns))
 
 
@@ -406,19 +406,19 @@ def _check_guess(machine: AbstractMachine, state: State) -> None:
             "Argument `guess` must be one state, or several along one axis, but its position has "
             f"{axes} axes."
         )
-    many = axes > 0
-    if not many:
+    is_batch = axes > 0
+    if not is_batch:
         shape_of("guess", machine, without_modes(state))
-    shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if many else {()}
+    shapes = {jnp.shape(leaf)[:1] for leaf in jtu.tree_leaves(state)} if is_batch else {()}
     if len(shapes) > 1:
-        whole = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
+        all_shapes = sorted(jnp.shape(leaf) for leaf in jtu.tree_leaves(state))
         raise ValueError(
             "Argument `guess` must hold the numbers of a state, or rows of one length for as many "
-            f"guesses, but holds shapes {whole}."
+            f"guesses, but holds shapes {all_shapes}."
         )
     for path, leaf in jtu.tree_leaves_with_path(state):
         numbers = concrete(leaf)
-        if numbers is not None and not many and not np.isfinite(numbers).all():
+        if numbers is not None and not is_batch and not np.isfinite(numbers).all():
             name = jtu.keystr(path).lstrip(".")
             raise ValueError(f"Argument `guess` must be finite, but its {name} is {numbers}.")
 
@@ -428,62 +428,62 @@ def _find(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
     multipliers: bool,
 ) -> Orbit:  # fmt: skip
-    def one(guess):
-        return _judged(the_map, guess, root_finder, impact_log, multipliers)
+    def find_one(guess):
+        return _find_one(the_map, guess, root_finder, impact_log, multipliers)
 
     first = jtu.tree_leaves(guess)[0]
     if not axes_of(the_map.machine, guess):
-        return one(guess)
-    return jax.lax.map(one, guess, batch_size=min(_BATCH, first.shape[0]))
+        return find_one(guess)
+    return jax.lax.map(find_one, guess, batch_size=min(_BATCH, first.shape[0]))
 
 
-def _judged(
+def _find_one(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
     multipliers: bool,
 ) -> Orbit:  # fmt: skip
     machine, cycles = the_map.machine, the_map.cycles
-    guess = _in_later_modes(the_map, jax.lax.stop_gradient(guess))
+    guess = _with_later_modes(the_map, jax.lax.stop_gradient(guess))
     moved, start, place = move_section(the_map, guess, impact_log)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
-    root, seen = find_and_observe(arc, start, root_finder, impact_log, multipliers)
+    root, observed = find_and_observe(arc, start, root_finder, impact_log, multipliers)
     x = root.x
-    jacobians = chain_jacobians(seen.jacobians)
+    jacobians = chain_jacobians(observed.jacobians)
     angles = angles_in(machine, without_modes(guess))
-    sizes = row_sizes(machine, start, in_rows(without_modes(seen.states), 3))
-    error, drifts = error_of(angles, seen, x, sizes)
-    seen = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), seen)
+    sizes = row_sizes(machine, start, in_rows(without_modes(observed.states), 3))
+    error, drifts = error_of(angles, observed, x, sizes)
+    observed = jtu.tree_map(lambda a: a.reshape(cycles, *a.shape[2:]), observed)
 
     # Return to the given section; the last one met is the guess's.
-    last = seen.states.shape[1] - 1
-    sections = jnp.roll(jnp.take(seen.states, last - place, axis=1), 1, axis=0)
+    last = observed.states.shape[1] - 1
+    sections = jnp.roll(jnp.take(observed.states, last - place, axis=1), 1, axis=0)
     modes, rows = None, sections
-    if seen.modes is not None:
-        modes = jnp.roll(jnp.take(seen.modes, last - place, axis=1), 1, axis=0)
+    if observed.modes is not None:
+        modes = jnp.roll(jnp.take(observed.modes, last - place, axis=1), 1, axis=0)
         rows = jnp.concatenate([sections, modes], axis=1)
     unit = jax.lax.stop_gradient(root.unit)
     scale = unit * (sizes if modes is None else jnp.append(sizes, jnp.ones(modes.shape[1])))
     least = _least_period(rows, error / unit, scale, angles)
-    again = _must_slide(start, seen)
+    recurs = _modes_recur(start, observed)
     monodromy = jacobians[least - 1] if multipliers else jnp.full_like(jacobians[0], jnp.nan)
     within = jnp.arange(cycles) < least
-    hit = (seen.listed.stop >= 0) & within[:, None]
-    listed = order_impacts(seen, hit, least, machine, place if last else None)
-    duration = jnp.sum(jnp.where(within, seen.duration, 0.0))
-    sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in seen.integrals.items()}
-    clearance = jnp.min(jnp.where(within, seen.clearance, jnp.inf))
+    hit = (observed.listed.stop >= 0) & within[:, None]
+    listed = order_impacts(observed, hit, least, machine, place if last else None)
+    duration = jnp.sum(jnp.where(within, observed.duration, 0.0))
+    sums = {name: jnp.sum(jnp.where(within, a, 0.0)) for name, a in observed.integrals.items()}
+    clearance = jnp.min(jnp.where(within, observed.clearance, jnp.inf))
     unravel = ravel_pytree(without_modes(guess))[1]
     state = unravel(sections[0])
     state = state if modes is None else HybridState(state, tuple(modes[0]))
-    still = is_equilibrium(machine, state, duration, unit * sizes)
-    close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
-    found = (root.converged > 0) & again & ~still & close
-    y_min = jnp.min(jnp.where(within, seen.y_min, jnp.inf))
-    y_max = jnp.max(jnp.where(within, seen.y_max, -jnp.inf))
+    is_still = is_equilibrium(machine, state, duration, unit * sizes)
+    is_close = error < jnp.sqrt(jnp.finfo(x.dtype).eps) * 100 * unit
+    is_found = (root.converged > 0) & recurs & ~is_still & is_close
+    y_min = jnp.min(jnp.where(within, observed.y_min, jnp.inf))
+    y_max = jnp.max(jnp.where(within, observed.y_max, -jnp.inf))
     # Speeds of a harmonic motion of this extent, once in a cycle: the greatest, and at `clearance`.
-    fast = jnp.pi * (y_max - y_min) * least / duration
-    slow = fast * jnp.sqrt(4 * jnp.maximum(clearance, 0) / (y_max - y_min))
-    slowest = jnp.min(jnp.where(hit, seen.listed.speed, jnp.inf))
-    near = jnp.minimum(slowest, slow) < _SLOW * fast
+    fastest = jnp.pi * (y_max - y_min) * least / duration
+    slow_turn = fastest * jnp.sqrt(4 * jnp.maximum(clearance, 0) / (y_max - y_min))
+    slowest = jnp.min(jnp.where(hit, observed.listed.speed, jnp.inf))
+    near_grazing = jnp.minimum(slowest, slow_turn) < _SLOW * fastest
     return Orbit(
         machine=machine,
         method=the_map.method,
@@ -495,8 +495,8 @@ def _judged(
         impact_phase=phase_at(machine, listed.phase),
         impact_speed=listed.speed,
         impact_stop=listed.stop.astype(jnp.int32),
-        impacts=jnp.sum(jnp.where(within, seen.impacts, 0.0)).astype(jnp.int32),
-        rests=jnp.sum(jnp.where(within, seen.rests, 0.0)).astype(jnp.int32),
+        impacts=jnp.sum(jnp.where(within, observed.impacts, 0.0)).astype(jnp.int32),
+        rests=jnp.sum(jnp.where(within, observed.rests, 0.0)).astype(jnp.int32),
         y_min=y_min,
         y_max=y_max,
         clearance=clearance,
@@ -507,31 +507,31 @@ def _judged(
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
         averages=means(sums, duration),
-        result=_verdict(
-            found, least < cycles, grazing=near, drifts=drifts, equilibrium=still,
-            other_modes=(root.converged > 0) & ~again, not_simulated=jnp.isnan(root.residual),
+        result=_result_of(
+            is_found, least < cycles, grazing=near_grazing, drifts=drifts, equilibrium=is_still,
+            other_modes=(root.converged > 0) & ~recurs, not_simulated=jnp.isnan(root.residual),
         ),
     )  # fmt: skip
 
 
-def _in_later_modes(the_map: CycleMap, guess: State) -> State:
+def _with_later_modes(the_map: CycleMap, guess: State) -> State:
     """Return the guess in the modes in which its motion is a period later: an orbit near it has
     these more likely than the modes in which a motion begins."""
     if modes_of(guess) is None:
         return guess
     later = the_map(guess)
-    there = jnp.all(jnp.isfinite(raveled(later)[0]))
+    is_finite = jnp.all(jnp.isfinite(raveled(later)[0]))
     return jtu.tree_map(
-        lambda a, b: jnp.where(there, a, b), replaced(later, without_modes(guess)), guess
+        lambda a, b: jnp.where(is_finite, a, b), replaced(later, without_modes(guess)), guess
     )
 
 
-def _must_slide(start: State, seen: ObservedArc) -> Flag:
+def _modes_recur(start: State, observed: ObservedArc) -> Flag:
     """Return whether a motion ends in its first modes, after all cycles of the search."""
     modes = modes_of(start)
-    if modes is None or seen.modes is None:
+    if modes is None or observed.modes is None:
         return jnp.ones((), bool)
-    return jnp.all(seen.modes[-1, -1] == jnp.stack(modes))
+    return jnp.all(observed.modes[-1, -1] == jnp.stack(modes))
 
 
 def _least_period(
@@ -539,7 +539,7 @@ def _least_period(
 ) -> Array:
     cycles = sections.shape[0]
     least = jnp.asarray(cycles, jnp.int32)
-    slack = jnp.maximum(_slack(sections.dtype), 100 * error)
+    slack = jnp.maximum(_state_tolerance(sections.dtype), 100 * error)
     for m in range(cycles - 1, 0, -1):
         if cycles % m == 0:
             later = nearest_images(angles, jnp.roll(sections, -m, axis=0), sections)
@@ -551,25 +551,25 @@ def _least_period(
 def is_equilibrium(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
     """Return whether an autonomous machine is at an equilibrium: at the rate of the state it would
     not move in its period, relative to `unit` + |state|."""
-    own, state = modes_of(state), without_modes(state)
+    machine_modes, state = modes_of(state), without_modes(state)
     if not is_autonomous(machine, state):
         return jnp.zeros((), bool)
     x = ravel_pytree(state)[0]
     s = jnp.zeros((), x.dtype)
-    field = in_modes(machine, begin_modes(machine, s, state, own)).field
-    passed = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
-    return jnp.all(passed <= _slack(x.dtype) * (unit + jnp.abs(x)))
+    field = in_modes(machine, begin_modes(machine, s, state, machine_modes)).field
+    moved = jnp.abs(ravel_pytree(field(s, state))[0]) * duration
+    return jnp.all(moved <= _state_tolerance(x.dtype) * (unit + jnp.abs(x)))
 
 
-def _slack(dtype: object) -> float:
+def _state_tolerance(dtype: object) -> float:
     """Return the tolerance for equal states, see `distance`."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-def _verdict(found: Array, smaller: Array, **reasons: Array) -> ORBIT_RESULTS:
+def _result_of(found: Array, smaller: Array, **reasons: Array) -> ORBIT_RESULTS:
     """Return the result of a search; of several reasons for a failure the last in this order."""
-    where, missed = ORBIT_RESULTS.where, ORBIT_RESULTS.no_orbit
+    where, failure = ORBIT_RESULTS.where, ORBIT_RESULTS.no_orbit
     for name in ("grazing", "drifts", "other_modes", "equilibrium", "not_simulated"):
-        missed = where(reasons[name], getattr(ORBIT_RESULTS, name), missed)
+        failure = where(reasons[name], getattr(ORBIT_RESULTS, name), failure)
     successful = where(smaller, ORBIT_RESULTS.smaller_period, ORBIT_RESULTS.successful)
-    return where(found, successful, missed)
+    return where(found, successful, failure)

@@ -18,24 +18,24 @@ from .._messages import Interrupted, at_work, count_of
 from ..flow import NamedEnumeration, simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
 from ._flight import Event
-from ._local_map import Graze, LocalMap, graze_at
+from ._local_map import LocalGrazing, LocalMap, graze_at
 from ._shooting import Shooting
 from ._solution import on_host
 from .results import complex_in_words
 from .special import Point
 
 # Longest period that is sought, and the number of iterates in which it is sought.
-LONGEST, LOOKED = 64, 192
+LONGEST, SOUGHT = 64, 192
 
 # A motion is periodic if it repeats within this share of one kick: a choice, far above the rest of
-# the transient (`_LEFT`) and far below the differences of chaos.
+# the transient (`_REMAINING`) and far below the differences of chaos.
 _REPEATS = 1e-3
 
 # A motion beyond so many kicks does not return: a choice.
 _LOST = 1e9
 
 # Share of the slowest transient that remains after settling; bounds of the iterates for it.
-_LEFT, _FEWEST, _MOST = 1e-7, 400, 6000
+_REMAINING, _FEWEST, _MOST = 1e-7, 400, 6000
 
 # Attractors of the local map shrink towards the grazing. One whose depth exceeds this multiple of a
 # first impact's does not (a chain of impacts within a small attractor reached twice that at most in
@@ -72,7 +72,7 @@ class SCENARIOS(NamedEnumeration):
     jump = "no attractor is near: the next motion is far away"
 
 
-class Settled(NamedTuple):
+class Attractors(NamedTuple):
     """Attractors of the map near the grazing, lane by lane."""
 
     period: np.ndarray
@@ -90,18 +90,18 @@ def periods_in(rows: np.ndarray, hits: np.ndarray, size: np.ndarray) -> np.ndarr
     components) must repeat to a share of a kick's `size`, `hits` (impacts per iterate) exactly."""
     found = np.zeros(len(rows), int)
     for p in range(LONGEST, 0, -1):
-        apart = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
-        same = (hits[:, p:] == hits[:, :-p]).all(axis=1)
-        found = np.where(same & (apart <= _REPEATS * size), p, found)
+        differences = np.abs(rows[:, p:] - rows[:, :-p]).max(axis=(1, 2))
+        same_hits = (hits[:, p:] == hits[:, :-p]).all(axis=1)
+        found = np.where(same_hits & (differences <= _REPEATS * size), p, found)
     return found
 
 
-def settling(local: LocalMap) -> int:
+def transient_length(local: LocalMap) -> int:
     """Return the number of iterates of the transient, from the slowest multiplier."""
     slowest = np.abs(np.linalg.eigvals(local.matrix)).max()
     if slowest <= 0 or slowest >= 1:
         return _FEWEST if slowest <= 0 else _MOST
-    return int(np.clip(np.log(_LEFT) / np.log(slowest), _FEWEST, _MOST))
+    return int(np.clip(np.log(_REMAINING) / np.log(slowest), _FEWEST, _MOST))
 
 
 def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
@@ -110,21 +110,21 @@ def kick_sizes(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
     return (depth**local.orders * np.abs(local.kicks).max(axis=1)).max(axis=1)
 
 
-def settled(local: LocalMap, offsets: np.ndarray) -> Settled:
-    found = _iterated(local, offsets)
+def find_attractors(local: LocalMap, offsets: np.ndarray) -> Attractors:
+    found = _iterate(local, offsets)
     near = found.depth <= local_depths(local, offsets)
     return found._replace(period=np.where(near, found.period, -1))
 
 
-def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
+def _iterate(local: LocalMap, offsets: np.ndarray) -> Attractors:
     """Iterate the local map from the smooth motion, at each offset of the parameter."""
     z = np.zeros((len(offsets), local.matrices.shape[1]))
-    settle = settling(local)
-    places = np.zeros((len(offsets), LOOKED, z.shape[1]))
-    hits = np.zeros((len(offsets), LOOKED))
+    settle = transient_length(local)
+    places = np.zeros((len(offsets), SOUGHT, z.shape[1]))
+    hits = np.zeros((len(offsets), SOUGHT))
     deepest, size = np.zeros(len(offsets)), kick_sizes(local, offsets)
     with np.errstate(over="ignore", invalid="ignore"):
-        for n in range(settle + LOOKED):
+        for n in range(settle + SOUGHT):
             i = n - settle
             for k, N in enumerate(local.matrices):
                 depth = np.maximum(-(local.slopes[k] * offsets + z @ local.gradients[k]), 0.0)
@@ -136,9 +136,9 @@ def _iterated(local: LocalMap, offsets: np.ndarray) -> Settled:
                     if k == 0:
                         places[:, i] = kicked
         period = periods_in(places, hits, size)
-    lost = ~(np.abs(z).max(axis=1) <= _LOST * size)
-    period = np.where(lost, -1, period)
-    return Settled(period, impacts_in(hits, period), places, deepest)
+    is_lost = ~(np.abs(z).max(axis=1) <= _LOST * size)
+    period = np.where(is_lost, -1, period)
+    return Attractors(period, impacts_in(hits, period), places, deepest)
 
 
 def impacts_in(hits: np.ndarray, period: np.ndarray) -> np.ndarray:
@@ -159,13 +159,13 @@ def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
         return _LOCAL * first
     scale = np.sqrt(natural_depth(local))
     sense = -np.sign(local.slopes[0])
-    tiny = sense * np.geomspace(*_TINY, _PROBES) * scale**2 / np.abs(local.slopes[0])
-    shallow = np.sqrt(np.abs(np.outer(tiny, local.slopes)).max(axis=1))
-    found = _iterated(local, tiny)
+    tiny_offsets = sense * np.geomspace(*_TINY, _PROBES) * scale**2 / np.abs(local.slopes[0])
+    shallow = np.sqrt(np.abs(np.outer(tiny_offsets, local.slopes)).max(axis=1))
+    found = _iterate(local, tiny_offsets)
     if (found.depth <= _LOCAL * shallow).mean() > 0.5:
         return _LOCAL * first
-    near = (found.depth <= _LOCAL * np.sqrt(scale * shallow)) & (found.period >= 0)
-    return _LOCAL * np.sqrt(scale * first) if near.mean() > 0.5 else _LOCAL * first
+    is_near = (found.depth <= _LOCAL * np.sqrt(scale * shallow)) & (found.period >= 0)
+    return _LOCAL * np.sqrt(scale * first) if is_near.mean() > 0.5 else _LOCAL * first
 
 
 def natural_depth(local: LocalMap) -> float:
@@ -175,32 +175,32 @@ def natural_depth(local: LocalMap) -> float:
     return float(entries.max() ** 2)
 
 
-def scenario_of(local: LocalMap, offsets: np.ndarray, found: Settled) -> tuple[str, float]:
+def scenario_of(local: LocalMap, offsets: np.ndarray, found: Attractors) -> tuple[str, float]:
     """Return the scenario's name in `SCENARIOS`, and the share of offsets without a period. The
     half of the offsets nearer to zero decides whether an attractor is near, and whether it is the
     motion itself. The offsets lie on the side of the impacts, evenly spaced by their logarithm."""
-    near = found.period >= 0
-    close = np.abs(offsets) <= np.median(np.abs(offsets))
-    if near[close].mean() < 0.5:
+    is_near = found.period >= 0
+    is_close = np.abs(offsets) <= np.median(np.abs(offsets))
+    if is_near[is_close].mean() < 0.5:
         folds = local.orders[0] == 0.5 and len(local.kicks) == 1 and _sum_of_entries(local) < 0
         return ("nonsmooth_fold" if folds else "jump"), 0.0
-    if (found.period[near & close] == 1).mean() > _ALL:
+    if (found.period[is_near & is_close] == 1).mean() > _ALL:
         return "persistence", 0.0
-    period, impacts = found.period[near], found.impacts[near]
+    period, impacts = found.period[is_near], found.impacts[is_near]
     aperiodic = float((period == 0).mean())
     if aperiodic > _ALL:
         return "chaos", aperiodic
     # A motion with one impact in n periods, or its period doublings.
     single = (period > 1) & (impacts > 0) & (period == impacts * (period // np.maximum(impacts, 1)))
-    adding = single.sum() > 0.5 * (period > 0).sum() and _next_to_each_other(
-        offsets[near], np.where(single & (impacts == 1), period, 0)
+    adding = single.sum() > 0.5 * (period > 0).sum() and _are_adjacent(
+        offsets[is_near], np.where(single & (impacts == 1), period, 0)
     )
     if aperiodic < _FEW:
         return ("period_adding" if adding else "periodic"), aperiodic
     return ("period_adding_with_chaos" if adding else "windows_and_chaos"), aperiodic
 
 
-def _next_to_each_other(offsets: np.ndarray, period: np.ndarray) -> bool:
+def _are_adjacent(offsets: np.ndarray, period: np.ndarray) -> bool:
     """Return whether the periods of motions with one impact (0 elsewhere) grow towards the grazing,
     with some n next to n + 1. 5 and 7 without 6, as between two stops, are no period adding."""
     kinds = np.unique(period[period > 0])
@@ -235,22 +235,22 @@ def windows(local: LocalMap, reach: float, count: int) -> Windows:
     N, h, kick = local.matrix, local.gradients[0], local.kicks[0]
     identity = np.eye(len(N))
     depths = np.sqrt(reach) * np.geomspace(1e-6, 1, 1200)
-    exist, steady = [], []
+    existing, stable = [], []
     for n in range(1, count + 1):
         power = np.linalg.matrix_power(N, n)
-        back = np.linalg.solve(identity - power, power @ kick)  # the state after n periods, over y
-        lack = depths**2 + (h @ back) * depths
-        offset = -lack / local.slopes[0]
-        passages = local.later(back + kick, n - 1)
-        exists = (-lack + passages[:, None] * depths > 0).all(axis=0)
-        kicked = np.einsum("y,i,j->yij", -0.5 / depths, kick, h)
-        values = np.linalg.eigvals(power @ (identity + kicked))
-        exist.append(_between(offset[exists]))
-        steady.append(_between(offset[exists & (np.abs(values).max(axis=1) < 1)]))
-    return Windows(np.arange(1, count + 1), np.array(exist), np.array(steady))
+        after_n = np.linalg.solve(identity - power, power @ kick)  # state after n periods, over y
+        residual = depths**2 + (h @ after_n) * depths
+        offset = -residual / local.slopes[0]
+        passages = local.later_distances(after_n + kick, n - 1)
+        exists = (-residual + passages[:, None] * depths > 0).all(axis=0)
+        kick_slopes = np.einsum("y,i,j->yij", -0.5 / depths, kick, h)
+        values = np.linalg.eigvals(power @ (identity + kick_slopes))
+        existing.append(_interval(offset[exists]))
+        stable.append(_interval(offset[exists & (np.abs(values).max(axis=1) < 1)]))
+    return Windows(np.arange(1, count + 1), np.array(existing), np.array(stable))
 
 
-def _between(offset: np.ndarray) -> tuple[float, float]:
+def _interval(offset: np.ndarray) -> tuple[float, float]:
     """Return the ends of an interval, the one nearer to zero first."""
     if not offset.size:
         return np.nan, np.nan
@@ -265,16 +265,16 @@ _ROUNDING = 1e-11
 _FAR = 1e-3
 
 # A motion on the section farther off than so many of the deepest kicks has left: a choice.
-_KICKS = 64
+_KICKS_SUMMED = 64
 
 
-class Simulated(NamedTuple):
+class SimulatedAttractors(NamedTuple):
     """Attractors of the machine, lane by lane."""
 
     period: np.ndarray
-    """As `Settled.period`; -1 also for a lane that left the neighbourhood or failed."""
+    """As `Attractors.period`; -1 also for a lane that left the neighbourhood or failed."""
     impacts: np.ndarray
-    """As `Settled.impacts`; NaN if a touch is not one of a rigid stop."""
+    """As `Attractors.impacts`; NaN if a touch is not one of a rigid stop."""
     places: np.ndarray
     """States on the section, less the smooth motion; (lanes, LOOKED, states)."""
     far: np.ndarray
@@ -287,7 +287,7 @@ class Simulated(NamedTuple):
 def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
     """Return sections and impacts of the last cycles, (lanes, cycles)."""
 
-    def one(value, u):
+    def simulate_one(value, u):
         run = simulate(
             problem.at(value[None]), problem.unravel(u), cycles, settle=settle,
             method=problem.method, record="sections",
@@ -295,44 +295,44 @@ def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
         rows = in_rows(run.sections)
         return rows[1:], run.impacts, run.successful
 
-    return jax.vmap(one)(values, states)
+    return jax.vmap(simulate_one)(values, states)
 
 
-def simulated(graze: Graze, offsets: np.ndarray) -> Simulated:
+def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAttractors:
     """Simulate the machine at each offset of the parameter, from the smooth motion."""
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
-    rows, impacts, good = _lanes(
-        problem, value + offsets, smooth, problem.cycles * LOOKED,
-        settling(local) * problem.cycles,
+    rows, impacts, is_finite = _lanes(
+        problem, value + offsets, smooth, problem.cycles * SOUGHT,
+        transient_length(local) * problem.cycles,
     )  # fmt: skip
-    last = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
-    hits = impacts.reshape(len(rows), LOOKED, problem.cycles).sum(axis=2) - len(problem.impacts)
+    displacements = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
+    hits = impacts.reshape(len(rows), SOUGHT, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
-    u, added = local.kicks.T, np.zeros(len(section.state))
-    for _ in range(_KICKS):
-        added += np.abs(section.matrix @ u).max(axis=1)
+    u, kick_sum = local.kicks.T, np.zeros(len(section.state))
+    for _ in range(_KICKS_SUMMED):
+        kick_sum += np.abs(section.matrix @ u).max(axis=1)
         u = local.matrix @ u
     unit = np.abs(local.kicks).max()
     reach = np.abs(section.matrix @ local.kicks.T).max() / unit * size
     rounding = _ROUNDING * np.abs(smooth).max()
-    period = periods_in(last, hits, reach + rounding)
+    period = periods_in(displacements, hits, reach + rounding)
     deepest = local_depths(local, offsets) ** (2 * local.orders.min())
-    away = np.abs(last).max(axis=(1, 2)) > added.max() * deepest + rounding
-    good = good & np.isfinite(last).all(axis=(1, 2))
-    span = np.abs(last).max(axis=(1, 2), initial=0.0, where=np.isfinite(last))
-    far = np.where(good & away, periods_in(last, hits, _FAR * span), 0)
-    period = np.where(good & ~away, period, -1)
+    is_away = np.abs(displacements).max(axis=(1, 2)) > kick_sum.max() * deepest + rounding
+    is_finite = is_finite & np.isfinite(displacements).all(axis=(1, 2))
+    span = np.abs(displacements).max(axis=(1, 2), initial=0.0, where=np.isfinite(displacements))
+    far = np.where(is_finite & is_away, periods_in(displacements, hits, _FAR * span), 0)
+    period = np.where(is_finite & ~is_away, period, -1)
     rigid = all(touch.number < len(stops_of(problem.machine)) for touch in graze.touches)
-    counted = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
-    whole = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
-    return Simulated(period, counted, last, far, whole)
+    impacts = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
+    total = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
+    return SimulatedAttractors(period, impacts, displacements, far, total)
 
 
-def alike(forecast: Settled, machine: Simulated) -> np.ndarray:
-    counted = np.isnan(machine.impacts) | (forecast.impacts == machine.impacts)
-    return (forecast.period == machine.period) & (counted | (forecast.period <= 0))
+def agree_at(forecast: Attractors, machine: SimulatedAttractors) -> np.ndarray:
+    same_impacts = np.isnan(machine.impacts) | (forecast.impacts == machine.impacts)
+    return (forecast.period == machine.period) & (same_impacts | (forecast.period <= 0))
 
 
 # Decades below the greatest depth that are examined: a choice.
@@ -361,57 +361,57 @@ class Motions(NamedTuple):
 
 @on_host
 def _position_of(problem: Shooting, states):
-    place = lambda u: problem.machine.position(problem.unravel(u))
-    return jax.vmap(place)(states.reshape(-1, problem.states)).reshape(states.shape[:-1])
+    position = lambda u: problem.machine.position(problem.unravel(u))
+    return jax.vmap(position)(states.reshape(-1, problem.states)).reshape(states.shape[:-1])
 
 
-def positions(graze: Graze, offsets: np.ndarray, beside: np.ndarray) -> np.ndarray:
+def positions(graze: LocalGrazing, offsets: np.ndarray, displacements: np.ndarray) -> np.ndarray:
     """Return the first coordinate at displacements from the smooth section state, less its own."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
-    there = _position_of(graze.problem, smooth[:, None] + beside)
-    return there - _position_of(graze.problem, smooth)[:, None]
+    moved = _position_of(graze.problem, smooth[:, None] + displacements)
+    return moved - _position_of(graze.problem, smooth)[:, None]
 
 
-def beside_grazing(
-    graze: Graze, offsets: np.ndarray, found: Settled
+def compare_with_machine(
+    graze: LocalGrazing, offsets: np.ndarray, found: Attractors
 ) -> tuple[Motions, tuple[np.ndarray, np.ndarray], tuple[int, int] | None]:
     """Return the machine's attractors at offsets with the local attractors `found`; whether they
     agree there, and (at some offsets) on the other side; period and impacts far away, or `None`."""
     sparse, n = offsets[::_SPARSE], len(offsets)
-    machine = simulated(graze, np.concatenate([offsets, -sparse]))
-    here, there = (jax.tree.map(lambda a: a[:n], machine), jax.tree.map(lambda a: a[n:], machine))
-    same = alike(found, here), alike(settled(graze.map, -sparse), there)
-    beyond = Motions(offsets, here.period, here.impacts, positions(graze, offsets, here.places))
-    return beyond, same, _far(here, graze.problem.cycles)
+    machine = simulate_attractors(graze, np.concatenate([offsets, -sparse]))
+    ahead, behind = (jax.tree.map(lambda a: a[:n], machine), jax.tree.map(lambda a: a[n:], machine))
+    agreement = agree_at(found, ahead), agree_at(find_attractors(graze.map, -sparse), behind)
+    beyond = Motions(offsets, ahead.period, ahead.impacts, positions(graze, offsets, ahead.places))
+    return beyond, agreement, _distant_attractor(ahead, graze.problem.cycles)
 
 
-def _far(seen: Simulated, cycles: int) -> tuple[int, int] | None:
+def _distant_attractor(attractors: SimulatedAttractors, cycles: int) -> tuple[int, int] | None:
     """Return period and impacts of the attractor of most lanes that left."""
-    left = seen.period < 0
-    if left.mean() < 0.5:
+    has_left = attractors.period < 0
+    if has_left.mean() < 0.5:
         return None
-    both = zip(seen.far[left], seen.hits[left], strict=True)
-    kinds = [(int(p) * cycles, round(float(n)) if p else 0) for p, n in both]
+    pairs = zip(attractors.far[has_left], attractors.hits[has_left], strict=True)
+    kinds = [(int(p) * cycles, round(float(n)) if p else 0) for p, n in pairs]
     return max(set(kinds), key=kinds.count)
 
 
-def stretch(
-    size: np.ndarray, here: np.ndarray, there: np.ndarray
+def agreeing_range(
+    size: np.ndarray, ahead: np.ndarray, behind: np.ndarray
 ) -> tuple[tuple[float, float] | None, float]:
     """Return the longest range of sizes of offsets (rising), in half decades, in which forecast and
-    machine agree `here` and, on the other side, `there`; and the share of equal values in it."""
+    machine agree `ahead` and, on the other side, `behind`; and the share of equal values in it."""
     parts = 2 * DECADES
-    half = np.minimum((np.arange(len(size)) * parts) // (len(size) - 1), parts - 1)
-    good = [
-        here[half == i].mean() >= _AGREES and there[half[::_SPARSE] == i].all()
+    part = np.minimum((np.arange(len(size)) * parts) // (len(size) - 1), parts - 1)
+    agrees = [
+        ahead[part == i].mean() >= _AGREES and behind[part[::_SPARSE] == i].all()
         for i in range(parts)
     ]
-    runs = (run for run in itertools.combinations(range(parts + 1), 2) if all(good[slice(*run)]))
+    runs = (run for run in itertools.combinations(range(parts + 1), 2) if all(agrees[slice(*run)]))
     begin, end = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
-    inside = (half >= begin) & (half < end)
+    inside = (part >= begin) & (part < end)
     if not inside.any():
         return None, np.nan
-    share = np.concatenate([here[inside], there[inside[::_SPARSE]]]).mean()
+    share = np.concatenate([ahead[inside], behind[inside[::_SPARSE]]]).mean()
     return (float(size[inside][0]), float(size[inside][-1])), float(share)
 
 
@@ -569,52 +569,52 @@ def grazing(
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)
-    unchecked, settles = _unchecked(graze, periods)
+    unchecked, attractors = _unchecked(graze, periods)
     if not check:
         return unchecked
     offsets = unchecked.forecast.offset[::SIMULATE_EVERY]
     with at_work(
         "grazing", lambda: Interrupted("check of the grazing", unchecked),
         progress=progress, unit="value", total=len(offsets),
-    ) as tell:  # fmt: skip
-        some = jax.tree.map(lambda a: a[::SIMULATE_EVERY], settles)
-        beside, same, far = beside_grazing(graze, offsets, some)
-        checked, agreement = stretch(np.abs(offsets), *same)
-        tell(len(offsets))
+    ) as report:  # fmt: skip
+        subset = jax.tree.map(lambda a: a[::SIMULATE_EVERY], attractors)
+        by_machine, agree, far = compare_with_machine(graze, offsets, subset)
+        checked, agreement = agreeing_range(np.abs(offsets), *agree)
+        report(len(offsets))
     found = dataclasses.replace(
-        unchecked, machine=beside, checked=checked, agreement=agreement, far=far
+        unchecked, machine=by_machine, checked=checked, agreement=agreement, far=far
     )
-    return found if checked is None else _within(found, graze, settles, checked)
+    return found if checked is None else _limit_to_checked(found, graze, attractors, checked)
 
 
-def _within(
-    found: Grazing, graze: Graze, settles: Settled, checked: tuple[float, float]
+def _limit_to_checked(
+    found: Grazing, graze: LocalGrazing, attractors: Attractors, checked: tuple[float, float]
 ) -> Grazing:
     """Name the scenario from those values only at which the machine agrees: elsewhere the local map
     may have other attractors than the machine."""
     size = np.abs(found.forecast.offset)
-    inside = (size >= checked[0]) & (size <= checked[1])
-    some = jax.tree.map(lambda a: a[inside], settles)
-    outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[inside], some)
+    is_checked = (size >= checked[0]) & (size <= checked[1])
+    subset = jax.tree.map(lambda a: a[is_checked], attractors)
+    outcome, aperiodic = scenario_of(graze.map, found.forecast.offset[is_checked], subset)
     return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)
 
 
-def _unchecked(graze: Graze, periods: int) -> tuple[Grazing, Settled]:
+def _unchecked(graze: LocalGrazing, periods: int) -> tuple[Grazing, Attractors]:
     """Return the forecast of the local map, and its attractor at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     half = 0.5 * _BRIEF * float(graze.problem.period(graze.x)) / graze.problem.cycles
-    natural, brief = natural_depth(local), 0.5 * first.rate * half**2
-    if natural < _VANISHES * brief:
+    root_depth, brief_depth = natural_depth(local), 0.5 * first.rate * half**2
+    if root_depth < _VANISHES * brief_depth:
         raise ValueError(
             "Argument `point` must be a grazing whose impacts come back to the stop, but here what "
             "they do is forgotten within a period to first order, as of an autonomous machine with "
             "one degree of freedom, where they only shift the time."
         )
-    deepest = _DEEPEST * min(natural, brief)
+    deepest = _DEEPEST * min(root_depth, brief_depth)
     side = -1 if first.slope > 0 else 1
     offsets = side * deepest / abs(first.slope) * np.logspace(-DECADES, 0, DECADES * _EACH + 1)
-    found = settled(local, offsets)
+    found = find_attractors(local, offsets)
     outcome, aperiodic = scenario_of(local, offsets, found)
     single = len(graze.touches) == 1 and first.kick.order == 0.5
     values = np.linalg.eigvals(local.matrix)

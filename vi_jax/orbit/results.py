@@ -95,12 +95,12 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
     largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
     size = jnp.abs(largest)
     real = jnp.abs(largest.imag) <= NEUTRAL * size
-    how = STABILITY.where(
+    unstable_kind = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
         STABILITY.where(real, STABILITY.period_doubling, STABILITY.neimark_sacker),
     )
-    verdict = STABILITY.where(size < 1, STABILITY.stable, how)
+    verdict = STABILITY.where(size < 1, STABILITY.stable, unstable_kind)
     rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
     verdict = STABILITY.where(jnp.abs(size - 1) <= rounding, STABILITY.neutral, verdict)
     return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)
@@ -302,19 +302,19 @@ class Orbit(Summarized):
         no such dimension.
         """
         batch = batch_names(dims, self.residual.ndim)
-        alone = ("cycles", "duration", "frequency_ratio", "impacts", "rests", "y_min", "y_max",
-                 "clearance", "residual", "error", "iterations")  # fmt: skip
-        each = ("impact_phase", "impact_speed", "impact_stop")
+        scalars = ("cycles", "duration", "frequency_ratio", "impacts", "rests", "y_min", "y_max",
+                   "clearance", "residual", "error", "iterations")  # fmt: skip
+        per_impact = ("impact_phase", "impact_speed", "impact_stop")
         variables = states("section", self.sections, (*batch, "section"))
         variables |= states("section", self.quantities, (*batch, "section"))
-        variables |= present({name: getattr(self, name) for name in alone} | self.averages, batch)
-        variables |= present({name: getattr(self, name) for name in each}, (*batch, "impact"))
+        variables |= present({name: getattr(self, name) for name in scalars} | self.averages, batch)
+        variables |= present({name: getattr(self, name) for name in per_impact}, (*batch, "impact"))
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
         variables |= present({"monodromy": self.monodromy}, (*batch, "row", "column"))
         words = {"result": in_names(self.result), "stability": in_names(self.stability)}
         data = xr.Dataset(variables | present(words, batch))
-        own = {name: name for name in self.averages}
-        return tidy(with_units(data, units_of(self.machine), own), along)
+        quantities = {name: name for name in self.averages}
+        return tidy(with_units(data, units_of(self.machine), quantities), along)
 
     def summary(self) -> str:
         """Describe the motion, its impacts and its multipliers."""
@@ -327,7 +327,7 @@ class Orbit(Summarized):
             return f"{searches}: {int(jnp.sum(found))} orbits found, {counted}"
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
-            return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_nearly(self)}"
+            return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_advice(self)}"
         count, cycles, units = int(self.impacts), int(self.cycles), units_of(self.machine)
         period = cycles_in_words(self.machine, cycles)
         lines = [
@@ -382,7 +382,7 @@ class InWords:
         return summary_table(str(self), getattr(self, "y_min", None))
 
 
-def _nearly(orbit: Orbit) -> str:
+def _advice(orbit: Orbit) -> str:
     """Return advice for a search that ended close to an orbit, at the errors of the steps."""
     # A choice: searches from bad starts end with residuals of some 1e-3 and more.
     if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
@@ -426,8 +426,8 @@ def trimmed(orbit: Orbit) -> Orbit:
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
     keep = slice(int(orbit.impacts))
-    each = ("impact_phase", "impact_speed", "impact_stop")
-    cut = {name: getattr(orbit, name)[keep] for name in each}
+    per_impact = ("impact_phase", "impact_speed", "impact_stop")
+    cut = {name: getattr(orbit, name)[keep] for name in per_impact}
     sections = jtu.tree_map(lambda x: x[: int(orbit.cycles)], orbit.sections)
     return dataclasses.replace(orbit, **cut, sections=sections)
 
@@ -452,10 +452,10 @@ def in_one_line(orbit: Orbit) -> str:
     cycles = int(orbit.cycles)
     period = cycles_in_words(orbit.machine, cycles)
     stable = STABILITY[orbit.stability].partition(":")[0]
-    where = state_in_words(without_modes(orbit.state), 6, units_of(orbit.machine))
+    place = state_in_words(without_modes(orbit.state), 6, units_of(orbit.machine))
     size = f"; greatest multiplier {np.abs(orbit.multipliers).max():.6g}"
     size = "" if orbit.stability == STABILITY.unknown else size
-    found = f"  {period}, {hits_in_words(orbit)}, {stable}: {where}; {span_in_words(orbit, 6)}"
+    found = f"  {period}, {hits_in_words(orbit)}, {stable}: {place}; {span_in_words(orbit, 6)}"
     return found + size
 
 
@@ -485,7 +485,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     chosen: list[Orbit] = []
     paths: list[tuple[np.ndarray, np.ndarray]] = []
     counts: list[np.ndarray] = []
-    for which, orbits in enumerate(batches):
+    for batch, orbits in enumerate(batches):
         shape = orbits.residual.shape
 
         def in_one_row(x: object, shape: tuple[int, ...] = shape) -> np.ndarray:
@@ -498,18 +498,18 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
         angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))
         for i in np.flatnonzero(found):
             path = sections[i, : cycles[i]]
-            j = _known(paths, path, tolerance, angles)
+            j = _index_of(paths, path, tolerance, angles)
             if j == len(paths):
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
                 paths.append((path, sizes_on_host(chosen[j].machine, chosen[j].state, path)))
                 counts.append(np.zeros(len(batches), int))
-            counts[j][which] += 1
+            counts[j][batch] += 1
     order = sorted(range(len(chosen)), key=lambda j: (len(paths[j][0]), float(chosen[j].y_min)))
     table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
     return Orbits(chosen[j] for j in order), table
 
 
-def _known(
+def _index_of(
     paths: list[tuple[np.ndarray, np.ndarray]], path: np.ndarray, tolerance: float,
     angles: np.ndarray | None,
 ) -> int:  # fmt: skip

@@ -32,16 +32,16 @@ def rounding(dtype: object) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
-def smallest_solution(matrix: Matrix, missing: Array, least: float | None = None) -> Array:
-    """Return the smallest solution of `matrix @ step = missing`; singular values below the share
-    `least` of the greatest are zero. `missing - matrix @ step` is the part that no step reaches."""
+def smallest_solution(matrix: Matrix, right_side: Array, threshold: float | None = None) -> Array:
+    """Return the smallest solution of `matrix @ step = right_side`; singular values below the
+    share `threshold` of the greatest are zero. `right_side - matrix @ step` is unreachable."""
     left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
-    least = rounding(matrix.dtype) if least is None else least
-    lost = sizes <= least * jnp.minimum(sizes[0], _STEEP)
+    threshold = rounding(matrix.dtype) if threshold is None else threshold
+    is_zero = sizes <= threshold * jnp.minimum(sizes[0], _STEEP)
     size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
     # Directions without an image get one, so that the matrix can be inverted.
-    filled = (left * (lost.astype(matrix.dtype) * size)) @ right
-    return jnp.linalg.solve(matrix + filled, missing)
+    filled = (left * (is_zero.astype(matrix.dtype) * size)) @ right
+    return jnp.linalg.solve(matrix + filled, right_side)
 
 
 # A motion smaller than the first share of the guess, or than the second, is at rest: choices.
@@ -106,8 +106,8 @@ class Newton(AbstractRootFinder):
 
     def _solver(self, dtype):
         # If a direction is neutral, take the smallest of all steps.
-        least = lx.SVD(rcond=rounding(dtype))
-        return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=least)
+        linear_solver = lx.SVD(rcond=rounding(dtype))
+        return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=linear_solver)
 
     def init(self, residual, x):
         """Return the first memory, the dogleg's state."""
@@ -163,17 +163,17 @@ class Gradient(AbstractRootFinder):
         """Make one step of the optimiser; the returned residual is that at its start."""
 
         def loss(x):
-            missing = residual(x)
-            return 0.5 * jnp.sum(missing**2), missing
+            values = residual(x)
+            return 0.5 * jnp.sum(values**2), values
 
-        slope, missing = jax.grad(loss, has_aux=True)(x)
-        update, memory = self._optimiser.update(slope, memory, x)
-        return jnp.asarray(optax.apply_updates(x, update)), memory, x, _largest(missing)
+        gradient, values = jax.grad(loss, has_aux=True)(x)
+        update, memory = self._optimiser.update(gradient, memory, x)
+        return jnp.asarray(optax.apply_updates(x, update)), memory, x, _largest(values)
 
 
-def _largest(missing: Array) -> Array:
+def _largest(values: Array) -> Array:
     # A NaN must win; `max` does not guarantee this on every backend.
-    return jnp.where(jnp.all(jnp.isfinite(missing)), jnp.max(jnp.abs(missing)), jnp.nan)
+    return jnp.where(jnp.all(jnp.isfinite(values)), jnp.max(jnp.abs(values)), jnp.nan)
 
 
 class Found(NamedTuple):
@@ -211,22 +211,22 @@ def find_root(root_finder: AbstractRootFinder, residual: Residual, x: Unknowns) 
     memory, static = eqx.partition(root_finder.init(residual, x), eqx.is_array)
     history = jnp.full((root_finder.max_steps,), jnp.nan, x.dtype)
 
-    def going(carry):
+    def continues(carry):
         _, _, best, size, last, steps, _ = carry
         # Newton's last steps from the tolerance to rounding are worth their cost.
-        gaining = ~(size > 0.1 * last) & (size > 0)
+        decreases = ~(size > 0.1 * last) & (size > 0)
         hopeless = (steps > 0) & jnp.isnan(size)
-        done = hopeless | ((size <= tolerance * unit(best)) & ~gaining)
+        done = hopeless | ((size <= tolerance * unit(best)) & ~decreases)
         return ~done & (steps < root_finder.max_steps)
 
     def body(carry):
         x, memory, best, size, _, steps, history = carry
-        x, memory, place, now = root_finder.step(residual, x, eqx.combine(memory, static))
-        better = ~jnp.isnan(now) & ~(now >= size)
-        best, smallest = jnp.where(better, place, best), jnp.where(better, now, size)
-        history = history.at[steps].set(now)
+        x, memory, place, size_here = root_finder.step(residual, x, eqx.combine(memory, static))
+        better = ~jnp.isnan(size_here) & ~(size_here >= size)
+        best, smallest = jnp.where(better, place, best), jnp.where(better, size_here, size)
+        history = history.at[steps].set(size_here)
         return x, eqx.filter(memory, eqx.is_array), best, smallest, size, steps + 1, history
 
     carry = (x, memory, x, nan, nan, jnp.zeros((), jnp.int32), history)
-    _, _, best, size, _, steps, history = jax.lax.while_loop(going, body, carry)
+    _, _, best, size, _, steps, history = jax.lax.while_loop(continues, body, carry)
     return Found(best, size, size <= tolerance * unit(best), steps, history, unit(best))

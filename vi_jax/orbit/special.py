@@ -129,23 +129,23 @@ class Point(InWords):
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
-        from ._switch import BEGINS  # imported here: it needs this class
+        from ._switch import STARTS  # imported here: it needs this class
 
         distance = given_number("distance", distance, low=0.0, open_low=True)
-        found = BEGINS.get((self.curve, self.kind), {})
-        if not found:
-            known = ", ".join(kind for curve, kind in BEGINS if curve == self.curve) or "none"
-            where = "a branch" if self.curve is None else f"a curve of {self.curve}"
+        starts = STARTS.get((self.curve, self.kind), {})
+        if not starts:
+            known = ", ".join(kind for curve, kind in STARTS if curve == self.curve) or "none"
+            owner = "a branch" if self.curve is None else f"a curve of {self.curve}"
             raise ValueError(
-                f"`switch` has nothing to return at {with_article(self.kind)} of {where}. At these "
+                f"`switch` has nothing to return at {with_article(self.kind)} of {owner}. At these "
                 f"kinds it has: {known}. Elsewhere use `find_orbit`, from a simulated motion."
             )
-        begins = found[next(iter(found)) if to is None else one_of("to", to, tuple(found))]
-        return begins(self, distance)
+        start = starts[next(iter(starts)) if to is None else one_of("to", to, tuple(starts))]
+        return start(self, distance)
 
     def __str__(self) -> str:
-        shown = self.parameters[: 1 if self.curve is None else None]
-        place = ", ".join(f"{x:.10g}" for x in shown)
+        values = self.parameters[: 1 if self.curve is None else None]
+        place = ", ".join(f"{x:.10g}" for x in values)
         return f"{self.kind} at {f'({place})' if self.curve else place}: {self.detail}"
 
 
