@@ -77,7 +77,7 @@ def traces(monkeypatch):
         monkeypatch.setattr(module, name, wrapper)
 
     counted("simulate", "vi_jax.flow._simulate", "collect")
-    counted("find_orbit", "vi_jax.orbit.find", "_judged")
+    counted("find_orbit", "vi_jax.orbit.find", "_find_one")
     return counts
 
 

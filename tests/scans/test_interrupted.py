@@ -155,7 +155,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
         amplitude=1.0, frequency=0.9, damping=10.1, gap=1.1 * amplitude, two_sided=False
     )
     point = grazing_of(machine, "gap", (0.9 * amplitude, 1.2 * amplitude))
-    interrupt_at(monkeypatch, "orbit.grazing.simulated", after=0)
+    interrupt_at(monkeypatch, "orbit.grazing.simulate_attractors", after=0)
     found = interrupted_by(vi.Interrupted, lambda: vi.grazing(point)).partial
     assert found.machine is None and found.windows is not None
     interrupt_at(monkeypatch, "orbit._follow.advance", after=4)

@@ -325,9 +325,9 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     far = np.where(is_finite & is_away, periods_in(displacements, hits, _FAR * span), 0)
     period = np.where(is_finite & ~is_away, period, -1)
     rigid = all(touch.number < len(stops_of(problem.machine)) for touch in graze.touches)
-    impacts = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
+    touch_impacts = impacts_in(hits, period) if rigid else np.full(len(period), np.nan)
     total = impacts_in(hits, np.where(far > 0, far, 1)) + np.maximum(far, 1) * len(problem.impacts)
-    return SimulatedAttractors(period, impacts, displacements, far, total)
+    return SimulatedAttractors(period, touch_impacts, displacements, far, total)
 
 
 def agree_at(forecast: Attractors, machine: SimulatedAttractors) -> np.ndarray:
