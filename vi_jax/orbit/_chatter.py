@@ -4,8 +4,8 @@ The hops of a chatter are computed one by one until one is slow compared with th
 body is put on its stop without rebound: the error of the state is of third order in that speed.
 
 The body rests if its chatter ends before its release from the stop. Near that limit the hops are a
-map with a saddle. Its variables are τ, the time left until the release, and ξ = u/(β τ²), with the
-speed u of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest,
+map with a saddle. Its variables are the time τ until the release and ξ = u/(β τ²), with the speed u
+of the rebound and the force β τ. Motions below the saddle's stable manifold come to rest,
 those above it escape (`escape_margin`).
 """
 
@@ -136,7 +136,7 @@ def escape_margin(held: Flight, number: int, hops: Chatter, s: Scalar, u: Vector
     """Return how far the last impact of a chatter is above the stable manifold of the hops.
 
     This is ((ξ/ξ of the manifold)^(5/6) - 1) τ^(5/3), negative if the body comes to rest. Close to
-    the manifold ln(ξ/ξ of the manifold) grows from hop to hop as τ^-q with q close to 5/3, so the
+    the manifold ln(ξ/ξ of the manifold) grows from hop to hop as τ^-q with q close to 5/3. So the
     result depends little on the number of hops. Far from it the result is not zero if the last
     impact coincides with the release (τ = 0, while ξ τ² is not 0).
 

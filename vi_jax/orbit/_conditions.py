@@ -1,6 +1,6 @@
 """Conditions added to the equations of a motion; each frees one more parameter of the machine.
 
-With one condition fewer than parameters, the motions form a curve, which `_follow.both_ways`
+With one condition fewer than parameters, the motions form a curve, which `follow_both_ways`
 follows. `boundary` requires a special motion, `continue_orbit` a fixed quantity of the motion.
 Quantities of a motion have names and are differentiable functions of its unknowns.
 """
@@ -27,8 +27,8 @@ from .results import compound
 
 _SECTION = "section_"
 
-# Branches cross for all values of a second parameter if the component of its derivative along the
-# left null vector is at most this share of the largest: a choice, above the error of a point.
+# A second parameter separates crossing branches if its derivative has a larger component along the
+# left null vector than this share of the largest singular value: a choice, above a point's error.
 _SEPARATES = 1e-6
 
 
@@ -116,9 +116,9 @@ class HeldQuantity(AbstractCondition):
 
 
 class HeldMultiplier(AbstractCondition):
-    """The condition that the greatest multiplier has a given modulus: a root of the characteristic
-    polynomial of the monodromy matrix or of its second compound (`compound`). Unlike the moduli it
-    is smooth where two multipliers meet on the real axis."""
+    """The condition that the greatest multiplier has a given modulus. Its residual is a
+    characteristic polynomial, of the monodromy matrix or, for a pair, of its second compound.
+    Unlike the moduli it is smooth where two multipliers meet on the real axis."""
 
     value: Scalar
     """The multiplier, with its sign; for a complex pair the modulus."""
@@ -189,7 +189,7 @@ def held_in_words(problem: Shooting) -> str:
 class Replacement(eqx.Module):
     """A replacement for one equation of a motion where branches of it cross.
 
-    There the equations F(x, p) = 0 from event to event cannot be solved for x: the Jacobian J =
+    There the equations F(x, p) = 0 from event to event cannot be solved for x. The Jacobian J =
     ∂F/∂x has a null vector r and a left null vector l. Let branches cross for all values of a
     second parameter, as symmetric and other motions do. Then l·F = 0 follows from the other
     equations. It is replaced by l(x)·∂F/∂p = 0, with the left null vector at x:
@@ -253,8 +253,8 @@ class Special(AbstractCondition):
     """V⁻ of that impact, for motions near a grazing."""
     double: bool = eqx.field(static=True, default=False)
     """True if two multipliers are 1 all along a curve of folds, with an eigenvector each, as for
-    uncoupled equal machines. Then det(M - I) has a double zero, and the condition is that the
-    product of its other factors, the sum of the principal minors, is zero."""
+    uncoupled equal machines. Then det(M - I) has a double zero. The condition is that the product
+    of its other factors is zero, which is the sum of the principal minors."""
 
     @property
     def observes(self) -> bool:

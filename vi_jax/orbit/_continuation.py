@@ -12,7 +12,7 @@ from .._checks import flag, given_number, instance_of, interval, one_of, short, 
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf, may_rest
 from ._conditions import Special, hold_values, is_defective, known_names, rates_at, replacement_at
-from ._follow import both_ways, check_walk, rescaled
+from ._follow import check_walk, follow_both_ways, rescaled
 from ._motion_table import MotionTable
 from ._problem import (
     check_parameter,
@@ -113,7 +113,7 @@ def continue_orbit(
     problem = with_sizes(problem, start.x, start.observed.largest)
     (start,) = rescaled([start], old_scale, problem.scale)
     start = advance(problem, start.x, start.tangent, 0.0)
-    return both_ways(
+    return follow_both_ways(
         lambda: MotionTable(problem, ranges, sought, watched),
         start,
         Branch,
@@ -324,7 +324,7 @@ def boundary(
             f"{float(start.size):.2g}).{several}"
         )
 
-    return both_ways(
+    return follow_both_ways(
         lambda: SpecialTable(problem, ranges),
         start,
         lambda special, **fields: Boundary(**fields),

@@ -60,8 +60,8 @@ _WARN_ABOVE = 1e-8
 # A curve begins at the zero of a test that is at most this share of its value a step further on.
 _ZERO_AT_START = 1e-7
 
-# A walk that stalls this close to a bound (in the parameter's scale) is extended to it: a few times
-# the rest that its shortest steps leave.
+# A walk that stalls this close to a bound (in the parameter's scale) is extended to it. This is a
+# few times the remainder of its shortest steps.
 _NEAR_BOUND = 1e-6
 
 # A parameter this close to its bound (in its scale) is at it, to rounding: a choice, below the
@@ -130,8 +130,8 @@ class Table(abc.ABC):
         return locate_zero(*ends, test, self._known_points)
 
     def snap_to_bounds(self, step: Step) -> Step:
-        """Return a point with its parameters on their bounds if they are there to rounding: beyond
-        a bound, a number may be out of its range."""
+        """Move parameters that are on a bound to rounding exactly onto it. Beyond a bound a
+        parameter may be invalid."""
         x = np.array(step.x)
         for i, ends in enumerate(self.bounds, -len(self.bounds)):
             for bound in ends:
@@ -160,7 +160,7 @@ def check_walk(*, step: object, max_step: object, max_points: object) -> dict[st
     }
 
 
-def both_ways(
+def follow_both_ways(
     table: Callable[[], Table],
     start: Step,
     result: Callable[..., Any],
@@ -290,8 +290,8 @@ class _Walk:
                 return first
 
     def _stalled_ending(self, last: Step) -> Ending:
-        """Return how the curve ends if the corrector fails: at a bound right ahead beyond which the
-        machine has another form, as with a restitution of 0 or 1, or as the table defines."""
+        """Return the end of a curve at which the corrector fails: a very close bound, if there is
+        one, else the table's `stall_end`. At a restitution of 0 or 1 the machine changes form."""
         table, axes = self.table, np.eye(len(last.x))
         for i, ends in enumerate(table.bounds, -len(table.bounds)):
             for bound in ends:
@@ -372,8 +372,8 @@ def bound_rows(table: Table) -> list[Event]:
     return [row(i, *end) for i, (low, high) in intervals for end in ((low, 1.0), (high, -1.0))]
 
 
-# A motion within this distance (scaled), in a direction within the second number, is the same one
-# again: choices, ten thousand times the corrector's error, far below the distance of two passages.
+# Two motions are the same within this distance (scaled), if their tangents differ by less than the
+# second number. Choices: 10⁴ times the corrector's error, far below the distance of two passages.
 _SAME_MOTION, _SAME_TANGENT = 1e-7, 1e-2
 
 # A curve is away from its first point beyond so many lengths of its step, else near it: a choice.
@@ -383,8 +383,8 @@ _NEAR = 2.0
 class Closing:
     """A detector of curves that come back to one of their points.
 
-    A curve has come back if it passes the plane across one of its points, the first or a later one,
-    at the same motion in the same direction. A curve that only comes close to itself passes that
+    A curve has come back if it passes the plane across one of its points at the same motion and in
+    the same direction. A curve that only comes close to itself passes that
     plane elsewhere. The same motion may reappear some cycles later, with angles that have made
     whole turns, or with another of its events as the first one.
     """
@@ -401,7 +401,7 @@ class Closing:
             self._store_start(points[0])
 
     def rows(self, here: Step, new: Step) -> Iterator[Event]:
-        """Return the rows for a step between two points, one for each earlier place near it."""
+        """Return the rows for a step between two points, one for each earlier point near it."""
         if not self.points:
             self._store_start(here)
         if not self.points or self.points[-1] is not here:

@@ -85,8 +85,8 @@ _AT_REST = 1e-6
 # A motion with this share of its neighbours' size is about to shrink to rest.
 _SHRINKS = 1e-2
 
-# The motion of half the period is sought if the halves of the period differ by at most so many
-# times `ALIKE`: for a motion with twelve impacts in 32π the corrector fails from four times on.
+# The motion of half the period is sought if the halves differ by at most so many times `ALIKE`. The
+# corrector fails from four times on for a motion with twelve impacts in 32π.
 _ALMOST_ALIKE = 10.0
 
 # A branch ends at this multiple of its first duration; the steps are then as much longer. For a
@@ -114,8 +114,8 @@ _ZERO = 1e-6
 # the stop's place, changes by some 1e-16.
 _CHANGES = 1e-9
 
-# An extremum is a corner if the quantity still changes there by more than this share of its rates
-# on both sides: a choice, far above the rest at a place that is located to rounding.
+# An extremum is a corner if the rate there exceeds this share of the rates on both sides: a choice,
+# far above the remainder at a place that is located to rounding.
 _CORNER = 1e-4
 
 Located = list[tuple[Point, Step]]
@@ -350,14 +350,13 @@ class MotionTable(Table):
         return self._split_bifurcations((here, middle, last), halves_left - 1)
 
     def _split_bifurcations(self, steps: tuple[Step, ...], halves_left: int) -> Located:
-        """Return the bifurcations in several parts of a step."""
         parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(steps))
         return list(itertools.chain.from_iterable(parts))
 
     def _separate_turn(self, here: Step, last: Step) -> tuple[Step, ...]:
-        """Return two points around the place where the branch turns back between two others, if a
-        multiplier passes 1 there: the place is a fold, and a branch point lies within the same
-        step. If they are closer to each other than `SPACING`, they count as one branch point."""
+        """Return two points around a fold within a step that also contains a branch point, or none.
+        At the fold the branch turns back and a multiplier passes 1. If both are closer to each
+        other than `SPACING`, they count as one branch point."""
         at = self.locate_zero(here, last, lambda step: bifurcation_tests(step)[TURNS])
         if at is None:
             return ()
@@ -448,8 +447,8 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
         return None
     lengths = problem.lengths(at.x)
     first = int(np.argmin(lengths))
-    this, after = (problem.events[i % problem.legs] for i in (first, first + 1))
-    lands = this.use == LEAVES and after == this._replace(use=LANDS)
+    leaving, after = (problem.events[i % problem.legs] for i in (first, first + 1))
+    lands = leaving.use == LEAVES and after == leaving._replace(use=LANDS)
     return first if lands and lengths[first] < _BRIEF * problem.radian else None
 
 

@@ -115,8 +115,8 @@ def steps_of(
 def longest_leg(
     places: Sequence[float] | np.ndarray, events: Sequence[Event], period: float, cycles: int
 ) -> int:
-    """Return the number of cycles for which each leg gets steps: those of the longest leg, rounded
-    up, plus one, since legs grow along a branch. All cycles if a chatter takes a share of them."""
+    """Return the number of cycles for which each leg gets steps. It is that of the longest leg,
+    rounded up, plus one, since legs grow along a branch. With a chatter it is the whole period."""
     if not events or any(event.use == LANDS for event in events):
         return cycles
     longest = float(np.diff([*places, places[0] + period]).max())
@@ -136,12 +136,12 @@ def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State)
 # Most events of a cycle that are followed, with switches or a section of the machine: a choice.
 _LISTED = 32
 
-# Steps are doubled until this changes a flight's end by less than the first (relative to the
-# motion's size; the corrector's tolerance), but not beyond the second (a choice).
+# Steps are doubled until the end of a flight changes by less than the first number (relative to the
+# motion's size; the corrector's tolerance). The second is their largest number: a choice.
 _SETTLED, _MOST = 1e-11, 4096
 
-# Doubling the steps changes the states of a point of a curve by less than this: above the
-# corrector's tolerance, below the promised accuracy of special points.
+# Doubling the steps changes the states of a point of a curve by less than this. It is above the
+# corrector's tolerance and below the promised accuracy of special points.
 COARSE = 1e-10
 
 
@@ -254,8 +254,8 @@ def with_grown_sizes(problem: Shooting, largest: np.ndarray) -> Shooting | None:
 
 def _sizes(problem: Shooting, states: np.ndarray, small: float = _SMALL) -> np.ndarray:
     """Return half the largest modulus of each component of some states, (…, states). A component
-    that is a small share of the others gets the size that its rates give it, else that of the
-    largest of all, at most 1: it may be larger elsewhere."""
+    that is small here may be larger elsewhere. Its size is then that which its rates determine,
+    else that of the largest component, at most 1."""
     maxima = np.abs(np.atleast_2d(states)).max(axis=0)
     largest = maxima.max() if maxima.max() > _REST else 1.0
     if (maxima > small * largest).all():
@@ -268,8 +268,8 @@ def _sizes(problem: Shooting, states: np.ndarray, small: float = _SMALL) -> np.n
 def _check_instants(
     blank: Shooting, found: list[Placed], states: np.ndarray, in_flight: Modes
 ) -> None:
-    """Raise `ValueError` for an event that another event or the restart of the clock triggers: its
-    guard is not zero there, so that the equations cannot contain it."""
+    """Raise `ValueError` for an event that another event or the restart of the clock triggers. Its
+    guard is not zero there, so the equations cannot contain it."""
     machine, previous = blank.machine, 0.0
     for i, (place, event) in enumerate(found):
         if abs(place - previous) <= _SAME_INSTANT and event.cycle is None:
@@ -356,8 +356,8 @@ def events_in(orbit: Orbit) -> list[Placed]:
     return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
-# Angles of a turn at which a machine is compared with itself, a turn later and at another clock (a
-# share of the period), and the largest relative difference: choices.
+# A machine is compared with itself a turn later and at another clock: at so many angles, after this
+# share of the period, with this largest relative difference. Choices.
 _AROUND, _LATER, _DIFFERS = 7, 0.37, 1e-8
 
 

@@ -52,7 +52,7 @@ from .results import multipliers_of
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
 
-# Newton steps from the begin of a step to where an angle passes within it: four reach rounding if
+# Newton steps from the begin of a step to the passage of an angle within it. Four reach rounding if
 # the speed changes by less than half in a step.
 _PASSING = 5
 
@@ -80,9 +80,9 @@ class Observed(NamedTuple):
     modes_agree: Scalar
     """1 if each event puts its switch into the mode of its leg, else -1."""
     order_margin: Scalar
-    """Margin until the order of events changes: the least time between consecutive events, or the
-    least distance, at an event, to another one that does not occur there. Negative if the machine
-    does not have this motion."""
+    """Margin until the order of events changes. It is the least time between consecutive events, or
+    the least distance at an event to one that does not occur there. Negative if the machine does
+    not have this motion."""
     duration: Scalar
     """The period in time."""
     averages: dict[str, Scalar]
@@ -290,7 +290,6 @@ class Shooting(eqx.Module):
         return np.asarray(self.ends(clock, self.period(x)) - clock)
 
     def period(self, x: Unknowns) -> Array:
-        """Return the period by the clock."""
         if self.autonomous:
             return jnp.asarray(x[0])
         return jnp.asarray(self.at(x).cycle, x.dtype) * self.cycles
@@ -484,9 +483,9 @@ class Shooting(eqx.Module):
         return jnp.concatenate([residual, jnp.stack(added)])
 
     def motion_residual(self, x: Vector, steps: Scalar | None = None) -> Vector:
-        """Return the left sides of the motion's own equations, zero for a periodic motion: the
-        difference from the end of each leg to the begin of the next, then the guards. `steps` is
-        the number of steps of a flight, if not `self.steps`."""
+        """Return the left sides of the motion's own equations, zero for a periodic motion: end of
+        each leg minus begin of the next, then the guards. `steps` is the number of steps of a
+        flight, by default `self.steps`."""
         return self._shoot(x, steps)[0]
 
     def _shoot(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Chatter]:

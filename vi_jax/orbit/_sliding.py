@@ -55,9 +55,9 @@ SLIDING = {
     ),
 }
 
-# A part of a motion this brief, as a share of its period, vanishes; if nothing else is found, also
-# a nearly brief one, as a corrector may not get closer. A guard this small is zero. Choices:
-# special points are located far closer (see `locate_change`).
+# A part of a motion vanishes if it is shorter than the first share of the period. The second share
+# is used if nothing else is found, as a corrector may not get closer. A guard below the third is
+# zero. Choices: special points are located far closer (see `locate_change`).
 _BRIEF, _NEARLY_BRIEF, _ZERO = 1e-4, 1e-2, 1e-6
 
 
@@ -93,10 +93,10 @@ def change_at(problem: Shooting, at: Step) -> Change | None:
     if not problem.modes[0]:
         return None
     found = (
-        _vanishing(problem, at, _BRIEF)
-        or _touching(problem, at)
-        or _beginning(problem, at)
-        or _vanishing(problem, at, _NEARLY_BRIEF)
+        _vanishing_part(problem, at, _BRIEF)
+        or _touching_part(problem, at)
+        or _change_at_event(problem, at)
+        or _vanishing_part(problem, at, _NEARLY_BRIEF)
     )
     return found if found is not None and found.kind is not None else None
 
@@ -105,7 +105,7 @@ def _mode(problem: Shooting, leg: int, number: int) -> float:
     return float(problem.modes[leg % problem.legs][mode_number(problem.machine, number)])
 
 
-def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
+def _vanishing_part(problem: Shooting, at: Step, brief: float) -> Change | None:
     """Return the briefest part between two events of one switch, if shorter than this share."""
     (clock, _, period), lengths = problem.values(at.x), problem.lengths(at.x)
     events, found = problem.events, []
@@ -119,7 +119,7 @@ def _vanishing(problem: Shooting, at: Step, brief: float) -> Change | None:
     return change if length < brief * period else None
 
 
-def _touching(problem: Shooting, at: Step) -> Change | None:
+def _touching_part(problem: Shooting, at: Step) -> Change | None:
     """Return a flight's touch of a switch's surface, or a body at the limit of being held."""
     nearest, number = at.observed.nearest, int(at.observed.nearest.event)
     if not holds(Event(number).of(problem.machine)):
@@ -136,7 +136,7 @@ def _touching(problem: Shooting, at: Step) -> Change | None:
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
 
 
-def _beginning(problem: Shooting, at: Step) -> Change | None:
+def _change_at_event(problem: Shooting, at: Step) -> Change | None:
     """Return an event of a switch at the limit of being held there."""
     clock, found = problem.values(at.x)[0], []
     for i, event in enumerate(problem.events):

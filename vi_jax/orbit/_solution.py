@@ -102,8 +102,8 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
         else:
             move, along = jnp.linalg.solve(jacobian, right_sides).T
         size = jnp.max(jnp.abs(move))
-        # One correction more than needed: the tangent is then that of the solution. Where the curve
-        # is steep, rounding may keep all corrections above the tolerance.
+        # One correction more than needed, so that the tangent is that of the solution. On a steep
+        # curve rounding may keep all corrections above the tolerance.
         done = (before <= _TOLERANCE) | ((before <= _ROUNDED) & (size >= before))
         return y - move, size, count + 1, along, done
 
@@ -180,19 +180,19 @@ def jacobian_and_rows(problem: Shooting, x: Unknowns) -> tuple[np.ndarray, np.nd
 
 
 def jacobian_at(problem: Shooting, x: Unknowns) -> np.ndarray:
-    """Return the derivatives of the equations with respect to all unknowns, in the unknowns' sizes
-    and relative to the largest of each equation, so that no unit matters."""
+    """Return the Jacobian with respect to all scaled unknowns. Each row is divided by its largest
+    entry, so that no unit matters."""
     return jacobian_and_rows(problem, x)[0]
 
 
 # Distances, as shares of the step, to retry before a place without a solution: choices.
 _RETRIES = (1e-6, 1e-5, 1e-4, 1e-3)
 
-# A test is zero below this share of its largest value, and a place is known to this distance in
-# scaled unknowns, or to that of the last correction. Choices: closer, rounding would be resolved.
+# A test is zero below this share of its largest value. A place is accurate to the second number in
+# scaled unknowns, or to the last correction. Choices: closer, rounding would be resolved.
 _ZERO, _PLACED = 1e-13, 1e-13
 
-# Search no closer after this number of places without a solution: around a singularity of the
+# The search stops after this number of places without a solution: around a singularity of the
 # equations only the corrector's rounding would be resolved. A choice.
 _TRIALS = 5
 
@@ -202,8 +202,8 @@ SPACING = 1e-3
 # At most so many times that distance on each side.
 MOST_SAMPLES = 8
 
-# A neighbour lies on the crossing curve if its tangent deviates from the median one by more than
-# this multiple of the median deviation: a choice; equal distances give 3 at most.
+# A neighbour lies on the crossing curve if its tangent deviates from the median by more than this
+# multiple of the median deviation. A choice: equal distances give 3 at most.
 _OUTLIER = 10.0
 
 # A zero near a solution is at most this far from it (in the parameter's scale): a choice.
@@ -235,12 +235,12 @@ def locate_zero(
     def solve_at(s: float) -> Step:
         """Return the solution there; if none, as at crossing branches, the one just before it."""
         step = advance(problem, here.x, here.tangent, s)
-        for short in _RETRIES:
+        for share in _RETRIES:
             if bool(step.good):
                 break
-            if short == _RETRIES[0]:
+            if share == _RETRIES[0]:
                 failed.append(s)
-            step = advance(problem, here.x, here.tangent, s - short * length)
+            step = advance(problem, here.x, here.tangent, s - share * length)
         return step
 
     def value(s: float) -> float:
@@ -273,11 +273,11 @@ def locate_zero(
     except _TooCloseError:
         root = failed[-1]
     # At crossing branches, or if a motion shrinks to rest, use a point just before it.
-    for short in _RETRIES:
-        if any(bool(points[s].good) for s in tested if abs(s - root) <= short * abs(length)):
+    for share in _RETRIES:
+        if any(bool(points[s].good) for s in tested if abs(s - root) <= share * abs(length)):
             break
         with contextlib.suppress(NoValueError, _TooCloseError):
-            value(root - short * length)
+            value(root - share * length)
 
     def rank(s: float) -> tuple[float, bool, float]:
         """Rank a point by its distance from zero; if the test jumps, prefer the last one before."""
@@ -329,7 +329,7 @@ def crossing(
     """Return the point of a curve at which a test is zero and the equations are singular: where
     branches cross, or where an impact grazes. `None` with too few points or without a zero.
 
-    The equations cannot be solved close to it, but the curve passes through it smoothly: a
+    The equations cannot be solved close to it, but the curve passes through it smoothly. A
     polynomial through its neighbours gives the place and the motion there. If the curve is found on
     the near side only, more neighbours of that side are taken.
 

@@ -265,7 +265,7 @@ def _resonant_grazings(
     def local(step: Step) -> LocalMap:
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
 
-    # Where another impact is lost as well, at an end, the map has a pole: its sign is rounding.
+    # If another impact is lost as well, at an end, the map has a pole: its sign is rounding.
     usually_lost = lost_at(steps[len(steps) // 2])
     maps = [None if (lost_at(step) & ~usually_lost).any() else local(step) for step in steps]
     is_planar = problem.states == 2  # folds and doublings begin at the same point

@@ -1,7 +1,7 @@
-"""The equations of a motion without some of its events, or over another number of its cycles;
-motions whose second half equals the first, or its image under the machine's symmetry.
+"""The equations of a motion without some of its events, or over another number of its cycles.
 
-A branch may begin at a motion of half its period (`locate_origin`).
+The second half of a motion may equal the first, or its image under the machine's symmetry. A branch
+may begin at a motion of half its period (`locate_origin`).
 """
 
 import dataclasses
@@ -28,8 +28,8 @@ from ._solution import (
     tangent_at,
 )
 
-# Halves of a period that differ by less than the first are equal, or images of each other; by less
-# than the second up to rounding. Both are choices.
+# Halves of a period are equal, or images of each other, if they differ by less than the first; by
+# less than the second, up to rounding. Choices.
 ALIKE, ROUNDED = 1e-3, 1e-7
 
 
@@ -68,8 +68,8 @@ def may_repeat(problem: Shooting) -> bool:
 def _differences(
     problem: Shooting, x: Float[Array, " unknowns"], mirrored: bool
 ) -> Float[Array, " differences"]:
-    """Return the difference of the second half of a period from the first, or from its image;
-    smooth along a branch, as the events of both halves are compared."""
+    """Return the difference of the second half of a period from the first, or from its image. It
+    is smooth along a branch, as the events of both halves are compared."""
     half, half_period = len(problem.events) // 2, 0.5 * problem.period(x)
 
     def image(u):
@@ -112,8 +112,8 @@ def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndar
 
 
 def locate_origin(problem: Shooting, at: Step) -> tuple[Step, Shooting, Step]:
-    """Return the point where a branch begins, the problem of the motion of half the period, and the
-    point on the latter, on which it is located.
+    """Return the point where a branch begins, and the equations of the motion of half the period
+    with their solution, on which the point is located.
 
     Both branches cross there, so the equations of this one are singular close by. The mean of both
     halves is a motion of half the period up to a term of second order.
@@ -156,7 +156,7 @@ def admissible_near(problem: Shooting, x: np.ndarray, distance: float) -> Step |
     return None
 
 
-# Sections of one motion that differ by less than this (relative to 1 + |state|) are the same: a
+# Sections of one motion are the same if they differ by less than this (in the state's sizes): a
 # choice, far above the error of a located point, far below the difference of distinct motions.
 _SAME = 1e-7
 

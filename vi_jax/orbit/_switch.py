@@ -89,8 +89,8 @@ def _crossing_orbit(point: Point, distance: float) -> Orbit:
     # The equations have two null vectors here: one leads along this branch, the other off it.
     plane = np.linalg.svd(jacobian)[2][-2:]
     along = plane.T @ (plane @ point.step.tangent)
-    off = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
-    step = advance(problem, x, off / np.linalg.norm(off), distance)
+    across = plane[0] * (plane[1] @ along) - plane[1] * (plane[0] @ along)
+    step = advance(problem, x, across / np.linalg.norm(across), distance)
     return _orbit_at(problem, step, "the other branch", distance)
 
 
@@ -155,10 +155,10 @@ def _search(
     """Return a motion near a point that does not belong to the branch.
 
     The section map has no jump there unless an impact falls on the section, so its fixed points are
-    sought: from the guesses, from points close by on the branch, and from a settled simulation. The
-    far side of the point is tried first.
+    sought. The search begins at the guesses, at points close by on the branch, and at a settled
+    simulation. The far side of the point is tried first.
 
-    **Arguments:** `what`, the motion in words; `accepts`, a test of a motion;
+    **Arguments:** `what`, the motion in words; `accepts`, whether a motion is of that kind;
     `guesses`, states on the section.
 
     **Raises:** `ValueError` if none is found.
@@ -247,7 +247,7 @@ def _as_kind(kind: str, point: Point, distance: float) -> Point:
     return dataclasses.replace(found, further=point.further)
 
 
-def _in_two(
+def _in_two_parameters(
     point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
 ) -> tuple[Shooting, np.ndarray]:
     """Return equations and unknowns near a point of a two-parameter boundary, with a condition."""
@@ -269,7 +269,7 @@ def _orbit_of_periods(n: int, point: Point, distance: float) -> Orbit:
     second, first = (np.append(vector, [0.0, 0.0]) for vector in vectors[-2:])
     row = first[:-1] / new.scale
     condition = FixedComponent(jnp.asarray(np.append(row, 0.0)), jnp.asarray(row @ x + distance))
-    two, begin = _in_two(point, new, x, condition)
+    two, begin = _in_two_parameters(point, new, x, condition)
     step = advance(two, begin + distance * first * two.scale, second, 0.0)
     return _orbit_at(two, step, f"{n} times the period", distance)
 
@@ -301,7 +301,7 @@ def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
 
     def locate(share: float) -> tuple[Shooting, Step | None, float]:
         condition = Special(GRAZING, impact, speed=jnp.asarray(share * distance * fastest))
-        two, begin = _in_two(point, new, x, condition)
+        two, begin = _in_two_parameters(point, new, x, condition)
         at = _locate_change(two, begin, distance, CROSSING if kind == FOLD else kind)
         return two, at, np.nan if at is None else float(at.x[-2] - begin[-2])
 
@@ -319,8 +319,8 @@ def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
 
 
 def _locate_change(two: Shooting, x: np.ndarray, distance: float, test: str) -> Step | None:
-    """Return the point where a test changes sign along the motions with an impact of a given low
-    speed, a curve in both parameters; the closest one to the resonance, which is about at `x`."""
+    """Return the point closest to the resonance where a test changes sign. The motions with an
+    impact of a given low speed are a curve in both parameters, which begins about at `x`."""
     begin = advance(two, x, np.eye(len(x))[-2], 0.0)
     ends = [begin._replace(tangent=sense * begin.tangent) for sense in (1.0, -1.0)]
     value = lambda step: bifurcation_tests(step)[test]

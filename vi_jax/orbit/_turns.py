@@ -95,8 +95,6 @@ class _Quantity(NamedTuple):
 
 
 class _Guard(_Quantity):
-    """The guard of an event."""
-
     def value(self, flight, s, state):
         return guard_of(flight.machine, self.number, s, state, flight.modes, flight.contact)
 
@@ -133,8 +131,8 @@ _Margins = tuple[Float[Array, " steps"], Float[Array, " steps"]]
 
 
 def turns_of(path: Path) -> tuple[Scalar, Scalar, Nearest, Nearest]:
-    """Return the least and the greatest turn of the first coordinate (infinite without a turn), the
-    turn nearest to an event, and the result of `pull_of`."""
+    """Return least and greatest turn of the first coordinate, the turn nearest to an event, and the
+    result of `pull_of`. Without a turn the first two are infinite."""
     bodies, margins = turning_points(path)
     low = jnp.min(jnp.where(bodies[0].turns, bodies[0].height, jnp.inf))
     high = jnp.max(jnp.where(bodies[0].turns, bodies[0].height, -jnp.inf))
@@ -214,8 +212,8 @@ def _state_after_step(flight: Flight, inputs: tuple[Scalar, Scalar, Vector]) -> 
 def _turn(
     watched: _Quantity, flight: Flight, inputs: tuple[Scalar, Scalar, Vector, Scalar, Scalar]
 ) -> _Turns:
-    """Return the turning point in a step, if the rate changes its sign (`v0` and `v1` at the ends),
-    by Newton's method on the length from the step's start; each trial is a step of the method."""
+    """Return the turning point in a step, if the rates `v0` and `v1` at its ends differ in sign.
+    The unknown of Newton's method is the length from the start; each trial is a step."""
     h, s, u, v0, v1 = inputs
     # A turn may coincide with the end of a step.
     turns = (v0 * v1 < 0) | ((v1 == 0) & (v0 != 0))

@@ -216,8 +216,8 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
     if second:
         return found
     numbers, rest = eqx.partition((arc, state), eqx.is_array)
-    still = eqx.combine(jax.lax.stop_gradient(numbers), rest)
-    return found._replace(jacobians=jacobians_from(*still))
+    constants = eqx.combine(jax.lax.stop_gradient(numbers), rest)
+    return found._replace(jacobians=jacobians_from(*constants))
 
 
 @eqx.filter_custom_jvp
@@ -268,8 +268,8 @@ def _(primals, tangents):
 
 
 def chain_jacobians(jacobians: Float[Array, "arcs cycles n n"]) -> Float[Array, "all n n"]:
-    """Return the derivatives of the states after all cycles with respect to the first state: a
-    running product of those with respect to the first state of their own arc."""
+    """Return the derivatives of the states after all cycles with respect to the first state, from
+    those with respect to the first state of each arc."""
     product, chained = jnp.eye(jacobians.shape[-1], dtype=jacobians.dtype), []
     for jacobian in jacobians:
         chained.append(jacobian @ product)
@@ -281,7 +281,7 @@ def error_of(
     angles: np.ndarray | None, observed: ObservedArc, x: Float[Array, "arcs states"], sizes: Vector
 ) -> tuple[Scalar, Flag]:
     """Return the largest component of Newton's next step from the arcs' starts `x`, relative to
-    `sizes`, and whether the motion drifts: most of F remains for any change of the starts."""
+    `sizes`, and whether the motion drifts. It drifts if no change of the starts reduces F much."""
     after = jnp.roll(x, -1, axis=0)
     residual = (nearest_images(angles, observed.states[:, -1, -1], after) - after).ravel()
     step = _start_change(observed.jacobians[:, -1], residual, sizes)
@@ -317,8 +317,8 @@ def order_impacts(
 # Lanes of a batch, a choice: a batch lasts as long as its slowest lane.
 _BATCH = 512
 
-# A search that fails with an impact (or a turn) slower than this failed at a grazing: there the
-# map's derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
+# A search that fails with an impact or a turn slower than this failed at a grazing. There the map's
+# derivative is of the order of 1/V⁻, here 50, and jumps. A choice.
 _SLOW = 0.02
 
 
@@ -515,8 +515,8 @@ def _find_one(
 
 
 def _with_later_modes(the_map: CycleMap, guess: State) -> State:
-    """Return the guess in the modes in which its motion is a period later: an orbit near it has
-    these more likely than the modes in which a motion begins."""
+    """Return the guess with the modes of its motion a period later. An orbit near it is more likely
+    to have these than the modes with which a motion begins."""
     if modes_of(guess) is None:
         return guess
     later = the_map(guess)
@@ -549,7 +549,7 @@ def _least_period(
 
 
 def is_equilibrium(machine: AbstractMachine, state: State, duration: Any, unit: Any) -> Flag:
-    """Return whether an autonomous machine is at an equilibrium: at the rate of the state it would
+    """Return whether an autonomous machine is at an equilibrium. At the rate of its state it would
     not move in its period, relative to `unit` + |state|."""
     machine_modes, state = modes_of(state), without_modes(state)
     if not is_autonomous(machine, state):

@@ -37,9 +37,9 @@ _LOST = 1e9
 # Share of the slowest transient that remains after settling; bounds of the iterates for it.
 _REMAINING, _FEWEST, _MOST = 1e-7, 400, 6000
 
-# Attractors of the local map shrink towards the grazing. One whose depth exceeds this multiple of a
-# first impact's does not (a chain of impacts within a small attractor reached twice that at most in
-# trials). Depths, relative to the largest relevant one, of the test of this; their number. Choices.
+# An attractor shrinks towards the grazing if its depth is at most this multiple of a first impact's
+# (in trials a chain of impacts within a small attractor reached half of it). Its test uses so many
+# depths in this interval, relative to the largest relevant one. Choices.
 _LOCAL, _TINY, _PROBES = 4.0, (1e-14, 1e-12), 24
 
 # Largest share of aperiodic values for adjacent windows, and smallest share for chaos alone.
@@ -151,8 +151,8 @@ def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
     """Return the greatest depth of an attractor that begins at the grazing, at each offset.
 
     Its depth is a multiple of that of a first impact, √ε. It is of the order of ε^(1/4) if an
-    impact brings a further touch whose depth exceeds ε as its kick does (as for some motions
-    between two stops). Iterates far below all offsets decide which.
+    impact causes a second touch that is deeper than ε, as for some motions between two stops.
+    Iterates far below all offsets decide between the two.
     """
     first = np.sqrt(np.abs(np.outer(offsets, local.slopes)).max(axis=1))
     if local.orders[0] != 0.5:
@@ -169,8 +169,8 @@ def local_depths(local: LocalMap, offsets: np.ndarray) -> np.ndarray:
 
 
 def natural_depth(local: LocalMap) -> float:
-    """Return the depth (in the distance h) at which a kick of the root equals its later change of
-    the distance: beyond it there are no windows."""
+    """Return the depth (in the distance h) at which a kick of order 1/2 changes a later distance by
+    this depth. Beyond it there are no windows."""
     entries = np.abs(local.entries(_ENTRIES)) if local.orders[0] == 0.5 else np.array([np.inf])
     return float(entries.max() ** 2)
 
@@ -284,7 +284,7 @@ class SimulatedAttractors(NamedTuple):
 
 
 @on_host
-def _lanes(problem: Shooting, values, states, cycles: int, settle: int):
+def _simulate_lanes(problem: Shooting, values, states, cycles: int, settle: int):
     """Return sections and impacts of the last cycles, (lanes, cycles)."""
 
     def simulate_one(value, u):
@@ -303,7 +303,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
-    rows, impacts, is_finite = _lanes(
+    rows, impacts, is_finite = _simulate_lanes(
         problem, value + offsets, smooth, problem.cycles * SOUGHT,
         transient_length(local) * problem.cycles,
     )  # fmt: skip
@@ -341,8 +341,8 @@ DECADES = 4
 # The machine is simulated at every 6th value, and on the other side at every 4th of these.
 SIMULATE_EVERY, _SPARSE = 6, 4
 
-# The machine agrees over a range of the parameter if it does in this share of each half decade: the
-# local map is of first order and does not decide at the edges of windows.
+# The machine agrees over a range of the parameter if it does at this share of the values in each
+# half decade. The local map is of first order and does not decide at the edges of windows.
 _AGREES = 0.75
 
 
@@ -376,7 +376,7 @@ def compare_with_machine(
     graze: LocalGrazing, offsets: np.ndarray, found: Attractors
 ) -> tuple[Motions, tuple[np.ndarray, np.ndarray], tuple[int, int] | None]:
     """Return the machine's attractors at offsets with the local attractors `found`; whether they
-    agree there, and (at some offsets) on the other side; period and impacts far away, or `None`."""
+    agree, at the offsets and at some on the other side; period and impacts far away, or `None`."""
     sparse, n = offsets[::_SPARSE], len(offsets)
     machine = simulate_attractors(graze, np.concatenate([offsets, -sparse]))
     ahead, behind = (jax.tree.map(lambda a: a[:n], machine), jax.tree.map(lambda a: a[n:], machine))
@@ -398,8 +398,8 @@ def _distant_attractor(attractors: SimulatedAttractors, cycles: int) -> tuple[in
 def agreeing_range(
     size: np.ndarray, ahead: np.ndarray, behind: np.ndarray
 ) -> tuple[tuple[float, float] | None, float]:
-    """Return the longest range of sizes of offsets (rising), in half decades, in which forecast and
-    machine agree `ahead` and, on the other side, `behind`; and the share of equal values in it."""
+    """Return the longest range of rising sizes of offsets, in half decades, in which forecast and
+    machine agree on both sides (`ahead`, `behind`); and the share of equal values in it."""
     parts = 2 * DECADES
     part = np.minimum((np.arange(len(size)) * parts) // (len(size) - 1), parts - 1)
     agrees = [
@@ -415,12 +415,12 @@ def agreeing_range(
     return (float(size[inside][0]), float(size[inside][-1])), float(share)
 
 
-# Greatest depth, as a share of that at which windows end or of that of a touch which lasts the
-# second share of a cycle; values in each decade below it. Choices.
+# The greatest depth is this share of the depth at which windows end, or of a touch that lasts the
+# second share of a cycle. The third number is that of values in each decade below it. Choices.
 _DEEPEST, _BRIEF, _EACH = 0.1, 0.05, 144
 
-# The effect of an impact is lost if its later change of the distance is this small a share: a
-# choice, far above rounding (1e-28 for a van der Pol oscillator) and below all that was tried.
+# The effect of an impact is lost if it changes later distances by less than this share: a choice,
+# far above rounding (1e-28 for a van der Pol oscillator) and below all machines that were tried.
 _VANISHES = 1e-14
 
 
@@ -569,7 +569,7 @@ def grazing(
     check, periods = flag("check", check), count("periods", periods, least=1)
     progress = flag("progress", progress)
     graze = graze_at(point)
-    unchecked, attractors = _unchecked(graze, periods)
+    unchecked, attractors = _forecast(graze, periods)
     if not check:
         return unchecked
     offsets = unchecked.forecast.offset[::SIMULATE_EVERY]
@@ -599,7 +599,7 @@ def _limit_to_checked(
     return dataclasses.replace(found, outcome=getattr(SCENARIOS, outcome), aperiodic=aperiodic)
 
 
-def _unchecked(graze: LocalGrazing, periods: int) -> tuple[Grazing, Attractors]:
+def _forecast(graze: LocalGrazing, periods: int) -> tuple[Grazing, Attractors]:
     """Return the forecast of the local map, and its attractor at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
