@@ -168,7 +168,7 @@ def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     expected = [0.49, 0.21 * np.exp(1j), 0.21 * np.exp(-1j)]
     np.testing.assert_allclose(np.sort_complex(products), np.sort_complex(expected), atol=1e-12)
     pair = [0.7 * np.exp(1j), 0.7 * np.exp(-1j)]
-    (pair_held,) = _conditions.as_held({"multiplier": 0.7}, np.array([*pair, 0.3]))
+    (pair_held,) = _conditions.hold_values({"multiplier": 0.7}, np.array([*pair, 0.3]))
     assert pair_held.pair
 
     def dominance_margin(*values):
