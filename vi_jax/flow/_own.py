@@ -217,7 +217,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     paths = jtu.tree_leaves_with_path(start) if ticks else ()
     for (path, _), rates in zip(paths, fields, strict=True):
         if np.any(abs(rates[:2] - rates[2:]) > _APART * abs(rates).max(axis=0)):
-            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", cycle.item())
+            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", float(cycle))
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
