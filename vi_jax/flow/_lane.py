@@ -68,7 +68,7 @@ def select(condition: Flag, a: object, b: object) -> Any:
     return jtu.tree_map(lambda x, y: x if x is y else jnp.where(condition, x, y), a, b)
 
 
-def in_place(values: tuple, k: int, value: object) -> tuple:
+def with_item(values: tuple, k: int, value: object) -> tuple:
     return (*values[:k], value, *values[k + 1 :])
 
 
@@ -130,13 +130,13 @@ class Lane(NamedTuple):
     completed: Flag | None = None
     """True if the interval is complete, while events are applied; `None` between steps."""
 
-    def ended(self, where: Flag, when: Flag | None, reason: str | float) -> "Lane":
-        """Return the lane, ended with `reason` (a name in `RESULTS` or its number) if both flags
-        are true: `where`, the event happened; `when`, it ends the lane (`None`: it never does)."""
-        if when is None:
+    def end_if(self, happened: Flag, condition: Flag | None, reason: str | float) -> "Lane":
+        """Return the lane, ended with `reason` (a name in `RESULTS` or its number) if an event
+        `happened` and the `condition` is true under which it ends the lane (`None`: never)."""
+        if condition is None:
             return self
         number = code(reason) if isinstance(reason, str) else reason
-        return self._replace(fault=jnp.where(where & when, number, self.fault))
+        return self._replace(fault=jnp.where(happened & condition, number, self.fault))
 
     def complete_interval(self, when: Flag) -> "Lane":
         """Return the lane with its interval marked as complete where `when` is true."""
@@ -154,18 +154,18 @@ class Lane(NamedTuple):
         events = self.record.events
         if events is None:
             return self
-        place = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
-        return self.update_record(events=written(events, when, place, clock, kind, number, value))
+        used = jnp.sum(jnp.where(jnp.isnan(events[1]), 0.0, 1.0))
+        return self.update_record(events=add_entry(events, when, used, clock, kind, number, value))
 
 
-def written(log: Array, when: Flag, place: Scalar, *entry: Any) -> Array:
-    """Return a log with an entry in column `place` where `when` is true, if it has that column."""
-    here = when & (jnp.arange(log.shape[1], dtype=log.dtype) == place)
-    column = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
-    return jnp.where(here, column[:, None], log)
+def add_entry(log: Array, when: Flag, column: Scalar, *entry: Any) -> Array:
+    """Return a log with an entry in column `column` where `when` is true, if it has that column."""
+    is_column = when & (jnp.arange(log.shape[1], dtype=log.dtype) == column)
+    entries = jnp.stack([jnp.asarray(x, log.dtype) for x in entry])
+    return jnp.where(is_column, entries[:, None], log)
 
 
-def ticks(machine: AbstractMachine, state: State) -> bool:
+def s_counts_cycles(machine: AbstractMachine, state: State) -> bool:
     """Return whether the independent variable itself counts the cycles."""
     return clock_of(machine, state) is None and not is_autonomous(machine, state)
 
@@ -173,7 +173,7 @@ def ticks(machine: AbstractMachine, state: State) -> bool:
 def has_fixed_cycle(machine: AbstractMachine, state: State) -> bool:
     """Return whether all cycles have the same duration (`cycle_time`)."""
     return (
-        ticks(machine, state)
+        s_counts_cycles(machine, state)
         and machine.pace(jnp.zeros_like(machine.position(state)), state) is None
     )
 
@@ -188,7 +188,7 @@ class Impulses(eqx.Module):
     """Impulses in a cycle; a multiple of the record points."""
     functions: tuple[Callable | None, ...] = eqx.field(static=True)
     """For each array of the state, a function of the state that scales its impulses, or `None`."""
-    timed: bool = eqx.field(static=True)
+    measures_time: bool = eqx.field(static=True)
     """True if the loop measures the time between impulses; `scales` are then per unit of time."""
     modes: tuple[Array | None, ...] = ()
     """For each array of the state, the matrix that transforms its impulse to natural modes, if the
@@ -205,7 +205,7 @@ class Plan(eqx.Module):
     """Cycles to record."""
     parts: int = eqx.field(static=True)
     """Record points per cycle."""
-    motion: bool = eqx.field(static=True)
+    records_motion: bool = eqx.field(static=True)
     """True if extremes, durations and impact speeds are recorded."""
     log: int = eqx.field(static=True)
     events: int = eqx.field(static=True)
@@ -227,7 +227,7 @@ class Plan(eqx.Module):
     """Clock of the start, if it is not on the section."""
     until: Scalar | None = None
     """Clock at which the only cycle ends, if it is not the end of the machine's cycle."""
-    own: Scalars | None = None
+    start_modes: Scalars | None = None
     """The machine's own modes at the start, if the start contains them."""
     stop: Any = None
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
@@ -247,11 +247,11 @@ class Plan(eqx.Module):
         """Return the size of the guard of an event other than a stop, in the modes of the lane."""
         if self.extents is None:
             return 1.0
-        found = self.extents[len(self.machine.coordinates) + self.others(lane.state).index(number)]
+        extent = self.extents[len(self.machine.coordinates) + self.others(lane.state).index(number)]
         if not events_of(self.machine)[number].holds_mode:
-            return found
-        held = lane.modes[mode_number(self.machine, number)] == 0
-        return jnp.where(held, found[1], found[0])
+            return extent
+        in_mode_zero = lane.modes[mode_number(self.machine, number)] == 0
+        return jnp.where(in_mode_zero, extent[1], extent[0])
 
     def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""
@@ -259,22 +259,22 @@ class Plan(eqx.Module):
 
     def beyond_a_stop(self, state: State) -> Flag:
         """Return whether a coordinate is beyond one of its stops by more than rounding."""
-        found = jnp.zeros((), bool)
+        beyond = jnp.zeros((), bool)
         for stop in stops_of(self.machine):
-            place = self.machine.coordinates[stop.coordinate].position(state)
+            position = self.machine.coordinates[stop.coordinate].position(state)
             slack, _ = self.rounding(stop.coordinate, state)
-            found = found | (stop_gradient(stop.beyond(place)) > slack)
-        return found
+            beyond = beyond | (stop_gradient(stop.beyond(position)) > slack)
+        return beyond
 
     @property
-    def kept(self) -> int:
+    def recorded_intervals(self) -> int:
         """The number of intervals that are recorded, without those of `settle`."""
         return self.cycles * self.parts
 
     @property
     def intervals(self) -> Scalar:
         """Number of simulated intervals: one for each cycle of `settle`, then the recorded ones."""
-        return self.settle + self.kept
+        return self.settle + self.recorded_intervals
 
     @property
     def instants(self) -> int:
@@ -298,10 +298,10 @@ class Plan(eqx.Module):
 
     def is_record_point(self, part: Scalar, done: Scalar) -> Flag:
         """Return whether the `part`-th piece between two impulses completes an interval."""
-        behind, every = part + 1, self.instants // self.parts
+        passed, every = part + 1, self.instants // self.parts
         # A product of integers is exact, a quotient may be rounded.
-        whole = behind == every * jnp.round(behind / every)
-        return (behind >= self.instants) | (done >= self.settle) & whole
+        is_multiple = passed == every * jnp.round(passed / every)
+        return (passed >= self.instants) | (done >= self.settle) & is_multiple
 
     def others(self, state: State) -> list[int]:
         """Return the numbers of the events, other than stops, whose guards each step checks."""
@@ -326,20 +326,20 @@ class Plan(eqx.Module):
             return jnp.zeros_like(done)
         return jnp.where(done < self.settle, self.parts - 1.0, jnp.zeros_like(done))
 
-    def ticks(self, state: State) -> bool:
-        return ticks(self.machine, state)
+    def s_counts_cycles(self, state: State) -> bool:
+        return s_counts_cycles(self.machine, state)
 
     def clock(self, s: Scalar, state: State) -> Scalar:
         """Return the variable that counts the cycles: `s` or the machine's clock."""
         clock = clock_of(self.machine, state)
         return s if clock is None else clock
 
-    def timed(self, state: State) -> bool:
+    def integrates_time(self, state: State) -> bool:
         """Return whether the loop integrates time: cycles without a fixed duration are recorded, or
         the time between impulses is measured."""
-        if self.noise is not None and self.noise.timed:
+        if self.noise is not None and self.noise.measures_time:
             return True
-        return self.motion and not has_fixed_cycle(self.machine, state)
+        return self.records_motion and not has_fixed_cycle(self.machine, state)
 
     @property
     def meets_every_turn(self) -> bool:
@@ -349,52 +349,52 @@ class Plan(eqx.Module):
     def meets_turns(self, done: Scalar) -> Flag:
         """Return whether steps end on every turning point, after `done` intervals, as extremes
         require; else only on those close to a stop."""
-        if self.motion and not self.meets_every_turn:
+        if self.records_motion and not self.meets_every_turn:
             return done >= self.settle
         return jnp.full_like(done, self.meets_every_turn, bool)
 
-    def point(self, state: State, modes: Scalars) -> State:
+    def recorded_state(self, state: State, modes: Scalars) -> State:
         """Return the recorded state of a record point: the state with the machine's own modes."""
         return with_modes(state, own_modes(self.machine, modes))
 
-    def fresh(self, state: State) -> Record:
+    def empty_record(self, state: State) -> Record:
         Y = self.machine.position(state)
         zero = jnp.zeros_like(Y)
-        names = (TIME, *self.averages) if self.timed(state) else self.averages
+        names = (TIME, *self.averages) if self.integrates_time(state) else self.averages
         return Record(
             integrals=dict.fromkeys(names, zero),
-            y_max=Y if self.motion else None,
-            y_min=Y if self.motion else None,
+            y_max=Y if self.records_motion else None,
+            y_min=Y if self.records_motion else None,
             impacts=zero,
-            impact_speed=zero if self.motion else None,
-            impact_energy=zero if self.motion else None,
-            rests=zero if self.motion and self.rests else None,
+            impact_speed=zero if self.records_motion else None,
+            impact_energy=zero if self.records_motion else None,
+            rests=zero if self.records_motion and self.rests else None,
             log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
-            clearance=jnp.full_like(Y, jnp.inf) if self.motion and self.log else None,
+            clearance=jnp.full_like(Y, jnp.inf) if self.records_motion and self.log else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
     def at_stop(
-        self, k: int, contact: Scalar, part: Callable[[RigidStop], Any], otherwise: Scalar
+        self, k: int, contact: Scalar, value_of: Callable[[RigidStop], Any], value: Scalar
     ) -> Scalar:
-        """Return `part` of the stop on which coordinate number k rests (see `Lane.contact`), or
-        `otherwise` if it does not rest."""
+        """Return `value_of` of the stop on which coordinate number k rests (see `Lane.contact`), or
+        `value` if it does not rest."""
         for i, stop in enumerate(stops_of(self.machine)):
             if stop.coordinate == k:
-                otherwise = jnp.where(contact == to_event(i), part(stop), otherwise)
-        return otherwise
+                value = jnp.where(contact == to_event(i), value_of(stop), value)
+        return value
 
     def away(self, k: int, contact: Scalar) -> Scalar:
         """Return the sign of the direction away from the stop of coordinate number k, or 0."""
         return self.at_stop(k, contact, lambda stop: -float(stop.sign), jnp.zeros_like(contact))
 
-    def wall(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
+    def sign_and_gap(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """Return the sign (1 right, -1 left) and the gap of the stop in `contact` of coordinate
         number k; those of its first stop if `contact` names no other."""
-        mine = [(i, stop) for i, stop in enumerate(stops_of(self.machine)) if stop.coordinate == k]
-        (_, first), others = mine[0], mine[1:]
+        stops = [(i, stop) for i, stop in enumerate(stops_of(self.machine)) if stop.coordinate == k]
+        (_, first), others = stops[0], stops[1:]
         sign, gap = float(first.sign), first.gap
         for i, stop in others:
-            here = contact == to_event(i)
-            sign, gap = jnp.where(here, float(stop.sign), sign), jnp.where(here, stop.gap, gap)
+            match = contact == to_event(i)
+            sign, gap = jnp.where(match, float(stop.sign), sign), jnp.where(match, stop.gap, gap)
         return sign, gap

@@ -52,7 +52,7 @@ from ..machine import (
     switches_of,
 )
 
-_NO_NUMBERS = (
+_TRACER_ERRORS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
@@ -67,48 +67,48 @@ _APART, _INSIDE = 1e-4, 0.29
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
     """Check the field and the section, while the loop is traced, at no cost at run time.
     **Raises:** `TypeError` if one cannot be traced, takes other arguments or returns no state."""
-    whose = f"`field` of a {type(machine).__name__}"
+    label = f"`field` of a {type(machine).__name__}"
     modes = shown_modes(machine, modes)
-    check_takes(machine.field, whose, "`s`, the state", (s, state, *modes), len(modes))
+    check_takes(machine.field, label, "`s`, the state", (s, state, *modes), len(modes))
 
-    def asked(s, state, *modes):
+    def checked_field(s, state, *modes):
         found = machine.field(s, state, *modes)
-        return None if found is None else like(state, found, whose)
+        return None if found is None else like(state, found, label)
 
     try:
-        with in_words_of(whose):
-            flow = jax.eval_shape(asked, s, state, *modes)
+        with explain_errors(label):
+            flow = jax.eval_shape(checked_field, s, state, *modes)
     except (AttributeError, TypeError, LookupError):
-        if _runs(machine.field, state, s, *modes):
+        if _is_traceable(machine.field, state, s, *modes):
             raise TypeError(
-                f"{whose} must take `s` first and then the state, but takes them the other way "
+                f"{label} must take `s` first and then the state, but takes them the other way "
                 "round."
             ) from None
         raise
     if flow is None:
         raise TypeError(
-            f"{whose} must return the components of its state, but its `return` is missing."
+            f"{label} must return the components of its state, but its `return` is missing."
         )
     wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
     if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
         raise TypeError(
-            f"{whose} must return the components of its state, {in_short(state)}, but returned "
-            f"{in_short(flow)}.{rows_of(machine) if wanted != got else ''}"
+            f"{label} must return the components of its state, {tree_text(state)}, but returned "
+            f"{tree_text(flow)}.{batch_hint(machine) if wanted != got else ''}"
         )
     _output_shapes(
         f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state
     )
 
 
-def rows_of(machine: AbstractMachine) -> str:
+def batch_hint(machine: AbstractMachine) -> str:
     """Return a hint at fields of a machine that are arrays, perhaps of many machines."""
-    rows = [name for name, x in vars(machine).items() if eqx.is_array(x) and x.ndim]
-    if not rows:
+    arrays = [name for name, x in vars(machine).items() if eqx.is_array(x) and x.ndim]
+    if not arrays:
         return ""
-    return f" Of many machines, with a row as {' and '.join(rows)}, take `jax.vmap` or `scan`."
+    return f" Of many machines, with a row as {' and '.join(arrays)}, take `jax.vmap` or `scan`."
 
 
-def in_short(tree: Any) -> str:
+def tree_text(tree: Any) -> str:
     """Return the structure of a tree as text, with types and shapes for numbers."""
 
     def blank(x: Any) -> Any:
@@ -117,7 +117,7 @@ def in_short(tree: Any) -> str:
     return eqx.tree_pformat(jtu.tree_map(blank, tree), width=1000)
 
 
-def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
+def _is_traceable(function: Callable[..., Any], *arguments: Any) -> bool:
     try:
         jax.eval_shape(function, *arguments)
     except Exception:
@@ -126,27 +126,27 @@ def _runs(function: Callable[..., Any], *arguments: Any) -> bool:
 
 
 @contextlib.contextmanager
-def in_words_of(whose: str) -> Iterator[None]:
+def explain_errors(label: str) -> Iterator[None]:
     """Turn errors about traced numbers and assignments into one sentence with the remedy."""
     try:
         yield
     except jax.errors.TracerBoolConversionError as error:
         raise TypeError(
-            f"{whose} must be written for numbers that are traced: `jnp.where`, not `if`."
+            f"{label} must be written for numbers that are traced: `jnp.where`, not `if`."
         ) from error
-    except _NO_NUMBERS as error:
+    except _TRACER_ERRORS as error:
         raise TypeError(
-            f"{whose} must be written for numbers that are traced: with the functions of "
+            f"{label} must be written for numbers that are traced: with the functions of "
             "`jax.numpy`, not with those of `numpy` or `math`, `float` or `int`."
         ) from error
     except dataclasses.FrozenInstanceError as error:
         raise TypeError(
-            f"{whose} must return new numbers, and change neither machine nor state: {error}."
+            f"{label} must return new numbers, and change neither machine nor state: {error}."
         ) from error
 
 
-def _output_shapes(whose: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    with in_words_of(whose):
+def _output_shapes(label: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    with explain_errors(label):
         return eqx.filter_eval_shape(function, *arguments)
 
 
@@ -155,25 +155,25 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
     for i, stop in enumerate(stops_of(machine)):
         if stop.is_one_number:
             continue
-        whose = f"The restitution law of stop {i} of a {type(machine).__name__}"
+        label = f"The restitution law of stop {i} of a {type(machine).__name__}"
         try:
-            got = _output_shapes(whose, stop.rebound, speed)
+            got = _output_shapes(label, stop.rebound, speed)
         except TypeError as error:
-            if str(error).startswith(whose):
+            if str(error).startswith(label):
                 raise
             raise TypeError(
-                f"{whose} must be a function of the speed of approach that returns a number in "
+                f"{label} must be a function of the speed of approach that returns a number in "
                 f"[0, 1], but: {error}"
             ) from error
         if jnp.shape(got) != ():
             raise TypeError(
-                f"{whose} must return one number, but gives an array of shape {got.shape}."
+                f"{label} must return one number, but gives an array of shape {got.shape}."
             )
 
 
 # A guard is evaluated in this many states around the start. Their modes are those of the start or
 # these. Each number is moved by these distances, relative to 1 + its size. Choices.
-_TRIED, _MODES, _FAR = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
+_SAMPLES, _MODES, _DISTANCES = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 
 def check_values(machine: AbstractMachine, start: State) -> None:
@@ -184,8 +184,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     **Raises:** `ValueError` for invalid masses, or a stop's velocity that is not its position's.
     """
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
-    ours = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-    if ours or any(isinstance(x, Tracer) for x in leaves):
+    is_builtin = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+    if is_builtin or any(isinstance(x, Tracer) for x in leaves):
         return
     _check_slips(machine, start)
     try:
@@ -233,7 +233,7 @@ def _is_definite(masses: np.ndarray) -> bool:
 # A slip is evaluated at this many instants of a cycle. Then the interval of its greatest change is
 # halved this many times. If this share of the change is left, the slip jumps. If it changes by more
 # than this share of its range between two instants, it is steep. Choices.
-_SLIPS, _HALVES, _STILL, _STEEP = 1024, 40, 0.5, 0.05
+_INSTANTS, _HALVINGS, _JUMP, _STEEP = 1024, 40, 0.5, 0.05
 
 
 def _check_slips(machine: AbstractMachine, start: State) -> None:
@@ -249,7 +249,7 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
                 time, extent, coarse, fine = map(np.asarray, _steepest(machine, number, start))
         except Exception:  # the error is raised with a better message when the friction is traced
             return
-        if coarse > 0 and fine > _STILL * coarse:
+        if coarse > 0 and fine > _JUMP * coarse:
             raise ValueError(
                 f"The `slip` of a DryFriction of a {type(machine).__name__} must be continuous in "
                 f"time, but it jumps by {fine:.6g} at t = {time:.6g}. Let it jump where a "
@@ -267,7 +267,7 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
     return its changes there between two of many instants, and between two far closer ones."""
     friction: Any = switches_of(machine)[number]
     slip = lambda s: jnp.asarray(friction.speed_of_slip(machine, s, start), float)
-    s = jnp.asarray(machine.cycle, float) * (np.arange(_SLIPS) / _SLIPS)
+    s = jnp.asarray(machine.cycle, float) * (np.arange(_INSTANTS) / _INSTANTS)
     values = jax.vmap(slip)(s)
     steps = jnp.abs(jnp.diff(values))
     place = jnp.argmax(steps)
@@ -275,10 +275,10 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
     def halve(_: Any, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends
         middle = 0.5 * (low + high)
-        first = jnp.abs(slip(middle) - slip(low)) > jnp.abs(slip(high) - slip(middle))
-        return jnp.where(first, low, middle), jnp.where(first, middle, high)
+        is_first = jnp.abs(slip(middle) - slip(low)) > jnp.abs(slip(high) - slip(middle))
+        return jnp.where(is_first, low, middle), jnp.where(is_first, middle, high)
 
-    low, high = jax.lax.fori_loop(0, _HALVES, halve, (s[place], s[place + 1]))
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (s[place], s[place + 1]))
     extent = jnp.max(values) - jnp.min(values)
     return high, extent, steps[place], jnp.abs(slip(high) - slip(low))
 
@@ -339,16 +339,16 @@ def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) ->
     far = np.resize(_FAR, _TRIED)
     s = zero + cycle * np.append(0.0, random.uniform(size=_TRIED))
 
-    def spread(x: Any) -> Array:
+    def draw_around(x: Any) -> Array:
         x = jnp.asarray(x)
-        shape = (_TRIED, *x.shape)
-        moved = random.standard_normal(shape) * far.reshape(-1, *(1 for _ in x.shape))
+        shape = (_SAMPLES, *x.shape)
+        moved = random.standard_normal(shape) * distances.reshape(-1, *(1 for _ in x.shape))
         return jnp.concatenate([x[None], x + jnp.asarray(moved, x.dtype) * (1 + jnp.abs(x))])
 
-    def chosen(mode: Scalar) -> Array:
-        others = np.append(len(_MODES), random.choice(len(_MODES) + 1, size=_TRIED))
-        values = np.append(_MODES, 0.0)[others].astype(zero.dtype)
-        return jnp.where(others == len(_MODES), zero + mode, values)
+    def draw_modes(mode: Scalar) -> Array:
+        choices = np.append(len(_MODES), random.choice(len(_MODES) + 1, size=_SAMPLES))
+        values = np.append(_MODES, 0.0)[choices].astype(zero.dtype)
+        return jnp.where(choices == len(_MODES), zero + mode, values)
 
     return s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
 
@@ -383,7 +383,7 @@ def _warn_of_slip(kind: type, time: float) -> None:
 def _warn_of_guard(kind: type, i: int, name: str) -> None:
     warn(
         f"The guard of event {i} ({name}) of a {kind.__name__} was not below zero in any of "
-        f"{_TRIED + 1} states around the start, and an event whose guard is never negative never "
+        f"{_SAMPLES + 1} states around the start, and an event whose guard is never negative never "
         "happens. Return a number that is negative before the event and positive after it: "
         "`x - 1`, not `jnp.maximum(x - 1, 0)`."
     )
@@ -419,23 +419,23 @@ def check_parts(machine: AbstractMachine) -> None:
     if jnp.shape(machine.cycle):
         raise ValueError(
             f"`cycle` of a {name} must be one number, but has shape {jnp.shape(machine.cycle)}."
-            f"{rows_of(machine)}"
+            f"{batch_hint(machine)}"
         )
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
-    many = len(machine.coordinates)
+    count = len(machine.coordinates)
     for i, stop in enumerate(stops_of(machine)):
         for part in ("gap", "restitution"):
             shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))
             if shape:
                 raise ValueError(
                     f"Stop {i} of a {name} must have one number as `{part}`, but has shape {shape}."
-                    f"{rows_of(machine)}"
+                    f"{batch_hint(machine)}"
                 )
-        if stop.coordinate >= many:
+        if stop.coordinate >= count:
             raise ValueError(
-                f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {many}: "
+                f"Stop {i} of a {name} limits coordinate {stop.coordinate}, but there are {count}: "
                 "name each in `coordinates`."
             )
         if stop.at is not None and not isinstance(machine, LinearMachine):
@@ -451,11 +451,11 @@ def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop on an angle of `wrap_angles`, or with an invalid `on`."""
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
-        named = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
-        wrapped = [x for x in named if is_angle(machine, x)]
-        if isinstance(stop, RigidStop) and wrapped:
+        names = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
+        angles = [x for x in names if is_angle(machine, x)]
+        if isinstance(stop, RigidStop) and angles:
             raise ValueError(
-                f"A stop is at one value of {wrapped[0]!r}, which `wrap_angles` changes "
+                f"A stop is at one value of {angles[0]!r}, which `wrap_angles` changes "
                 "by whole turns: leave the angle out there, with a stop at each end of its range."
             )
         if isinstance(machine, Mechanical):
@@ -465,8 +465,8 @@ def _check_names(machine: AbstractMachine) -> None:
                     f"{type(machine).__name__}, whose own masses are used."
                 )
             continue
-        pair = isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
-        if isinstance(stop, RigidStop | SoftStop) and on is not None and not pair:
+        is_pair = isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
+        if isinstance(stop, RigidStop | SoftStop) and on is not None and not is_pair:
             raise ValueError(
                 f"Argument `on` of a stop of a {type(machine).__name__} must be the names of "
                 f'position and velocity, `on=("x", "u")`, but got {on!r}.'
@@ -505,23 +505,23 @@ def check_events(machine: AbstractMachine, s: Scalar, state: State, modes: Scala
     name = type(machine).__name__
     for k, coordinate in enumerate(machine.coordinates if stops_of(machine) else ()):
         _check_mass(f"`mass` of coordinate {k} of a {name}", coordinate, s, state)
-        whose = f"`placed` of coordinate {k} of a {name}"
+        label = f"`placed` of coordinate {k} of a {name}"
         place, velocity = coordinate.position(state), coordinate.velocity(state)
-        _check_state(whose, state, _output_shapes(whose, coordinate.placed, state, place, velocity))
+        _check_state(label, state, _output_shapes(label, coordinate.placed, state, place, velocity))
     first = len(stops_of(machine))
     for number, event in enumerate(events_of(machine)[first:-1], start=first):
         _check_event(machine, number, event, (s, state, modes))
 
 
-def _check_mass(whose: str, coordinate: Coordinate, s: Scalar, state: State) -> None:
+def _check_mass(label: str, coordinate: Coordinate, s: Scalar, state: State) -> None:
     mass = coordinate.mass
     if callable(mass):
-        mass = _output_shapes(whose, lambda: jnp.asarray(coordinate.mass_at(s, state)))
+        mass = _output_shapes(label, lambda: jnp.asarray(coordinate.mass_at(s, state)))
     kind = getattr(mass, "dtype", None) or jnp.result_type(type(mass))
     if jnp.shape(mass) or not jnp.issubdtype(kind, jnp.number):
         raise TypeError(
-            f"{whose} must be one number, or a function `mass(s, state)` that returns one, but "
-            f"is {in_short(mass)}."
+            f"{label} must be one number, or a function `mass(s, state)` that returns one, but "
+            f"is {tree_text(mass)}."
         )
 
 
@@ -532,55 +532,55 @@ def _check_event(
     switches, name = len(switches_of(machine)), type(machine).__name__
     i = number - len(stops_of(machine))
     what, i = ("switch", i) if i < switches else ("event", i - switches)
-    whose = f"{what} {i} ({event.name or type(event).__name__}) of a {name}"
+    label = f"{what} {i} ({event.name or type(event).__name__}) of a {name}"
     contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates)
-    _, own, more = event_of(machine, number, modes, contact)
-    around = machine, s, state, *modes[own]
-    guard = _output_shapes(f"`guard` of {whose}", lambda: event.guard(*around, **more))
+    _, own_modes, keywords = event_of(machine, number, modes, contact)
+    arguments = machine, s, state, *modes[own_modes]
+    guard = _output_shapes(f"`guard` of {label}", lambda: event.guard(*arguments, **keywords))
     if getattr(guard, "shape", None) != () or not jnp.issubdtype(guard.dtype, jnp.floating):
         raise TypeError(
-            f"`guard` of {whose} must return one floating-point number, but returned "
-            f"{in_short(guard)}."
+            f"`guard` of {label} must return one floating-point number, but returned "
+            f"{tree_text(guard)}."
         )
-    when = _output_shapes(f"`when` of {whose}", lambda: event.happens(*around))
+    when = _output_shapes(f"`when` of {label}", lambda: event.happens(*arguments))
     if when is not None and (jnp.shape(when) or not jnp.issubdtype(when.dtype, bool)):
         raise TypeError(
-            f"`when` of {whose} must return a flag, but returned {in_short(when)}. Compare it with "
-            "a number: `state.V > 0`."
+            f"`when` of {label} must return a flag, but returned {tree_text(when)}. Compare it "
+            "with a number: `state.V > 0`."
         )
     if isinstance(event, Reset):  # `after` evaluates its modes in that state
-        new = _output_shapes(f"`reset` of {whose}", lambda: event.jump(machine, s, state, *modes))
-        _check_state(f"The state after {whose}", state, new)
-    found = _output_shapes(f"`after` of {whose}", lambda: event.after(*around, **more))
+        new = _output_shapes(f"`reset` of {label}", lambda: event.jump(machine, s, state, *modes))
+        _check_state(f"The state after {label}", state, new)
+    found = _output_shapes(f"`after` of {label}", lambda: event.after(*arguments, **keywords))
     if type(found) is not tuple or len(found) != 2:
         raise TypeError(
-            f"`after` of {whose} must return the state and the modes afterwards, but returned "
-            f"{in_short(found)}."
+            f"`after` of {label} must return the state and the modes afterwards, but returned "
+            f"{tree_text(found)}."
         )
     new, changed = found
-    _check_state(f"The state after {whose}", state, new)
+    _check_state(f"The state after {label}", state, new)
     number = len(changed) if isinstance(changed, Sequence) else -1
     if not event.holds_mode and number != len(modes):
         raise TypeError(
-            f"The modes after {whose} must be {len(modes)} in number, as many as the machine has "
-            f"(those of its switches, then those of its `begin`), but are {in_short(changed)}."
+            f"The modes after {label} must be {len(modes)} in number, as many as the machine has "
+            f"(those of its switches, then those of its `begin`), but are {tree_text(changed)}."
         )
 
 
-def _check_state(whose: str, state: State, found: Any) -> None:
+def _check_state(label: str, state: State, found: Any) -> None:
     def kind(x: Any) -> Any:
         floats = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         return jnp.shape(x), floats
 
-    alike = jtu.tree_structure(state) == jtu.tree_structure(found)
-    if not alike or jtu.tree_map(kind, state) != jtu.tree_map(kind, found):
+    same_structure = jtu.tree_structure(state) == jtu.tree_structure(found)
+    if not same_structure or jtu.tree_map(kind, state) != jtu.tree_map(kind, found):
         raise TypeError(
-            f"{whose} must be like its state, {in_short(state)}, but is {in_short(found)}."
+            f"{label} must be like its state, {tree_text(state)}, but is {tree_text(found)}."
         )
 
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.
-_TAKEN = frozenset(
+_RESERVED = frozenset(
     """admissible clearance column cycle cycles duration error event exponent exponents extremes
     frequency_ratio history impact impact_energy impact_phase impact_rate impact_speed impact_stop
     impacts iterations lane monodromy multiplier multipliers number parameter period point regime
@@ -604,7 +604,7 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
     modes = shown_modes(machine, begin_modes(machine, zero, start))
-    names = _names(machine, "averages", machine.averages, start, (zero, start, *modes))
+    names = _checked_names(machine, "averages", machine.averages, start, (zero, start, *modes))
     both = sorted(set(names) & set(quantity_names(machine, start)))
     if both:
         raise ValueError(
@@ -619,7 +619,7 @@ def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     if not has_quantities(machine):
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
-    return _names(machine, "quantities", machine.quantities, start, (zero, start))
+    return _checked_names(machine, "quantities", machine.quantities, start, (zero, start))
 
 
 def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> dict[str, Array]:
@@ -630,43 +630,43 @@ def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> d
     dtype = jnp.result_type(*jtu.tree_leaves(sections))
     numbers, rest = eqx.partition(machine, eqx.is_array)
 
-    def one(numbers: Any, state: State) -> dict[str, Array]:
+    def of_state(numbers: Any, state: State) -> dict[str, Array]:
         found = eqx.combine(numbers, rest).quantities(jnp.zeros((), dtype), state)
         return {name: jnp.asarray(x, dtype) for name, x in found.items()}
 
-    one = jax.vmap(one, in_axes=(None, 0))
+    of_state = jax.vmap(of_state, in_axes=(None, 0))
     for _ in range(lead):
-        one = jax.vmap(one)
-    return one(numbers, sections)
+        of_state = jax.vmap(of_state)
+    return of_state(numbers, sections)
 
 
-def _names(
-    machine: AbstractMachine, which: str, function: Callable, start: State, arguments: tuple
+def _checked_names(
+    machine: AbstractMachine, attribute: str, function: Callable, start: State, arguments: tuple
 ) -> tuple[str, ...]:
-    """Return the names of a machine's averages or quantities (`which`), sorted; names of components
-    of `start` are in use already. **Raises:** as `average_names`."""
-    whose = f"`{which}` of a {type(machine).__name__}"
-    with in_words_of(whose):
-        found = jax.eval_shape(lambda *x: _as_arrays(whose, function(*x)), *arguments)
-    taken = _TAKEN | set(leaf_names(machine)) | set(components(start))
+    """Return the names of a machine's averages or quantities (`attribute`), sorted; names of
+    components of `start` are in use already. **Raises:** as `average_names`."""
+    label = f"`{attribute}` of a {type(machine).__name__}"
+    with explain_errors(label):
+        found = jax.eval_shape(lambda *x: _as_arrays(label, function(*x)), *arguments)
+    taken = _RESERVED | set(leaf_names(machine)) | set(components(start))
     for name, value in found.items():
         if name in taken or name.startswith("section_"):  # columns of a branch have such names
-            raise ValueError(f"{whose} must have names of their own, but {name!r} is taken.")
+            raise ValueError(f"{label} must have names of their own, but {name!r} is taken.")
         if value.shape:
             raise TypeError(
-                f"{whose} must be numbers, but {name!r} is an array of shape {value.shape}."
+                f"{label} must be numbers, but {name!r} is an array of shape {value.shape}."
             )
     return tuple(sorted(found))  # in the order of pytrees
 
 
-def _as_arrays(whose: str, found: object) -> dict[str, Array]:
+def _as_arrays(label: str, found: object) -> dict[str, Array]:
     if not isinstance(found, Mapping):
         raise TypeError(
-            f"{whose} must be a mapping of names to numbers, but returned {type(found).__name__}."
+            f"{label} must be a mapping of names to numbers, but returned {type(found).__name__}."
         )
     for name, value in found.items():
         if not isinstance(name, str) or not name.isidentifier():
-            raise ValueError(f"{whose} must have names that are identifiers, but got {name!r}.")
+            raise ValueError(f"{label} must have names that are identifiers, but got {name!r}.")
         if not hasattr(value, "dtype") and not isinstance(value, int | float):
-            raise TypeError(f"{whose} must be numbers, but {name!r} is {value!r}.")
+            raise TypeError(f"{label} must be numbers, but {name!r} is {value!r}.")
     return {name: jnp.asarray(value) for name, value in found.items()}

@@ -213,7 +213,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
 
     period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
     duration = None
-    if plan.motion:
+    if plan.records_motion:
         reached = jnp.isfinite(records.impacts).reshape(plan.cycles, parts).all(axis=1)
         fixed = jnp.where(reached, period, jnp.nan)
         duration = fixed if times is None else per_cycle(times, jnp.sum)
@@ -228,7 +228,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     if sampled:
         interval = jnp.repeat(period / parts, parts) if times is None else times
         time = jnp.concatenate([jnp.zeros_like(interval[:1]), jnp.cumsum(interval)])
-        place = jnp.arange(plan.kept + 1, dtype=time.dtype) / parts
+        place = jnp.arange(plan.recorded_intervals + 1, dtype=time.dtype) / parts
         dense = Samples(place, time, points, quantities, modes)
     return Run(
         sections=jtu.tree_map(lambda x: x[::parts], points),
@@ -277,9 +277,9 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
     if not has_quantities(machine):
         return {}
     first = jtu.tree_map(lambda x: x[0], points)
-    parts = jnp.arange(plan.kept + 1) % plan.parts
+    parts = jnp.arange(plan.recorded_intervals + 1) % plan.parts
     s = parts.astype(machine.position(first).dtype) * (jnp.asarray(machine.cycle) / plan.parts)
-    if not plan.ticks(first):
+    if not plan.s_counts_cycles(first):
         s = jnp.zeros_like(s)
     found = jax.vmap(machine.quantities)(s, points)
     return {name: jnp.asarray(x, s.dtype) for name, x in found.items()}

@@ -165,7 +165,7 @@ def planned(
         method=method,
         cycles=cycles,
         parts=parts,
-        motion=motion,
+        records_motion=motion,
         log=options.impact_log,
         events=options.event_log,
         averages=averages,
@@ -177,7 +177,7 @@ def planned(
         begin=_clock_reading(options.begin, dtype),
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
-        own=_own_modes(machine, start, own, dtype),
+        start_modes=_own_modes(machine, start, own, dtype),
     )
     return plan, start
 

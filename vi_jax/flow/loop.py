@@ -188,7 +188,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     bad = jax.lax.stop_gradient(bad)
     zero = jnp.zeros_like(Y)
     s = zero if plan.begin is None else zero + plan.begin
-    modes = begin_modes(machine, s, start, plan.own)
+    modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
     here = [rates(free.field, x.position, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.
@@ -216,7 +216,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     return Lane(
         s=s,
         state=start,
-        record=plan.fresh(start),
+        record=plan.empty_record(start),
         direction=jax.lax.stop_gradient(direction),
         contact=contact,
         modes=modes,
@@ -231,7 +231,7 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         steps=zero,
         spent=zero,
         rejected=zero,
-        last_impulse=zero if plan.noise is not None and plan.noise.timed else None,
+        last_impulse=zero if plan.noise is not None and plan.noise.measures_time else None,
     )
 
 
@@ -305,8 +305,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     """Run a lane to its end in one flat loop; in a batch no lane waits for another at a section.
 
     **Returns:** its `Ends`; states and records of the recorded intervals, with leading axis
-    `plan.kept + 1`. The first is the state in which recording begins, with an empty record. The
-    states are `HybridState`s if the machine has its own modes.
+    `plan.recorded_intervals + 1`. The first are the state in which recording begins, and an empty
+    record. The states are `HybridState`s if the machine has its own modes.
     """
     form = prepared(plan.machine)
     own = form.machine is plan.machine
@@ -318,7 +318,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         start = form.inward(start)
     zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
-    modes = begin_modes(plan.machine, s, start, plan.own)
+    modes = begin_modes(plan.machine, s, start, plan.start_modes)
     check_field(plan.machine, s, start, modes)
     check_laws(plan.machine, zero)
     check_events(plan.machine, s, start, modes)
@@ -331,7 +331,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), partial(_end, rest),
-        (numbers, start, jnp.asarray(wanted)), rows=plan.kept + 1, backend=plan.backend,
+        (numbers, start, jnp.asarray(wanted)), rows=plan.recorded_intervals + 1,
+        backend=plan.backend,
     )  # fmt: skip
     if not own:
         states = replaced(states, jax.vmap(form.outward)(without_modes(states)))
@@ -344,8 +345,8 @@ def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
     lane = launched(plan, start, wanted)
-    first, here = plan.settle <= 0, plan.point(start, lane.modes)
-    return lane, lanes.Emitted(_active(plan, lane), first, (here, plan.fresh(start)))
+    first, here = plan.settle <= 0, plan.recorded_state(start, lane.modes)
+    return lane, lanes.Emitted(_active(plan, lane), first, (here, plan.empty_record(start)))
 
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
@@ -357,7 +358,7 @@ def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]
         first = lane.done <= plan.settle
         left = plan.stop(plan.machine, lane.state, record, first)
         active = active if left is None else active & ~(complete & left)
-    here = plan.point(lane.state, lane.modes)
+    here = plan.recorded_state(lane.state, lane.modes)
     return lane, lanes.Emitted(active, complete, (here, record))
 
 

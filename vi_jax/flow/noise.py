@@ -24,8 +24,8 @@ from ..machine import (
     others_of,
     prepared,
 )
-from ._lane import Impulses, Plan, has_fixed_cycle, ticks
-from ._own import in_words_of
+from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
+from ._own import explain_errors
 from .smooth import limited_of
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
@@ -169,7 +169,7 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
         )
     for leaf, function in zip(jtu.tree_leaves(start), functions, strict=True):
         if function is not None:
-            with in_words_of("A function in argument `noise`"):
+            with explain_errors("A function in argument `noise`"):
                 found = jax.eval_shape(lambda x, f=function: _real(f(x)), start)
             if found.shape not in ((), jnp.shape(leaf)):
                 raise ValueError(
@@ -188,7 +188,7 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
     """Return the duration of each cycle; `None` if it is not known in advance."""
     if has_fixed_cycle(machine, start):
         return cycle_time(machine)
-    if not ticks(machine, start):
+    if not s_counts_cycles(machine, start):
         return None
     # s is proportional to time if the pace depends neither on s nor on the state.
     zero = jnp.zeros_like(machine.position(start))

@@ -376,7 +376,7 @@ def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
     `aim_at` finds other events."""
     limit = stop_gradient(jnp.asarray(plan.method.longest(plan.machine, lane.s, lane.state)))
     h = jnp.minimum(lane.attempt, motion.reach(limit))
-    if plan.ticks(lane.state):
+    if plan.s_counts_cycles(lane.state):
         h = jnp.minimum(h, plan.end(lane.part) - lane.s)
     h = stop_gradient(h)
     guards, courses = _foreseen(plan, lane, motion, h)
@@ -403,7 +403,7 @@ def _foreseen(
 ) -> tuple[list[Passed], list[Course]]:
     """Return the arguments of `first_event` for a step of length h along `motion`."""
     machine, courses, ends, paths = plan.machine, [], [], []
-    if plan.motion or stops_of(machine):
+    if plan.records_motion or stops_of(machine):
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     if not exact(machine, lane.state):
         shortest = 64 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s))

@@ -25,7 +25,7 @@ from ...machine import (
     switches_of,
     value_of,
 )
-from .._lane import Lane, Plan, any_of, in_place, select, to_event, to_turn_of
+from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, rates, to_turn
 from ..results import EventKind, code_of_outcome
@@ -77,7 +77,7 @@ def apply_events(
         # The number of iterations is constant, since a loop of varying length has no transpose.
         end, _ = jax.lax.scan(turn, begin, None, length=_ROUNDS * len(due))
         endless = sum(end.due, start=zero) > 0
-        return end.lane.ended(endless, endless, "simultaneous")
+        return end.lane.end_if(endless, endless, "simultaneous")
     return end.lane
 
 
@@ -133,7 +133,7 @@ def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
             slides = _must_slide(plan, number, lane._replace(state=its_state, modes=its_modes))
-            lane = lane.ended(turns[number], slides, "sliding")
+            lane = lane.end_if(turns[number], slides, "sliding")
             its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
             jumps = jumps | here
@@ -170,7 +170,7 @@ def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, her
     if not event.ends:
         return lane
     outcome = code_of_outcome(outcomes_of(machine).index(event.ends))
-    return lane.ended(here, jnp.ones_like(here), outcome)
+    return lane.end_if(here, jnp.ones_like(here), outcome)
 
 
 def _must_slide(plan: Plan, i: int, lane: Lane) -> Flag | None:
@@ -224,7 +224,7 @@ def release_pulled(
             free = holding(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k].position, s, state).a
 
-        sign, _ = plan.wall(k, contact[k])
+        sign, _ = plan.sign_and_gap(k, contact[k])
         pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
         goes = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
         if resting is not None:
@@ -241,7 +241,7 @@ def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> L
     the directions of motion in its new modes, and the bodies that still rest. A lane with a body
     beyond a stop ends."""
     if stops_of(plan.machine) and others_of(plan.machine):
-        lane = lane.ended(jumps, plan.beyond_a_stop(lane.state), "bad_reset")
+        lane = lane.end_if(jumps, plan.beyond_a_stop(lane.state), "bad_reset")
         lane = lane._replace(contact=contacts_after_jump(plan, lane, jumps, old))
     # A switch does not change velocities; but it changes the rate of a state without velocities.
     when = jumps if has_velocity(plan.machine, lane.state) else happens
@@ -293,7 +293,7 @@ def disarm(plan: Plan, lane: Lane, c: Crossing) -> Lane:
     if c.number not in numbers:
         return lane
     i = numbers.index(c.number)
-    return lane._replace(below=in_place(lane.below, i, jnp.where(c.landed, 0.0, lane.below[i])))
+    return lane._replace(below=with_item(lane.below, i, jnp.where(c.landed, 0.0, lane.below[i])))
 
 
 def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Flag]:
@@ -380,7 +380,7 @@ def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.
-    if not plan.ticks(lane.state) or switches_of(plan.machine):
+    if not plan.s_counts_cycles(lane.state) or switches_of(plan.machine):
         return lane, places
     fixed = _at_fixed_clock(at, lane)
     # No step follows an outcome: its derivatives stay those along with the event.
@@ -466,8 +466,8 @@ def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
     return lane._replace(
         s=s,
         state=select(free, state, lane.state),
-        direction=in_place(lane.direction, k, direction),
-        contact=in_place(contact, k, jnp.where(free, 0.0, contact[k])),
+        direction=with_item(lane.direction, k, direction),
+        contact=with_item(contact, k, jnp.where(free, 0.0, contact[k])),
     )
 
 
@@ -486,7 +486,7 @@ def _offset(at: AppliedStep, c: Crossing) -> Scalar:
     # In a motion so flat that the event's place is less certain than its surface, it is here.
     near = c.landed & (jnp.abs(c.offset) <= plan.in_units(furthest_landing(trial.h)))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
-    if plan.ticks(trial.state):
+    if plan.s_counts_cycles(trial.state):
         # An event on the section is not beyond it.
         beyond = trial.s + offset - plan.end(at.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
@@ -510,7 +510,7 @@ def _impact(at: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: Stat
             v = stop_gradient(body.velocity(lane.state))
             direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
         if k in blows:  # any remaining approach is rounding
-            sign, _ = plan.wall(k, blows[k].struck)
+            sign, _ = plan.sign_and_gap(k, blows[k].struck)
             away = -sign
             if lane.contact is not None:
                 away = jnp.where(lane.contact[k] > 0, sign, away)

@@ -141,7 +141,7 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
         part = part + jnp.where(reached, 1.0, 0.0)
         turned = reached & (part >= plan.instants)
         part = jnp.where(turned, plan.first_part(done), part)
-    if not plan.ticks(state):
+    if not plan.s_counts_cycles(state):
         state = select(turned, with_earlier_clock(plan.machine, state), state)
     lane = arrived._replace(s=jnp.where(turned, 0.0, arrived.s), state=state)
     renewed = plan.machine.renewed(state)
@@ -151,7 +151,7 @@ def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Sca
     lane = _strike_frictions(plan, arrived, lane, turned)
     if plan.noise is not None:
         lane = after_impulse(plan, lane, reached, completed)
-    record = select(completed, plan.fresh(lane.state), lane.record)
+    record = select(completed, plan.empty_record(lane.state), lane.record)
     return lane._replace(part=part, record=record)
 
 
@@ -246,7 +246,7 @@ def _faults(
 
 def _reason_for_giving_up(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:
     machine, reason = plan.machine, code("unresolved")
-    if plan.motion or stops_of(machine):
+    if plan.records_motion or stops_of(machine):
         reason = jnp.where(target < FREE, code("turn_unresolved"), reason)
     first = len(stops_of(machine))
     if switches_of(machine):
@@ -255,7 +255,7 @@ def _reason_for_giving_up(plan: Plan, lane: Lane, target: Scalar) -> Scalar | fl
     if others_of(machine):
         others = target >= to_event(first + len(switches_of(machine)))
         reason = jnp.where(others, code("reset_unresolved"), reason)
-    if not plan.ticks(lane.state):
+    if not plan.s_counts_cycles(lane.state):
         ends = target == to_event(section_number(machine))
         reason = jnp.where(ends, code("section_unresolved"), reason)
     return reason

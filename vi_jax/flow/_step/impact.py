@@ -31,7 +31,7 @@ from ...machine import (
     struck_modes,
     with_friction_impulse,
 )
-from .._lane import Lane, Plan, any_of, in_place, select, to_event, written
+from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
 from ..drift import FlowToEvent
 from ..events import force_rate, rates
 from ..results import EventKind
@@ -79,7 +79,7 @@ def recorded(
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
     if log is not None:
-        log = written(log, hit, impacts, clock, approach, number)
+        log = add_entry(log, hit, impacts, clock, approach, number)
     impacts = impacts + jnp.where(hit, 1.0, 0.0)
     lane = lane.update_record(impact_speed=speed, log=log, impacts=impacts)
     return lane.log_event(hit, clock, EventKind.impact, number, approach)
@@ -99,7 +99,7 @@ def strike_once(
         stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
         rebound, share = stop.velocity_and_ratio(approach)
-        lane = lane.ended(met, gains_speed(stop, approach, rebound), "bad_impact")
+        lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
         lane = recorded(plan, lane._replace(state=state), at_event, taken & met, number, approach)
         energy = lane.record.impact_energy
@@ -197,11 +197,11 @@ def resolve_impact_sequence(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
     )
     endless = end.rounds >= _ROUNDS
-    lane = end.lane.ended(instant.met, endless, "simultaneous")
+    lane = end.lane.end_if(instant.met, endless, "simultaneous")
     blows = {}
     for k, body in instant.bodies.items():
         struck, fastest = end.struck[k], end.approach[k]
-        leaves = -plan.wall(k, struck)[0] * body.velocity(lane.state)
+        leaves = -plan.sign_and_gap(k, struck)[0] * body.velocity(lane.state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
         blows[k] = ImpactResult(struck, fastest, jnp.clip(share, 0.0, 1.0))
     return lane, blows
@@ -302,7 +302,7 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
     for number, hit in hits.items():
         stop, k = stops[number], stops[number].coordinate
         speed = jnp.maximum(closing[number], 0.0)
-        lane = lane.ended(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
+        lane = lane.end_if(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
         lane = recorded(plan, lane, instant.at_event, instant.taken & hit, number, speed)
         if stop.modes is not None:
             given = plan.machine, lane.s, state, new, lane.modes
@@ -410,7 +410,7 @@ def _with_losses(
         hit = instant.taken & instant.met
         lane = lane.update_record(impact_energy=energy + jnp.where(hit, lost, 0.0))
     wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
-    return lane.ended(instant.met, wrong, "bad_impact")
+    return lane.end_if(instant.met, wrong, "bad_impact")
 
 
 # Longest remaining chatter that is completed, as a share of the longest step, in double and in
@@ -431,7 +431,7 @@ def settle(
         return lane
     if len(blows) == 1:
         ((k, blow),) = blows.items()
-        sign, _ = at.plan.wall(k, blow.struck)
+        sign, _ = at.plan.sign_and_gap(k, blow.struck)
         path, alone = at.trial.paths[k], at.trial.alone[k]
         speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
@@ -457,7 +457,7 @@ def _held(
     for k, ends in rests.items():
         left = jnp.where(ends, waits[k], 0.0)
         wait = left if len(rests) == 1 else jnp.maximum(wait, left)
-        contact = in_place(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
+        contact = with_item(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
     walls, modes = {k: blow.struck for k, blow in blows.items()}, lane.modes
     if has_contact_friction(plan.machine):
         # The direction of slip is known after the impact.
@@ -529,7 +529,7 @@ def stilled(
     velocities = [body.velocity(state) for body in bodies.values()]
     slower, shifts = [-V for V in velocities], []
     for k, body in bodies.items():
-        sign, gap = plan.wall(k, walls[k])
+        sign, gap = plan.sign_and_gap(k, walls[k])
         shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
         coordinates, on = list(bodies.values()), list(rests.values())
@@ -539,7 +539,7 @@ def stilled(
     for (k, body), change, shift, V in zip(bodies.items(), slower, shifts, velocities, strict=True):
         place, speed = body.position(new) + shift, body.velocity(new) + change
         if len(rests) == 1:
-            sign, gap = plan.wall(k, walls[k])
+            sign, gap = plan.sign_and_gap(k, walls[k])
             place, speed = sign * gap, jnp.zeros_like(V)
         moved = body.placed(new, place, speed)
         new = moved if len(rests) == 1 else select(rests[k], moved, new)
@@ -557,7 +557,7 @@ def _ends(
     s; `lane` at the impact; `growth`, the rate of the force on the body, if known.
     """
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
-    sign, gap = plan.wall(k, blow.struck)
+    sign, gap = plan.sign_and_gap(k, blow.struck)
     # The force on a body at rest, which has no damping by its velocity.
     rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
     pressing = sign * rates(free.field, body.position, s, rested).a
@@ -577,7 +577,7 @@ def _ends(
     brief = (_BRIEF if s.dtype == jnp.float64 else _BRIEF_SINGLE) * limit
     ends = stop_gradient(left) <= jnp.where(flat, 0.1 * limit, brief)
     ends = ends & (flat | ~not_yet | (hop <= brief))
-    if plan.ticks(lane.state):
+    if plan.s_counts_cycles(lane.state):
         ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
     return ends, left
 
@@ -623,7 +623,7 @@ def _together(
     speeds = {}
     closed = list(contact)
     for k, blow in blows.items():
-        sign, _ = plan.wall(k, blow.struck)
+        sign, _ = plan.sign_and_gap(k, blow.struck)
         speeds[k] = jnp.maximum(
             -sign * rates(free.field, plan.machine.coordinates[k].position, s, state).v, 0.0
         )

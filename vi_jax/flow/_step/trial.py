@@ -168,7 +168,7 @@ def attempt(
     h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
     nothing = None if clear is None else free & (h <= clear)
     s1, last = lane.s + h, jnp.zeros_like(free)
-    if plan.ticks(lane.state):
+    if plan.s_counts_cycles(lane.state):
         # The margin avoids an extra step for a remainder of rounding.
         last = free & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
         s1 = jnp.where(last, bound, s1)
@@ -195,7 +195,7 @@ def attempt(
     bodies = range(len(machine.coordinates))
     alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
     ends: list[tuple[Rates, Rates]] = []
-    if plan.motion or stops_of(machine):
+    if plan.records_motion or stops_of(machine):
         for one, body in zip(alone, machine.coordinates, strict=True):
             begin = rates(one.field, body.position, lane.s, lane.state)
             ends.append((begin, rates(one.field, body.position, s1, new)))
