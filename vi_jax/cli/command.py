@@ -31,7 +31,7 @@ from .._checks import unwritable
 from .._messages import Interrupted, installed_version
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
-from ..flow import Run, RunOptions, planned, simulate
+from ..flow import Run, RunOptions, make_plan, simulate
 from ..machine import (
     AbstractMachine,
     State,
@@ -198,7 +198,7 @@ def run_in_parts(
     cycles recorded so far."""
     length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
     before = options.get("settle", 0)
-    planned(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
+    make_plan(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
     if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
         return simulate(machine, start, cycles, samples=samples, **options), False
     try:

@@ -19,7 +19,7 @@ from .arguments import check_reals as check_reals
 from .arguments import check_start as check_start
 from .arguments import check_values as check_values
 from .arguments import machine_of as machine_of
-from .arguments import planned as planned
+from .arguments import make_plan as make_plan
 from .arguments import shape_of as shape_of
 from .events import Rates as Rates
 from .events import force_rate as force_rate

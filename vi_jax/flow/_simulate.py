@@ -30,7 +30,7 @@ from ..machine import (
 )
 from ._lane import Plan, Record
 from ._own import has_quantities
-from .arguments import RunOptions, planned
+from .arguments import RunOptions, make_plan
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .noise import with_noise
@@ -136,7 +136,7 @@ def simulate(
         event_log=event_log, record=record, rests=rests, max_impacts=max_impacts,
         max_steps=max_steps,
     )  # fmt: skip
-    plan, start = planned(machine, start, cycles, options)
+    plan, start = make_plan(machine, start, cycles, options)
     plan = plan if noise is None else with_noise(plan, start, noise, key, samples)
     with lanes.interruptible():
         run = _simulate(plan, start, samples > 0)
@@ -155,14 +155,14 @@ def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
 def _errors(run: Run, tighter: Run) -> Errors:
     """Return the differences between a run and one by a tighter method; NaN if either failed."""
 
-    def apart(a: Any, b: Any) -> Any:
+    def difference(a: Any, b: Any) -> Any:
         both = run.successful & tighter.successful
         return jtu.tree_map(lambda a, b: jnp.where(both, jnp.abs(a - b), jnp.nan), a, b)
 
     return Errors(
-        sections=apart(run.sections, tighter.sections),
-        y_max=apart(run.y_max, tighter.y_max),
-        y_min=apart(run.y_min, tighter.y_min),
+        sections=difference(run.sections, tighter.sections),
+        y_max=difference(run.y_max, tighter.y_max),
+        y_min=difference(run.y_min, tighter.y_min),
         impacts=jnp.abs(run.impacts - tighter.impacts),
     )
 
@@ -183,8 +183,8 @@ def simulate_pool(
     returns noise and key of one lane from its values.
     """
 
-    def one(value, wanted):
-        plan, start = planned(*lane_of(value), cycles, options)
+    def run_one(value, wanted):
+        plan, start = make_plan(*lane_of(value), cycles, options)
         if noise_of is not None:
             plan = with_noise(plan, start, *noise_of(value), options.samples)
         run = collect(plan, options.samples > 0, *run_lane(plan, start, wanted))
@@ -192,7 +192,7 @@ def simulate_pool(
 
     if wanted is None:
         wanted = jnp.ones(jtu.tree_leaves(values)[0].shape[0], bool)
-    return jax.vmap(one)(values, wanted)
+    return jax.vmap(run_one)(values, wanted)
 
 
 def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Record) -> Run:
@@ -208,7 +208,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     integrals = dict(records.integrals)
     times = integrals.pop(TIME, None)
 
-    def whole(values):
+    def as_counts(values):
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
     period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
@@ -234,16 +234,16 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         sections=jtu.tree_map(lambda x: x[::parts], points),
         y_max=per_cycle(records.y_max, jnp.max),
         y_min=per_cycle(records.y_min, jnp.min),
-        impacts=whole(per_cycle(records.impacts, jnp.sum)),
+        impacts=as_counts(per_cycle(records.impacts, jnp.sum)),
         impact_speed=per_cycle(records.impact_speed, jnp.max),
-        rests=whole(per_cycle(records.rests, jnp.sum)) if records.rests is not None else None,
+        rests=as_counts(per_cycle(records.rests, jnp.sum)) if records.rests is not None else None,
         impact_energy=per_cycle(records.impact_energy, jnp.sum),
         clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
         frequency_ratio=None if duration is None else frequency_ratio(machine, duration),
         samples=dense,
-        impact_log=_log(plan, records.log) if plan.log else None,
-        event_log=_events(plan, records.events) if plan.events else None,
+        impact_log=_impact_log(plan, records.log) if plan.log else None,
+        event_log=_event_log(plan, records.events) if plan.events else None,
         errors=None,
         result=reason_of(lane.fault),
         steps=lane.steps.astype(jnp.int32),
@@ -285,16 +285,16 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
     return {name: jnp.asarray(x, s.dtype) for name, x in found.items()}
 
 
-def _log(plan: Plan, entries: Any) -> ImpactLog:
+def _impact_log(plan: Plan, entries: Any) -> ImpactLog:
     phase, speed, stop = _by_cycle(plan, entries, used=2)
-    return ImpactLog(as_logged(plan.machine, phase), speed, _numbers(stop))
+    return ImpactLog(as_logged(plan.machine, phase), speed, _as_integers(stop))
 
 
-def _events(plan: Plan, entries: Any) -> EventLog:
+def _event_log(plan: Plan, entries: Any) -> EventLog:
     phase, code, number, value = _by_cycle(plan, entries, used=1)
     names = tuple(event.name for event in others_of(plan.machine))
     clock = as_logged(plan.machine, phase)
-    return EventLog(clock, _numbers(code), _numbers(number), value, names)
+    return EventLog(clock, _as_integers(code), _as_integers(number), value, names)
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:
@@ -307,7 +307,7 @@ def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:
     return [jnp.take_along_axis(x, order, axis=1) for x in entries]
 
 
-def _numbers(x: Array) -> Array:
+def _as_integers(x: Array) -> Array:
     return jnp.where(jnp.isnan(x), -1.0, x).astype(jnp.int32)
 
 
@@ -318,44 +318,44 @@ def _numbers(x: Array) -> Array:
 def failed_derivatives(run: Run) -> Run:
     """Return the same run, with derivatives that are NaN if it failed."""
     numbers, rest = eqx.partition(run, eqx.is_inexact_array)
-    found = _marked(run.successful, numbers)
+    marked = _with_nan_derivatives(run.successful, numbers)
     if run.outcome is not None:
-        own = {name: getattr(numbers, name) for name in ("outcome_phase", "outcome_state")}
-        found = dataclasses.replace(found, **_marked(run.outcome >= 0, own))
-    return eqx.combine(found, rest)
+        outcome = {name: getattr(numbers, name) for name in ("outcome_phase", "outcome_state")}
+        marked = dataclasses.replace(marked, **_with_nan_derivatives(run.outcome >= 0, outcome))
+    return eqx.combine(marked, rest)
 
 
 @jax.custom_jvp
-def _marked(good: object, numbers: object) -> Any:
+def _with_nan_derivatives(succeeded: object, numbers: object) -> Any:
     return numbers
 
 
-@_marked.defjvp
+@_with_nan_derivatives.defjvp
 def _(primals, tangents):
     (good, numbers), (_, rates) = primals, tangents
 
     def marked(rate):
-        wide = jnp.reshape(good, good.shape + (1,) * (rate.ndim - good.ndim))
-        return _fail.bind(jnp.broadcast_to(wide, rate.shape), rate, back=False)
+        flags = jnp.reshape(good, good.shape + (1,) * (rate.ndim - good.ndim))
+        return _fail.bind(jnp.broadcast_to(flags, rate.shape), rate, back=False)
 
     return numbers, jtu.tree_map(marked, rates)
 
 
-def _value(good, x, *, back: bool):
-    return jnp.where(good | (x == 0) if back else good, x, jnp.nan)
+def _value(succeeded, x, *, back: bool):
+    return jnp.where(succeeded | (x == 0) if back else succeeded, x, jnp.nan)
 
 
 def _jvp(primals, tangents, *, back: bool):
-    (good, x), (_, rate) = primals, tangents
-    out = _fail.bind(good, x, back=back)
-    return out, rate if type(rate) is ad.Zero else _fail.bind(good, rate, back=back)
+    (succeeded, x), (_, rate) = primals, tangents
+    out = _fail.bind(succeeded, x, back=back)
+    return out, rate if type(rate) is ad.Zero else _fail.bind(succeeded, rate, back=back)
 
 
-def _transposed(weight, good, _, *, back: bool):
-    return None, weight if type(weight) is ad.Zero else _fail.bind(good, weight, back=not back)
+def _transpose(weight, succeeded, _, *, back: bool):
+    return None, weight if type(weight) is ad.Zero else _fail.bind(succeeded, weight, back=not back)
 
 
 # Linear for JAX, with a transpose that arithmetic cannot have: a zero cotangent stays zero. So a
 # loss that leaves failed lanes out has a finite gradient.
 _fail = elementwise_primitive("fail_derivatives", _value, _jvp)
-ad.primitive_transposes[_fail] = _transposed
+ad.primitive_transposes[_fail] = _transpose

@@ -52,13 +52,13 @@ from ._own import check_values as check_values
 from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding
 
-_NUMBERS = ["settle", "method", "begin", "until", "stop"]
-_FIXED = [
+_TRACED = ["settle", "method", "begin", "until", "stop"]
+_STATIC = [
     "clock", "samples", "impact_log", "event_log", "record", "rests", "max_impacts", "max_steps",
 ]  # fmt: skip
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=_NUMBERS, meta_fields=_FIXED)
+@functools.partial(jax.tree_util.register_dataclass, data_fields=_TRACED, meta_fields=_STATIC)
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RunOptions:
     """The options of a run, with the meanings and defaults of `simulate`.
@@ -89,14 +89,14 @@ class RunOptions:
     def checked(self, machine: AbstractMachine | None) -> "RunOptions":
         """Return the options after validation, with the method that they choose for the machine
         (`None` if not known yet). **Raises:** `TypeError` or `ValueError` that names the option."""
-        most, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
+        max_steps, counts = self.max_steps, ("samples", "impact_log", "event_log", "max_impacts")
         return dataclasses.replace(
             self,
             **{name: count(name, getattr(self, name)) for name in counts},
             method=chosen(machine, self.method),
             settle=self.settle if isinstance(self.settle, Tracer) else count("settle", self.settle),
             rests=None if self.rests is None else flag("rests", self.rests),
-            max_steps=None if most is None else count("max_steps", most, least=1),
+            max_steps=None if max_steps is None else count("max_steps", max_steps, least=1),
             record=one_of("record", self.record, ("motion", "sections")),
         )
 
@@ -116,7 +116,7 @@ def largest_count(dtype: object) -> int:
     return round(2 / float(jnp.finfo(dtype).eps))
 
 
-def planned(
+def make_plan(
     machine: AbstractMachine, start: State, cycles: int | Int[Array, ""], options: RunOptions
 ) -> tuple[Plan, State]:
     """Check the arguments of `simulate`. Returns the plan of the loop, and the start as a state of
@@ -131,7 +131,7 @@ def planned(
     if options.clock is not None:
         machine = in_clock(machine, options.clock)
     require_session("machine", machine)
-    own, start = modes_of(start), convert_start(machine, without_modes(start))
+    modes, start = modes_of(start), convert_start(machine, without_modes(start))
     start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)
@@ -159,7 +159,7 @@ def planned(
         )
     dtype = machine.position(start).dtype
     options.check_limits(dtype)
-    most, rests = options.max_steps, options.rests
+    max_steps, rests = options.max_steps, options.rests
     plan = Plan(
         machine=machine,
         method=method,
@@ -171,29 +171,29 @@ def planned(
         averages=averages,
         rests=(may_rest(machine) if rests is None else rests) and bool(stops_of(machine)),
         backend=lanes.current_backend(),
-        settle=_countable(cycles, options.settle, parts, dtype),
-        max_steps=jnp.asarray(jnp.inf if most is None else most, dtype),
+        settle=_checked_settle(cycles, options.settle, parts, dtype),
+        max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
         max_impacts=jnp.asarray(options.max_impacts, dtype),
         begin=_clock_reading(options.begin, dtype),
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
-        start_modes=_own_modes(machine, start, own, dtype),
+        start_modes=_own_modes(machine, start, modes, dtype),
     )
     return plan, start
 
 
-def _own_modes(machine: AbstractMachine, start: State, own: Any, dtype: Any) -> Any:
+def _own_modes(machine: AbstractMachine, start: State, modes: Any, dtype: Any) -> Any:
     """Return the machine's own modes of a start as arrays; `None` if it does not contain them.
     **Raises:** `ValueError` unless there are as many as the machine has."""
-    if own is None:
+    if modes is None:
         return None
     wanted = jax.eval_shape(lambda x: modes_at_start(machine, jnp.zeros((), dtype), x), start)
-    if len(own) != len(wanted) or any(jnp.shape(mode) for mode in own):
+    if len(modes) != len(wanted) or any(jnp.shape(mode) for mode in modes):
         raise ValueError(
             f"Argument `start` must have {len(wanted)} modes, one number each, as many as a "
-            f"{type(machine).__name__} has, but has {tuple(own)}."
+            f"{type(machine).__name__} has, but has {tuple(modes)}."
         )
-    return tuple(jnp.asarray(mode, dtype) for mode in own)
+    return tuple(jnp.asarray(mode, dtype) for mode in modes)
 
 
 def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
@@ -207,7 +207,7 @@ def machine_of(machine: Machine) -> AbstractMachine:
     return jtu.tree_map(strongly_typed, machine)
 
 
-def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
+def _checked_settle(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
     """Return `settle` as an array. It is NaN, with which no lane starts, if it is traced and no
     valid number of cycles. **Raises:** `ValueError` if it is known and too large."""
     most = largest_count(dtype) // parts
@@ -219,8 +219,8 @@ def _countable(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Array:
             )
         return jnp.asarray(settle, dtype)
     settle = jnp.asarray(settle)
-    counts = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
-    return jnp.where(counts, settle.astype(dtype), jnp.nan)
+    is_valid = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
+    return jnp.where(is_valid, settle.astype(dtype), jnp.nan)
 
 
 def as_floats(machine: AbstractMachine, state: State) -> State:

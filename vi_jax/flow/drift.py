@@ -26,23 +26,23 @@ from .events import rates
 from .smooth import SmoothMachine, holding, rate_of_integrals
 
 
-def _numbers(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
+def _nonzero_tangents(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
     """Return which leaves have a tangent, and those tangents."""
     slopes = jtu.tree_leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
     moves = tuple(not isinstance(x, SymbolicZero) for x in slopes)
     return moves, [x for x, m in zip(slopes, moves, strict=True) if m]
 
 
-def _along(function: Callable, at: tuple, moves: tuple[bool, ...], slopes: list) -> tuple[Any, Any]:
+def _jvp(function: Callable, at: tuple, moves: tuple[bool, ...], slopes: list) -> tuple[Any, Any]:
     """Return value and derivative of a function of trees, along those of their leaves that move."""
     leaves, tree = jtu.tree_flatten(at)
 
-    def of_moving(*changing):
-        given = iter(changing)
-        both = [next(given) if m else x for x, m in zip(leaves, moves, strict=True)]
-        return function(*jtu.tree_unflatten(tree, both))
+    def of_changing(*changing):
+        values = iter(changing)
+        all_leaves = [next(values) if m else x for x, m in zip(leaves, moves, strict=True)]
+        return function(*jtu.tree_unflatten(tree, all_leaves))
 
-    return jax.jvp(of_moving, [x for x, m in zip(leaves, moves, strict=True) if m], slopes)
+    return jax.jvp(of_changing, [x for x, m in zip(leaves, moves, strict=True) if m], slopes)
 
 
 def _with_zeros(tangents: Any) -> Any:
@@ -54,7 +54,7 @@ def _with_zeros(tangents: Any) -> Any:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
+def extrapolate(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) -> Any:
     """Return `moving` after a further `offset` of s. The value is of first order, which is accurate
     enough for an offset of 1e-9; the derivatives are those of the exact flow."""
     return jtu.tree_map(lambda x, dx: x + offset * dx, moving, rate(moving, fixed, rest))
@@ -64,34 +64,34 @@ def drifted(rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any) 
 def with_flow_derivatives(
     rate: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
 ) -> Any:
-    """Return `drifted` for an offset that is zero in value, but has derivatives: `moving` itself,
-    with those of the flow."""
+    """Return `moving` itself, with the derivatives of `extrapolate` for an offset that is zero in
+    value but has derivatives."""
     return moving
 
 
-def _carried_jvp(carried, rate, primals, tangents):
+def _flow_jvp(flow, rate, primals, tangents):
     offset, moving, fixed, rest = primals
-    there = carried(rate, offset, moving, fixed, rest)
+    end = flow(rate, offset, moving, fixed, rest)
     slope = _with_zeros(tangents[1])
-    moves, numbers = _numbers(tangents[2])
-    if any(moves) or any(_numbers(tangents[1])[0]):
+    moves, tangents_of_fixed = _nonzero_tangents(tangents[2])
+    if any(moves) or any(_nonzero_tangents(tangents[1])[0]):
         # The same flow carries the derivative with respect to the start.
         all_move = (True,) * len(jtu.tree_leaves(moving)) + moves
 
         def both(pair, fixed_pair, rest):
             slopes = [*jtu.tree_leaves(pair[1]), *fixed_pair[1]]
             at = pair[0], fixed_pair[0]
-            return _along(lambda x, p: rate(x, p, rest), at, all_move, slopes)
+            return _jvp(lambda x, p: rate(x, p, rest), at, all_move, slopes)
 
-        slope = carried(both, offset, (moving, slope), (fixed, numbers), rest)[1]
+        slope = flow(both, offset, (moving, slope), (fixed, tangents_of_fixed), rest)[1]
     if not isinstance(tangents[0], SymbolicZero):
-        onward = rate(there, fixed, rest)
-        slope = jtu.tree_map(lambda dx, v: dx + tangents[0] * v, slope, onward)
-    return there, slope
+        rate_at_end = rate(end, fixed, rest)
+        slope = jtu.tree_map(lambda dx, v: dx + tangents[0] * v, slope, rate_at_end)
+    return end, slope
 
 
-drifted.defjvp(partial(_carried_jvp, drifted), symbolic_zeros=True)
-with_flow_derivatives.defjvp(partial(_carried_jvp, with_flow_derivatives), symbolic_zeros=True)
+extrapolate.defjvp(partial(_flow_jvp, extrapolate), symbolic_zeros=True)
+with_flow_derivatives.defjvp(partial(_flow_jvp, with_flow_derivatives), symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -103,30 +103,30 @@ def event_offset(
     return offset
 
 
-def _met_after_jvp(rate, guard, primals, tangents):
+def _event_offset_jvp(rate, guard, primals, tangents):
     _, moving, fixed, rest = primals
     offset = event_offset(rate, guard, *primals)
-    moves, numbers = _numbers(tangents[1:3])
+    moves, slopes = _nonzero_tangents(tangents[1:3])
     if not any(moves):
         return offset, jnp.zeros_like(offset)
 
-    def left(moving, fixed):
-        return guard(drifted(rate, offset, moving, fixed, rest), fixed, rest)
+    def guard_at_end(moving, fixed):
+        return guard(extrapolate(rate, offset, moving, fixed, rest), fixed, rest)
 
-    change = _along(left, (moving, fixed), moves, numbers)[1]
-    there = drifted(rate, offset, moving, fixed, rest)
-    onward = rate(there, fixed, rest)
-    speed = jax.jvp(lambda x: guard(x, fixed, rest), (there,), (onward,))[1]
+    change = _jvp(guard_at_end, (moving, fixed), moves, slopes)[1]
+    end = extrapolate(rate, offset, moving, fixed, rest)
+    rate_at_end = rate(end, fixed, rest)
+    speed = jax.jvp(lambda x: guard(x, fixed, rest), (end,), (rate_at_end,))[1]
     return offset, -change / jnp.where(speed == 0, 1.0, speed)
 
 
-event_offset.defjvp(_met_after_jvp, symbolic_zeros=True)
+event_offset.defjvp(_event_offset_jvp, symbolic_zeros=True)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def height_of_turn(
     rate: Callable,
-    place: Callable,
+    position: Callable,
     height: Scalar,
     turns: Flag,
     offset: Scalar,
@@ -134,32 +134,32 @@ def height_of_turn(
     fixed: Any,
     rest: Any,
 ) -> Scalar:
-    """Return `height`, the height of a turning point of `place`, which is a function like the rate.
+    """Return `height`, the height of a turning point of `position`, a function like the rate.
     If the motion `turns` after a further `offset` of s, its derivatives are those of the turning
     point; else those of the position in `moving`."""
     return height
 
 
-def _height_of_turn_jvp(rate, place, primals, tangents):
+def _height_of_turn_jvp(rate, position, primals, tangents):
     _, turns, offset, moving, fixed, rest = primals
-    height = height_of_turn(rate, place, *primals)
-    moves, numbers = _numbers(tangents[3:5])
+    height = height_of_turn(rate, position, *primals)
+    moves, slopes = _nonzero_tangents(tangents[3:5])
     if not any(moves):
         return height, jnp.zeros_like(height)
 
     def speed(moving, fixed, rest):
-        onward = rate(moving, fixed, rest)
-        return jax.jvp(lambda x: place(x, fixed, rest), (moving,), (onward,))[1]
+        flow = rate(moving, fixed, rest)
+        return jax.jvp(lambda x: position(x, fixed, rest), (moving,), (flow,))[1]
 
-    def top(moving, fixed):
-        there = event_offset(rate, speed, offset, moving, fixed, rest)
-        return place(drifted(rate, there, moving, fixed, rest), fixed, rest)
+    def height_at_turn(moving, fixed):
+        to_turn = event_offset(rate, speed, offset, moving, fixed, rest)
+        return position(extrapolate(rate, to_turn, moving, fixed, rest), fixed, rest)
 
     def slope_of(function: Callable) -> Scalar:
-        return _along(function, (moving, fixed), moves, numbers)[1]
+        return _jvp(function, (moving, fixed), moves, slopes)[1]
 
-    here = slope_of(lambda x, p: place(x, p, rest))
-    return height, jax.lax.cond(turns, lambda _: slope_of(top), lambda x: x, here)
+    slope_here = slope_of(lambda x, p: position(x, p, rest))
+    return height, jax.lax.cond(turns, lambda _: slope_of(height_at_turn), lambda x: x, slope_here)
 
 
 height_of_turn.defjvp(_height_of_turn_jvp, symbolic_zeros=True)
@@ -182,32 +182,32 @@ class FlowToEvent:
         self._fixed, others = eqx.partition((smooth, plan.end(part)), eqx.is_inexact_array)
         self._rest, self._static = eqx.partition(others, eqx.is_array)
         # Numbers that the functions close over, which may have a derivative too.
-        self._around: list[Any] = []
+        self._captured: list[Any] = []
         self._pure_rate = self._pure(self._rate)
 
-    def drifted(self, offset: Scalar, moving: tuple | None = None) -> Any:
+    def extrapolate(self, offset: Scalar, moving: tuple | None = None) -> Any:
         """Return s, state and integrals after a further `offset`, by default from the start."""
-        return drifted(self._pure_rate, offset, *self._given(moving))
+        return extrapolate(self._pure_rate, offset, *self._arguments(moving))
 
     def with_flow_derivatives(self, offset: Scalar) -> Any:
         """Return the same for an offset that is zero in value, but has derivatives."""
-        return with_flow_derivatives(self._pure_rate, offset, *self._given())
+        return with_flow_derivatives(self._pure_rate, offset, *self._arguments())
 
     def event_offset(self, guard: Callable, offset: Scalar) -> Scalar:
         """Return `offset`, to the zero of a guard or a force, with its derivatives."""
         guard = self._pure(guard)
-        return event_offset(self._pure_rate, guard, offset, *self._given())
+        return event_offset(self._pure_rate, guard, offset, *self._arguments())
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
         """Return the `height` of coordinate number k with derivatives (`drift.height_of_turn`)."""
-        place = self._pure(self._position_of(k))
-        return height_of_turn(self._pure_rate, place, height, turns, offset, *self._given())
+        position = self._pure(self._position_of(k))
+        return height_of_turn(self._pure_rate, position, height, turns, offset, *self._arguments())
 
     def guard(self, number: int) -> Callable:
         """Return the guard of the machine's event of this number, as a function of the motion."""
 
         def event(moving, fixed, rest):
-            (smooth, bound), (s, state, _) = self._whole(fixed, rest), moving
+            (smooth, bound), (s, state, _) = self._combined(fixed, rest), moving
             machine = smooth.machine
             clocked = clock_of(machine, state) is not None
             if clocked and number == section_number(machine):
@@ -217,37 +217,37 @@ class FlowToEvent:
         return event
 
     def _position_of(self, k: int) -> Callable:
-        def coordinate(moving, fixed, rest):
-            smooth, _ = self._whole(fixed, rest)
+        def position(moving, fixed, rest):
+            smooth, _ = self._combined(fixed, rest)
             return smooth.machine.coordinates[k].position(moving[1])
 
-        return coordinate
+        return position
 
     def force(self, k: int) -> Callable:
         """Return the acceleration that coordinate number k would have if it were free; the body is
         released when that changes sign."""
 
         def acceleration(moving, fixed, rest):
-            (smooth, _), (s, state, _) = self._whole(fixed, rest), moving
+            (smooth, _), (s, state, _) = self._combined(fixed, rest), moving
             free = holding(smooth.machine, smooth.modes, smooth.contact, but=k)
             return rates(free.field, smooth.machine.coordinates[k].position, s, state).a
 
         return acceleration
 
     def _rate(self, moving, fixed, rest):
-        (smooth, _), (s, state, time) = self._whole(fixed, rest), moving
+        (smooth, _), (s, state, time) = self._combined(fixed, rest), moving
         return jnp.ones_like(s), smooth.field(s, state), rate_of_integrals(smooth, s, state, time)
 
-    def _given(self, moving: tuple | None = None) -> tuple[Any, Any, Any]:
+    def _arguments(self, moving: tuple | None = None) -> tuple[Any, Any, Any]:
         begin = self._moving if moving is None else moving
-        return begin, (self._fixed, tuple(self._around)), self._rest
+        return begin, (self._fixed, tuple(self._captured)), self._rest
 
-    def _whole(self, fixed: object, rest: object) -> Any:
+    def _combined(self, fixed: object, rest: object) -> Any:
         return eqx.combine(fixed, rest, self._static)
 
     def _pure(self, function: Callable) -> Callable:
         # A machine's functions may close over numbers.
-        written, found = jax.closure_convert(function, self._moving, self._fixed, self._rest)
-        here = slice(len(self._around), len(self._around) + len(found))
-        self._around.extend(found)
-        return lambda moving, fixed, rest: written(moving, fixed[0], rest, *fixed[1][here])
+        pure, captured = jax.closure_convert(function, self._moving, self._fixed, self._rest)
+        place = slice(len(self._captured), len(self._captured) + len(captured))
+        self._captured.extend(captured)
+        return lambda moving, fixed, rest: pure(moving, fixed[0], rest, *fixed[1][place])

@@ -110,8 +110,8 @@ def rising_root(c: Scalars, *, iterations: int = 3) -> Scalar:
     floor = jnp.maximum(c[0], 0.0)
     for _ in range(iterations):
         value, rate = horner(c, theta), horner(derivative, theta)
-        left = (value < 0) | ((rate <= 0) & (value <= floor))
-        low, high = jnp.where(left, theta, low), jnp.where(left, high, theta)
+        is_left = (value < 0) | ((rate <= 0) & (value <= floor))
+        low, high = jnp.where(is_left, theta, low), jnp.where(is_left, high, theta)
         newton = theta - value / jnp.where(rate > 0, rate, 1.0)
         inside = (rate > 0) & (newton >= low) & (newton <= high)
         theta = jnp.where(inside, newton, 0.5 * (low + high))
@@ -131,14 +131,14 @@ def landing(gap: Rates) -> tuple[Scalar, Scalar]:
     return jnp.where(real, delta, jnp.inf), square
 
 
-def to_turn(end: Rates) -> Scalar:
+def offset_to_turn(end: Rates) -> Scalar:
     """Return the offset from a step's end to the turning point near it."""
     bend = jax.lax.stop_gradient(end.a)
     return -jax.lax.stop_gradient(end.v) / jnp.where(bend == 0, 1.0, bend)
 
 
 def turns_within(length: Scalar, end: Rates) -> Flag:
-    """Return whether |`to_turn`| ≤ `length`, without a division, since each step calls it."""
+    """Return whether |`offset_to_turn`| ≤ `length`, without a division: each step calls it."""
     bend = jax.lax.stop_gradient(end.a)
     return jnp.abs(jax.lax.stop_gradient(end.v)) <= length * jnp.where(
         bend == 0, 1.0, jnp.abs(bend)

@@ -24,7 +24,7 @@ from ...machine import (
     switches_of,
 )
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
-from ..events import Rates, highest, quintic, rising_root, slope, to_turn
+from ..events import Rates, highest, offset_to_turn, quintic, rising_root, slope
 from ..methods import Foreseen
 from ..smooth import exact
 from .guards import Crossing, Side, at_stops, beyond, for_each, may_be_above
@@ -560,7 +560,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             # moves is rounding, as between bodies that move together.
             now = 4 * eps * (plan.unit + stop_gradient(trial.s))
             moves = jnp.abs(end.v) * h > eps * (plan.extent(k) + jnp.abs(end.x))
-            turned = turned & (jnp.abs(to_turn(end)) > now) & moves
+            turned = turned & (jnp.abs(offset_to_turn(end)) > now) & moves
         courses.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
@@ -574,7 +574,7 @@ def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
     """Return the goal with lengths by Newton's method, which is better close to an event."""
     turns, h = goal.before, trial.h
     for k, path in enumerate(trial.paths):
-        shift, turn = to_turn(path.end), to_turn_of(k)
+        shift, turn = offset_to_turn(path.end), to_turn_of(k)
         again = turns & (goal.target == turn) & (lane.target == turn) & (jnp.abs(shift) < 0.25 * h)
         goal = goal._replace(length=jnp.where(again, h + shift, goal.length))
     for c in reversed(trial.crossings):  # of several the first listed

@@ -27,7 +27,7 @@ from ...machine import (
 )
 from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
-from ..events import Rates, guard_rates, rates, to_turn
+from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
 from ..smooth import exact, holding, in_modes, limited_of
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
@@ -367,7 +367,7 @@ def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
         offset = jnp.zeros_like(lane.s)
         for c in trial.crossings:
             offset = jnp.where(c.landed, _offset(at, c), offset)
-        _, at_event, passed = flow.drifted(offset)
+        _, at_event, passed = flow.extrapolate(offset)
         met = any_of(at.taken, landed.values())
         integrals = select(met, passed, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
@@ -456,7 +456,7 @@ def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
     free, offset = leaves.landed, stop_gradient(leaves.offset)
     offset = flow.event_offset(flow.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
-    _, state, integrals = flow.drifted(offset, moving)
+    _, state, integrals = flow.extrapolate(offset, moving)
     if not exact(plan.machine, state):
         state = select(contact[k] > 0, on_its_stops(plan, lane._replace(state=state)), state)
     direction = jnp.where(free, -at.old.direction[k], lane.direction[k])
@@ -562,4 +562,4 @@ def _top(trial: Trial, k: int, flow: FlowToEvent) -> Scalar:
     end: Rates = stop_gradient(path.end)
     bend = jnp.where(end.a == 0, 1.0, end.a)
     height = end.x - jnp.where(path.at_turn, 0.5 * end.v**2 / bend, 0.0)
-    return flow.height_of_turn(k, height, path.at_turn, to_turn(end))
+    return flow.height_of_turn(k, height, path.at_turn, offset_to_turn(end))

@@ -498,7 +498,7 @@ def leniency(plan: Plan, lane: Lane) -> Scalar:
 
 def landing_tolerance(x: Scalar) -> float:
     """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. State
-    and derivatives are carried over it to first order (`drift.drifted`): errors are of order δ²."""
+    and derivatives are extrapolated to first order (`drift.extrapolate`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 

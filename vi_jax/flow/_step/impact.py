@@ -471,7 +471,7 @@ def _held(
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
     resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
-    later, still, passed = flow.drifted(pin(wait))
+    later, still, passed = flow.extrapolate(pin(wait))
     if len(rests) > 1:  # another body may reach this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}
