@@ -29,7 +29,7 @@ from ..machine import (
 )
 from .methods import AbstractMethod
 from .results import EventKind, code
-from .smooth import TIME, Integrals, rounding, unit_of
+from .smooth import TIME, Integrals, rounding_bounds, unit_of
 
 # Targets of the next step, as numbers, which the loop carries: none, or one of the following.
 FREE = 0.0
@@ -253,16 +253,16 @@ class Plan(eqx.Module):
         in_mode_zero = lane.modes[mode_number(self.machine, number)] == 0
         return jnp.where(in_mode_zero, extent[1], extent[0])
 
-    def rounding(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
+    def rounding_bounds(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""
-        return rounding(self.machine, k, state, self.extent(k), self.unit)
+        return rounding_bounds(self.machine, k, state, self.extent(k), self.unit)
 
     def beyond_a_stop(self, state: State) -> Flag:
         """Return whether a coordinate is beyond one of its stops by more than rounding."""
         beyond = jnp.zeros((), bool)
         for stop in stops_of(self.machine):
             position = self.machine.coordinates[stop.coordinate].position(state)
-            slack, _ = self.rounding(stop.coordinate, state)
+            slack, _ = self.rounding_bounds(stop.coordinate, state)
             beyond = beyond | (stop_gradient(stop.beyond(position)) > slack)
         return beyond
 

@@ -50,7 +50,7 @@ from ._lane import Plan
 from ._own import average_names, check_parts, quantity_names
 from ._own import check_values as check_values
 from .methods import AbstractMethod, MethodLike, chosen
-from .smooth import rounding
+from .smooth import rounding_bounds
 
 _TRACED = ["settle", "method", "begin", "until", "stop"]
 _STATIC = [
@@ -339,7 +339,7 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         if Y is None or gap is None:
             continue
         depth = np.max(stop.sign * Y - gap)
-        slack = concrete(rounding(machine, stop.coordinate, start)[0]) if depth > 0 else None
+        slack = concrete(rounding_bounds(machine, stop.coordinate, start)[0]) if depth > 0 else None
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "

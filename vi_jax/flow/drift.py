@@ -23,7 +23,7 @@ from .._types import Flag, Scalar
 from ..machine import clock_of, guard_of, section_number
 from ._lane import Plan
 from .events import rates
-from .smooth import SmoothMachine, holding, rate_of_integrals
+from .smooth import SmoothMachine, hold_contacts, rate_of_integrals
 
 
 def _nonzero_tangents(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
@@ -229,7 +229,7 @@ class FlowToEvent:
 
         def acceleration(moving, fixed, rest):
             (smooth, _), (s, state, _) = self._combined(fixed, rest), moving
-            free = holding(smooth.machine, smooth.modes, smooth.contact, but=k)
+            free = hold_contacts(smooth.machine, smooth.modes, smooth.contact, but=k)
             return rates(free.field, smooth.machine.coordinates[k].position, s, state).a
 
         return acceleration

@@ -46,14 +46,14 @@ from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
-from .smooth import exact, holding, in_modes, limited_of
+from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
 
 # A number of the state smaller than this share of what the other numbers make of it has still to
 # grow. Rates are evaluated at this many instants of a cycle. Choices.
 _GROWS, _INSTANTS = 1e-3, 7
 
 # A number of this size or smaller counts as zero: it is rounding of numbers about 1. A choice.
-_REST = 1e-15
+_ZERO = 1e-15
 
 
 def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
@@ -67,7 +67,7 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
     if scales_known(machine):
         return None
     known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
-    return stop_gradient(jtu.tree_map(_or_one, known))
+    return stop_gradient(jtu.tree_map(_known_or_one, known))
 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
@@ -89,7 +89,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     if rows is not None:
         rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
         sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
-    return stop_gradient(jnp.where(angles | ~(sizes > _REST), 1.0, sizes))
+    return stop_gradient(jnp.where(angles | ~(sizes > _ZERO), 1.0, sizes))
 
 
 _compiled_sizes = compiled(row_sizes)
@@ -111,8 +111,8 @@ def _known_sizes(
     slips = (jnp.where(x == 0, 1.0, x) if y else x for x, y in zip(modes, sticks, strict=False))
     smooth = in_modes(machine, tuple(slips))
     s, start = stop_gradient((s, start))
-    limit = 5 * jnp.asarray(machine.step_limit(s, start)) / (2 * pi)
-    unit = stop_gradient(jnp.minimum(jnp.asarray(machine.cycle) / (2 * pi), limit))
+    longest = 5 * jnp.asarray(machine.step_limit(s, start)) / (2 * pi)
+    unit = stop_gradient(jnp.minimum(jnp.asarray(machine.cycle) / (2 * pi), longest))
     instants = s + jnp.asarray(machine.cycle) * np.arange(_INSTANTS) / _INSTANTS
     rates = jax.vmap(smooth.field, (0, None))(instants, start)
     sizes = jtu.tree_map(
@@ -120,16 +120,16 @@ def _known_sizes(
     )
     # Different factors prevent a force that acts on a difference from cancelling.
     leaves, tree = jtu.tree_flatten(sizes)
-    draw = np.random.default_rng(0)
-    signs = [draw.choice([-1, 1], x.shape) * draw.uniform(0.7, 1.0, x.shape) for x in leaves]
-    along = tree.unflatten([x * sign for x, sign in zip(leaves, signs, strict=True)])
-    moved = jax.jvp(lambda x: smooth.field(s, x), (start,), (along,))[1]
+    rng = np.random.default_rng(0)
+    signs = [rng.choice([-1, 1], x.shape) * rng.uniform(0.7, 1.0, x.shape) for x in leaves]
+    direction = tree.unflatten([x * sign for x, sign in zip(leaves, signs, strict=True)])
+    change_of_rate = jax.jvp(lambda x: smooth.field(s, x), (start,), (direction,))[1]
 
     def size(x: Scalar, change: Scalar) -> Scalar:
         change = unit * jnp.abs(change)
         return jnp.where(x > _GROWS * change, x, change)
 
-    return jtu.tree_map(size, sizes, moved)
+    return jtu.tree_map(size, sizes, change_of_rate)
 
 
 def extents_of(
@@ -146,36 +146,36 @@ def extents_of(
             return jnp.asarray(guard_of(machine, number, s, x, modes, contact), s.dtype)
 
         value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
-        own = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        return _or_one(jnp.maximum(own, size_of(lambda x: guard(s, x), start, sizes)))
+        size = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
+        return _known_or_one(jnp.maximum(size, size_of(lambda x: guard(s, x), start, sizes)))
 
-    places = (size_of(x.position, start, sizes) for x in machine.coordinates)
-    found: list[Any] = [_small(_or_one(size)) for size in places]
+    of_coordinates = (size_of(x.position, start, sizes) for x in machine.coordinates)
+    extents: list[Any] = [_at_most_one(_known_or_one(size)) for size in of_coordinates]
     for number in plan.others(start):
         event, rest = events_of(machine)[number], contact
         if not event.holds_mode:
-            found.append(of_guard(number, modes, rest))
+            extents.append(of_guard(number, modes, rest))
             continue
         if contact and isinstance(event, ContactFriction):  # it holds a resting body
             k = stops_of(machine)[event.stop].coordinate
             rest = (*contact[:k], jnp.full_like(s, to_event(event.stop)), *contact[k + 1 :])
-        own = mode_number(machine, number)
-        each = ((*modes[:own], jnp.full_like(s, x), *modes[own + 1 :]) for x in (1.0, 0.0))
-        found.append(tuple(of_guard(number, x, rest) for x in each))
-    return stop_gradient(tuple(found))
+        mode = mode_number(machine, number)
+        both_modes = ((*modes[:mode], jnp.full_like(s, x), *modes[mode + 1 :]) for x in (1.0, 0.0))
+        extents.append(tuple(of_guard(number, x, rest) for x in both_modes))
+    return stop_gradient(tuple(extents))
 
 
-def _or_one(size: Array) -> Array:
+def _known_or_one(size: Array) -> Array:
     """Return a size; 1 if it is 0 or NaN, which is unknown."""
     return jnp.where(size > 0, size, 1.0)
 
 
-def _small(size: Array) -> Array:
+def _at_most_one(size: Array) -> Array:
     """Return a size; 1 if it is larger, since the motion may become smaller."""
     return jnp.minimum(size, 1.0)
 
 
-def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
+def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     """Return the lane at the first step of its loop, in the state `start`. A lane that cannot be
     simulated, or is not `wanted`, has ended already."""
     machine = plan.machine
@@ -190,24 +190,24 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
-    here = [rates(free.field, x.position, s, start) for x in machine.coordinates]
+    current = [rates(free.field, x.position, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.
-    direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in here)
+    direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in current)
     contact = None
     if plan.rests:
-        growth = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
-        contact = _contacts_at(plan, start, here, growth)
+        jerks = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
+        contact = _contacts_at(plan, start, current, jerks)
         if len(limited_of(machine)) > 1:
             contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
-            jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), along)
-            for x, j, along in zip(here, growth, direction, strict=True)
+            jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
+            for x, j, sign in zip(current, jerks, direction, strict=True)
         )
         for i, stop in enumerate(stops_of(machine)):
             # From slightly off the stop it would come to rest there too: no derivatives.
-            at = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
+            on_stop = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
             rests = contact[stop.coordinate] == to_event(i)
-            start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), at, start)
+            start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
@@ -235,12 +235,12 @@ def launched(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     )
 
 
-def _contacts_at(plan: Plan, start: State, here: list[Rates], growth: list[Scalar]) -> Scalars:
+def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]) -> Scalars:
     """Return the stops on which the coordinates rest, by their rates and those of the forces."""
     found = []
-    for k, (body, rate) in enumerate(zip(here, growth, strict=True)):
-        slack, slow = plan.rounding(k, start)
-        if not exact(plan.machine, start):
+    for k, (body, rate) in enumerate(zip(current, jerks, strict=True)):
+        slack, slow = plan.rounding_bounds(k, start)
+        if not stops_are_exact(plan.machine, start):
             # A resting body gathers the rounding of the force on it: a woodpecker 0.03 of this.
             share = 4 * float(jnp.finfo(body.x.dtype).eps)
             slow = jnp.maximum(slow, share * plan.machine.cycle * jnp.abs(body.a))
@@ -255,33 +255,33 @@ def _pressed_together(
     that would fall faster than it."""
     bodies = plan.machine.coordinates
 
-    def again(contact: Scalars, _: None) -> tuple[Scalars, None]:
-        held = stop_gradient(holding(plan.machine, modes, contact))
-        here = [rates(held.field, x.position, s, start) for x in bodies]
-        growth = [force_rate(held, x.position, held, s, start) for x in bodies]
-        more = _contacts_at(plan, start, here, growth)
+    def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
+        held = stop_gradient(hold_contacts(plan.machine, modes, contact))
+        current = [rates(held.field, x.position, s, start) for x in bodies]
+        jerks = [force_rate(held, x.position, held, s, start) for x in bodies]
+        more = _contacts_at(plan, start, current, jerks)
         return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
 
-    return jax.lax.scan(again, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
+    return jax.lax.scan(add_contacts, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
 
 
 def _rests_on(
-    plan: Plan, k: int, here: Rates, growth: Scalar, slack: Scalar | float, slow: Scalar | float
+    plan: Plan, k: int, current: Rates, jerk: Scalar, slack: Scalar | float, slow: Scalar | float
 ) -> Scalar:
     """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
     about to be by a force that grows. Its position is known to within `slack`, its velocity to
     `slow`, and both to the rounding of a search that ends there."""
-    contact, least = jnp.zeros_like(here.x), 4 * jnp.finfo(here.x.dtype).eps * plan.extent(k)
+    contact, least = jnp.zeros_like(current.x), 4 * jnp.finfo(current.x.dtype).eps * plan.extent(k)
     slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
     for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
-            pressed = (stop.sign * here.a > 0) | (here.a == 0) & (stop.sign * growth > 0)
-            rests = (stop.beyond(here.x) >= -slack) & (jnp.abs(here.v) <= slow) & pressed
+            pressed = (stop.sign * current.a > 0) | (current.a == 0) & (stop.sign * jerk > 0)
+            rests = (stop.beyond(current.x) >= -slack) & (jnp.abs(current.v) <= slow) & pressed
             contact = jnp.where(rests, to_event(i), contact)
     return contact
 
 
-def _active(plan: Plan, lane: Lane) -> Flag:
+def _is_active(plan: Plan, lane: Lane) -> Flag:
     return (jax.lax.stop_gradient(lane.done) < plan.intervals) & (
         jax.lax.stop_gradient(lane.fault) == 0
     )
@@ -309,8 +309,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     record. The states are `HybridState`s if the machine has its own modes.
     """
     form = prepared(plan.machine)
-    own = form.machine is plan.machine
-    if not own:
+    is_unchanged = form.machine is plan.machine
+    if not is_unchanged:
         if plan.noise is not None:
             plan = dataclasses.replace(plan, noise=in_modes_of(form, plan.noise, start))
         # The condition that ends a lane early is a function of the machine's own state.
@@ -325,7 +325,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     sizes = sizes_of(plan.machine, s, start, modes)
     if sizes is not None:
         extents = extents_of(plan, s, start, modes, sizes)
-        sizes = jtu.tree_map(_small, sizes)
+        sizes = jtu.tree_map(_at_most_one, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
     numbers, rest = eqx.partition(plan, eqx.is_array)
@@ -334,7 +334,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         (numbers, start, jnp.asarray(wanted)), rows=plan.recorded_intervals + 1,
         backend=plan.backend,
     )  # fmt: skip
-    if not own:
+    if not is_unchanged:
         states = replaced(states, jax.vmap(form.outward)(without_modes(states)))
         if ends.at is not None:
             ends = ends._replace(at=(*ends.at[:2], form.outward(ends.at[2])))
@@ -344,22 +344,22 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
 def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
-    lane = launched(plan, start, wanted)
-    first, here = plan.settle <= 0, plan.recorded_state(start, lane.modes)
-    return lane, lanes.Emitted(_active(plan, lane), first, (here, plan.empty_record(start)))
+    lane = initial_lane(plan, start, wanted)
+    first, state = plan.settle <= 0, plan.recorded_state(start, lane.modes)
+    return lane, lanes.Emitted(_is_active(plan, lane), first, (state, plan.empty_record(start)))
 
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
     plan = eqx.combine(inputs[0], rest)
     lane, completed, record = iterate(plan, lane)
-    complete = completed & (lane.done >= plan.settle)
-    active = _active(plan, lane)
+    is_recorded = completed & (lane.done >= plan.settle)
+    active = _is_active(plan, lane)
     if plan.stop is not None:
         first = lane.done <= plan.settle
-        left = plan.stop(plan.machine, lane.state, record, first)
-        active = active if left is None else active & ~(complete & left)
-    here = plan.recorded_state(lane.state, lane.modes)
-    return lane, lanes.Emitted(active, complete, (here, record))
+        should_stop = plan.stop(plan.machine, lane.state, record, first)
+        active = active if should_stop is None else active & ~(is_recorded & should_stop)
+    state = plan.recorded_state(lane.state, lane.modes)
+    return lane, lanes.Emitted(active, is_recorded, (state, record))
 
 
 def _end(rest: Plan, inputs: _Inputs, lane: Lane) -> Ends:

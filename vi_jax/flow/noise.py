@@ -38,9 +38,9 @@ def threefry(key: Array, first: Array, second: Array) -> tuple[Array, Array]:
     keys = key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY)
     x, y = first + keys[0], second + keys[1]
     for group in range(5):
-        for by in _ROTATIONS[group % 2]:
+        for n in _ROTATIONS[group % 2]:
             x = x + y
-            y = x ^ (shift_left(y, jnp.uint32(by)) | shift_right_logical(y, jnp.uint32(32 - by)))
+            y = x ^ (shift_left(y, jnp.uint32(n)) | shift_right_logical(y, jnp.uint32(32 - n)))
         x = x + keys[(group + 1) % 3]
         y = y + keys[(group + 2) % 3] + jnp.uint32(group + 1)
     return x, y
@@ -147,8 +147,8 @@ def in_modes_of(form: Prepared, noise: Impulses, start: State) -> Impulses:
 
     def matrix(i: int) -> Array:
         """The linear map from array number i of the state to the modes."""
-        put = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
-        return jax.jacfwd(lambda x: jtu.tree_leaves(form.inward(put(x)))[i])(leaves[i])
+        with_leaf = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
+        return jax.jacfwd(lambda x: jtu.tree_leaves(form.inward(with_leaf(x)))[i])(leaves[i])
 
     modes = [None if x is None else matrix(i) for i, x in enumerate(noise.scales)]
     return dataclasses.replace(noise, modes=tuple(modes))
@@ -170,7 +170,7 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
     for leaf, function in zip(jtu.tree_leaves(start), functions, strict=True):
         if function is not None:
             with explain_errors("A function in argument `noise`"):
-                found = jax.eval_shape(lambda x, f=function: _real(f(x)), start)
+                found = jax.eval_shape(lambda x, f=function: _real_amplitude(f(x)), start)
             if found.shape not in ((), jnp.shape(leaf)):
                 raise ValueError(
                     "Argument `noise` must have functions that return one amplitude, or an array "
@@ -178,7 +178,7 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
                 )
 
 
-def _real(amplitude: Any) -> Array:
+def _real_amplitude(amplitude: Any) -> Array:
     """Return the amplitude from a function. **Raises:** `TypeError` if it is no real number."""
     require_real("noise", "amplitude by a function", amplitude)
     return jnp.asarray(amplitude)
@@ -201,16 +201,16 @@ def _duration(machine: AbstractMachine, start: State) -> Scalar | float | None:
 
 
 def _check_machine(machine: AbstractMachine, start: State) -> None:
-    who = type(machine).__name__
+    name = type(machine).__name__
     if is_autonomous(machine, start):
         raise ValueError(
-            f"Argument `noise` needs a machine whose cycles end with its drive's, but got a {who}. "
-            "Observe it at equal intervals, as `machine.observed_every(interval)`."
+            "Argument `noise` needs a machine whose cycles end with its drive's, but got a "
+            f"{name}. Observe it at equal intervals, as `machine.observed_every(interval)`."
         )
     if others_of(machine):
         raise ValueError(
             "Argument `noise` needs a machine without resets and user-defined events, which its "
-            f"velocities may pass in a jump, but got a {who}."
+            f"velocities may pass in a jump, but got a {name}."
         )
 
 
@@ -234,21 +234,21 @@ def _by_leaf(start: State, noise: WhiteNoise) -> tuple[tuple[Any, ...], tuple[An
                 f"Argument `noise` must have for {name!r} one amplitude, or an array of shape "
                 f"{jnp.shape(leaf)}, but got shape {shape}."
             )
-    given = tuple(amplitudes.get(name) for name in names)
-    return given, tuple(functions.get(name) for name in names)
+    of_leaves = tuple(amplitudes.get(name) for name in names)
+    return of_leaves, tuple(functions.get(name) for name in names)
 
 
 def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple) -> None:
     """**Raises:** `ValueError` if noise changes more of what a stop limits than its velocity."""
     leaves, tree = jtu.tree_flatten(start)
-    along = [
+    direction = [
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
         for x, a in zip(leaves, amplitudes, strict=True)
     ]
     for k in limited_of(machine):
         place = machine.coordinates[k].position
-        moved = concrete(jax.jvp(place, (start,), (tree.unflatten(along),))[1])
-        if moved is not None and np.any(moved):
+        velocity = concrete(jax.jvp(place, (start,), (tree.unflatten(direction),))[1])
+        if velocity is not None and np.any(velocity):
             raise ValueError(
                 "Argument `noise` must change velocities only, but it moves coordinate number "
                 f"{k}, which a stop limits."
@@ -290,7 +290,7 @@ def with_impulse(
     words = cycle.astype(jnp.uint32), instant.astype(jnp.uint32)
     dtype = next(leaf.dtype for leaf, n in zip(leaves, sizes, strict=True) if n)
 
-    def drawn(words: tuple[Array, Array]) -> tuple[Array, ...]:
+    def draw(words: tuple[Array, Array]) -> tuple[Array, ...]:
         numbers: list[Array] = []
         for pair in range((sum(sizes) + 1) // 2):
             # The instant takes 16 bits of the second word, the pair those above.
@@ -298,21 +298,21 @@ def with_impulse(
             numbers += normal_pair(noise.key, words[0], second, dtype)
         return tuple(numbers[: sum(sizes)])
 
-    def none(words: tuple[Array, Array]) -> tuple[Array, ...]:
+    def zeros(words: tuple[Array, Array]) -> tuple[Array, ...]:
         return tuple(jnp.zeros((), dtype) for _ in range(sum(sizes)))
 
-    numbers = list(jax.lax.cond(when, drawn, none, words))
-    root = None
+    numbers = list(jax.lax.cond(when, draw, zeros, words))
+    sqrt_elapsed = None
     if elapsed is not None:
-        root = jnp.sqrt(jnp.where(when & (elapsed > 0), elapsed, 1.0))
+        sqrt_elapsed = jnp.sqrt(jnp.where(when & (elapsed > 0), elapsed, 1.0))
     new = []
     for i, (leaf, scale, n) in enumerate(zip(leaves, noise.scales, sizes, strict=True)):
         if scale is not None and n:
-            mine, numbers = numbers[:n], numbers[n:]
-            here = mine[0] if leaf.ndim == 0 else jnp.stack(mine).reshape(leaf.shape)
+            drawn, numbers = numbers[:n], numbers[n:]
+            normal = drawn[0] if leaf.ndim == 0 else jnp.stack(drawn).reshape(leaf.shape)
             f = noise.functions[i]
             size = scale if f is None else scale * f(state)
-            jump = here * (size if root is None else size * root)
+            jump = normal * (size if sqrt_elapsed is None else size * sqrt_elapsed)
             matrix = noise.modes[i] if noise.modes else None
             jump = jump if matrix is None else matrix @ jump
             leaf = jnp.where(when, leaf + jump, leaf)

@@ -75,7 +75,7 @@ class SmoothMachine(eqx.Module):
         if several or dry:
             flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]
         for k in () if several else limited:  # no rounding if one body rests
-            flow = _held_still(machine.coordinates[k], state, flow, self.contact[k] > 0)
+            flow = _without_motion(machine.coordinates[k], state, flow, self.contact[k] > 0)
         return flow
 
 
@@ -85,16 +85,16 @@ def _traced_once(smooth: SmoothMachine, s: Scalar, state: State) -> State:
     return smooth.held_field(s, state)
 
 
-def _held_still(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
+def _without_motion(coordinate: Coordinate, state: State, flow: State, rests: Flag) -> State:
     """Return the rate of a state along `flow` with this coordinate's position and velocity constant
     if it `rests`: without the part along `push`, else by the derivative of `placed`."""
     if coordinate.push is not None:
-        taken = jnp.where(rests, -velocity_change(coordinate, state, flow), 0.0)
-        return added(flow, (taken,), (push_of(coordinate, state),))
+        amount = jnp.where(rests, -velocity_change(coordinate, state, flow), 0.0)
+        return added(flow, (amount,), (push_of(coordinate, state),))
     place, velocity = coordinate.position(state), coordinate.velocity(state)
     zero = jnp.zeros_like(place)
-    along = (state, place, velocity), (flow, zero, jnp.zeros_like(velocity))
-    still = jax.jvp(coordinate.placed, *along)[1]
+    argument = (state, place, velocity), (flow, zero, jnp.zeros_like(velocity))
+    still = jax.jvp(coordinate.placed, *argument)[1]
     return jtu.tree_map(lambda a, b: jnp.where(rests, a, b), still, flow)
 
 
@@ -103,7 +103,7 @@ def in_modes(machine: AbstractMachine, modes: Scalars) -> SmoothMachine:
     return SmoothMachine(machine, modes, ())
 
 
-def holding(
+def hold_contacts(
     machine: AbstractMachine, modes: Scalars, contact: Scalars | None, but: int | None = None
 ) -> SmoothMachine:
     """Return the machine in these modes, with the bodies held that rest on a stop (see
@@ -114,12 +114,12 @@ def holding(
     return SmoothMachine(machine, modes, tuple(others))
 
 
-def exact(machine: AbstractMachine, state: State) -> bool:
+def stops_are_exact(machine: AbstractMachine, state: State) -> bool:
     """Return whether stops limit only one number of the state itself, so that it can be put on a
     stop without rounding. The result is known at trace time."""
-    place = machine.coordinates[0].position(state)
-    own = any(place is x for x in jtu.tree_leaves(state))
-    return own and len(machine.coordinates) == 1
+    position = machine.coordinates[0].position(state)
+    is_number_of_state = any(position is x for x in jtu.tree_leaves(state))
+    return is_number_of_state and len(machine.coordinates) == 1
 
 
 # Primitives that are linear in all of their operands together, and in each of them.
@@ -134,35 +134,35 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     """Return whether a function of the state is affine with constant factors, so that its value is
     as accurate as the state; found at trace time."""
 
-    def moved(eqn: Any, moves: list[bool]) -> list[bool]:
+    def mark(eqn: Any, depends: list[bool]) -> list[bool]:
         name, body = eqn.primitive.name, called(eqn)
         if body is not None:
-            return propagate_marks(body if isinstance(body, Jaxpr) else body.jaxpr, moves, moved)
-        linear = name in _LINEAR or (name in _BILINEAR and sum(moves) == 1)
-        if not linear and (name != "div" or moves[1]):
-            others.append(name)
+            return propagate_marks(body if isinstance(body, Jaxpr) else body.jaxpr, depends, mark)
+        linear = name in _LINEAR or (name in _BILINEAR and sum(depends) == 1)
+        if not linear and (name != "div" or depends[1]):
+            nonlinear.append(name)
         return [True] * len(eqn.outvars)
 
-    others: list[str] = []
+    nonlinear: list[str] = []
     jaxpr = jax.make_jaxpr(function)(state).jaxpr
-    propagate_marks(jaxpr, [True] * len(jaxpr.invars), moved)
-    return not others
+    propagate_marks(jaxpr, [True] * len(jaxpr.invars), mark)
+    return not nonlinear
 
 
-def rounding(
+def rounding_bounds(
     machine: AbstractMachine, k: int, state: State, least: Scalar | float = 1.0,
     unit: Scalar | float = 1.0,
 ) -> tuple[Scalar | float, Scalar | float]:  # fmt: skip
     """Return bounds of the rounding errors of position and velocity of coordinate number k at its
     stop: 0 if the position is itself a number of the state. A position counts as at least `least`
     large, a velocity as `least / unit`."""
-    if exact(machine, state):
+    if stops_are_exact(machine, state):
         return 0.0, 0.0
     body = machine.coordinates[k]
-    return _rounding(body.position, state, least), _rounding(body.velocity, state, least / unit)
+    return _bound(body.position, state, least), _bound(body.velocity, state, least / unit)
 
 
-def _rounding(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
+def _bound(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
     state = stop_gradient(state)
     slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
     terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)

@@ -26,7 +26,7 @@ from ...machine import (
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
 from ..events import Rates, highest, offset_to_turn, quintic, rising_root, slope
 from ..methods import Foreseen
-from ..smooth import exact
+from ..smooth import stops_are_exact
 from .guards import Crossing, Side, at_stops, beyond, for_each, may_be_above
 from .trial import Path, Trial
 
@@ -405,7 +405,7 @@ def _foreseen(
     machine, courses, ends, paths = plan.machine, [], [], []
     if plan.records_motion or stops_of(machine):
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
-    if not exact(machine, lane.state):
+    if not stops_are_exact(machine, lane.state):
         shortest = 64 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s))
         paths = [path.without_rounding_after_release(shortest) for path in paths]
     for k, path in enumerate(paths):
@@ -544,7 +544,7 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             slack = 0.0 if c.slack is None else c.slack
             sides.append(side._replace(slack=slack))
             below.append((side.end.x <= slack) | c.landed)
-    exactly, twice = exact(plan.machine, lane.state), jnp.zeros_like(good)
+    exactly, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
         if path.pull is not None and path.leaves is not None:

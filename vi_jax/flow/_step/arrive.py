@@ -29,7 +29,7 @@ from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
-from ..smooth import exact, holding, in_modes, limited_of
+from ..smooth import hold_contacts, in_modes, limited_of, stops_are_exact
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
 from .impact import is_compound, resolve_impact_sequence, settle, stilled, strike_once
 from .trial import AppliedStep, Release, Trial
@@ -93,7 +93,7 @@ def trigger_events(
     """
     (old, modes), contact, machine = before, lane.contact or (), plan.machine
     below, nearby, off = [], [], {}
-    moving = holding(machine, lane.modes, lane.contact)
+    moving = hold_contacts(machine, lane.modes, lane.contact)
     along = jnp.ones_like(lane.s), moving.field(lane.s, lane.state)
     numbers = plan.from_below(lane.state)
     for number, armed, close in zip(numbers, lane.below, near, strict=True):
@@ -221,7 +221,7 @@ def release_pulled(
     for k in limited_of(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
-            free = holding(machine, modes, contact, but=k)
+            free = hold_contacts(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k].position, s, state).a
 
         sign, _ = plan.sign_and_gap(k, contact[k])
@@ -267,7 +267,7 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
             (coordinate.position(x), coordinate.velocity(x)) for x in (old, lane.state)
         )
         if not (moved_to is place and after is before):
-            slack, slow = plan.rounding(k, lane.state)
+            slack, slow = plan.rounding_bounds(k, lane.state)
             moved = (jnp.abs(moved_to - place) > slack) | (jnp.abs(after - before) > slow)
             contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
     return tuple(contacts)
@@ -275,7 +275,7 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
 
 def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> Scalars:
     found, new = list(lane.direction), lane.state
-    smooth = holding(plan.machine, lane.modes, lane.contact)
+    smooth = hold_contacts(plan.machine, lane.modes, lane.contact)
     for k, coordinate in enumerate(plan.machine.coordinates):
         after, known = coordinate.velocity(new), has_velocity(plan.machine, new)
         if not known or after is not coordinate.velocity(old):
@@ -439,7 +439,7 @@ def _at_fixed_clock(at: AppliedStep, lane: Lane) -> Lane:
     """Return the lane with its derivatives at a fixed clock. After an event whose time depends on a
     parameter, s has a derivative. It is transferred to the state, so that later steps need no
     derivative with respect to `s`."""
-    smooth = holding(at.plan.machine, lane.modes, lane.contact)
+    smooth = hold_contacts(at.plan.machine, lane.modes, lane.contact)
     bound = at.plan.end(lane.part)
     # The end of the interval may depend on a differentiated parameter.
     moved = jnp.where(at.trial.ends_interval, bound - stop_gradient(bound), 0.0)
@@ -457,7 +457,7 @@ def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
     offset = flow.event_offset(flow.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
-    if not exact(plan.machine, state):
+    if not stops_are_exact(plan.machine, state):
         state = select(contact[k] > 0, on_its_stops(plan, lane._replace(state=state)), state)
     direction = jnp.where(free, -at.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)

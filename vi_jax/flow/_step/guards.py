@@ -33,7 +33,7 @@ from ...machine import (
 from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
-from ..smooth import SmoothMachine, exact, is_affine, limited_of
+from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -73,7 +73,7 @@ def events_within_step(plan: Plan, state: State) -> list[int]:
     """Return the numbers of the events whose guards are evaluated at stages: not those of stops on
     coordinates that are as accurate as the state."""
     machine, events, stops = plan.machine, events_of(plan.machine), []
-    if not exact(machine, state):
+    if not stops_are_exact(machine, state):
         known = [is_affine(x.position, state) for x in machine.coordinates]
         stops = [i for i, stop in enumerate(stops_of(machine)) if not known[stop.coordinate]]
     others = [number for number in plan.others(state) if events[number].checked_within_step]
@@ -307,7 +307,7 @@ def crossings(
     guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
     # The stops of one coordinate and a clock coincide only on a section, where a step ends; other
     # events may coincide.
-    if plan.others(lane.state) or not exact(machine, lane.state):
+    if plan.others(lane.state) or not stops_are_exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
         guards = [guard if guard.coordinate is not None else _jumped(guard) for guard in guards]
@@ -497,8 +497,8 @@ def leniency(plan: Plan, lane: Lane) -> Scalar:
 
 
 def landing_tolerance(x: Scalar) -> float:
-    """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. State
-    and derivatives are extrapolated to first order (`drift.extrapolate`): errors are of order δ²."""
+    """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. The
+    state is extrapolated over it to first order (`drift.extrapolate`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 

@@ -38,7 +38,7 @@ from ...machine import (
 from .._lane import FREE, Lane, Plan, Record, any_of, select, to_event, total
 from ..noise import with_impulse
 from ..results import code
-from ..smooth import TIME, carried, exact, holding
+from ..smooth import TIME, carried, hold_contacts, stops_are_exact
 from .aim import aim_ahead, aim_at
 from .arrive import after_jump, arrive, contacts_after_jump, on_its_stops, release_pulled
 from .trial import Trial, attempt
@@ -63,7 +63,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     """Take one step of one lane: advance, aim or land. A lane that has ended is unchanged. Returns
     the lane; whether an interval ended; the record of that interval."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
-    smooth = holding(plan.machine, lane.modes, lane.contact)
+    smooth = hold_contacts(plan.machine, lane.modes, lane.contact)
     beside = carried(smooth, lane.s, lane.state, lane.record.integrals)
     motion = plan.method.foresee(smooth, lane.s, lane.state, beside)
     if motion is not None:
@@ -78,7 +78,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     if section_in(plan.machine, lane.state) is not None and not counts_turns(plan.machine):
         completed = completed | taken & _is_equilibrium_on_section(plan, lane, arrived)
     reached = completed = pin_flag(completed, lane.s)
-    if arrived.contact is not None and not exact(plan.machine, arrived.state):
+    if arrived.contact is not None and not stops_are_exact(plan.machine, arrived.state):
         rests = reached & any_of(reached, (x > 0 for x in arrived.contact))
         put, kept = partial(on_its_stops, plan), lambda x: x.state
         arrived = arrived._replace(state=jax.lax.cond(rests, put, kept, arrived))

@@ -35,7 +35,7 @@ from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
 from ..drift import FlowToEvent
 from ..events import force_rate, rates
 from ..results import EventKind
-from ..smooth import SmoothMachine, holding, in_modes, limited_of
+from ..smooth import SmoothMachine, hold_contacts, in_modes, limited_of
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -228,7 +228,7 @@ def _before_impacts(
     acts = _acting(plan.machine, bodies, gains, pushes, at_event)
     coupled = _coupled(plan, acts, touches, coupled)
     before = {k: body.velocity(at_event) for k, body in bodies.items()}
-    slow = {k: plan.rounding(k, at_event)[1] for k in bodies}
+    slow = {k: plan.rounding_bounds(k, at_event)[1] for k in bodies}
     return _Instant(
         plan, taken, lane.s, met, at_event, bodies, before, gains, landed, touches, coupled, slow
     )
@@ -469,7 +469,7 @@ def _held(
         still, lost = stilled(plan, s, state, rests, walls)
         if holds_anywhere(plan.machine):
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
-    resting, integrals = holding(plan.machine, modes, contact), lane.record.integrals
+    resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
     later, still, passed = flow.extrapolate(pin(wait))
     if len(rests) > 1:  # another body may reach this one before its impacts are over
@@ -605,7 +605,7 @@ def _broken(
     for k, blow in blows.items():
         body = plan.machine.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, at_event))
-        _, slow = plan.rounding(k, at_event)
+        _, slow = plan.rounding_bounds(k, at_event)
         apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slow))
         contact[k] = jnp.where(apart, 0.0, contact[k])
     return tuple(contact)
@@ -634,7 +634,7 @@ def _together(
         closed, _, _, count = found
         new, waits = list(contact), []
         for k, blow in blows.items():
-            alone = holding(plan.machine, lane.modes, closed, but=k)
+            alone = hold_contacts(plan.machine, lane.modes, closed, but=k)
             ends, left = _ends(plan, alone, k, blow, speeds[k], lane)
             ends = (blow.struck > 0) & ends
             new[k] = jnp.where(ends, blow.struck, contact[k])

@@ -13,7 +13,7 @@ from .._lane import FREE, Lane, Plan, to_event, to_release, to_turn_of, total
 from ..drift import FlowToEvent
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods import Foreseen, stages_to_step_to
-from ..smooth import Integrals, SmoothMachine, carried, elapsed, exact, holding
+from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, stops_are_exact
 from .guards import (
     SHARES,
     Crossing,
@@ -193,7 +193,7 @@ def attempt(
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
     bodies = range(len(machine.coordinates))
-    alone = tuple(holding(machine, lane.modes, lane.contact, but=k) for k in bodies)
+    alone = tuple(hold_contacts(machine, lane.modes, lane.contact, but=k) for k in bodies)
     ends: list[tuple[Rates, Rates]] = []
     if plan.records_motion or stops_of(machine):
         for one, body in zip(alone, machine.coordinates, strict=True):
@@ -263,7 +263,7 @@ def _path(
     """
     (begin, end), (s1, new, h, limit) = ends, there
     position = plan.machine.coordinates[k].position
-    if lane.contact is not None and not exact(plan.machine, lane.state):
+    if lane.contact is not None and not stops_are_exact(plan.machine, lane.state):
         # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
         rests = lane.contact[k] > 0
