@@ -32,7 +32,7 @@ from ..machine import (
 )
 
 # A batch of at most this many members is listed one by one: a choice, as many as fit a line.
-_NAMED = 8
+_MOST_LISTED = 8
 
 if TYPE_CHECKING:
     from equinox import Enumeration as NamedEnumeration
@@ -63,7 +63,7 @@ else:
             found = names_of(self.kind)[number]
             if not found.ndim:
                 return f"{name}.{found}"
-            if found.size <= _NAMED:
+            if found.size <= _MOST_LISTED:
                 return f"{name}{found.tolist()}".replace("'", "")
             kinds, counts = np.unique(found, return_counts=True)
             parts = (f"{count:,} {kind}" for kind, count in zip(kinds, counts, strict=True))
@@ -195,10 +195,10 @@ def _columns(name: str, x: Any) -> dict[str, Any]:
 
 
 # Logs, by their dimension, and the variable that is negative in unused places.
-_LISTED = {"impact": "log_stop", "event": "event_number"}
+_LOGS = {"impact": "log_stop", "event": "event_number"}
 
 
-def _met(log: Any, number: str) -> Any:
+def _used_rows(log: Any, number: str) -> Any:
     """Return the entries of a log as rows, without unused places, in which `number` is negative."""
     rows = log.stack(row=log[number].dims).reset_index("row")
     return rows.isel(row=np.flatnonzero(np.asarray(rows[number]) >= 0))
@@ -228,25 +228,25 @@ def run_dataset(
         coordinates["sample"] = place.reshape(-1, place.shape[-1])[0]
     if run.impact_log is not None:
         log = (*cycle, "impact")
-        kept = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
-        variables |= present(kept, log)
+        more = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
+        variables |= present(more, log)
     if run.event_log is not None:
         names = ("phase", "number", "value")
-        kept = {f"event_{name}": getattr(run.event_log, name) for name in names}
-        kept["event_kind"] = np.asarray([*EVENTS, ""])[np.asarray(run.event_log.kind)]
-        variables |= present(kept, (*cycle, "event"))
+        more = {f"event_{name}": getattr(run.event_log, name) for name in names}
+        more["event_kind"] = np.asarray([*EVENTS, ""])[np.asarray(run.event_log.kind)]
+        variables |= present(more, (*cycle, "event"))
     if run.errors is not None:
         variables |= states("error_section", run.errors.sections, section)
-        kept = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
-        variables |= present(kept, cycle)
+        more = {f"error_{name}": getattr(run.errors, name) for name in ("y_max", "y_min")}
+        variables |= present(more, cycle)
     variables |= present({"result": result, "steps": run.steps, "rejected": run.rejected}, batch)
     if run.outcome is not None:
-        kept = {name: getattr(run, name) for name in ("outcome_cycle", "outcome_phase")}
-        kept["outcome"] = np.asarray([*run.outcomes, ""])[np.asarray(run.outcome)]
-        variables |= present(kept, batch) | states("outcome_state", run.outcome_state, batch)
-    own = {name: name for name in run.averages}
-    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units), own), along)
-    return _met(data, _LISTED[along]) if along in _LISTED else data
+        more = {name: getattr(run, name) for name in ("outcome_cycle", "outcome_phase")}
+        more["outcome"] = np.asarray([*run.outcomes, ""])[np.asarray(run.outcome)]
+        variables |= present(more, batch) | states("outcome_state", run.outcome_state, batch)
+    averages = {name: name for name in run.averages}
+    data = tidy(with_units(xr.Dataset(variables, coordinates), dict(run.units), averages), along)
+    return _used_rows(data, _LOGS[along]) if along in _LOGS else data
 
 
 class RESULTS(NamedEnumeration):
@@ -347,9 +347,9 @@ class Samples(Shown):
 _CYCLES, _EVENTS = 8, 6
 
 
-def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
+def _listing(what: str, used: object, text: Callable[[int, int], str]) -> str:
     """Return the number of entries and a line for each of the first cycles. `used`, (…, cycles,
-    size), is true for entries in use; `word` returns the text of the entry at a cycle and place."""
+    size), is true for entries in use; `text` returns the text of the entry at a cycle and place."""
     used = np.asarray(used)
     if used.ndim > 2:
         return f"{int(used.sum())} {what}s in lanes of shape {used.shape[:-2]}"
@@ -358,7 +358,7 @@ def _listed(what: str, used: object, word: Callable[[int, int], str]) -> str:
     some = np.flatnonzero(used.any(axis=1))
     for i in some[:_CYCLES]:
         places = np.flatnonzero(used[i])
-        words = [word(int(i), int(j)) for j in places[:_EVENTS]]
+        words = [text(int(i), int(j)) for j in places[:_EVENTS]]
         more = [f"and {len(places) - _EVENTS} more"] * (len(places) > _EVENTS)
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:
@@ -386,7 +386,7 @@ class ImpactLog(Summarized):
         def word(i: int, j: int) -> str:
             return f"stop {self.stop[i, j]} at {self.phase[i, j]:.6g} by {self.speed[i, j]:.4g}"
 
-        return _listed("impact", self.stop >= 0, word)
+        return _listing("impact", self.stop >= 0, word)
 
 
 class EventLog(Summarized):
@@ -419,7 +419,7 @@ class EventLog(Summarized):
             name = self.names[number] if kind == "reset" and self.names else None
             return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
 
-        return _listed("event", self.number >= 0, word)
+        return _listing("event", self.number >= 0, word)
 
 
 class Errors(Shown):

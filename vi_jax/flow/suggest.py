@@ -60,11 +60,11 @@ class Suggestion(NamedTuple):
 
     def __str__(self) -> str:
         best = next(t for t in self.tried if t.method is self.method)
-        kept = "" if self.reached else "; no method tried is within the error allowed"
-        lines = [f"{best.name}: error {self.error:.1e}{kept}", "  tried:"]
+        note = "" if self.reached else "; no method tried is within the error allowed"
+        lines = [f"{best.name}: error {self.error:.1e}{note}", "  tried:"]
         for t in self.tried:
-            took = "" if np.isnan(t.seconds) else f", {1e3 * t.seconds:.3g} ms"
-            lines.append(f"    {t.name}: error {t.error:.1e}{took}")
+            timing = "" if np.isnan(t.seconds) else f", {1e3 * t.seconds:.3g} ms"
+            lines.append(f"    {t.name}: error {t.error:.1e}{timing}")
         return "\n".join(lines)
 
 
@@ -120,13 +120,13 @@ def suggest_method(
     exact = isinstance(best, ExactFlight)
     stiff = not exact and _is_stiff(machine, start)
     if exact:
-        truth = best.tighter()
+        reference = best.tighter()
     elif stiff:
-        truth = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
+        reference = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
     else:  # at most half as long as the shortest steps that are tried
-        truth = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
-    bench.follow(truth)
-    failed = int(np.sum(~np.isfinite(bench.truth[:, 0])))
+        reference = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
+    bench.set_reference(reference)
+    failed = int(np.sum(~np.isfinite(bench.reference[:, 0])))
     if failed:
         raise ValueError(
             f"Argument `machine` must run for {cycles} cycles, but {failed} of {lanes} lanes of "
@@ -140,8 +140,8 @@ def suggest_method(
         tried += _until(bench, error, _adaptive(diffrax.Kvaerno5())) if stiff else []
         with contextlib.suppress(NotImplementedError):  # a primitive has no recursion
             tried += _until(bench, error, _series(error))
-    good = [t for t in tried if t.error <= error]
-    timed = bench.race(good)
+    accurate = [t for t in tried if t.error <= error]
+    timed = bench.measure_times(accurate)
     tried = [timed.get(t.name, t) for t in tried]
     if timed:
         found = min(timed.values(), key=lambda t: t.seconds)
@@ -153,8 +153,8 @@ def suggest_method(
 def _is_stiff(machine: AbstractMachine, start: State) -> bool:
     """Return whether something decays much faster than the motion, at its start."""
     s = jnp.zeros(())
-    fading = machine.relaxation(s, start)
-    return fading is not None and bool(machine.step_limit(s, start) > _STIFF * fading)
+    decay_time = machine.relaxation(s, start)
+    return decay_time is not None and bool(machine.step_limit(s, start) > _STIFF * decay_time)
 
 
 def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMethod]]) -> list[Tried]:
@@ -197,28 +197,28 @@ def _fixed(bench: "_Bench", error: float) -> list[Tried]:
 class _Bench:
     """The run by which methods are compared, for lanes that differ in their first velocity."""
 
-    truth: np.ndarray
+    reference: np.ndarray
     sizes: np.ndarray
 
     def __init__(
         self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
     ):
         self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
-        row, unravel = ravel_pytree(without_modes(start))
-        sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(row))))
+        numbers, unravel = ravel_pytree(without_modes(start))
+        sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(numbers))))
         # Stops limit everything except velocities.
         self.speed = size_of(machine.coordinates[0].velocity, without_modes(start), sizes)
-        self.nudges = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
+        self.offsets = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
-    def lane(self, method: AbstractMethod, nudge: Scalar) -> tuple[Array, Array]:
+    def lane(self, method: AbstractMethod, offset: Scalar) -> tuple[Array, Array]:
         """Return the compared numbers, as one vector, of the lane whose first velocity differs by
-        `nudge`, and their sizes. The first number is infinite if the lane failed."""
+        `offset`, and their sizes. The first number is infinite if the lane failed."""
         machine = self.machine
 
-        def looked_at(nudge):
+        def measure(offset):
             body = machine.coordinates[0]
-            velocity = body.velocity(self.start) + nudge
+            velocity = body.velocity(self.start) + offset
             start = body.placed(self.start, body.position(self.start), velocity)
             # As users run it: if only sections are recorded, steps are different.
             log = 32 if self.quantity == "impacts" else 0
@@ -230,21 +230,21 @@ class _Bench:
             elif self.quantity == "impacts":
                 assert run.impact_log is not None
                 found = jnp.stack([run.impact_log.phase, run.impact_log.speed])
-                most = jnp.stack([jnp.asarray(machine.cycle), jnp.nanmax(found[1], initial=0.0)])
-                sizes = jnp.broadcast_to(most[:, None, None], found.shape)
+                largest = jnp.stack([jnp.asarray(machine.cycle), jnp.nanmax(found[1], initial=0.0)])
+                sizes = jnp.broadcast_to(largest[:, None, None], found.shape)
             else:
                 found = in_rows(without_modes(run.last), 0)
                 sizes = row_sizes(machine, start, in_rows(without_modes(run.sections)))
             return found, (sizes, run.successful)
 
         if self.quantity == "derivative":
-            found, (sizes, good) = jax.jacfwd(looked_at, has_aux=True)(nudge)
+            found, (sizes, successful) = jax.jacfwd(measure, has_aux=True)(offset)
             sizes = sizes / self.speed
         else:
-            found, (sizes, good) = looked_at(nudge)
+            found, (sizes, successful) = measure(offset)
         # The first number marks a failed lane; NaN elsewhere means that there was no impact.
-        ended = jnp.where(good, jnp.zeros_like(nudge), jnp.inf)
-        return jnp.append(ended, found), jnp.append(jnp.ones_like(nudge), sizes)
+        ended = jnp.where(successful, jnp.zeros_like(offset), jnp.inf)
+        return jnp.append(ended, found), jnp.append(jnp.ones_like(offset), sizes)
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:
         """Return a function that runs all lanes; other tolerances do not compile again."""
@@ -253,25 +253,25 @@ class _Bench:
         if key not in self.compiled:
             self.compiled[key] = jit(
                 jax.vmap(
-                    lambda numbers, nudge: self.lane(eqx.combine(numbers, rest), nudge),
+                    lambda numbers, offset: self.lane(eqx.combine(numbers, rest), offset),
                     in_axes=(None, 0),
                 )
             )
         run = self.compiled[key]
-        return lambda: jax.block_until_ready(run(numbers, self.nudges))
+        return lambda: jax.block_until_ready(run(numbers, self.offsets))
 
-    def follow(self, truth: AbstractMethod) -> None:
-        self.truth, sizes = map(np.asarray, self.program(truth)())
+    def set_reference(self, method: AbstractMethod) -> None:
+        self.reference, sizes = map(np.asarray, self.program(method)())
         self.sizes = np.where(sizes > 0, sizes, 1.0).max(axis=0)
 
     def tried(self, method: AbstractMethod, name: str) -> Tried:
-        found, truth = np.asarray(self.program(method)()[0]), self.truth
-        apart = np.abs(found - truth) / (self.sizes + np.abs(truth))
-        apart = np.where(np.isnan(found) & np.isnan(truth), 0.0, apart)
-        worst = np.where(np.isfinite(apart), apart, np.inf).max(axis=1)
+        found, reference = np.asarray(self.program(method)()[0]), self.reference
+        difference = np.abs(found - reference) / (self.sizes + np.abs(reference))
+        difference = np.where(np.isnan(found) & np.isnan(reference), 0.0, difference)
+        worst = np.where(np.isfinite(difference), difference, np.inf).max(axis=1)
         return Tried(method, name, float(np.quantile(worst, 0.95, method="higher")), np.nan)
 
-    def race(self, tried: list[Tried]) -> dict[str, Tried]:
+    def measure_times(self, tried: list[Tried]) -> dict[str, Tried]:
         """Return these methods with their times, measured in interleaved rounds."""
         runs = [self.program(t.method) for t in tried]
         times: list[list[float]] = [[] for _ in runs]

@@ -111,9 +111,9 @@ class AbstractMethod(eqx.Module):
         that explicit Runge–Kutta methods are stable, and the series of `ExactFlight` accurate.
         """
         limit = machine.step_limit(s, state)
-        fading = machine.relaxation(s, state) if self.is_limited_by_decay else None
-        if fading is not None:
-            limit = jnp.minimum(limit, 0.8 * pi * fading)
+        decay_time = machine.relaxation(s, state) if self.is_limited_by_decay else None
+        if decay_time is not None:
+            limit = jnp.minimum(limit, 0.8 * pi * decay_time)
         return limit * (5 / self.steps_per_cycle)
 
     def clear(self, machine: AbstractMachine, s: Scalar, state: State) -> Scalar | None:

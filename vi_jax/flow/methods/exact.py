@@ -66,7 +66,7 @@ def modal_flight(
         free = free & (rests == 0)
     q, p = state.displacement, state.velocity
     closed = _closed(machine, s, h, q, p)
-    series = _by_series(machine, contact, s, h, (q, p), ~free)
+    series = _series_flight(machine, contact, s, h, (q, p), ~free)
     return type(state)(*(jnp.where(free, a, b) for a, b in zip(closed, series, strict=True)))
 
 
@@ -76,14 +76,14 @@ def longest(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     cannot make or hide an event. Decayed modes thus cost no steps."""
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
-    pace = machine.modal_frequency
-    moves = jnp.abs(q - place) + jnp.abs(p - rate) * machine.inverse_frequency
-    fastest, least = machine.frequency, _MATTERS * jnp.finfo(pace.dtype).eps
+    frequencies = machine.modal_frequency
+    amplitudes = jnp.abs(q - place) + jnp.abs(p - rate) * machine.inverse_frequency
+    fastest, least = machine.frequency, _MATTERS * jnp.finfo(frequencies.dtype).eps
     for row in machine.rows:
-        part = jnp.abs(row) * moves
+        part = jnp.abs(row) * amplitudes
         matters = part > least * jnp.sum(part + jnp.abs(row * place))
-        fastest = jnp.maximum(fastest, jnp.max(jnp.where(matters, pace, 0.0)))
-    count = _ALONE if pace.size == 1 else _SEVERAL
+        fastest = jnp.maximum(fastest, jnp.max(jnp.where(matters, frequencies, 0.0)))
+    count = _ALONE if frequencies.size == 1 else _SEVERAL
     return stop_gradient(2 * jnp.pi / (count * fastest))
 
 
@@ -95,12 +95,12 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
     y, v = q - place, p - rate
-    sway = machine.swing_time * (v + 0.5 * machine.damping * y)
-    free = jnp.sqrt(y * y + sway * sway)
+    velocity_amplitude = machine.swing_time * (v + 0.5 * machine.damping * y)
+    amplitude = jnp.sqrt(y * y + velocity_amplitude * velocity_amplitude)
     length = jnp.asarray(jnp.inf, q.dtype)
     for stop in stops_of(machine):
         row = machine.rows[stop.coordinate]
-        part = jnp.abs(row) * free
+        part = jnp.abs(row) * amplitude
         reach, pull = jnp.sum(part), jnp.dot(machine.stiffness, part)
         middle = jnp.zeros_like(reach)
         if machine.steady is not None:
@@ -112,10 +112,10 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
         # The form without cancellation, of two equivalent ones.
         towards = 2 * room / jnp.where(speed + root > 0, speed + root, 1.0)
         away = (root - speed) / jnp.where(pull > 0, pull, 1.0)
-        until = jnp.where(speed > 0, towards, away)
-        never = -stop.beyond(middle) > _WIDER * reach
-        until = jnp.where(never, jnp.inf, jnp.where(room > 0, until, 0.0))
-        length = jnp.minimum(length, until)
+        time_to_stop = jnp.where(speed > 0, towards, away)
+        is_out_of_reach = -stop.beyond(middle) > _WIDER * reach
+        time_to_stop = jnp.where(is_out_of_reach, jnp.inf, jnp.where(room > 0, time_to_stop, 0.0))
+        length = jnp.minimum(length, time_to_stop)
     return jnp.where(machine.plain * machine.all_decay > 0, length / _WIDER, 0.0)
 
 
@@ -132,7 +132,7 @@ def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -
     half = 0.5 * machine.damping
     square = machine.stiffness - half * half
     known = machine.swing, machine.swing_time, machine.oscillates
-    even, odd = _pair(known, half, square, h)
+    even, odd = _decaying_pair(known, half, square, h)
     if machine.steady is None:
         y, v, place, rate = q, p, 0.0, 0.0
     else:
@@ -145,7 +145,7 @@ def _closed(machine: ModalMachine, s: Scalar, h: Scalar, q: object, p: object) -
 
 
 @jax.custom_jvp
-def _pair(known: tuple, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
+def _decaying_pair(known: tuple, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
     """Return e^(-at) cos(wt) and e^(-at) sin(wt)/w for w² (`square`) of any sign, and a (`half`);
     `known` are `swing`, `swing_time` and `oscillates` of the machine."""
     swing, swing_time, oscillates = known
@@ -156,44 +156,44 @@ def _pair(known: tuple, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
 
 
 def _without_turns(pair: Any, half: Any, square: Any, h: Scalar) -> tuple[Any, Any]:
-    """Return `_pair` for modes that do not oscillate, and entries of `pair` for the others."""
-    slow = square <= 0
-    root = jnp.sqrt(jnp.where(slow, -square, 0.0))
+    """Return `_decaying_pair` for overdamped modes, and entries of `pair` for the others."""
+    is_overdamped = square <= 0
+    root = jnp.sqrt(jnp.where(is_overdamped, -square, 0.0))
     # The slower rate a - r, without the cancellation of a difference.
-    gentle = (half * half + square) / jnp.where(slow & (half + root > 0), half + root, 1.0)
-    gentle = jnp.where(half + root > 0, gentle, half - root)
-    fade = jnp.exp(-jnp.where(slow, gentle, 0.0) * h)
-    some = root > 0
-    odd = jnp.where(some, -jnp.expm1(-2 * root * h) / jnp.where(some, 2 * root, 1.0), h)
+    slower = (half * half + square) / jnp.where(is_overdamped & (half + root > 0), half + root, 1.0)
+    slower = jnp.where(half + root > 0, slower, half - root)
+    fade = jnp.exp(-jnp.where(is_overdamped, slower, 0.0) * h)
+    has_root = root > 0
+    odd = jnp.where(has_root, -jnp.expm1(-2 * root * h) / jnp.where(has_root, 2 * root, 1.0), h)
     odd = fade * odd
     even = fade - root * odd
-    return jnp.where(slow, even, pair[0]), jnp.where(slow, odd, pair[1])
+    return jnp.where(is_overdamped, even, pair[0]), jnp.where(is_overdamped, odd, pair[1])
 
 
 def _pair_jvp(primals, tangents):
     known, half, square, h = primals
-    even, odd = _pair(known, half, square, h)
+    even, odd = _decaying_pair(known, half, square, h)
     d_even, d_odd = jnp.zeros_like(even), jnp.zeros_like(odd)
-    _, by_half, by_square, by_h = tangents
-    if not isinstance(by_half, SymbolicZero):
-        d_even, d_odd = d_even - h * even * by_half, d_odd - h * odd * by_half
-    if not isinstance(by_square, SymbolicZero):
+    _, half_dot, square_dot, h_dot = tangents
+    if not isinstance(half_dot, SymbolicZero):
+        d_even, d_odd = d_even - h * even * half_dot, d_odd - h * odd * half_dot
+    if not isinstance(square_dot, SymbolicZero):
         y = square * h * h
         flat = jnp.abs(y) < 1
         series = jnp.exp(-half * h) * h**3 * horner(_BEND, jnp.where(flat, y, 0.0))
         bend = (h * even - odd) / jnp.where(flat, 1.0, 2 * square)
-        d_even = d_even - 0.5 * h * odd * by_square
-        d_odd = d_odd + jnp.where(flat, series, bend) * by_square
-    if not isinstance(by_h, SymbolicZero):
-        d_even = d_even - (half * even + square * odd) * by_h
-        d_odd = d_odd + (even - half * odd) * by_h
+        d_even = d_even - 0.5 * h * odd * square_dot
+        d_odd = d_odd + jnp.where(flat, series, bend) * square_dot
+    if not isinstance(h_dot, SymbolicZero):
+        d_even = d_even - (half * even + square * odd) * h_dot
+        d_odd = d_odd + (even - half * odd) * h_dot
     return (even, odd), (d_even, d_odd)
 
 
-_pair.defjvp(_pair_jvp, symbolic_zeros=True)
+_decaying_pair.defjvp(_pair_jvp, symbolic_zeros=True)
 
 
-def _by_series(
+def _series_flight(
     machine: ModalMachine, contact: Scalars, s: Scalar, h: Scalar, state: State, wanted: Flag
 ) -> tuple[Any, Any]:
     """Return the state by the series of the matrix exponential, in parts so short that it converges
@@ -201,34 +201,34 @@ def _by_series(
     length = stop_gradient(jnp.abs(h)) * machine.fastest
     count = stop_gradient(jnp.where(wanted, jnp.maximum(jnp.ceil(length / _LONGEST), 1.0), 0.0))
     part, change = h / jnp.maximum(count, 1.0), length / jnp.maximum(count, 1.0)
-    last = _LAST * jnp.finfo(h.dtype).eps
-    held = _holding(machine, contact)
+    smallest = _LAST * jnp.finfo(h.dtype).eps
+    project = _resting_projection(machine, contact)
     omega = machine.frequency
     steady, cosine, sine = (0.0 if f is None else f for f in machine.forces)
 
-    def turn(carry):
+    def advance(carry):
         i, q, p = carry
         angle = omega * (s + i * part)
         one = jnp.ones_like(s)
 
         def term(carry):
             k, size, sums, (dq, dp, (u, c, d)) = carry
-            by = part / k
-            pull = steady * u + cosine * c + sine * d
-            pull = pull - machine.stiffness * dq - machine.damping * dp - machine.coupled(dq, dp)
-            new = by * dp, by * held(pull), (jnp.zeros_like(u), -by * omega * d, by * omega * c)
+            hk = part / k
+            force = steady * u + cosine * c + sine * d
+            force = force - machine.stiffness * dq - machine.damping * dp - machine.coupled(dq, dp)
+            new = hk * dp, hk * project(force), (jnp.zeros_like(u), -hk * omega * d, hk * omega * c)
             return k + 1.0, size * change / k, (sums[0] + new[0], sums[1] + new[1]), new
 
         first = q, p, (one, jnp.cos(angle), jnp.sin(angle))
         begin = one, one, (q, p), first
-        _, _, (q, p), _ = jax.lax.while_loop(lambda x: x[1] > last, term, begin)
+        _, _, (q, p), _ = jax.lax.while_loop(lambda x: x[1] > smallest, term, begin)
         return i + 1.0, q, p
 
-    _, q, p = jax.lax.while_loop(lambda x: x[0] < count, turn, (jnp.zeros_like(s), *state))
+    _, q, p = jax.lax.while_loop(lambda x: x[0] < count, advance, (jnp.zeros_like(s), *state))
     return q, p
 
 
-def _holding(machine: ModalMachine, contact: Scalars) -> Any:
+def _resting_projection(machine: ModalMachine, contact: Scalars) -> Any:
     """Return a function that removes from an acceleration the part that resting contacts cancel:
     each contact's push keeps its velocity constant."""
     limited = limited_of(machine) if contact else []
@@ -244,13 +244,13 @@ def _holding(machine: ModalMachine, contact: Scalars) -> Any:
         for unit in units
     ]
 
-    def held(pull):
+    def project(pull):
         new = pull
         for row, change, acts in zip(rows, changes, acting, strict=True):
             new = new - jnp.where(acts, jnp.dot(row, pull), 0.0) * change
         return new
 
-    return held
+    return project
 
 
 # Series of the cosine and of sin(x)/x in x²: on an arc, of up to 2π/5, the next term is below
@@ -326,8 +326,8 @@ class ExactFlight(AbstractMethod):
         """Return the flight from `s0` to `s1`, exact to rounding, with averages by quadrature."""
         machine = smooth.machine
         if isinstance(machine, LinearMachine | ModalMachine):
-            return _linear(smooth, s0, s1, state, beside)
-        zeta, xi, in_phase = _numbers(machine)
+            return _linear_flight(smooth, s0, s1, state, beside)
+        zeta, xi, in_phase = _drive_numbers(machine)
         tau = (s1 - s0) / zeta if in_phase else s1 - s0
         phase = phase_at(machine, s0 if in_phase else zeta * s0)
 
@@ -336,11 +336,11 @@ class ExactFlight(AbstractMethod):
             return OscillatorState(*flight(zeta, xi, phase, state.Y, state.V, part))
 
         if beside:
-            beside = _integrated(smooth, s0, s1, state, along, beside)
+            beside = _integrals_of_flight(smooth, s0, s1, state, along, beside)
         return along(None), beside, jnp.zeros_like(s0)
 
 
-def _linear(
+def _linear_flight(
     smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, beside: Integrals
 ) -> tuple[State, Integrals, Scalar]:
     """Return the flight of a linear machine, as `ExactFlight.step`, in natural modes."""
@@ -355,23 +355,23 @@ def _linear(
         return form.outward(modal_flight(form.machine, smooth.contact, s0, share * h, begin))
 
     if beside:
-        beside = _integrated(smooth, s0, s1, state, along, beside)
+        beside = _integrals_of_flight(smooth, s0, s1, state, along, beside)
     new = form.outward(modal_flight(form.machine, smooth.contact, s0, h, begin))
     return new, beside, jnp.zeros_like(s0)
 
 
-def _integrated(
+def _integrals_of_flight(
     smooth: SmoothMachine, s0: Scalar, s1: Scalar, state: State, along: Callable, beside: Integrals
 ) -> Integrals:
     """Return the integrals of a flight from `s0` to `s1`, by quadrature. A held body stays as in
     `state`; `along` returns the state of the flight at a share of its length."""
     total = beside
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        there = along(float(node))
+        at_node = along(float(node))
         if smooth.contact and not isinstance(smooth.machine, LinearMachine):
             rests = smooth.contact[0] > 0
-            there = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, there)
-        rate = rate_of_integrals(smooth, s0 + float(node) * (s1 - s0), there, beside)
+            at_node = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), state, at_node)
+        rate = rate_of_integrals(smooth, s0 + float(node) * (s1 - s0), at_node, beside)
         share = float(weight) * (s1 - s0)
         total = jtu.tree_map(lambda x, v, share=share: x + share * v, total, rate)
     return total
@@ -393,11 +393,11 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
         (machine.drive, IdealDrive, ("field", "fixed_speed")),
     )
     for part, base, names in equations:
-        own = changed(part, base, names)
-        if own is not None:
+        override = changed(part, base, names)
+        if override is not None:
             return (
                 f"`{base.__name__}` with its own equations, but a `{type(part).__name__}` has "
-                f"another `{own}`"
+                f"another `{override}`"
             )
     if switches_of(machine):
         return f"machine without soft stops, but it has {len(switches_of(machine))}"
@@ -409,15 +409,15 @@ def _lack_of_linear(machine: AbstractMachine) -> str | None:
     name = type(machine).__name__
     if isinstance(machine, LinearMachine):
         # Resting bodies are held by the rows of the matrices' own coordinates.
-        own = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
-        if own is not None:
-            return f"linear machine as its matrices say, but a `{name}` has another `{own}`"
+        override = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
+        if override is not None:
+            return f"linear machine as its matrices say, but a `{name}` has another `{override}`"
     if switches_of(machine):
         return f"machine without switches, but it has {len(switches_of(machine))}"
     return None
 
 
-def _numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
+def _drive_numbers(machine: AbstractMachine) -> tuple[Scalar, Scalar, bool]:
     """Return ζ, ξ and whether the machine is in the phase clock."""
     assert isinstance(machine, Scene) and isinstance(machine.drive, IdealDrive)
     return machine.drive.frequency_ratio, machine.damping_ratio, machine.clock_name == "phase"
@@ -437,12 +437,12 @@ def flight(
     # C = cos(ω_d τ) and S = sin(ω_d τ)/ω_d are entire in ω_d² = 1 - ξ², for either sign.
     square = (1 - xi * xi) * tau * tau
     bend, S = square * horner(_COS[1:], square), tau * horner(_SINC, square)
-    loss = _less_one(-xi * tau)
+    loss = _expm1(-xi * tau)
     fade = 1 + loss
     fall = bend + loss + loss * bend  # of the free motion: fade·C - 1
 
     sine0, cosine0 = sincos(phase)
-    turn = _turned(sine0, cosine0, 0.5 * zeta * tau)
+    turn = _phase_change(sine0, cosine0, 0.5 * zeta * tau)
     detune, drag = 1 - zeta * zeta, 2 * xi * zeta
     size = detune * detune + drag * drag
     near = size < _NEAR * _NEAR
@@ -462,7 +462,7 @@ def flight(
     return Y + (Y_change + Y_rest), V + (V_change + V_rest)
 
 
-def _less_one(x: Scalar) -> Scalar:
+def _expm1(x: Scalar) -> Scalar:
     """Return e^x - 1 for |x| up to 1.3, without cancellation."""
     part = 0.125 * x * horner(_EXP_SLOPE, 0.125 * x)
     for _ in range(3):
@@ -470,7 +470,7 @@ def _less_one(x: Scalar) -> Scalar:
     return part
 
 
-def _turned(sine: Scalar, cosine: Scalar, half: Scalar) -> tuple[Scalar, Scalar]:
+def _phase_change(sine: Scalar, cosine: Scalar, half: Scalar) -> tuple[Scalar, Scalar]:
     """Return the changes of a phase's cosine and sine, in this order, over the angle 2·`half`."""
     s, c = sincos(half)
     return -2 * s * (sine * c + cosine * s), 2 * s * (cosine * c - sine * s)
@@ -493,9 +493,9 @@ def _from_rest(zeta, xi, begin, turn, tau):
     numbers are pairs, because pairs of floats fuse.
     """
     omega = (1 - xi * xi) ** 0.5
-    loss = _less_one(-xi * tau)
+    loss = _expm1(-xi * tau)
     # e^(pτ) - 1
-    bend, sine = _turned(jnp.zeros_like(tau), jnp.ones_like(tau), 0.5 * omega * tau)
+    bend, sine = _phase_change(jnp.zeros_like(tau), jnp.ones_like(tau), 0.5 * omega * tau)
     change = (bend + loss + loss * bend, (1 + loss) * sine)
     decay = (1 + change[0], change[1])
     w = (xi * tau, (zeta - omega) * tau)

@@ -26,7 +26,7 @@ from .verner import Verner9
 Vector = Float[Array, " n"]
 
 # Newton's iterations until a stage fails, so that the step is repeated shorter: a choice.
-_MOST = 12
+_MAX_ITERATIONS = 12
 
 
 def implicit_stages(
@@ -47,25 +47,25 @@ def implicit_stages(
     implicit function theorem.
     """
     gamma = float(tableau.a_diagonal[-1])
-    still = stop_gradient((s0, y0))
-    jacobian = jax.jacfwd(field, argnums=1)(*still)
+    constants = stop_gradient((s0, y0))
+    jacobian = jax.jacfwd(field, argnums=1)(*constants)
     inverse = inverse_of(jnp.eye(y0.size, dtype=y0.dtype) - stop_gradient(h) * gamma * jacobian)
-    stages, left = [field(s0, y0)], jnp.zeros_like(h)
+    stages, last_change = [field(s0, y0)], jnp.zeros_like(h)
     for row, predictor, c in zip(tableau.a_lower, tableau.a_predictor, tableau.c, strict=True):
         base = y0 + h * weighted(row, stages)
         s = s0 + float(c) * h
 
-        def lacks(k: Vector, s: Scalar = s, base: Vector = base) -> Vector:
+        def residual(k: Vector, s: Scalar = s, base: Vector = base) -> Vector:
             return k - field(s, base + h * gamma * k)
 
-        def solve(lacks: Callable[[Vector], Vector], k: Vector) -> tuple[Vector, Scalar]:
+        def solve(residual: Callable[[Vector], Vector], k: Vector) -> tuple[Vector, Scalar]:
             def goes_on(carry):
                 _, size, i = carry
-                return (size > tolerance) & (i < _MOST)
+                return (size > tolerance) & (i < _MAX_ITERATIONS)
 
             def newton(carry):
                 k, _, i = carry
-                change = dot(inverse, lacks(k))
+                change = dot(inverse, residual(k))
                 return k - change, change_of(h * gamma * change, y0, sizes), i + 1
 
             start = (k, jnp.full_like(h, jnp.inf), jnp.zeros_like(h))
@@ -73,10 +73,10 @@ def implicit_stages(
             return k, jnp.where(size <= tolerance, size, jnp.inf)
 
         guess = stop_gradient(weighted(predictor, stages))
-        k, size = jax.lax.custom_root(lacks, guess, solve, _tangent, has_aux=True)
+        k, size = jax.lax.custom_root(residual, guess, solve, _tangent, has_aux=True)
         stages.append(k)
-        left = jnp.maximum(left, stop_gradient(size))
-    return stages, left
+        last_change = jnp.maximum(last_change, stop_gradient(size))
+    return stages, last_change
 
 
 def change_of(change: Vector, y: Vector, sizes: Vector) -> Scalar:
@@ -188,16 +188,16 @@ class Unrolled(diffrax.AbstractSolver):
         slopes, y1 = [terms.vf(t0, y0, args)], None
         places = [(0.0, t0, y0)]
 
-        def reached(weights):
+        def advance(weights):
             return jtu.tree_map(jnp.add, y0, terms.prod(weighted(weights, slopes), control))
 
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
-            y1 = reached(a)
+            y1 = advance(a)
             t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
             places.append((float(c), t, y1))
             slopes.append(terms.vf(t, y1, args))
         if not tableau.ssal or y1 is None:
-            y1 = reached(tableau.b_sol)
+            y1 = advance(tableau.b_sol)
         error = terms.prod(weighted(tableau.b_error, slopes), control)
         return y1, error, slopes, _with_error_weights(tableau, places)
 
@@ -218,17 +218,17 @@ class Unrolled(diffrax.AbstractSolver):
         sizes = jtu.tree_map(jnp.ones_like, y0)
         if self.sizes is not None:
             sizes = jtu.tree_map(lambda one, size: one * size, sizes, self.sizes)
-        each = ravel_pytree(sizes)[0]
-        slopes, left = implicit_stages(tableau, field, t0, control, flat, tolerance, each)
+        scales = ravel_pytree(sizes)[0]
+        slopes, change = implicit_stages(tableau, field, t0, control, flat, tolerance, scales)
         stages = [unravel(control * k) for k in slopes]
         error = weighted(tableau.b_error, stages)
-        error = jtu.tree_map(lambda e, size: jnp.abs(e) + left * size, error, sizes)
+        error = jtu.tree_map(lambda e, size: jnp.abs(e) + change * size, error, sizes)
         y1 = weighted(tableau.b_sol, stages, y0)
         assert tableau.a_diagonal is not None
         diagonal, places = tableau.a_diagonal[-1], [(0.0, t0, y0)]
         for n, (a, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True), start=2):
-            there = weighted(np.append(a, diagonal), stages[:n], y0)
-            places.append((float(c), t0 + float(c) * (t1 - t0), there))
+            y_stage = weighted(np.append(a, diagonal), stages[:n], y0)
+            places.append((float(c), t0 + float(c) * (t1 - t0), y_stage))
         return y1, error, [unravel(k) for k in slopes], _with_error_weights(tableau, places)
 
 
@@ -257,7 +257,7 @@ def _unrolled(solver: object) -> Unrolled:
     return solver if isinstance(solver, Unrolled) else Unrolled(solver)
 
 
-def _within(solver: Unrolled, tolerance: Any, sizes: Any, beside: Integrals) -> Unrolled:
+def _implicit_solver(solver: Unrolled, tolerance: Any, sizes: Any, beside: Integrals) -> Unrolled:
     """Return an implicit solver for a state of these sizes, and for the integrals `beside` it."""
     if sizes is not None:
         sizes = sizes, jtu.tree_map(jnp.ones_like, beside)
@@ -288,7 +288,7 @@ def _size(state: State) -> Scalar:
     return jnp.asarray(sum(jnp.sum(jnp.abs(x)) for x in leaves))
 
 
-def _number(x: Any) -> Any:
+def _as_array(x: Any) -> Any:
     return x if isinstance(x, Tracer) else np.asarray(x)
 
 
@@ -316,9 +316,9 @@ class Adaptive(_RungeKutta):
 
     solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
     # Arrays, so that another tolerance does not compile again.
-    rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_number)
+    rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_as_array)
     atol: Any = eqx.field(
-        kw_only=True, default=None, converter=lambda x: x if x is None else _number(x)
+        kw_only=True, default=None, converter=lambda x: x if x is None else _as_array(x)
     )
     steps_per_cycle: int = eqx.field(static=True, kw_only=True, default=5)  # pyright: ignore
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
@@ -354,20 +354,20 @@ class Adaptive(_RungeKutta):
         rtol, atol, floor = self._tolerances(s0)
         solver = self.solver
         if solver.implicit:
-            solver = _within(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
-        new, after, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
-        old, there, error = (_sized_by(*x) for x in ((state, beside), (new, after), errors))
+            solver = _implicit_solver(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
+        new, integrals, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
+        old, end, error = (_sized_by(*x) for x in ((state, beside), (new, integrals), errors))
         least = jtu.tree_map(lambda x: atol, old)
         if self.sizes is not None:
             least = jtu.tree_map(lambda size: atol * size, self.sizes), least[1]
         scaled = jtu.tree_map(
             lambda e, least, a, b: (e / (least + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2,
-            error, least, old, there,
+            error, least, old, end,
         )  # fmt: skip
         parts = jtu.tree_leaves(scaled)
         number = sum(x.size for x in parts)
         norm = jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
-        return new, after, norm, stages
+        return new, integrals, norm, stages
 
     def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
         """Return rtol, atol and the floor of both, below which rounding would reject all steps."""
@@ -440,13 +440,13 @@ class FixedStep(_RungeKutta):
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, whether it is unstable, and its stages."""
-        new, after, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
+        new, integrals, _, slopes, stages = _runge_kutta(self.solver, smooth, s0, s1, state, beside)
         error = jnp.zeros_like(s0)
         if self.may_be_unstable(smooth.machine, s0, state):
             error = self._unstable(
                 (state, new), [slope for slope, _ in slopes], s1 - s0, unit_of(smooth.machine)
             )
-        return new, after, error, stages
+        return new, integrals, error, stages
 
     def _unstable(
         self, ends: tuple[State, State], slopes: list[State], h: Scalar, unit: Scalar | float
@@ -459,14 +459,14 @@ class FixedStep(_RungeKutta):
         if not isinstance(unit, float):  # in other units of time rates are much larger, or smaller
             after = jnp.maximum(after, jnp.where(unit == 1, 0.0, unit * _size(slopes[0])))
 
-        def judged(size, h, slopes):
-            apart = _size(self.solver.error(slopes, h))
-            return jnp.where(apart > _UNSTABLE * size, 2.0, jnp.zeros_like(h))
+        def unstable(size, h, slopes):
+            error = _size(self.solver.error(slopes, h))
+            return jnp.where(error > _UNSTABLE * size, 2.0, jnp.zeros_like(h))
 
         # A step too short to change the state by its own size is stable without a test.
-        given = jax.lax.stop_gradient((jnp.maximum(before, after), h, slopes))
-        long = given[1] * _size(slopes[0]) > before
-        return jax.lax.cond(long, judged, lambda size, h, slopes: jnp.zeros_like(h), *given)
+        values = jax.lax.stop_gradient((jnp.maximum(before, after), h, slopes))
+        is_long = values[1] * _size(slopes[0]) > before
+        return jax.lax.cond(is_long, unstable, lambda size, h, slopes: jnp.zeros_like(h), *values)
 
     def tighter(self):
         """Return the method with twice as many steps in a cycle."""
@@ -493,7 +493,7 @@ class ImplicitSteps(FixedStep):
 
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, an error of 0, and its stages."""
-        solver = _within(self.solver, 8 * jnp.finfo(s0.dtype).eps, self.sizes, beside)
+        solver = _implicit_solver(self.solver, 8 * jnp.finfo(s0.dtype).eps, self.sizes, beside)
         new, beside, errors, _, stages = _runge_kutta(solver, smooth, s0, s1, state, beside)
         solved = jnp.isfinite(sum(map(jnp.sum, jtu.tree_leaves(errors))))
         new = jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), new)

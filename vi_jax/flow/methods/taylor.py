@@ -134,7 +134,7 @@ _DECIDED = (
 )  # fmt: skip
 
 
-def _bound(eqn: Any, *values: Any) -> Any:
+def _bind(eqn: Any, *values: Any) -> Any:
     if any(isinstance(v, Tracer) for v in values):
         return eqn.primitive.bind(*values, **eqn.params)
     with jax.ensure_compile_time_eval():  # known values, such as an exponent, stay known
@@ -150,7 +150,7 @@ def _linear(eqn, n, operands, results, extra):
     c = nth(operands[0], n)
     if c is None:
         return [None] * len(eqn.outvars)
-    out = _bound(eqn, c, *(x[0] for x in operands[1:]))
+    out = _bind(eqn, c, *(x[0] for x in operands[1:]))
     return list(out) if eqn.primitive.multiple_results else [out]
 
 
@@ -161,11 +161,11 @@ def _joined(eqn, n, operands, results, extra):
     if all(p is None for p in moving):
         return None
     full = [jnp.zeros_like(x[0]) if p is None else p for p, x in zip(parts, operands, strict=True)]
-    return _bound(eqn, *full)
+    return _bind(eqn, *full)
 
 
 def _decided(eqn, n, operands, results, extra):
-    return None if n else _bound(eqn, *(x[0] for x in operands))
+    return None if n else _bind(eqn, *(x[0] for x in operands))
 
 
 def _selected(eqn, n, operands, results, extra):
@@ -174,7 +174,7 @@ def _selected(eqn, n, operands, results, extra):
     if all(p is None for p in parts):
         return None
     zero = jnp.zeros_like(cases[0][0])
-    return _bound(eqn, which[0], *(zero if p is None else p for p in parts))
+    return _bind(eqn, which[0], *(zero if p is None else p for p in parts))
 
 
 def _product(eqn, n, operands, results, extra):
@@ -186,7 +186,7 @@ def _dot(eqn, n, operands, results, extra):
     total = None
     for j in range(n + 1):
         a, b = nth(operands[0], j), nth(operands[1], n - j)
-        total = plus(total, None if a is None or b is None else _bound(eqn, a, b))
+        total = plus(total, None if a is None or b is None else _bind(eqn, a, b))
     return total
 
 
@@ -204,12 +204,12 @@ def _quotient(eqn, n, operands, results, extra):
     return times(rest, _inverse(extra, b[0]))
 
 
-def _power(series: Series, own: Series, p: float, n: int, first: Any, extra: dict) -> Coefficient:
-    """Return the n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}. `own` are
+def _power(series: Series, known: Series, p: float, n: int, first: Any, extra: dict) -> Coefficient:
+    """Return the n-th coefficient c_n of a^p: n a0 c_n = Σ (p j - (n - j)) a_j c_{n-j}. `known` are
     the previous ones, `first` returns a^p of a number."""
     if n == 0:
         return first(series[0])
-    total = convolution(series, own, n, 1, lambda j: (p * j - (n - j)) / n)
+    total = convolution(series, known, n, 1, lambda j: (p * j - (n - j)) / n)
     return times(total, _inverse(extra, series[0]))
 
 
@@ -233,17 +233,17 @@ def _multiplied(a: Series, y: int, n: int, extra: dict) -> Coefficient:
     """Return the n-th coefficient of a^y by squares and products, whose series are kept."""
     if y == 1:
         return nth(a, n)
-    own: Series = extra.setdefault(y, [])
+    power: Series = extra.setdefault(y, [])
     if y % 2 == 0:
-        half_of: Series = a if y == 2 else extra.setdefault(("half", y), [])
+        half_power: Series = a if y == 2 else extra.setdefault(("half", y), [])
         if y > 2:
-            half_of.append(_multiplied(a, y // 2, n, extra))
-        c = square(half_of, n)
+            half_power.append(_multiplied(a, y // 2, n, extra))
+        c = square(half_power, n)
     else:
-        less: Series = extra.setdefault(("less", y), [])
-        less.append(_multiplied(a, y - 1, n, extra))
-        c = convolution(a, less, n)
-    own.append(c)
+        lower_power: Series = extra.setdefault(("less", y), [])
+        lower_power.append(_multiplied(a, y - 1, n, extra))
+        c = convolution(a, lower_power, n)
+    power.append(c)
     return c
 
 
@@ -257,12 +257,12 @@ def _constant_exponent(exponent: Series) -> float:
 def _pow(eqn, n, operands, results, extra):
     a, b = operands
     p = _constant_exponent(b)
-    return _power(a, results[0], p, n, lambda x: _bound(eqn, x, b[0]), extra)
+    return _power(a, results[0], p, n, lambda x: _bind(eqn, x, b[0]), extra)
 
 
 def _root(p: float):
     def rule(eqn, n, operands, results, extra):
-        return _power(operands[0], results[0], p, n, lambda x: _bound(eqn, x), extra)
+        return _power(operands[0], results[0], p, n, lambda x: _bind(eqn, x), extra)
 
     return rule
 
@@ -273,14 +273,14 @@ def _derivative_weight(n: int) -> Callable[[int], float]:
 
 def _exp(eqn, n, operands, results, extra):
     if n == 0:
-        return _bound(eqn, operands[0][0])
+        return _bind(eqn, operands[0][0])
     return convolution(operands[0], results[0], n, 1, _derivative_weight(n))
 
 
 def _log(eqn, n, operands, results, extra):
     a = operands[0]
     if n == 0:
-        return _bound(eqn, a[0])
+        return _bind(eqn, a[0])
     total = None
     for j in range(1, n):
         total = plus(total, scaled(j / n, times(nth(results[0], j), nth(a, n - j))))
@@ -295,7 +295,7 @@ def _pair(n: int, a: Series, sine: Series, cosine: Series) -> tuple[Coefficient,
 
 def _sincos(eqn, n, operands, results, extra):
     if n == 0:
-        return list(_bound(eqn, operands[0][0]))
+        return list(_bind(eqn, operands[0][0]))
     return list(_pair(n, operands[0], *results))
 
 
@@ -317,7 +317,7 @@ def _saturating(slope: Callable[[Any], Any], next_slope: Callable[[Series, int],
     def rule(eqn, n, operands, results, extra):
         rates: Series = extra.setdefault("slope", [])
         if n == 0:
-            y = _bound(eqn, operands[0][0])
+            y = _bind(eqn, operands[0][0])
             rates.append(slope(y))
             return y
         y = convolution(operands[0], rates, n, 1, _derivative_weight(n))
@@ -369,8 +369,8 @@ def expand(
     series: list[Series] = [[x] for x in leaves]
     flow = _Flow(closed, [clock, *series])
     for n in range(order):
-        for own, rate in zip(series, flow.next(n), strict=True):
-            own.append(None if rate is None else rate * (1 / (n + 1)) if n else rate)
+        for coefficients, rate in zip(series, flow.next(n), strict=True):
+            coefficients.append(None if rate is None else rate * (1 / (n + 1)) if n else rate)
     return treedef, series
 
 
@@ -394,7 +394,7 @@ def _sum_series(series: Series, h: Scalar) -> Coefficient:
     return total
 
 
-def _slope(series: Series) -> Series:
+def _derivative(series: Series) -> Series:
     return [None if c is None else c * float(n) for n, c in enumerate(series)][1:]
 
 
@@ -415,23 +415,23 @@ class Along(NamedTuple):
         return Along([x, v, a, j, *rest])
 
     def ends(self, h: Scalar) -> tuple[Rates, Rates]:
-        slope, zero = _slope(self.series), jnp.zeros_like(h)
-        each = self.series, slope, _slope(slope)
+        slope, zero = _derivative(self.series), jnp.zeros_like(h)
+        derivatives = self.series, slope, _derivative(slope)
 
         def rates(place: Callable[[Series], Coefficient]) -> Rates:
-            return Rates(*(zero if (x := place(c)) is None else x for c in each))
+            return Rates(*(zero if (x := place(c)) is None else x for c in derivatives))
 
         return rates(lambda c: c[0]), rates(lambda c: _sum_series(c, h))
 
     def over(self, h: Scalar, factor: int = 1, offset: Scalar | None = None) -> Scalars:
         """Return the coefficients of factor·x - offset in θ, from 0 to 1 along such a step."""
-        found, power = [], None
+        terms, power = [], None
         for c in self.series:
-            found.append(jnp.zeros_like(h) if c is None else c if power is None else c * power)
+            terms.append(jnp.zeros_like(h) if c is None else c if power is None else c * power)
             power = h if power is None else power * h
         if factor != 1:
-            found = [factor * c for c in found]
-        return tuple(found) if offset is None else (found[0] - offset, *found[1:])
+            terms = [factor * c for c in terms]
+        return tuple(terms) if offset is None else (terms[0] - offset, *terms[1:])
 
 
 class _Flow:
@@ -448,23 +448,23 @@ class _Flow:
 
     def _inline(self, jaxpr: Jaxpr, consts: list, args: list[Series]) -> list[Series]:
         """Add the equations of a jaxpr and all that it calls, with a series for each variable."""
-        names: dict[Any, Series] = {}
+        series: dict[Any, Series] = {}
         for var, const in zip(jaxpr.constvars, consts, strict=True):
-            names[var] = [const]
-        names.update(zip(jaxpr.invars, args, strict=True))
+            series[var] = [const]
+        series.update(zip(jaxpr.invars, args, strict=True))
 
         def read(atom: object) -> Series:
             if isinstance(atom, Literal):
                 return [np.asarray(atom.val, getattr(atom.aval, "dtype", None))]
-            return names[atom]
+            return series[atom]
 
         for eqn in jaxpr.eqns:
             operands = [read(a) for a in eqn.invars]
             name = eqn.primitive.name
             if (inner := called(eqn)) is not None:
-                own = inner if isinstance(inner, Jaxpr) else inner.jaxpr
-                held = [] if isinstance(inner, Jaxpr) else list(inner.consts)
-                names.update(zip(eqn.outvars, self._inline(own, held, operands), strict=True))
+                body = inner if isinstance(inner, Jaxpr) else inner.jaxpr
+                captured = [] if isinstance(inner, Jaxpr) else list(inner.consts)
+                series.update(zip(eqn.outvars, self._inline(body, captured, operands), strict=True))
                 continue
             if name not in RULES:
                 raise NoSeries(name)
@@ -475,7 +475,7 @@ class _Flow:
             results: list[Series] = [[] for _ in eqn.outvars]
             if any(moves):
                 self.moving.update(map(id, results))
-            names.update(zip(eqn.outvars, results, strict=True))
+            series.update(zip(eqn.outvars, results, strict=True))
             self.equations.append((eqn, operands, results))
             self.extra.append({})
         return [read(a) for a in jaxpr.outvars]
@@ -492,7 +492,7 @@ class _Flow:
 
 
 @contextmanager
-def _in_words() -> Iterator[None]:
+def _explain_errors() -> Iterator[None]:
     """**Raises:** `NotImplementedError` with a remedy for primitives without a series."""
     where = "in the machine's field, averages or coordinates"
     try:
@@ -527,9 +527,9 @@ class Expansion(NamedTuple):
 
     def of(self, function: Callable[[State], Any]) -> Along:
         """Return a function of the state along the motion, a constant for differentiation."""
-        still = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
-        with _in_words():
-            return along(lambda y: function(y[0]), self.treedef, still)
+        constants = [[None if c is None else stop_gradient(c) for c in x] for x in self.series]
+        with _explain_errors():
+            return along(lambda y: function(y[0]), self.treedef, constants)
 
     def reach(self, limit: Scalar) -> Scalar:
         """Return the length at which the last two terms are as small as the tolerance, relative to
@@ -540,21 +540,21 @@ class Expansion(NamedTuple):
         size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
         allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
         for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
-            there = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
-            terms = [jnp.sum(jnp.abs(x)) for x in there]
+            coefficients = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
+            terms = [jnp.sum(jnp.abs(x)) for x in coefficients]
             if not terms:
                 continue
             term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
 
-            def shortened(limit: Scalar, ratio: Scalar, n: int = n) -> Scalar:
+            def shorten(limit: Scalar, ratio: Scalar, n: int = n) -> Scalar:
                 return jnp.minimum(limit, jnp.exp(jnp.log(ratio) * (1.0 / n)))
 
             ratio = allowed / term
             if self.rarely:
-                long = limit**n > ratio
-                limit = jax.lax.cond(long, shortened, lambda x, _: x, limit, ratio)
+                is_long = limit**n > ratio
+                limit = jax.lax.cond(is_long, shorten, lambda x, _: x, limit, ratio)
             else:
-                limit = shortened(limit, ratio)
+                limit = shorten(limit, ratio)
         return limit
 
 
@@ -621,7 +621,7 @@ class Taylor(AbstractMethod):
             state, beside = y
             return smooth.field(s, state), rate_of_integrals(smooth, s, state, beside)
 
-        with _in_words():
+        with _explain_errors():
             treedef, series = expand(field, s, (state, beside), self.order)
         if self.rtol is not None:
             return Expansion(treedef, series, self.rtol)

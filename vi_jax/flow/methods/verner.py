@@ -65,7 +65,7 @@ _B = (
     0.12748953408543898, 0.2244617745463132, 0.1787254491259903, 0.07594344758096558,
     0.12948458791975614, 0.029477447612619417, 0,
 )
-_BESIDE = (
+_B_EMBEDDED = (
     0.020346666552244347, 0, 0, 0, 0, 0, 0, 1.0696176509827, 0.07680834711303187,
     0.11307781868852404, 0.25525873579819625, -0.9825898086919164, 0.3981545824421514, 0, 0,
     0.04932600711506839,
@@ -85,7 +85,7 @@ class Verner9(diffrax.AbstractERK):
         c=np.array(_C),
         a_lower=tuple(np.array(row) for row in _A),
         b_sol=np.array(_B),
-        b_error=np.array(_B) - np.array(_BESIDE),
+        b_error=np.array(_B) - np.array(_B_EMBEDDED),
     )
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
