@@ -63,11 +63,11 @@ def hump(plan: Plan, c: Crossing, h: Scalar) -> tuple[Flag, Scalar]:
     rises = (begin.x < 0) & (end.x < 0) & (begin.v > 0) & (end.v < 0)
     _, bound, place = _corner((begin.x, begin.v), (end.x, end.v), h, rises)
     brief = _BRIEF * h
-    seen = rises & (bound > 0) & (place > brief) & (h - place > brief)
+    visible = rises & (bound > 0) & (place > brief) & (h - place > brief)
     dips = (begin.x <= 0) & (end.x < 0) & (begin.v < 0) & (end.v < 0) & (begin.a > 0)
     least = -begin.v / jnp.where(dips, begin.a, 1.0)
     dips = dips & (least < 0.5 * h) & _may_be_shortened(plan, h)
-    return seen | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
+    return visible | dips, jnp.where(dips, jnp.maximum(1.5 * least, brief), place)
 
 
 def crests(
@@ -81,25 +81,25 @@ def crests(
     find = partial(_crest, plan, shares, h)
     stacked = jtu.tree_map(lambda *x: jnp.stack(x), *zip(ends, values, slack, strict=True))
 
-    def at_a_glance(given: Sequence[Any]) -> Flag:
+    def quick_test(given: Sequence[Any]) -> Flag:
         x, inner, zero = given
         return may_be_above(x[:2], x[2:], inner, shares, zero)
 
     no = jnp.zeros((), bool)
     doubtful = jnp.stack([
-        flag & at_a_glance(x) if side.asked is None
-        else jax.lax.cond(flag, at_a_glance, lambda _: no, x)
+        flag & quick_test(x) if side.is_used is None
+        else jax.lax.cond(flag, quick_test, lambda _: no, x)
         for side, *x, flag in zip(sides, ends, values, slack, below, strict=True)
     ])  # fmt: skip
 
     def one(flag: Flag, side: tuple) -> tuple[Flag, Scalar]:
-        none = jnp.zeros((), bool), jnp.zeros_like(h)
-        return jax.lax.cond(flag, lambda x: find(*x), lambda _: none, side)
+        no_place = jnp.zeros((), bool), jnp.zeros_like(h)
+        return jax.lax.cond(flag, lambda x: find(*x), lambda _: no_place, side)
 
-    nowhere = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
-    asked = doubtful, stacked
+    no_places = jnp.zeros(len(sides), bool), jnp.zeros(len(sides), h.dtype)
+    arguments = doubtful, stacked
     above, place = jax.lax.cond(
-        jnp.any(doubtful), lambda x: for_each(one, x), lambda _: nowhere, asked
+        jnp.any(doubtful), lambda x: for_each(one, x), lambda _: no_places, arguments
     )
     return [(above[n], place[n]) for n in range(len(sides))]
 
@@ -112,24 +112,24 @@ def _crest(
     The correction is the shape of the cubic's error times a factor, interpolated linearly. The
     factor's greatest change from stage to stage is a margin."""
     x0, v0, x1, v1 = ends
-    over, rises, over_end, falls = x0 - slack, h * v0, x1 - slack, h * v1
+    height0, rises, height1, falls = x0 - slack, h * v0, x1 - slack, h * v1
     grid, inner = np.arange(_PARTS + 1) / _PARTS, _inner(shares)
 
     def cubic(theta: np.ndarray) -> Array:
         left = 1 - theta
         late, early = theta * theta * (1 + 2 * left), left * left * (1 + 2 * theta)
         slopes = rises * (theta * left * left) - falls * (theta * theta * left)
-        return over * early + over_end * late + slopes
+        return height0 * early + height1 * late + slopes
 
     heights = cubic(grid)
     if inner:
         places = np.asarray([shares[n] for n in inner])
-        off = (values[np.asarray(inner)] - slack - cubic(places)) / _bump(places)
+        err = (values[np.asarray(inner)] - slack - cubic(places)) / _bump(places)
         left = np.clip(np.searchsorted(places, grid) - 1, 0, max(len(inner) - 2, 0))
         right = np.minimum(left + 1, len(inner) - 1)
         share = np.interp(grid, places, np.arange(len(inner))) - left
-        doubt = jnp.max(jnp.abs(off[1:] - off[:-1])) if len(inner) > 1 else jnp.abs(off[0])
-        heights = heights + _bump(grid) * (off[left] + share * (off[right] - off[left]) + doubt)
+        margin = jnp.max(jnp.abs(err[1:] - err[:-1])) if len(inner) > 1 else jnp.abs(err[0])
+        heights = heights + _bump(grid) * (err[left] + share * (err[right] - err[left]) + margin)
     above, place = _first_top(heights, rises / _PARTS, falls / _PARTS)
     first = jnp.min(jnp.where(values > slack, np.asarray(shares), 2.0))
     place = jnp.maximum(jnp.minimum(place, first), _BRIEF)
@@ -161,14 +161,14 @@ def _first_top(heights: Array, rise: Scalar, fall: Scalar) -> tuple[Flag, Scalar
     at = np.arange(1, parts) + jnp.where(top, 0.5 * tilt / jnp.where(top, bend, 1.0), 0.0)
     place = jnp.min(jnp.where(found, at, parts + 1.0))
 
-    def beside(height: Scalar, slope: Scalar, next_one: Scalar) -> Scalar:
+    def top_near_end(height: Scalar, slope: Scalar, next_one: Scalar) -> Scalar:
         bend = height + slope - next_one
         found = (slope > 0) & (slope < 2 * bend) & (slope * slope > -4 * bend * height)
         return jnp.where(found, slope / jnp.where(found, 2 * bend, 1.0), parts + 1.0)
 
-    place = jnp.minimum(place, beside(heights[0], rise, heights[1]))
-    back = beside(heights[-1], -fall, heights[-2])
-    place = jnp.minimum(place, jnp.where(back < parts, parts - back, parts + 1.0))
+    place = jnp.minimum(place, top_near_end(heights[0], rise, heights[1]))
+    last = top_near_end(heights[-1], -fall, heights[-2])
+    place = jnp.minimum(place, jnp.where(last < parts, parts - last, parts + 1.0))
     return place < parts, place / parts
 
 
@@ -239,7 +239,7 @@ _WIDER = 1.001
 _UNCERTAIN = 1e-3
 
 
-class First(NamedTuple):
+class FirstEvent(NamedTuple):
     """The first event of a step."""
 
     crossed: Flag
@@ -252,11 +252,11 @@ class First(NamedTuple):
 
 
 def first_event(
-    plan: Plan, lane: Lane, guards: list[Passed], courses: list[Course], met: Flag, corrections: int
-) -> First:
+    plan: Plan, lane: Lane, guards: list[Passed], turns: list[Course], met: Flag, corrections: int
+) -> FirstEvent:
     """Return the first event of a step.
 
-    **Arguments:** `guards` and `courses`, of the events and of each coordinate, not both empty;
+    **Arguments:** `guards` and `turns`, of the events and of each coordinate, not both empty;
     `met`, whether the step landed on its target; `corrections`, how often a root is corrected.
     A quintic through a step's ends needs none, since its root is only the next target.
     """
@@ -272,33 +272,33 @@ def first_event(
             place = jnp.where(guard.above, -3.0, place)
         found.append((place, to_event(guard.number), curve(), guard.at_once))
         crossed = crossed | over
-    behind = crossed | met
-    paths = [curve() for _, curve in courses]
+    event_met = crossed | met
+    paths = [curve() for _, curve in turns]
 
-    def that_matter(k: int, turned: Flag, theta: Scalar, known: Flag | None) -> Flag:
+    def matters(k: int, turned: Flag, theta: Scalar, certain: Flag | None) -> Flag:
         if plan.meets_every_turn:
             return turned
         height = horner(paths[k], theta)
-        close = _has_to_be_met(plan, lane, k, lambda stop: stop.beyond(height), _MARGIN)
-        return turned & (behind | close if known is None else behind | ~known | close)
+        close = _must_end_at_turn(plan, lane, k, lambda stop: stop.beyond(height), _MARGIN)
+        return turned & (event_met | close if certain is None else event_met | ~certain | close)
 
-    for k, (turned, _) in enumerate(courses):
+    for k, (turned, _) in enumerate(turns):
         facing = tuple(-lane.direction[k] * c for c in slope(paths[k]))
         # The motion turned within the step. Unless it went through a stop before, that comes first:
         # events beyond the turn are met by the next steps.
-        turned, place = turned & ~_ran_into_stop(plan, lane, guards, k), -1.0
-        if len(courses) > 1:  # of the turns that matter the earliest comes first
-            theta, known = _root(facing, corrections)
-            turned, place = that_matter(k, turned, theta, known), theta - 2
+        turned, place = turned & ~_passed_stop(plan, lane, guards, k), -1.0
+        if len(turns) > 1:  # of the turns that matter the earliest comes first
+            theta, certain = _root(facing, corrections)
+            turned, place = matters(k, turned, theta, certain), theta - 2
         found.append((jnp.where(turned, place, jnp.inf), to_turn_of(k), facing, None))
         any_turn = any_turn | turned
     target, curve, at_once = _earliest(lane, found)
-    theta, known = _root(curve, corrections)
-    if len(courses) == 1:  # one root serves for the turn as well
-        any_turn = that_matter(0, any_turn, theta, known)
+    theta, certain = _root(curve, corrections)
+    if len(turns) == 1:  # one root serves for the turn as well
+        any_turn = matters(0, any_turn, theta, certain)
     if at_once is not None:
         theta = jnp.where(at_once, 0.0, theta)
-    return First(crossed, any_turn, theta, target)
+    return FirstEvent(crossed, any_turn, theta, target)
 
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
@@ -310,17 +310,17 @@ def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | Non
     """
     (soonest, target, curve, at_once), *others = found
     target = jnp.full_like(lane.s, target)
-    for place, its_target, its_curve, begins in others:
+    for place, its_target, its_curve, its_at_once in others:
         sooner = place < soonest
         soonest = jnp.where(sooner, place, soonest)
         target = jnp.where(sooner, its_target, target)
         curve = select(sooner, its_curve, curve)
         if at_once is not None:
-            at_once = jnp.where(sooner, False if begins is None else begins, at_once)
+            at_once = jnp.where(sooner, False if its_at_once is None else its_at_once, at_once)
     return target, curve, at_once
 
 
-def _ran_into_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Flag:
+def _passed_stop(plan: Plan, lane: Lane, guards: list[Passed], k: int) -> Flag:
     through = jnp.zeros_like(lane.s, bool)
     for guard, over, _ in guards:
         if guard.coordinate == k:
@@ -353,10 +353,10 @@ def may_matter(plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, h: Scal
         gap = stop_gradient(stop.gap)
         return highest(begin.scaled(stop.sign, gap), end.scaled(stop.sign, gap), h)
 
-    return _has_to_be_met(plan, lane, k, bound, _WIDER * _MARGIN)
+    return _must_end_at_turn(plan, lane, k, bound, _WIDER * _MARGIN)
 
 
-def _has_to_be_met(
+def _must_end_at_turn(
     plan: Plan, lane: Lane, k: int, depth: Callable[[RigidStop], Scalar], margin: float
 ) -> Flag:
     """Return whether a step has to end at a turning point of coordinate number k: at each one (see
@@ -379,18 +379,18 @@ def aim_ahead(plan: Plan, lane: Lane, motion: Foreseen) -> Lane:
     if plan.s_counts_cycles(lane.state):
         h = jnp.minimum(h, plan.end(lane.part) - lane.s)
     h = stop_gradient(h)
-    guards, courses = _foreseen(plan, lane, motion, h)
-    none, whole = jnp.zeros_like(h, bool), (h, jnp.full_like(h, FREE))
+    guards, turns = _foreseen(plan, lane, motion, h)
+    nothing, uncut = jnp.zeros_like(h, bool), (h, jnp.full_like(h, FREE))
 
-    def cut(whole: tuple) -> tuple:
-        first = first_event(plan, lane, guards, courses, none, corrections=2)
-        return select(first.crossed | first.turned, (first.theta * h, first.target), whole)
+    def cut(uncut: tuple) -> tuple:
+        first = first_event(plan, lane, guards, turns, nothing, corrections=2)
+        return select(first.crossed | first.turned, (first.theta * h, first.target), uncut)
 
-    met = none
-    for flag in (*(over for _, over, _ in guards), *(turned for turned, _ in courses)):
+    met = nothing
+    for flag in (*(over for _, over, _ in guards), *(turned for turned, _ in turns)):
         met = met | flag
-    nothing_to_meet = not guards and not courses
-    length, target = whole if nothing_to_meet else jax.lax.cond(met, cut, lambda x: x, whole)
+    nothing_to_meet = not guards and not turns
+    length, target = uncut if nothing_to_meet else jax.lax.cond(met, cut, lambda x: x, uncut)
     free = lane.target == FREE
     return lane._replace(
         attempt=jnp.where(free, length, lane.attempt),
@@ -402,7 +402,7 @@ def _foreseen(
     plan: Plan, lane: Lane, motion: Foreseen, h: Scalar
 ) -> tuple[list[Passed], list[Course]]:
     """Return the arguments of `first_event` for a step of length h along `motion`."""
-    machine, courses, ends, paths = plan.machine, [], [], []
+    machine, turns, ends, paths = plan.machine, [], [], []
     if plan.records_motion or stops_of(machine):
         paths = [motion.of(coordinate.position) for coordinate in machine.coordinates]
     if not stops_are_exact(machine, lane.state):
@@ -413,7 +413,7 @@ def _foreseen(
         turned = (lane.direction[k] * end.v < 0) & may_matter(plan, lane, k, begin, end, h)
         if lane.contact is not None:  # a body at rest meets nothing
             turned = turned & (lane.contact[k] == 0)
-        courses.append((turned, partial(path.over, h)))
+        turns.append((turned, partial(path.over, h)))
         ends.append((begin, end))
     guards = []
     for guard in at_stops(plan, ends):
@@ -428,7 +428,7 @@ def _foreseen(
         begin, end = (x.scaled(1, bound) for x in clock.ends(h))
         guard = Crossing(events_of(machine)[-1], section_number(machine), begin, end, bound)
         guards.append((guard, guard.end.x > 0, partial(clock.over, h, 1, bound)))
-    return guards, courses
+    return guards, turns
 
 
 def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, Scalar, Scalar]:
@@ -436,28 +436,28 @@ def aim_at(plan: Plan, lane: Lane, trial: Trial, foreseen: bool) -> tuple[Flag, 
     target (see `Lane.target`). If the motion is `foreseen`, `aim_ahead` has found its turns."""
     # The result only directs the search, so that it needs no derivatives.
     trial = trial._replace(h=stop_gradient(trial.h), paths=stop_gradient(trial.paths))
-    nothing = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
+    no_goal = jnp.zeros_like(trial.good), trial.h, jnp.full_like(trial.h, FREE)
     if not trial.paths and not trial.crossings:
-        return nothing
-    seen = _seen(plan, lane, trial)
+        return no_goal
+    found = _find_events(plan, lane, trial)
     # Rare: skipped if no lane of a group has met anything.
     return jax.lax.cond(
-        _met_something(plan, lane, trial, seen, foreseen),
-        lambda _: _aimed(plan, lane, trial, seen),
+        _may_have_met(plan, lane, trial, found, foreseen),
+        lambda _: _next_goal(plan, lane, trial, found),
         lambda x: x,
-        nothing,
+        no_goal,
     )
 
 
-def at_a_turn(trial: Trial) -> Flag:
+def is_at_turn(trial: Trial) -> Flag:
     return any_of(trial.good, (path.at_turn for path in trial.paths))
 
 
-class _Seen(NamedTuple):
+class _Found(NamedTuple):
     """The events between the ends of a tried step, as found from its ends and stages."""
 
     guards: list[Passed]
-    courses: list[Course]
+    turns: list[Course]
     """Both are arguments of `first_event`: quintics through the step's ends."""
     humps: list[tuple[Flag, Scalar]]
     """For each guard that holds a mode, whether and where it may have been positive between."""
@@ -468,17 +468,17 @@ class _Seen(NamedTuple):
     """True if a motion may have turned twice."""
 
 
-def _met_something(plan: Plan, lane: Lane, trial: Trial, seen: _Seen, foreseen: bool) -> Flag:
-    """Return whether a step may have met anything; if not, `_aimed` need not be evaluated."""
+def _may_have_met(plan: Plan, lane: Lane, trial: Trial, found: _Found, foreseen: bool) -> Flag:
+    """Return whether a step may have met anything; if not, `_next_goal` need not be evaluated."""
     if any(path.leaves is not None for path in trial.paths):
-        anything = jnp.ones_like(trial.good)
-        return anything if trial.clear is None else ~trial.clear
-    met = trial.good & ((lane.target != FREE) & ~at_a_turn(trial) | seen.twice)
-    for c, over, _ in seen.guards:
-        met = met | over & ~c.landed | c.again
-    for above, _ in (*seen.humps, *seen.rises):
+        always = jnp.ones_like(trial.good)
+        return always if trial.clear is None else ~trial.clear
+    met = trial.good & ((lane.target != FREE) & ~is_at_turn(trial) | found.twice)
+    for crossing, over, _ in found.guards:
+        met = met | over & ~crossing.landed | crossing.again
+    for above, _ in (*found.humps, *found.rises):
         met = met | above
-    for k, ((turned, _), path) in enumerate(zip(seen.courses, trial.paths, strict=True)):
+    for k, ((turned, _), path) in enumerate(zip(found.turns, trial.paths, strict=True)):
         if not foreseen:
             met = met | turned & may_matter(plan, lane, k, path.begin, path.end, trial.h)
     return met if trial.clear is None else met & ~trial.clear
@@ -494,26 +494,26 @@ class _Goal(NamedTuple):
     length: Scalar
     target: Scalar
 
-    def cut(self, when: Flag, length: Scalar) -> "_Goal":
-        """Return the goal at this length where `when` is true, without a target."""
+    def cut(self, condition: Flag, length: Scalar) -> "_Goal":
+        """Return the goal at this length where `condition` is true, without a target."""
         return _Goal(
-            self.event & ~when,
-            self.before | when,
-            jnp.where(when, length, self.length),
-            jnp.where(when, FREE, self.target),
+            self.event & ~condition,
+            self.before | condition,
+            jnp.where(condition, length, self.length),
+            jnp.where(condition, FREE, self.target),
         )
 
 
-def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Scalar, Scalar]:
+def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Flag, Scalar, Scalar]:
     h, landed = trial.h, any_of(trial.good, (c.landed for c in trial.crossings))
-    first = first_event(plan, lane, seen.guards, seen.courses, landed, corrections=0)
-    met = landed | at_a_turn(trial)
+    first = first_event(plan, lane, found.guards, found.turns, landed, corrections=0)
+    met = landed | is_at_turn(trial)
     goal = _Goal(first.crossed & ~landed, first.turned, pin(first.theta) * h, first.target)
     goal = _by_newton(lane, trial, goal)
-    for above, place in reversed(seen.humps):  # of several the first listed
+    for above, place in reversed(found.humps):  # of several the first listed
         goal = goal.cut(above & ~(goal.event | landed), place)
     nothing_else = trial.good & ~(first.crossed | first.turned | met)
-    goal = goal.cut(seen.twice & nothing_else, 0.5 * h)
+    goal = goal.cut(found.twice & nothing_else, 0.5 * h)
     for k, path in enumerate(trial.paths):
         if path.force_rates is not None:
             # An event may have come before the one that was met: step to the force's extremum.
@@ -527,13 +527,13 @@ def _aimed(plan: Plan, lane: Lane, trial: Trial, seen: _Seen) -> tuple[Flag, Sca
                 length=jnp.where(left, place, goal.length),
                 target=jnp.where(left, to_release(k), goal.target),
             )
-    for above, place in reversed(seen.rises):
+    for above, place in reversed(found.rises):
         goal = goal.cut(above & ~goal.event, place)
     return goal.event | goal.before, stop_gradient(goal.length), goal.target
 
 
-def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
-    h, good, guards, courses, humps = trial.h, trial.good, [], [], []
+def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
+    h, good, guards, turns, humps = trial.h, trial.good, [], [], []
     sides, below = [], []
     for c in trial.crossings:
         guards.append((c, good & beyond(c), partial(quintic, c.begin, c.end, h)))
@@ -544,30 +544,30 @@ def _seen(plan: Plan, lane: Lane, trial: Trial) -> _Seen:
             slack = 0.0 if c.slack is None else c.slack
             sides.append(side._replace(slack=slack))
             below.append((side.end.x <= slack) | c.landed)
-    exactly, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
+    stops_exact, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
         if path.pull is not None and path.leaves is not None:
             sides.append(path.pull)
-            same = (path.pull.end.x <= 0) | path.leaves.landed
-            asked = same if path.pull.asked is None else same & path.pull.asked
+            stays_below = (path.pull.end.x <= 0) | path.leaves.landed
+            asked = stays_below if path.pull.is_used is None else stays_below & path.pull.is_used
             below.append(~path.leaves.left & asked)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
-        if not exactly or any(x.blends for x in switches_of(plan.machine)):
+        if not stops_exact or any(x.blends for x in switches_of(plan.machine)):
             # A turn that is closer than the clock resolves, as of a body that a rounded difference
             # has almost stopped, has nothing before it to step to. Nor does it count if all that
             # moves is rounding, as between bodies that move together.
-            now = 4 * eps * (plan.unit + stop_gradient(trial.s))
-            moves = jnp.abs(end.v) * h > eps * (plan.extent(k) + jnp.abs(end.x))
-            turned = turned & (jnp.abs(offset_to_turn(end)) > now) & moves
-        courses.append((turned, partial(quintic, path.begin, end, h)))
+            resolution = 4 * eps * (plan.unit + stop_gradient(trial.s))
+            is_moving = jnp.abs(end.v) * h > eps * (plan.extent(k) + jnp.abs(end.x))
+            turned = turned & (jnp.abs(offset_to_turn(end)) > resolution) & is_moving
+        turns.append((turned, partial(quintic, path.begin, end, h)))
     rises = []
     if sides:
         below = [good & x for x in below]
         found = crests(plan, sides, below, trial.shares, h)
         rises = [(x & y, at) for (x, at), y in zip(found, below, strict=True)]
-    return _Seen(guards, courses, humps, rises, twice)
+    return _Found(guards, turns, humps, rises, twice)
 
 
 def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:

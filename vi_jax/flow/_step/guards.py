@@ -39,10 +39,10 @@ from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
 SHARES = tuple(n / 8 for n in range(1, 8))
 
 # One of several stages closer together than this share of a step is used. A choice.
-_APART = 0.08
+_MIN_DISTANCE = 0.08
 
 
-class Within(NamedTuple):
+class InnerGuards(NamedTuple):
     """Guards at the stages of a step; each array has a value for each stage."""
 
     forces: dict[int, Array]
@@ -58,7 +58,7 @@ class Within(NamedTuple):
     error: Scalar | None = None
     """The largest error of the forces, relative to the tolerance."""
 
-    def only(self, places: list[int]) -> "Within":
+    def only(self, places: list[int]) -> "InnerGuards":
         kept = self.forces, self.events
         forces, events = jtu.tree_map(lambda x: x[np.asarray(places)], kept)
         return self._replace(forces=forces, events=events)
@@ -81,12 +81,12 @@ def events_within_step(plan: Plan, state: State) -> list[int]:
 
 
 def guards_error(
-    plan: Plan, seen: Within, stages: list[Stage], h: Scalar, longest: Scalar
+    plan: Plan, inner: InnerGuards, stages: list[Stage], h: Scalar, longest: Scalar
 ) -> Scalar | None:
     """Return the largest error of the guards at the stages of a step, relative to the tolerance;
     `None` without guards, or for a method without an estimate."""
-    events, errors = events_of(plan.machine), [seen.error]
-    for number, sides in seen.events.items():
+    events, errors = events_of(plan.machine), [inner.error]
+    for number, sides in inner.events.items():
         acts = events[number].holds_mode
         errors += [
             plan.method.guard_error(stages, x, h, longest, acts=acts, size=plan.unit) for x in sides
@@ -95,33 +95,33 @@ def guards_error(
     return functools.reduce(jnp.maximum, known) if known else None
 
 
-def separated(stages: list[Stage]) -> list[Stage]:
+def separate_stages(stages: list[Stage]) -> list[Stage]:
     found: list[Stage] = []
     for stage in sorted(stages, key=lambda x: x.share):
-        if 0 < stage.share < 1 and (not found or stage.share - found[-1].share >= _APART):
+        if 0 < stage.share < 1 and (not found or stage.share - found[-1].share >= _MIN_DISTANCE):
             found.append(stage)
     return found
 
 
-def within(
-    plan: Plan, lane: Lane, alone: tuple[SmoothMachine, ...], ends: list[tuple[Rates, Rates]],
-    stages: list[Stage], at: Callable[[Scalar], State], h: Scalar, longest: Scalar,
-) -> Within:  # fmt: skip
+def inner_guards(
+    plan: Plan, lane: Lane, free_machines: tuple[SmoothMachine, ...],
+    ends: list[tuple[Rates, Rates]], stages: list[Stage], at: Callable[[Scalar], State],
+    h: Scalar, longest: Scalar,
+) -> InnerGuards:  # fmt: skip
     """Return the guards at the stages of a step.
 
-    **Arguments:** `alone`, for each coordinate the machine with its body free and the others held
-    if they rest; `ends`, its rates at both ends; `at(share)`, returns the state at a share of the
-    step, for stages without a state; `longest`, the length of the longest step.
+    **Arguments:** `free_machines`, as in `Trial`; `ends`, the rates of each coordinate at both
+    ends; `at(share)`, returns the state there, for stages without one; `longest`, a step's limit.
     """
     if not stages:
-        return Within({}, {}, {}, {})
-    machine, around = plan.machine, (lane.modes, lane.contact or ())
+        return InnerGuards({}, {}, {}, {})
+    machine, arguments = plan.machine, (lane.modes, lane.contact or ())
     limited = limited_of(machine) if plan.rests else []
     contacts: Any = lane.contact
-    looked_at = events_within_step(plan, lane.state)
+    checked = events_within_step(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
-        return rates(alone[k].field, machine.coordinates[k].position, s, state)
+        return rates(free_machines[k].field, machine.coordinates[k].position, s, state)
 
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):
@@ -137,32 +137,32 @@ def within(
 
     def guards(s: Scalar, state: State) -> dict[int, tuple[Scalar, ...]]:
         found = {}
-        for number in looked_at:
+        for number in checked:
             if number < len(stops_of(machine)):
                 found[number] = (_distance(machine, lane, number, state),)
             else:
-                found[number] = sides_of(machine, number, s, state, *around)
+                found[number] = sides_of(machine, number, s, state, *arguments)
         return found
 
-    known = stages[0].state is not None
-    places = [(x.s, x.state if known else jnp.asarray(x.share, h.dtype)) for x in stages]
+    has_states = stages[0].state is not None
+    places = [(x.s, x.state if has_states else jnp.asarray(x.share, h.dtype)) for x in stages]
     places = jtu.tree_map(lambda *x: jnp.stack(x), *stop_gradient(places))
 
-    def seen(function: Callable[..., Any]) -> Callable[[tuple], Any]:
-        there = function if known else lambda s, share: function(s, at(share))
-        return functools.partial(for_each, there)
+    def at_places(function: Callable[..., Any]) -> Callable[[tuple], Any]:
+        at_share = function if has_states else lambda s, share: function(s, at(share))
+        return functools.partial(for_each, at_share)
 
-    events = seen(guards)(places) if looked_at else {}
+    events = at_places(guards)(places) if checked else {}
     if not limited:
-        return Within({}, events, slow, {})
+        return InnerGuards({}, events, slow, {})
     # The integral of a force is a velocity.
     size = 1.0 if isinstance(plan.unit, float) else 1 / plan.unit
 
     def of_forces(places: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
-        forces, error, slack = seen(pulls)(places), jnp.zeros_like(h), {}
+        forces, error, slack = at_places(pulls)(places), jnp.zeros_like(h), {}
         for k, x in forces.items():
-            own = plan.method.guard_error(stages, x, h, longest, acts=True, size=size)
-            error = error if own is None else jnp.maximum(error, own)
+            force_error = plan.method.guard_error(stages, x, h, longest, acts=True, size=size)
+            error = error if force_error is None else jnp.maximum(error, force_error)
             slack[k] = 64 * float(jnp.finfo(h.dtype).eps) * jnp.max(jnp.abs(x))
         return forces, error, slack
 
@@ -171,9 +171,9 @@ def within(
         zero = jnp.zeros_like(h)
         return dict.fromkeys(limited, nothing), zero, dict.fromkeys(limited, zero)
 
-    asked = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
-    forces, error, slack = jax.lax.cond(asked, of_forces, of_none, places)
-    return Within(forces, events, slow, slack, error)
+    any_force = any_of(slow[limited[0]], ((contacts[k] > 0) | slow[k] for k in limited))
+    forces, error, slack = jax.lax.cond(any_force, of_forces, of_none, places)
+    return InnerGuards(forces, events, slow, slack, error)
 
 
 def for_each(function: Callable[..., Any], given: tuple) -> Any:
@@ -197,9 +197,9 @@ def may_be_above(
     or rises at its end, it has no top there.
     """
     (x0, v0), (x1, v1) = begin, end
-    seen = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
-    halves = 0.5 * jnp.abs(seen[1:] - seen[:-1])
-    within = jnp.any(seen[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero)
+    values = jnp.concatenate([x0[None], inner[np.argsort(shares)], x1[None]])
+    halves = 0.5 * jnp.abs(values[1:] - values[:-1])
+    within = jnp.any(values[1:-1] + jnp.maximum(halves[1:], halves[:-1]) > zero)
     return within | (v0 > 0) & (x0 + halves[0] > zero) | (v1 < 0) & (x1 + halves[-1] > zero)
 
 
@@ -247,7 +247,7 @@ class Side(NamedTuple):
     """The value at each stage."""
     slack: Scalar | float = 0.0
     """Values up to this count as zero."""
-    asked: Flag | None = None
+    is_used: Flag | None = None
     """True if the function is used; else it is a constant below zero. `None`: always used."""
 
 
@@ -292,29 +292,29 @@ class Crossing(NamedTuple):
 
 
 def crossings(
-    plan: Plan, lane: Lane, holding: SmoothMachine, paths: list[Any], there: tuple,
-    ends: tuple[Flag, Flag], seen: Within,
+    plan: Plan, lane: Lane, smooth: SmoothMachine, paths: list[Any], end: tuple,
+    ends: tuple[Flag, Flag], inner: InnerGuards,
 ) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
     """Return the events in a step, and `Lane.below` at its end.
 
-    **Arguments:** `holding`, the machine during the step; `paths`, the path of each coordinate;
-    `there`, s at its end, its length and the state; `ends`, whether the step was good, and ends an
-    interval; `seen`, guards at the stages.
+    **Arguments:** `smooth`, the machine during the step; `paths`, the path of each coordinate;
+    `end`, s at the step's end, its length and the state; `ends`, whether the step was good, and
+    ends an interval; `inner`, guards at the stages.
     """
-    machine, (s1, h, new), (good, last) = plan.machine, there, ends
-    others, below = _others(plan, lane, holding, (s1, new), seen)
+    machine, (s1, h, new), (good, last) = plan.machine, end, ends
+    others, below = _other_events(plan, lane, smooth, (s1, new), inner)
     stops = at_stops(plan, [(path.begin, path.end) for path in paths])
-    guards = [*(_with_stages(lane, c, seen) for c in stops), *others]
+    guards = [*(_with_stages(lane, c, inner) for c in stops), *others]
     # The stops of one coordinate and a clock coincide only on a section, where a step ends; other
     # events may coincide.
     if plan.others(lane.state) or not stops_are_exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
-        guards = [guard if guard.coordinate is not None else _jumped(guard) for guard in guards]
-    return tuple(_seen(plan, lane, good & last, good, h, each, guards) for each in guards), below
+        guards = [guard if guard.coordinate is not None else _mark_jump(guard) for guard in guards]
+    return tuple(_landed(plan, lane, good & last, good, h, each, guards) for each in guards), below
 
 
-def _jumped(guard: Crossing) -> Crossing:
+def _mark_jump(guard: Crossing) -> Crossing:
     """Set `above` of an event: its guard is above zero at the start of the step, by more than
     `_from_below` takes for zero in a guard that falls."""
     x = stop_gradient(guard.begin.x)
@@ -336,24 +336,24 @@ def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
     return found
 
 
-def _with_stages(lane: Lane, c: Crossing, seen: Within) -> Crossing:
+def _with_stages(lane: Lane, c: Crossing, inner: InnerGuards) -> Crossing:
     """Return a stop with its distance at the stages, if evaluated; -1 while its body rests."""
-    if c.number not in seen.events:
+    if c.number not in inner.events:
         return c
-    begin, end, (values,) = c.begin, c.end, seen.events[c.number]
+    begin, end, (values,) = c.begin, c.end, inner.events[c.number]
     if lane.contact is not None and c.coordinate is not None:
         moves = lane.contact[c.coordinate] == 0
-        begin, end = _if_armed(moves, begin), _if_armed(moves, end)
+        begin, end = _rates_if_armed(moves, begin), _rates_if_armed(moves, end)
     return c._replace(sides=(Side(begin, end, values),))
 
 
-def _others(
-    plan: Plan, lane: Lane, moving: SmoothMachine, there: tuple[Scalar, State], seen: Within
+def _other_events(
+    plan: Plan, lane: Lane, smooth: SmoothMachine, at_end: tuple[Scalar, State], inner: InnerGuards
 ) -> tuple[list[Crossing], Scalars]:
     """Return the events in a step other than stops, including the end of a cycle by a clock in the
-    state; and `Lane.below` at the step's end, `there`."""
+    state; and `Lane.below` at the step's end. `at_end` are s and the state there."""
     machine, found, below = plan.machine, [], []
-    numbers, around = plan.others(lane.state), (lane.modes, lane.contact or ())
+    numbers, arguments = plan.others(lane.state), (lane.modes, lane.contact or ())
     clocked = clock_of(machine, lane.state) is not None
     if not (numbers or clocked):
         return [], ()
@@ -361,9 +361,9 @@ def _others(
     def guards(s: Scalar, x: State) -> list[list[Scalar]]:
         """Return for each event its guard, or its sides; and the clock relative to its end."""
         values = [
-            sides_of(machine, i, s, x, *around)
-            if len(seen.events.get(i, ())) > 1
-            else [guard_of(machine, i, s, x, *around)]
+            sides_of(machine, i, s, x, *arguments)
+            if len(inner.events.get(i, ())) > 1
+            else [guard_of(machine, i, s, x, *arguments)]
             for i in numbers
         ]
         if (clock := clock_of(machine, x)) is not None:
@@ -371,13 +371,13 @@ def _others(
         return [[jnp.asarray(each) for each in of_one] for of_one in values]
 
     # All in one call, so that the field along which they change is compiled once.
-    begins, arrives = (
-        jax.tree.map(Rates, *guard_rates(moving.field, guards, *place))
-        for place in ((lane.s, lane.state), there)
+    begin_rates, end_rates = (
+        jax.tree.map(Rates, *guard_rates(smooth.field, guards, *place))
+        for place in ((lane.s, lane.state), at_end)
     )
     for place, number in enumerate(numbers):
-        event, values = events_of(machine)[number], seen.events.get(number, (jnp.zeros(0),))
-        both = zip(begins[place], arrives[place], strict=True)
+        event, values = events_of(machine)[number], inner.events.get(number, (jnp.zeros(0),))
+        both = zip(begin_rates[place], end_rates[place], strict=True)
         sides = [Side(*x, y) for x, y in zip(both, values, strict=True)]
         scale = plan.guard_extent(number, lane) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
@@ -385,7 +385,7 @@ def _others(
         if event.from_below:
             (side,) = sides
             armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
-            begin, end = _if_armed(armed, side.begin), _if_armed(armed, side.end)
+            begin, end = _rates_if_armed(armed, side.begin), _rates_if_armed(armed, side.end)
             sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
         if event.holds_mode:
@@ -395,9 +395,9 @@ def _others(
             greater = stop_gradient(side.end.x > end.x)
             begin, end = select(greater, (side.begin, side.end), (begin, end))
         crossing = Crossing(event, number, begin, end, scale)
-        found.append(crossing._replace(sides=tuple(sides)) if number in seen.events else crossing)
+        found.append(crossing._replace(sides=tuple(sides)) if number in inner.events else crossing)
     if clocked:
-        number, (begin,), (end,) = section_number(machine), begins[-1], arrives[-1]
+        number, (begin,), (end,) = section_number(machine), begin_rates[-1], end_rates[-1]
         section = events_of(machine)[number]
         found.append(Crossing(section, number, begin, end, plan.end(lane.part)))
     return found, tuple(below)
@@ -427,7 +427,7 @@ def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple
     return armed, jnp.where(armed | (stop_gradient(end.x) < -rounding), 1.0, below)
 
 
-def _if_armed(armed: Flag, r: Rates) -> Rates:
+def _rates_if_armed(armed: Flag, r: Rates) -> Rates:
     """Return the rates of a guard that counts; else those of a constant -1."""
     return Rates(jnp.where(armed, r.x, -1.0), *(jnp.where(armed, x, 0.0) for x in (r.v, r.a)))
 
@@ -443,9 +443,9 @@ def beyond(event: Crossing) -> Flag:
     return ends if event.above is None else ends | event.above
 
 
-def _seen(
+def _landed(
     plan: Plan, lane: Lane, ends: Flag, good: Flag, h: Scalar, guard: Crossing,
-    all_of_them: list[Crossing],
+    guards: list[Crossing],
 ) -> Crossing:  # fmt: skip
     """Return the event with the result of a step aimed at it: landed, or to be aimed again. A step
     that ends an interval (`ends`) and meets a stop there, to rounding, counts as aimed at it. An
@@ -453,13 +453,13 @@ def _seen(
     end = guard.end
     aimed = good & (lane.target == to_event(guard.number))
     eps = float(jnp.finfo(h.dtype).eps)
-    for other in all_of_them:
+    for other in guards:
         if other.number == guard.number:
             continue
         # A point beyond another event was not reached. Events may coincide, except for the stops of
         # one coordinate: then one is met after the other.
-        alone = guard.coordinate is not None and guard.coordinate == other.coordinate
-        if alone or other.slack is None:
+        same_coordinate = guard.coordinate is not None and guard.coordinate == other.coordinate
+        if same_coordinate or other.slack is None:
             aimed = aimed & ~beyond(other)
         else:
             reached = (other.end.x <= 4 * other.slack) | ~beyond(other)
@@ -469,16 +469,16 @@ def _seen(
     offset, square = landing(end)
     size = stop_gradient(jnp.abs(offset))
     # Two tests of being on the event to rounding: along the path, or, near grazing, in position.
-    close = size <= landing_tolerance(h) * leniency(plan, lane)
-    there = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
+    close = size <= landing_tolerance(h) * tolerance_factor(plan, lane)
+    on_event = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # On the event a parabola may have no root: a body that is at rest on a surface.
-    near = close & real | there
+    near = close & real | on_event
     landed = pin_flag(aimed & near, h)
     again = aimed & ~landed & real & (size < 0.25 * h)
     # When bodies touch at rest, their remaining speed is rounding.
     rises = end.v > 0 if guard.slack is None else end.v * lane.length > guard.slack
-    again = again | ends & there & close & rises
+    again = again | ends & on_event & close & rises
     sudden = None
     if guard.above is not None:
         shortest = jnp.maximum(
@@ -491,7 +491,7 @@ def _seen(
     return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
 
 
-def leniency(plan: Plan, lane: Lane) -> Scalar:
+def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
     """Return the factor of a lane's landing tolerance: its unit, and 1,000 after many attempts."""
     return plan.in_units(jnp.where(lane.attempts >= _PATIENCE, 1e3, jnp.ones_like(lane.attempts)))
 

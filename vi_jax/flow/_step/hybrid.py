@@ -41,14 +41,14 @@ from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
 from .aim import aim_ahead, aim_at
 from .arrive import after_jump, arrive, contacts_after_jump, on_its_stops, release_pulled
-from .trial import Trial, attempt
+from .trial import Trial, try_step
 
 # A lane has failed after this many attempts without landing; with this many impacts in one interval
 # it was chattering. Both are choices: a smooth flow needs two or three attempts.
-_LOST, _MANY = 64.0, 16.0
+_MOST_ATTEMPTS, _MOST_IMPACTS = 64.0, 16.0
 
 # No motion needs this many steps in one interval; a power of two, by choice.
-_STUCK = 65536.0
+_MOST_STEPS = 65536.0
 
 # A slip jumps if it changes by this share of itself: a choice. If it is zero to rounding, the modes
 # stay the same.
@@ -64,16 +64,16 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     the lane; whether an interval ended; the record of that interval."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
     smooth = hold_contacts(plan.machine, lane.modes, lane.contact)
-    beside = carried(smooth, lane.s, lane.state, lane.record.integrals)
-    motion = plan.method.foresee(smooth, lane.s, lane.state, beside)
+    integrals = carried(smooth, lane.s, lane.state, lane.record.integrals)
+    motion = plan.method.foresee(smooth, lane.s, lane.state, integrals)
     if motion is not None:
         lane = aim_ahead(plan, lane, motion)
-    trial = attempt(plan, lane, active, smooth, motion)
+    trial = try_step(plan, lane, active, smooth, motion)
     aim, goal, target = aim_at(plan, lane, trial, foreseen=motion is not None)
     aim = pin_flag(active & aim, lane.s)
     taken = pin_flag(active & trial.good & ~aim, lane.s)
     rejected = active & ~trial.good
-    length = _resized(plan, lane, trial, taken, rejected)
+    length = _next_length(plan, lane, trial, taken, rejected)
     arrived, completed = arrive(plan, lane, trial, taken)
     if section_in(plan.machine, lane.state) is not None and not counts_turns(plan.machine):
         completed = completed | taken & _is_equilibrium_on_section(plan, lane, arrived)
@@ -85,7 +85,7 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)
-    new = _onward(plan, arrived, reached, completed, done)._replace(
+    new = _next_interval(plan, arrived, reached, completed, done)._replace(
         length=length,
         attempt=jnp.where(aim, goal, _next_attempt(plan, lane, trial, taken, length)),
         target=jnp.where(aim, target, FREE),
@@ -108,11 +108,11 @@ def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Sca
     and fell short of it, it is at most as long: so the place where a guard jumps is bisected."""
     if not plan.others(lane.state):
         return length
-    short = taken & (lane.target >= to_event(len(stops_of(plan.machine))))
+    fell_short = taken & (lane.target >= to_event(len(stops_of(plan.machine))))
     for c in trial.crossings:
         if c.sudden is not None:
-            short = short & ~c.landed
-    return jnp.where(short, jnp.minimum(stop_gradient(trial.h), length), length)
+            fell_short = fell_short & ~c.landed
+    return jnp.where(fell_short, jnp.minimum(stop_gradient(trial.h), length), length)
 
 
 def _is_equilibrium_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
@@ -124,38 +124,38 @@ def _is_equilibrium_on_section(plan: Plan, lane: Lane, arrived: Lane) -> Flag:
     slack, cycle = 8 * float(jnp.finfo(arrived.s.dtype).eps), plan.machine.cycle
     share = jnp.ones_like(arrived.s)
     # A step with a target may be so short that nothing has time to change.
-    still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
+    is_still = (arrived.s >= 2 * cycle) & (arrived.s - lane.s >= _LONG * cycle)
     for before, after, size in zip(old, new, sizes, strict=True):
-        still = still & jnp.all(jnp.abs(after - before) <= slack * (size + jnp.abs(before)))
+        is_still = is_still & jnp.all(jnp.abs(after - before) <= slack * (size + jnp.abs(before)))
         share = share + jnp.max(jnp.abs(after)) / size
     guard = jnp.asarray(section_in(plan.machine, stop_gradient(arrived.state)))
     extent = plan.guard_extent(section_number(plan.machine), lane)
-    return still & (jnp.abs(guard) <= slack * share * extent)
+    return is_still & (jnp.abs(guard) <= slack * share * extent)
 
 
-def _onward(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
+def _next_interval(plan: Plan, arrived: Lane, reached: Flag, completed: Flag, done: Scalar) -> Lane:
     """Return the lane at the start of its next interval, if one was `completed`; and of its next
     cycle, if that was the cycle's last. The step `reached` the end of a piece of its cycle."""
-    turned, part, state = reached, arrived.part, arrived.state
+    cycle_ended, part, state = reached, arrived.part, arrived.state
     if plan.instants > 1:
         part = part + jnp.where(reached, 1.0, 0.0)
-        turned = reached & (part >= plan.instants)
-        part = jnp.where(turned, plan.first_part(done), part)
+        cycle_ended = reached & (part >= plan.instants)
+        part = jnp.where(cycle_ended, plan.first_part(done), part)
     if not plan.s_counts_cycles(state):
-        state = select(turned, with_earlier_clock(plan.machine, state), state)
-    lane = arrived._replace(s=jnp.where(turned, 0.0, arrived.s), state=state)
+        state = select(cycle_ended, with_earlier_clock(plan.machine, state), state)
+    lane = arrived._replace(s=jnp.where(cycle_ended, 0.0, arrived.s), state=state)
     renewed = plan.machine.renewed(state)
     if renewed is not state:
-        lane = after_jump(plan, lane._replace(state=renewed), turned, state)
-        lane = lane._replace(state=select(turned, renewed, state))
-    lane = _strike_frictions(plan, arrived, lane, turned)
+        lane = after_jump(plan, lane._replace(state=renewed), cycle_ended, state)
+        lane = lane._replace(state=select(cycle_ended, renewed, state))
+    lane = _update_frictions(plan, arrived, lane, cycle_ended)
     if plan.noise is not None:
         lane = after_impulse(plan, lane, reached, completed)
     record = select(completed, plan.empty_record(lane.state), lane.record)
     return lane._replace(part=part, record=record)
 
 
-def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
+def _update_frictions(plan: Plan, old: Lane, new: Lane, cycle_ended: Flag) -> Lane:
     """Return the lane with its modes after a jump of a slip at the start of a cycle: by `renewed`,
     or since the clock of a moving surface begins anew."""
     machine, renewed = plan.machine, new.state is not old.state
@@ -166,16 +166,16 @@ def _strike_frictions(plan: Plan, old: Lane, new: Lane, turned: Flag) -> Lane:
     for friction in dry:
         before, after = (friction.speed_of_slip(machine, x.s, x.state) for x in (old, new))
         jumps = jumps | (jnp.abs(after - before) > _JUMPS * (jnp.abs(after) + jnp.abs(before)))
-    jumps = pin_flag(turned & stop_gradient(jumps), new.s)
+    jumps = pin_flag(cycle_ended & stop_gradient(jumps), new.s)
 
-    def struck(new: Lane) -> Scalars:
+    def new_modes(new: Lane) -> Scalars:
         return struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
 
     # Rare: skipped if no lane of a group has such a jump.
-    return new._replace(modes=jax.lax.cond(jumps, struck, lambda new: new.modes, new))
+    return new._replace(modes=jax.lax.cond(jumps, new_modes, lambda new: new.modes, new))
 
 
-def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
+def _next_length(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
     """Return the length proposed for the next ordinary step. A step that is to be shortened to an
     event was neither `taken` nor `rejected`."""
     if not plan.method.adaptive:
@@ -193,13 +193,13 @@ def _resized(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) 
 def after_impulse(plan: Plan, lane: Lane, reached: Flag, completed: Flag) -> Lane:
     """Return the lane after the impulse at the end of a piece of its cycle, if it is `reached`."""
     assert plan.noise is not None
-    old, since = lane, None
+    old, elapsed = lane, None
     if lane.last_impulse is not None:
         time = lane.record.integrals[TIME]
-        since, reading = time - lane.last_impulse, jnp.where(completed, 0.0, time)
+        elapsed, reading = time - lane.last_impulse, jnp.where(completed, 0.0, time)
         lane = lane._replace(last_impulse=jnp.where(reached, reading, lane.last_impulse))
-    where = stop_gradient((plan.cycle_of(lane.done), lane.part))
-    lane = lane._replace(state=with_impulse(plan.noise, reached, *where, old.state, since))
+    instant = stop_gradient((plan.cycle_of(lane.done), lane.part))
+    lane = lane._replace(state=with_impulse(plan.noise, reached, *instant, old.state, elapsed))
     if _may_change_modes(plan):
         # A body that was moved does not rest any more, which affects friction on its stop.
         contact = contacts_after_jump(plan, lane, reached, old.state) or ()
@@ -222,26 +222,26 @@ def _faults(
     """Return conditions that end a lane, and the reasons' numbers; the first true one is the
     reason. `new` is the lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
-    many = impacts > _MANY
+    many = impacts > _MOST_IMPACTS
     if is_alive(plan.machine, trial.state) is not None:
         # If a clock breaks down, the steps shrink to zero.
         broken = code("stalled")
     ends = [
         (impacts > plan.max_impacts, code("chatter")),
-        (((new.attempts >= _LOST) | (new.spent >= _STUCK)) & many, code("chatter")),
-        (new.attempts >= _LOST, _reason_for_giving_up(plan, lane, new.target)),
+        (((new.attempts >= _MOST_ATTEMPTS) | (new.spent >= _MOST_STEPS)) & many, code("chatter")),
+        (new.attempts >= _MOST_ATTEMPTS, _reason_for_giving_up(plan, lane, new.target)),
         (new.steps >= plan.max_steps, code("max_steps")),
-        (new.spent >= _STUCK, code("max_steps")),
+        (new.spent >= _MOST_STEPS, code("max_steps")),
     ]
     if plan.method.may_be_unstable(plan.machine, lane.s, lane.state):
         ends = [(taken & (trial.error > 1), code("unstable")), *ends]
     if not plan.method.adaptive:
         return [(rejected, broken), *ends]
     eps = float(jnp.finfo(new.length.dtype).eps)
-    gone = rejected & (new.length < 4 * eps * jnp.maximum(plan.unit, plan.machine.cycle))
-    numeric = jnp.isfinite(total(trial.state, new.length))
-    tiny = code("underflow") if broken == code("not_finite") else broken
-    return [(gone & ~numeric, broken), (gone, tiny), *ends]
+    too_short = rejected & (new.length < 4 * eps * jnp.maximum(plan.unit, plan.machine.cycle))
+    is_finite = jnp.isfinite(total(trial.state, new.length))
+    underflow = code("underflow") if broken == code("not_finite") else broken
+    return [(too_short & ~is_finite, broken), (too_short, underflow), *ends]
 
 
 def _reason_for_giving_up(plan: Plan, lane: Lane, target: Scalar) -> Scalar | float:

@@ -432,7 +432,7 @@ def settle(
     if len(blows) == 1:
         ((k, blow),) = blows.items()
         sign, _ = at.plan.sign_and_gap(k, blow.struck)
-        path, alone = at.trial.paths[k], at.trial.alone[k]
+        path, alone = at.trial.paths[k], at.trial.free_machines[k]
         speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
         known = k, blow, speed, lane._replace(state=at_event), growth

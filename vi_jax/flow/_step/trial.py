@@ -17,16 +17,16 @@ from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, 
 from .guards import (
     SHARES,
     Crossing,
+    InnerGuards,
     Side,
-    Within,
     checks_within_step,
     crossings,
     guards_error,
+    inner_guards,
     landing_tolerance,
-    leniency,
-    separated,
+    separate_stages,
+    tolerance_factor,
     turn_tolerance,
-    within,
 )
 
 # Attempts in a row at a release until its distance is halved: a choice, three or four are usual.
@@ -46,7 +46,7 @@ class Release(NamedTuple):
     """Offset from the step's end to the release."""
 
 
-def release(
+def locate_release(
     plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> Release:
     """Return the release of coordinate number k from its stop, if it is released, by the rates of
@@ -59,8 +59,8 @@ def release(
     assert lane.contact is not None
     # Steps approach the release from the pressed side. Each ends a share short of the last
     # estimate, until one is so short that the force is linear over it: choices.
-    short, straight = (1e-3, 1e-5) if h.dtype == jnp.float64 else (1e-2, 1e-3)
-    close, straight = plan.in_units(landing_tolerance(h)), plan.in_units(straight)
+    short, linear = (1e-3, 1e-5) if h.dtype == jnp.float64 else (1e-2, 1e-3)
+    close, linear = plan.in_units(landing_tolerance(h)), plan.in_units(linear)
     away = plan.away(k, lane.contact[k])
     before, after = pin((away * begin.a, away * end.a))
     rise = stop_gradient(after - before)
@@ -69,7 +69,7 @@ def release(
     offset = -after * h / jnp.where(rising, rise, 1.0)
     near = jnp.abs(stop_gradient(offset)) <= close
     aimed = held & (lane.target == to_release(k))
-    met = rising & aimed & (h <= 2 * straight) & near
+    met = rising & aimed & (h <= 2 * linear) & near
     # At the start of so short a step the force was all rounding, and may still be: for example that
     # of a stack released as one, whose bodies separate later.
     landed = met | aimed & (h <= close)
@@ -77,7 +77,7 @@ def release(
     place = stop_gradient(h + offset)
     # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
-    place = jnp.where(h > straight, share * place, place)
+    place = jnp.where(h > linear, share * place, place)
     # Late rather than early by a rounding error, when it would be pressed on again; and no step
     # towards the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
@@ -133,7 +133,7 @@ class Trial(NamedTuple):
     """The places within the step at which guards were evaluated, as shares of it; static."""
     smooth: SmoothMachine
     """The machine during the step: its resting bodies are held."""
-    alone: tuple[SmoothMachine, ...]
+    free_machines: tuple[SmoothMachine, ...]
     """For each coordinate, the machine with its body free and other resting bodies held."""
     clear: Flag | None
     """True if nothing can be met within the step; `None` if that is never known in advance."""
@@ -152,7 +152,7 @@ class AppliedStep(NamedTuple):
     """The motion from the step's end on."""
 
 
-def attempt(
+def try_step(
     plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
     """Try the next step and find its events. For a lane that has ended, the step has length zero.
@@ -164,9 +164,9 @@ def attempt(
     free = lane.target == FREE
     bound = plan.end(lane.part)
     limit = method.longest(machine, lane.s, lane.state)
-    h, clear = jnp.minimum(lane.attempt, limit), _clear(plan, lane)
+    h, clear = jnp.minimum(lane.attempt, limit), _clear_time(plan, lane)
     h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
-    nothing = None if clear is None else free & (h <= clear)
+    is_clear = None if clear is None else free & (h <= clear)
     s1, last = lane.s + h, jnp.zeros_like(free)
     if plan.s_counts_cycles(lane.state):
         # The margin avoids an extra step for a remainder of rounding.
@@ -177,28 +177,28 @@ def attempt(
     h = s1 - lane.s
 
     old = lane.record.integrals
-    beside = carried(smooth, lane.s, lane.state, old)
-    stages, looks = [], checks_within_step(plan, lane.state)
+    integrals = carried(smooth, lane.s, lane.state, old)
+    stages, checks = [], checks_within_step(plan, lane.state)
     if motion is not None:
-        (new, beside), error = motion.at(h), jnp.zeros_like(h)
-        stages = stages_to_step_to(SHARES, lane.s, h) if looks else stages
-    elif looks:
-        there = lane.s, s1, lane.state
-        new, beside, error, stages = method.step_with_stages(smooth, *there, beside)
-        stages = stages if method.adaptive else separated(stages)
+        (new, integrals), error = motion.at(h), jnp.zeros_like(h)
+        stages = stages_to_step_to(SHARES, lane.s, h) if checks else stages
+    elif checks:
+        step = lane.s, s1, lane.state
+        new, integrals, error, stages = method.step_with_stages(smooth, *step, integrals)
+        stages = stages if method.adaptive else separate_stages(stages)
     else:
-        new, beside, error = method.step(smooth, lane.s, s1, lane.state, beside)
+        new, integrals, error = method.step(smooth, lane.s, s1, lane.state, integrals)
     if lane.contact is not None and not method.holds(machine):
         rests = lane.contact[0] > 0
         new = jtu.tree_map(lambda a, b: jnp.where(rests, a, b), lane.state, new)
     new = pin(new)
     bodies = range(len(machine.coordinates))
-    alone = tuple(hold_contacts(machine, lane.modes, lane.contact, but=k) for k in bodies)
+    free_machines = tuple(hold_contacts(machine, lane.modes, lane.contact, but=k) for k in bodies)
     ends: list[tuple[Rates, Rates]] = []
     if plan.records_motion or stops_of(machine):
-        for one, body in zip(alone, machine.coordinates, strict=True):
-            begin = rates(one.field, body.position, lane.s, lane.state)
-            ends.append((begin, rates(one.field, body.position, s1, new)))
+        for free_k, body in zip(free_machines, machine.coordinates, strict=True):
+            begin = rates(free_k.field, body.position, lane.s, lane.state)
+            ends.append((begin, rates(free_k.field, body.position, s1, new)))
 
     def at(share: Scalar) -> State:
         if motion is not None:
@@ -206,9 +206,9 @@ def attempt(
         return method.step(smooth, lane.s, lane.s + share * h, lane.state, {})[0]
 
     longest = jnp.asarray(limit)
-    seen = within(plan, lane, alone, ends, stages, at, h, longest)
-    of_guards = guards_error(plan, seen, stages, h, longest)
-    error = error if of_guards is None else jnp.maximum(error, of_guards)
+    inner = inner_guards(plan, lane, free_machines, ends, stages, at, h, longest)
+    guard_error = guards_error(plan, inner, stages, h, longest)
+    error = error if guard_error is None else jnp.maximum(error, guard_error)
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = is_alive(machine, new)
     if alive is not None:
@@ -218,19 +218,19 @@ def attempt(
         good = good & (error <= 1)
     good = pin_flag(good, h)
 
-    inner = [n for n, stage in enumerate(stages) if 0 < stage.share < 1]
-    seen, shares = seen.only(inner), tuple(stages[n].share for n in inner)
+    interior = [n for n, stage in enumerate(stages) if 0 < stage.share < 1]
+    inner, shares = inner.only(interior), tuple(stages[n].share for n in interior)
     paths = []
-    for k, (one, both) in enumerate(zip(alone, ends, strict=False)):
-        paths.append(_path(plan, lane, k, one, smooth, both, (s1, new, h, limit), good, seen))
-    met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), seen)
+    for k, (free_k, both) in enumerate(zip(free_machines, ends, strict=False)):
+        paths.append(_path(plan, lane, k, free_k, smooth, both, (s1, new, h, limit), good, inner))
+    met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), inner)
     return Trial(
-        h, s1, new, elapsed(old, beside, h), error, good, last, met, tuple(paths), below, shares,
-        smooth, alone, nothing,
+        h, s1, new, elapsed(old, integrals, h), error, good, last, met, tuple(paths), below, shares,
+        smooth, free_machines, is_clear,
     )  # fmt: skip
 
 
-def _clear(plan: Plan, lane: Lane) -> Scalar | None:
+def _clear_time(plan: Plan, lane: Lane) -> Scalar | None:
     """Return the time within which nothing can be met, so that only the end of a step counts; 0 if
     something can, `None` if that is never known."""
     if plan.averages or plan.meets_every_turn:
@@ -250,18 +250,18 @@ def _path(
     free: SmoothMachine,
     smooth: SmoothMachine,
     ends: tuple[Rates, Rates],
-    there: tuple,
+    at_end: tuple,
     good: Flag,
-    seen: Within,
+    inner: InnerGuards,
 ) -> Path:
     """Return the path of coordinate number k during a step.
 
     **Arguments:** `free`, the machine with this body free and other resting bodies held; `smooth`,
-    the machine during the step; `ends`, the rates in `free` at both ends; `there`, s and state at
-    the end, the step's length and the longest length; `good`, whether the step was good; `seen`,
+    the machine during the step; `ends`, the rates in `free` at both ends; `at_end`, s and state at
+    the end, the step's length and the longest length; `good`, whether the step was good; `inner`,
     guards at the stages.
     """
-    (begin, end), (s1, new, h, limit) = ends, there
+    (begin, end), (s1, new, h, limit) = ends, at_end
     position = plan.machine.coordinates[k].position
     if lane.contact is not None and not stops_are_exact(plan.machine, lane.state):
         # Position and velocity of a resting body are known more accurately than from the state, if
@@ -272,7 +272,7 @@ def _path(
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
         )
-    met = turns_within(turn_tolerance(h) * leniency(plan, lane), end)
+    met = turns_within(turn_tolerance(h) * tolerance_factor(plan, lane), end)
     aimed = lane.target == to_turn_of(k)
     for j in range(len(plan.machine.coordinates)):  # several may turn at once
         aimed = aimed if j == k else aimed | (lane.target == to_turn_of(j))
@@ -283,15 +283,15 @@ def _path(
     leaves, force_rates, pull = None, None, None
     limited = any(stop.coordinate == k for stop in stops_of(plan.machine))
     if lane.contact is not None and limited:
-        leaves = release(plan, lane, k, begin, end, good, h)
+        leaves = locate_release(plan, lane, k, begin, end, good, h)
         force_rates = (
             force_rate(free, position, smooth, lane.s, lane.state),
             force_rate(free, position, smooth, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
-        if k in seen.forces:
+        if k in inner.forces:
             rests, away = lane.contact[k] > 0, plan.away(k, lane.contact[k])
-            slow, along = seen.slow[k], -lane.direction[k]
+            slow, along = inner.slow[k], -lane.direction[k]
             first, last = (
                 Rates(
                     jnp.where(rests, away * r.a, jnp.where(slow, along * r.v, -1.0)),
@@ -300,5 +300,5 @@ def _path(
                 )
                 for r, rate in ((begin, force_rates[0]), (end, force_rates[1]))
             )
-            pull = Side(first, last, seen.forces[k], seen.slack[k], rests | slow)
+            pull = Side(first, last, inner.forces[k], inner.slack[k], rests | slow)
     return Path(begin, end, at_turn, leaves, force_rates, pull)
