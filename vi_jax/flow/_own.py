@@ -101,7 +101,6 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
 
 
 def batch_hint(machine: AbstractMachine) -> str:
-    """Return a hint at fields of a machine that are arrays, perhaps of many machines."""
     arrays = [name for name, x in vars(machine).items() if eqx.is_array(x) and x.ndim]
     if not arrays:
         return ""

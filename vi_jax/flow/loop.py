@@ -48,7 +48,7 @@ from .noise import in_modes_of
 from .results import code
 from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
 
-# A number of the state smaller than this share of what the other numbers make of it has still to
+# A number of the state below this share of the change that the other numbers cause has still to
 # grow. Rates are evaluated at this many instants of a cycle. Choices.
 _GROWS, _INSTANTS = 1e-3, 7
 

@@ -145,12 +145,11 @@ def in_modes_of(form: Prepared, noise: Impulses, start: State) -> Impulses:
     machine's own velocities. `start` is a state of the machine itself."""
     leaves, tree = jtu.tree_flatten(start)
 
-    def matrix(i: int) -> Array:
-        """The linear map from array number i of the state to the modes."""
+    def matrix_to_modes(i: int) -> Array:
         with_leaf = lambda x: tree.unflatten([*leaves[:i], x, *leaves[i + 1 :]])
         return jax.jacfwd(lambda x: jtu.tree_leaves(form.inward(with_leaf(x)))[i])(leaves[i])
 
-    modes = [None if x is None else matrix(i) for i, x in enumerate(noise.scales)]
+    modes = [None if x is None else matrix_to_modes(i) for i, x in enumerate(noise.scales)]
     return dataclasses.replace(noise, modes=tuple(modes))
 
 

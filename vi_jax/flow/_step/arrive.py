@@ -31,7 +31,7 @@ from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
 from ..smooth import hold_contacts, in_modes, limited_of, stops_are_exact
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
-from .impact import is_compound, resolve_impact_sequence, settle, stilled, strike_once
+from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
 
 # Each event of one instant may happen this often, by choice, before the lane ends: some trigger
@@ -39,7 +39,7 @@ from .trial import AppliedStep, Release, Trial
 _ROUNDS = 4
 
 
-class _Due(NamedTuple):
+class _DueEvents(NamedTuple):
     """The state of one instant between two of its events, and the events that are due."""
 
     lane: Lane
@@ -63,19 +63,19 @@ def apply_events(
     """
     zero = jnp.zeros_like(lane.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
-    begin = _Due(lane, due_, near_)
+    begin = _DueEvents(lane, due_, near_)
     if len(due) == 1:
-        end = _next(plan, taken, tuple(due), begin)
+        end = _apply_next(plan, taken, tuple(due), begin)
     else:
 
-        def turn(x: _Due, _: None) -> tuple[_Due, None]:
-            left = sum(x.due, start=zero) > 0
+        def apply_next(x: _DueEvents, _: None) -> tuple[_DueEvents, None]:
+            any_due = sum(x.due, start=zero) > 0
             return jax.lax.cond(
-                left, lambda x: _next(plan, taken, tuple(due), x), lambda x: x, x
+                any_due, lambda x: _apply_next(plan, taken, tuple(due), x), lambda x: x, x
             ), None
 
         # The number of iterations is constant, since a loop of varying length has no transpose.
-        end, _ = jax.lax.scan(turn, begin, None, length=_ROUNDS * len(due))
+        end, _ = jax.lax.scan(apply_next, begin, None, length=_ROUNDS * len(due))
         endless = sum(end.due, start=zero) > 0
         return end.lane.end_if(endless, endless, "simultaneous")
     return end.lane
@@ -83,20 +83,20 @@ def apply_events(
 
 def trigger_events(
     plan: Plan, lane: Lane, when: Flag, before: tuple[State, Scalars],
-    turns: dict[int, Flag], near: Scalars,
+    causes: dict[int, Flag], near: Scalars,
 ) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
     """Return the lane after a jump, the events that the jump triggers, and the remaining `near`. In
     `Lane.below` of the lane, guards that happened, or that the jump moved to or above zero, are 0.
 
-    **Arguments:** `when`, whether state or modes jumped; `before`, both before the jump; `turns`,
-    for each event whether it caused the jump; `near`, as in `_Due`.
+    **Arguments:** `when`, whether state or modes jumped; `before`, both before the jump; `causes`,
+    for each event whether it caused the jump; `near`, as in `_DueEvents`.
     """
     (old, modes), contact, machine = before, lane.contact or (), plan.machine
-    below, nearby, off = [], [], {}
-    moving = hold_contacts(machine, lane.modes, lane.contact)
-    along = jnp.ones_like(lane.s), moving.field(lane.s, lane.state)
+    below, nearby, triggered = [], [], {}
+    held = hold_contacts(machine, lane.modes, lane.contact)
+    along = jnp.ones_like(lane.s), held.field(lane.s, lane.state)
     numbers = plan.from_below(lane.state)
-    for number, armed, close in zip(numbers, lane.below, near, strict=True):
+    for number, was_below, close in zip(numbers, lane.below, near, strict=True):
 
         def guard(s: Scalar, state: State, number: int = number) -> Scalar:
             return jnp.asarray(guard_of(machine, number, s, state, lane.modes, contact))
@@ -104,65 +104,65 @@ def trigger_events(
         was = stop_gradient(guard_of(machine, number, lane.s, old, modes, contact))
         now, rate = jax.jvp(guard, *stop_gradient(((lane.s, lane.state), along)))
         slack = guard_rounding(plan.guard_extent(number, lane) + jnp.abs(now))
-        moved, own = jnp.abs(now - was) > slack, turns.get(number, jnp.zeros_like(when))
+        moved, caused = jnp.abs(now - was) > slack, causes.get(number, jnp.zeros_like(when))
         rises = when & (was < -slack) & (now > slack)
         if number == section_number(machine):
             rises = jnp.zeros_like(when)  # no cycle ends if a jump passes over the section
         # If its guard did not jump and still rises, a near event happens by itself later.
         missed = when & (close > 0) & (moved | (rate <= 0))
-        off[number] = (rises | missed) & ~own
-        nearby.append(jnp.where(own | missed, 0.0, close))
-        below.append(jnp.where(own | (when & (now >= -slack) & moved), 0.0, armed))
-    return lane._replace(below=tuple(below)), off, tuple(nearby)
+        triggered[number] = (rises | missed) & ~caused
+        nearby.append(jnp.where(caused | missed, 0.0, close))
+        below.append(jnp.where(caused | (when & (now >= -slack) & moved), 0.0, was_below))
+    return lane._replace(below=tuple(below)), triggered, tuple(nearby)
 
 
-def _next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _Due) -> _Due:
+def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents) -> _DueEvents:
     """Return the instant after the first listed of the events that are due."""
     machine, lane, old = plan.machine, x.lane, x.lane.state
     modes_before, contact = lane.modes, lane.contact or ()
     none = jnp.zeros_like(taken)
-    new, modes, any_turn, happens, jumps = old, modes_before, none, none, none
-    kind, listed, value, turns = EventKind.mode, 0.0, jnp.nan, {}
+    new, modes, any_chosen, happens, jumps = old, modes_before, none, none, none
+    kind, logged_number, value, chosen = EventKind.mode, 0.0, jnp.nan, {}
     for number, due in zip(numbers, x.due, strict=True):
-        event, met = events_of(machine)[number], (machine, number, lane.s, old, modes_before)
-        turns[number], any_turn = (due > 0) & ~any_turn, any_turn | (due > 0)
-        when = happens_at(*met)
-        here = turns[number] if when is None else turns[number] & when
-        its_state, its_modes = after_event(*met, contact)
+        event, arguments = events_of(machine)[number], (machine, number, lane.s, old, modes_before)
+        chosen[number], any_chosen = (due > 0) & ~any_chosen, any_chosen | (due > 0)
+        when = happens_at(*arguments)
+        here = chosen[number] if when is None else chosen[number] & when
+        its_state, its_modes = after_event(*arguments, contact)
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
             slides = _must_slide(plan, number, lane._replace(state=its_state, modes=its_modes))
-            lane = lane.end_if(turns[number], slides, "sliding")
+            lane = lane.end_if(chosen[number], slides, "sliding")
             its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
             jumps = jumps | here
-            its_kind, its_value = EventKind.reset, value_of(*met)
+            its_kind, its_value = EventKind.reset, value_of(*arguments)
             its_number = its_number - len(switches_of(machine))
         if event.ends_cycle:
             lane = lane.complete_interval(here)
         lane = with_outcome(machine, event, lane, here)
         new, modes = select(here, (its_state, its_modes), (new, modes))
-        its_own = its_kind, its_number, its_value
+        its_entry = its_kind, its_number, its_value
         if len(numbers) > 1:
-            its_own = select(here, its_own, (kind, listed, value))
-        (kind, listed, value), happens = its_own, happens | here
+            its_entry = select(here, its_entry, (kind, logged_number, value))
+        (kind, logged_number, value), happens = its_entry, happens | here
     clock = plan.clock(lane.s, old)
-    lane = lane.log_event(taken & happens, clock, kind, listed, value)
-    lane = _jumped(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
+    lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
+    lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
     lane = release_pulled(plan, lane, taken, happens, (old, modes_before))
-    off, near, before = {}, x.near, (old, modes_before)
+    triggered, near, before = {}, x.near, (old, modes_before)
     if others_of(machine):
-        lane, off, near = trigger_events(plan, lane, happens, before, turns, near)
-    due = [jnp.where(turns[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
+        lane, triggered, near = trigger_events(plan, lane, happens, before, chosen, near)
+    due = [jnp.where(chosen[n], 0.0, due) for n, due in zip(numbers, x.due, strict=True)]
     for i, number in enumerate(numbers):
         if events_of(machine)[number].holds_mode and len(numbers) > 1:
-            off[number] = _guard_jumped(plan, lane, happens & ~turns[number], number, before)
-        due[i] = jnp.where(off[number], 1.0, due[i]) if number in off else due[i]
-    last = off.get(section_number(machine))
-    if last is not None:
-        lane = lane.complete_interval(last)
-    return _Due(lane, tuple(due), near)
+            triggered[number] = _guard_jumped(plan, lane, happens & ~chosen[number], number, before)
+        due[i] = jnp.where(triggered[number], 1.0, due[i]) if number in triggered else due[i]
+    section = triggered.get(section_number(machine))
+    if section is not None:
+        lane = lane.complete_interval(section)
+    return _DueEvents(lane, tuple(due), near)
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -205,19 +205,19 @@ def _guard_jumped(
 
 def release_pulled(
     plan: Plan, lane: Lane, taken: Flag, when: Flag,
-    before: tuple[State, Scalars], resting: Scalars | None = None,
+    before: tuple[State, Scalars], contact_before: Scalars | None = None,
 ) -> Lane:  # fmt: skip
     """Return the lane with those bodies free that were pressed on their stops before an event, and
     are pulled away after it: a force that jumps does not pass through zero.
 
     **Arguments:** `when`, whether the event happens; `before`, state and modes before it;
-    `resting`, the contacts before it, if they may differ from the present ones.
+    `contact_before`, the contacts before it, if they may differ from the present ones.
     """
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
         return lane
     old, modes_before = before
-    freed, direction = list(contact), list(lane.direction)
+    contacts, direction = list(contact), list(lane.direction)
     for k in limited_of(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
@@ -226,17 +226,17 @@ def release_pulled(
 
         sign, _ = plan.sign_and_gap(k, contact[k])
         pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
-        goes = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
-        if resting is not None:
-            goes = goes & (resting[k] == contact[k])
+        leaves = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
+        if contact_before is not None:
+            leaves = leaves & (contact_before[k] == contact[k])
         clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
-        lane = lane.log_event(taken & goes, clock, EventKind.release, stop, jnp.nan)
-        freed[k] = jnp.where(goes, 0.0, contact[k])
-        direction[k] = jnp.where(goes, -sign, direction[k])
-    return lane._replace(contact=tuple(freed), direction=tuple(direction))
+        lane = lane.log_event(taken & leaves, clock, EventKind.release, stop, jnp.nan)
+        contacts[k] = jnp.where(leaves, 0.0, contact[k])
+        direction[k] = jnp.where(leaves, -sign, direction[k])
+    return lane._replace(contact=tuple(contacts), direction=tuple(direction))
 
 
-def _jumped(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
+def _update_after(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State) -> Lane:
     """Return the lane after an event that `happens` and may change the state if it `jumps`: with
     the directions of motion in its new modes, and the bodies that still rest. A lane with a body
     beyond a stop ends."""
@@ -268,8 +268,8 @@ def contacts_after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Scala
         )
         if not (moved_to is place and after is before):
             slack, slow = plan.rounding_bounds(k, lane.state)
-            moved = (jnp.abs(moved_to - place) > slack) | (jnp.abs(after - before) > slow)
-            contacts[k] = jnp.where(when & stop_gradient(moved), 0.0, contacts[k])
+            has_moved = (jnp.abs(moved_to - place) > slack) | (jnp.abs(after - before) > slow)
+            contacts[k] = jnp.where(when & stop_gradient(has_moved), 0.0, contacts[k])
     return tuple(contacts)
 
 
@@ -305,16 +305,18 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         below=trial.below, completed=trial.ends_interval,
     ).update_record(integrals=trial.integrals)  # fmt: skip
     # Y at the step's end, and Y before the state jumps there, if an event may change it.
-    here = position(trial.state)
-    places = (here, here) if others_of(plan.machine) else (here,)
+    Y = position(trial.state)
+    places = (Y, Y) if others_of(plan.machine) else (Y,)
     flow = FlowToEvent(plan, trial.smooth, lane.part, (trial.s, trial.state, trial.integrals))
-    at = AppliedStep(plan, lane, trial, taken, flow)
+    step = AppliedStep(plan, lane, trial, taken, flow)
     if trial.crossings:
-        leaves = [path.leaves.landed for path in trial.paths if path.leaves is not None]
-        met = any_of(taken, [*(c.landed for c in trial.crossings), *leaves])
+        released = [path.leaves.landed for path in trial.paths if path.leaves is not None]
+        met = any_of(taken, [*(c.landed for c in trial.crossings), *released])
         # Rare: skipped if no lane of a group has met anything.
-        arrived, places = jax.lax.cond(met, lambda x: _met(at, *x), lambda x: x, (arrived, places))
-    arrived = arrived.update_record(**_reached(at, places))
+        arrived, places = jax.lax.cond(
+            met, lambda x: _land(step, *x), lambda x: x, (arrived, places)
+        )
+    arrived = arrived.update_record(**_extremes(step, places))
     assert arrived.completed is not None
     completed = taken & arrived.completed
     arrived = lane._replace(
@@ -356,112 +358,112 @@ def _directions_at_end(plan: Plan, lane: Lane, trial: Trial) -> Scalars:
     return tuple(direction)
 
 
-def _met(at: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
+def _land(step: AppliedStep, lane: Lane, places: Scalars) -> tuple[Lane, Scalars]:
     """Return the lane after the event on which the step landed, and Y there and before a jump. The
     motion first goes on to the event, then comes the jump. Another event at the same instant is met
     by the next step, which has length zero."""
-    plan, trial, flow = at.plan, at.trial, at.flow
+    plan, trial, flow = step.plan, step.trial, step.flow
     landed = {c.number: c.landed for c in trial.crossings}
     before = places[1:]
     if landed:
         offset = jnp.zeros_like(lane.s)
         for c in trial.crossings:
-            offset = jnp.where(c.landed, _offset(at, c), offset)
-        _, at_event, passed = flow.extrapolate(offset)
-        met = any_of(at.taken, landed.values())
-        integrals = select(met, passed, lane.record.integrals)
+            offset = jnp.where(c.landed, _event_offset(step, c), offset)
+        _, at_event, integrals_at_event = flow.extrapolate(offset)
+        met = any_of(step.taken, landed.values())
+        integrals = select(met, integrals_at_event, lane.record.integrals)
         lane = lane._replace(s=lane.s + jnp.where(met, offset, 0.0))
         lane = lane.update_record(integrals=integrals)
         before = tuple(jnp.where(met, plan.machine.position(at_event), Y) for Y in before)
-        lane = _landed(at, lane, at_event)
+        lane = _apply_event(step, lane, at_event)
     for k, path in enumerate(trial.paths):
         if path.leaves is not None:
-            lane = _released(at, lane, k, path.leaves)
+            lane = _release_body(step, lane, k, path.leaves)
     places = (plan.machine.position(lane.state), *before)
     # At a switch the field may have an infinite slope (Hertz's damper at first touch). Derivatives
     # are finite along with the event, but not at a fixed clock.
     if not plan.s_counts_cycles(lane.state) or switches_of(plan.machine):
         return lane, places
-    fixed = _at_fixed_clock(at, lane)
+    fixed = _at_fixed_clock(step, lane)
     # No step follows an outcome: its derivatives stay those along with the event.
     return (select(lane.fault > 0, lane, fixed) if outcomes_of(plan.machine) else fixed), places
 
 
-def _landed(at: AppliedStep, lane: Lane, at_event: State) -> Lane:
+def _apply_event(step: AppliedStep, lane: Lane, at_event: State) -> Lane:
     """Return the lane after the event on which the step landed, and after all that it triggers;
     `at_event`: the state before it."""
-    plan, machine, trial = at.plan, at.plan.machine, at.trial
+    plan, machine, trial = step.plan, step.plan.machine, step.trial
     landed = {c.number: c.landed for c in trial.crossings}
-    near = _near(at)
-    off: dict[int, Flag] = {}
+    near = _near(step)
+    triggered: dict[int, Flag] = {}
     if stops_of(machine):
-        lane = _impact(at, lane, landed, at_event)
+        lane = _apply_impact(step, lane, landed, at_event)
         for number, stop in enumerate(stops_of(machine)):
             if stop.ends_cycle:
                 lane = lane.complete_interval(landed[number])
             lane = with_outcome(machine, stop, lane, landed[number])
     if stops_of(machine) and others_of(machine):
-        met = any_of(at.taken, (landed[n] for n in range(len(stops_of(machine)))))
+        met = any_of(step.taken, (landed[n] for n in range(len(stops_of(machine)))))
         close = tuple(jnp.where(near[n], 1.0, 0.0) for n in near)
         # A stop may have changed the modes already.
-        lane, off, _ = trigger_events(plan, lane, met, (at_event, at.old.modes), {}, close)
+        lane, triggered, _ = trigger_events(plan, lane, met, (at_event, step.old.modes), {}, close)
     due = {}
     for c in trial.crossings:
         if c.coordinate is None:
             lane = lane._replace(state=select(c.landed, at_event, lane.state))
-            here = c.landed | off[c.number] if c.number in off else c.landed
+            here = c.landed | triggered[c.number] if c.number in triggered else c.landed
             if c.number == section_number(machine):
                 lane = disarm(plan, lane.complete_interval(here), c)
             else:
                 due[c.number] = here
-    return apply_events(plan, at.taken, lane, due, near) if due else lane
+    return apply_events(plan, step.taken, lane, due, near) if due else lane
 
 
-def _near(at: AppliedStep) -> dict[int, Flag]:
+def _near(step: AppliedStep) -> dict[int, Flag]:
     """Return for each event that happens from below whether its guard is at zero to rounding at
     another event on which the step landed."""
-    plan, trial = at.plan, at.trial
+    plan, trial = step.plan, step.trial
     numbers = plan.from_below(trial.state) if others_of(plan.machine) else []
     found = {}
     eps = float(jnp.finfo(trial.h.dtype).eps)
     for c in trial.crossings:
         if c.number in numbers:
-            apart = jnp.full_like(trial.h, jnp.inf)
+            distance = jnp.full_like(trial.h, jnp.inf)
             for other in trial.crossings:
                 if other.number != c.number:
-                    apart = jnp.where(other.landed, jnp.abs(c.offset - other.offset), apart)
+                    distance = jnp.where(other.landed, jnp.abs(c.offset - other.offset), distance)
             slack = 64 * eps * (plan.unit + jnp.abs(trial.s))
-            found[c.number] = c.near & (stop_gradient(apart) <= slack)
+            found[c.number] = c.near & (stop_gradient(distance) <= slack)
     return found
 
 
-def _at_fixed_clock(at: AppliedStep, lane: Lane) -> Lane:
+def _at_fixed_clock(step: AppliedStep, lane: Lane) -> Lane:
     """Return the lane with its derivatives at a fixed clock. After an event whose time depends on a
     parameter, s has a derivative. It is transferred to the state, so that later steps need no
     derivative with respect to `s`."""
-    smooth = hold_contacts(at.plan.machine, lane.modes, lane.contact)
-    bound = at.plan.end(lane.part)
+    smooth = hold_contacts(step.plan.machine, lane.modes, lane.contact)
+    bound = step.plan.end(lane.part)
     # The end of the interval may depend on a differentiated parameter.
-    moved = jnp.where(at.trial.ends_interval, bound - stop_gradient(bound), 0.0)
-    s = stop_gradient(lane.s) + moved
+    shift = jnp.where(step.trial.ends_interval, bound - stop_gradient(bound), 0.0)
+    s = stop_gradient(lane.s) + shift
     moving = lane.s, lane.state, lane.record.integrals
-    flow = FlowToEvent(at.plan, smooth, lane.part, moving)
+    flow = FlowToEvent(step.plan, smooth, lane.part, moving)
     _, state, integrals = flow.with_flow_derivatives(s - lane.s)
     return lane._replace(s=s, state=state).update_record(integrals=integrals)
 
 
-def _released(at: AppliedStep, lane: Lane, k: int, leaves: Release) -> Lane:
-    plan, flow, contact = at.plan, at.flow, lane.contact
+def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
+    plan, flow, contact = step.plan, step.flow, lane.contact
     assert contact is not None
-    free, offset = leaves.landed, stop_gradient(leaves.offset)
+    free, offset = release.landed, stop_gradient(release.offset)
     offset = flow.event_offset(flow.force(k), offset)
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
     if not stops_are_exact(plan.machine, state):
         state = select(contact[k] > 0, on_its_stops(plan, lane._replace(state=state)), state)
-    direction = jnp.where(free, -at.old.direction[k], lane.direction[k])
+    direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
-    lane = lane.log_event(at.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
+    lane = lane.log_event(step.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
     lane = lane.update_record(integrals=select(free, integrals, lane.record.integrals))
     return lane._replace(
         s=s,
@@ -476,45 +478,45 @@ def on_its_stops(plan: Plan, lane: Lane) -> State:
     are held, their positions are accurate to the method's error only."""
     assert lane.contact is not None
     walls = {k: lane.contact[k] for k in limited_of(plan.machine)}
-    return stilled(plan, lane.s, lane.state, {k: x > 0 for k, x in walls.items()}, walls)[0]
+    return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in walls.items()}, walls)[0]
 
 
-def _offset(at: AppliedStep, c: Crossing) -> Scalar:
+def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:
     """Return the offset in s from the step's end to an event, with the derivatives of the event's
     time; its value is 0 if the step landed on another event."""
-    plan, trial, flow = at.plan, at.trial, at.flow
-    # In a motion so flat that the event's place is less certain than its surface, it is here.
+    plan, trial, flow = step.plan, step.trial, step.flow
+    # If the motion is so flat that the event's place is uncertain, the event is here.
     near = c.landed & (jnp.abs(c.offset) <= plan.in_units(furthest_landing(trial.h)))
     offset = stop_gradient(jnp.where(near, c.offset, 0.0))
     if plan.s_counts_cycles(trial.state):
         # An event on the section is not beyond it.
-        beyond = trial.s + offset - plan.end(at.old.part)
+        beyond = trial.s + offset - plan.end(step.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # These derivatives have no meaning if the event was not met.
     met = flow.event_offset(flow.guard(c.number), offset)
     return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
 
 
-def _impact(at: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
+def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:
     """Return the lane after the rebound from the stops in `landed`, or at rest on them; `at_event`:
     the state before the impact."""
-    plan, machine, before = at.plan, at.plan.machine, at.old
+    plan, machine, before = step.plan, step.plan.machine, step.old
     landed = {number: landed[number] for number in range(len(stops_of(machine)))}
-    strike = resolve_impact_sequence if is_compound(machine) else strike_once
-    lane, blows = strike(plan, at.taken, lane, landed, at_event)
-    met = any_of(at.taken, landed.values())
-    lane = settle(at, lane, at_event, met, blows)
+    resolve = resolve_impact_sequence if is_compound(machine) else resolve_impact
+    lane, impacts = resolve(plan, step.taken, lane, landed, at_event)
+    met = any_of(step.taken, landed.values())
+    lane = bring_to_rest(step, lane, at_event, met, impacts)
     direction = list(lane.direction)
     for k, body in enumerate(machine.coordinates):
-        if k not in blows or len(blows) > 1:  # it may share a body with one that was hit
+        if k not in impacts or len(impacts) > 1:  # it may share a body with one that was hit
             v = stop_gradient(body.velocity(lane.state))
             direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
-        if k in blows:  # any remaining approach is rounding
-            sign, _ = plan.sign_and_gap(k, blows[k].struck)
+        if k in impacts:  # any remaining approach is rounding
+            sign, _ = plan.sign_and_gap(k, impacts[k].contact)
             away = -sign
             if lane.contact is not None:
                 away = jnp.where(lane.contact[k] > 0, sign, away)
-            direction[k] = jnp.where(blows[k].struck > 0, away, direction[k])
+            direction[k] = jnp.where(impacts[k].contact > 0, away, direction[k])
     modes, contact = lane.modes, lane.contact or ()
     if modes and not is_compound(machine):
         for number, here in landed.items():
@@ -525,37 +527,37 @@ def _impact(at: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: Stat
         new = struck_modes(machine, lane.s, lane.state, modes, contact=contact)
         modes = select(met, new, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
-    if lane.contact is None or len(blows) == 1:
+    if lane.contact is None or len(impacts) == 1:
         return lane
     # It may release bodies on other stops. A stop may have changed the modes already.
-    return release_pulled(plan, lane, at.taken, met, (at_event, before.modes), before.contact)
+    return release_pulled(plan, lane, step.taken, met, (at_event, before.modes), before.contact)
 
 
-def _reached(at: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
+def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
     """Return the extremes of Y in this interval so far, and the smallest distance to a stop at a
     turning point; `None` if not recorded. `places` are Y at the step's end and before a jump."""
-    plan, lane, trial, taken = at.plan, at.old, at.trial, at.taken
+    plan, lane, trial, taken = step.plan, step.old, step.trial, step.taken
     record = lane.record
     y_max, y_min, clearance = record.y_max, record.y_min, record.clearance
     if y_max is None or y_min is None or not trial.paths:
         return {"y_max": y_max, "y_min": y_min, "clearance": clearance}
-    tops = [_top(trial, k, at.flow) for k in range(len(trial.paths))]
-    reached = jnp.where(trial.paths[0].at_turn, tops[0], places[0])
+    tops = [_height_at_turn(trial, k, step.flow) for k in range(len(trial.paths))]
+    end_position = jnp.where(trial.paths[0].at_turn, tops[0], places[0])
     if clearance is not None:
         for stop in stops_of(plan.machine):
             k = stop.coordinate
-            short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
+            turns_short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
             if lane.contact is not None:
-                short = short & (lane.contact[k] == 0)
-            room = jnp.where(short, -stop.beyond(tops[k]), jnp.inf)
-            clearance = jnp.minimum(clearance, room)
-    for place in (*places[1:], reached):
+                turns_short = turns_short & (lane.contact[k] == 0)
+            distance = jnp.where(turns_short, -stop.beyond(tops[k]), jnp.inf)
+            clearance = jnp.minimum(clearance, distance)
+    for place in (*places[1:], end_position):
         y_max = jnp.where(taken, jnp.maximum(y_max, place), y_max)
         y_min = jnp.where(taken, jnp.minimum(y_min, place), y_min)
     return {"y_max": y_max, "y_min": y_min, "clearance": clearance}
 
 
-def _top(trial: Trial, k: int, flow: FlowToEvent) -> Scalar:
+def _height_at_turn(trial: Trial, k: int, flow: FlowToEvent) -> Scalar:
     """Return the position of coordinate number k at the turning point that was the step's target;
     else at the step's end."""
     path = trial.paths[k]

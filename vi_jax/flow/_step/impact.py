@@ -40,13 +40,13 @@ from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
 # the one or two of a law's own arithmetic.
-_FASTER = 16.0
+_SPEED_ROUNDINGS = 16.0
 
 
 class ImpactResult(NamedTuple):
     """The impacts of one instant on one coordinate."""
 
-    struck: Scalar
+    contact: Scalar
     """1 + i if stop number i was struck last, 0 if none was."""
     approach: Scalar
     """The greatest speed of approach."""
@@ -65,11 +65,11 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
     if stop.is_one_number:
         return None
     leaves = stop_gradient(-stop.sign * rebound)
-    most = (1 + _FASTER * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
+    most = (1 + _SPEED_ROUNDINGS * float(jnp.finfo(leaves.dtype).eps)) * stop_gradient(approach)
     return ~((leaves >= 0) & (leaves <= most))
 
 
-def recorded(
+def log_impact(
     plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar
 ) -> Lane:
     """Return the lane with an impact counted and logged, if a stop is `hit` by a step that is
@@ -85,7 +85,7 @@ def recorded(
     return lane.log_event(hit, clock, EventKind.impact, number, approach)
 
 
-def strike_once(
+def resolve_impact(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, ImpactResult]]:
     """Return the lane after an impact, and its `ImpactResult` by the coordinate's number, if stops
@@ -93,7 +93,7 @@ def strike_once(
     landed on it; `at_event`: the state there."""
     machine, k = plan.machine, stops_of(plan.machine)[0].coordinate
     body = machine.coordinates[k]
-    blow = ImpactResult(*(jnp.zeros_like(lane.s) for _ in range(3)))
+    result = ImpactResult(*(jnp.zeros_like(lane.s) for _ in range(3)))
     velocity = body.velocity(at_event)
     for number, met in landed.items():
         stop = stops_of(machine)[number]
@@ -101,7 +101,7 @@ def strike_once(
         rebound, share = stop.velocity_and_ratio(approach)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
-        lane = recorded(plan, lane._replace(state=state), at_event, taken & met, number, approach)
+        lane = log_impact(plan, lane._replace(state=state), at_event, taken & met, number, approach)
         energy = lane.record.impact_energy
         if energy is not None:
             lost = stop.loss(approach, share)
@@ -109,21 +109,21 @@ def strike_once(
                 lost = body.mass_at(lane.s, at_event) * lost
             lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, share)
-        blow = new if len(landed) == 1 else select(met, new, blow)
-    return lane, {k: blow}
+        result = new if len(landed) == 1 else select(met, new, result)
+    return lane, {k: result}
 
 
 # Shares of the greatest speed of approach so far. Below the first a contact does not close: its
-# speed is rounding of the blows before. At the second the sequence is replaced by its limit, in
-# which those contacts come to rest that were struck and move no faster than `_ALIKE` times the
-# fastest. All three are choices; docs/internals/step.md lists the numbers of blows in known cases.
-_NONE, _WEAK, _ALIKE = 1e-12, 1e-7, 30.0
+# speed is rounding of earlier impacts. At the second the sequence is replaced by its limit, in
+# which those contacts come to rest that were struck and move no faster than `_STILL` times the
+# fastest. All three are choices; docs/internals/step.md lists numbers of impacts in known cases.
+_NO_SPEED, _WEAK, _STILL = 1e-12, 1e-7, 30.0
 
 # Speeds whose relative difference is smaller are equal: a choice, far above rounding.
 _EQUAL = 1e-9
 
 # Contacts that share less than this of each other's velocity are struck separately: a choice.
-_APART = 1e-6
+_UNCOUPLED = 1e-6
 
 # A ball between a wall and a body 100 times heavier is struck 31 times, one of 10,000 times 314 (π
 # times the root of the ratio): this is enough for a body 1.7 million times heavier.
@@ -134,10 +134,10 @@ class _Round(NamedTuple):
     """A sequence of impacts, between two of them."""
 
     lane: Lane
-    struck: dict[int, Scalar]
+    contact: dict[int, Scalar]
     """For each coordinate, as in `ImpactResult`."""
     approach: dict[int, Scalar]
-    most: Scalar
+    fastest: Scalar
     """The greatest speed of approach so far."""
     goes_on: Scalar
     rounds: Scalar
@@ -175,7 +175,7 @@ class _Instant(NamedTuple):
 def resolve_impact_sequence(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> tuple[Lane, dict[int, ImpactResult]]:
-    """Return the results of `strike_once` for stops on several coordinates or with friction.
+    """Return the results of `resolve_impact` for stops on several coordinates or with friction.
 
     If bodies touch, an impact on one contact closes the next one at the same instant. The contact
     that closes fastest is struck first; contacts that close equally fast are struck together, which
@@ -187,33 +187,33 @@ def resolve_impact_sequence(
     zero = jnp.zeros_like(lane.s)
     nothing = dict.fromkeys(instant.bodies, zero)
     # A contact without any speed, as between bodies released together, may come to rest.
-    touched = dict(nothing)
+    contacts = dict(nothing)
     for number, stop in enumerate(stops_of(plan.machine)):
         k = stop.coordinate
-        touched[k] = jnp.where(landed[number], to_event(number), touched[k])
+        contacts[k] = jnp.where(landed[number], to_event(number), contacts[k])
     lane = lane._replace(state=select(instant.met, at_event, lane.state))
-    begin = _Round(lane, touched, nothing, zero, jnp.where(instant.met, 1.0, zero), zero)
+    begin = _Round(lane, contacts, nothing, zero, jnp.where(instant.met, 1.0, zero), zero)
     end = jax.lax.while_loop(
-        lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _struck(instant, x), begin
+        lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _next_impacts(instant, x), begin
     )
     endless = end.rounds >= _ROUNDS
     lane = end.lane.end_if(instant.met, endless, "simultaneous")
-    blows = {}
+    results = {}
     for k, body in instant.bodies.items():
-        struck, fastest = end.struck[k], end.approach[k]
-        leaves = -plan.sign_and_gap(k, struck)[0] * body.velocity(lane.state)
+        contact, fastest = end.contact[k], end.approach[k]
+        leaves = -plan.sign_and_gap(k, contact)[0] * body.velocity(lane.state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
-        blows[k] = ImpactResult(struck, fastest, jnp.clip(share, 0.0, 1.0))
-    return lane, blows
+        results[k] = ImpactResult(contact, fastest, jnp.clip(share, 0.0, 1.0))
+    return lane, results
 
 
 def _before_impacts(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> _Instant:
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
-    each = list(bodies.values())
-    pushes = [push_of(body, at_event) for body in each]
-    gains = shares(each, at_event, pushes)
+    coordinates = list(bodies.values())
+    pushes = [push_of(body, at_event) for body in coordinates]
+    gains = shares(coordinates, at_event, pushes)
     met = jnp.zeros_like(taken)
     coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
@@ -238,7 +238,7 @@ def _acting(
     machine: AbstractMachine, bodies: dict[int, Coordinate], gains: list[list[Scalar]],
     pushes: list[State], state: State,
 ) -> list[list[Flag]]:  # fmt: skip
-    """Return for each pair of coordinates whether blows change each other's velocity, also by
+    """Return for each pair of coordinates whether impacts change each other's velocity, also by
     friction. Products of both changes do not depend on units."""
     size = range(len(gains))
     both = [[jnp.abs(gains[i][j] * gains[j][i]) for j in size] for i in size]
@@ -246,18 +246,18 @@ def _acting(
         friction = friction_on(machine, number)
         if friction is not None:
             along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
-            felt = shares([*bodies.values()], state, [push_of(along, state)])
+            response = shares([*bodies.values()], state, [push_of(along, state)])
             for i, change in enumerate(shares([along], state, pushes)[0]):
-                dragged = jnp.abs(change * felt[i][0])
+                dragged = jnp.abs(change * response[i][0])
                 both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
-    return [[stop_gradient(x) > _APART**2 for x in row] for row in both]
+    return [[stop_gradient(x) > _UNCOUPLED**2 for x in row] for row in both]
 
 
 def _coupled(
     plan: Plan, acts: list[list[Flag]], touches: dict[int, Flag], landed: dict[int, Flag]
 ) -> dict[int, Flag]:
-    """Return for each coordinate whether a blow on one of those `landed` acts on it through closed
-    contacts. `touches`: for each stop, whether its contact is closed."""
+    """Return for each coordinate whether an impact on one of those `landed` acts on it through
+    closed contacts. `touches`: for each stop, whether its contact is closed."""
     closes = dict.fromkeys(landed, jnp.zeros((), bool))
     for number, stop in enumerate(stops_of(plan.machine)):
         closes[stop.coordinate] = closes[stop.coordinate] | touches[number]
@@ -271,15 +271,15 @@ def _coupled(
     return dict(zip(landed, coupled, strict=True))
 
 
-def _struck(instant: _Instant, x: _Round) -> _Round:
+def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     """Return the sequence after its next impacts: those of the contacts that close fastest."""
-    plan, lane = instant.plan, x.lane
+    plan, lane = instant.plan, sequence.lane
     stops, state = stops_of(plan.machine), lane.state
     velocities = {k: body.velocity(state) for k, body in instant.bodies.items()}
-    closing = _closing(instant, x, velocities)
+    closing = _closing(instant, sequence, velocities)
     fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
-    most = jnp.maximum(x.most, fastest)
-    goes_on = fastest > _NONE * most
+    most = jnp.maximum(sequence.fastest, fastest)
+    goes_on = fastest > _NO_SPEED * most
     weak = goes_on & (fastest <= _WEAK * most)
 
     hits, rebounds = {}, {}
@@ -287,33 +287,33 @@ def _struck(instant: _Instant, x: _Round) -> _Round:
         hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
         hits[number] = hit
         rebounds[number] = stop.velocity_after(stop.sign * jnp.where(hit, closing[number], 0.0))
-    alone = _each_by_itself(instant, velocities, hits, rebounds)
+    separately = _one_after_other(instant, velocities, hits, rebounds)
     found = jnp.zeros_like(goes_on)
     for number, hit in hits.items():
-        hits[number], found = hit & ~(alone & found), found | hit
+        hits[number], found = hit & ~(separately & found), found | hit
     # In the limit the contacts that are still being struck come to rest.
     slow = {
-        k: weak & (x.struck[k] > 0) & (jnp.abs(stop_gradient(V)) <= _ALIKE * fastest)
+        k: weak & (sequence.contact[k] > 0) & (jnp.abs(stop_gradient(V)) <= _STILL * fastest)
         for k, V in velocities.items()
     }
     new, pushed = _pushed_state(instant, state, velocities, slow, hits, rebounds)
     lane = _with_losses(instant, lane._replace(state=new), state, pushed)
-    struck, approaches = dict(x.struck), dict(x.approach)
+    contacts, approaches = dict(sequence.contact), dict(sequence.approach)
     for number, hit in hits.items():
         stop, k = stops[number], stops[number].coordinate
         speed = jnp.maximum(closing[number], 0.0)
         lane = lane.end_if(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
-        lane = recorded(plan, lane, instant.at_event, instant.taken & hit, number, speed)
+        lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, number, speed)
         if stop.modes is not None:
             given = plan.machine, lane.s, state, new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
-        struck[k] = jnp.where(hit, to_event(number), struck[k])
+        contacts[k] = jnp.where(hit, to_event(number), contacts[k])
         approaches[k] = jnp.where(hit, jnp.maximum(approaches[k], speed), approaches[k])
     goes_on = jnp.where(goes_on & ~weak, 1.0, 0.0)
-    return _Round(lane, struck, approaches, most, goes_on, x.rounds + 1.0)
+    return _Round(lane, contacts, approaches, most, goes_on, sequence.rounds + 1.0)
 
 
-def _each_by_itself(
+def _one_after_other(
     instant: _Instant, velocities: dict[int, Scalar], hits: dict[int, Flag],
     rebounds: dict[int, Scalar],
 ) -> Flag:  # fmt: skip
@@ -332,13 +332,13 @@ def _each_by_itself(
         wanted[k] = jnp.where(hit, rebounds[number] - velocities[k], wanted[k])
         signs[k] = jnp.where(hit, float(stop.sign), signs[k])
     amounts = stop_gradient(instant.forces(on, wanted))
-    gained, size_of, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
+    gained, size, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
     for k, body in instant.bodies.items():
         amount, V, change = amounts[k], velocities[k], wanted[k]
         work = body.mass_at(instant.s, instant.at_event) * amount * (V + 0.5 * change)
-        gained, size_of = gained + work, size_of + jnp.abs(work)
+        gained, size = gained + work, size + jnp.abs(work)
         pulls = pulls | (amount * signs[k] > _EQUAL * jnp.abs(change))
-    return stop_gradient(pulls | (gained > _EQUAL * size_of))
+    return stop_gradient(pulls | (gained > _EQUAL * size))
 
 
 def _pushed_state(
@@ -371,26 +371,26 @@ def _pushed_state(
         friction = friction_on(machine, number)
         if friction is not None:
             k = stops[number].coordinate
-            rough = with_friction_impulse(machine, number, friction, instant.s, state, new)
-            new = select(hit, rough.state, new)
-            amounts[k] = jnp.where(hit, rough.pushed, amounts[k])
+            result = with_friction_impulse(machine, number, friction, instant.s, state, new)
+            new = select(hit, result.state, new)
+            amounts[k] = jnp.where(hit, result.pushed, amounts[k])
             along = machine.coordinates[friction.along]
-            pushed.append((along, jnp.where(hit, rough.dragged, 0.0)))
+            pushed.append((along, jnp.where(hit, result.dragged, 0.0)))
     return new, [*pushed, *((body, amounts[k]) for k, body in instant.bodies.items())]
 
 
 def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dict[int, Scalar]:
     """Return for each stop the speed of approach, if it may be hit next; else a negative number.
     Impacts that coincide without acting on each other are two instants for derivatives. Therefore
-    only contacts take part that a blow changed, or that act on those of `landed`."""
+    only contacts take part that an impact changed, or that act on those of `landed`."""
     found = {}
     for number, stop in enumerate(stops_of(instant.plan.machine)):
         k = stop.coordinate
         speed = stop.approach(velocities[k])
         size = stop_gradient(speed)
-        changed = jnp.abs(stop_gradient(velocities[k] - instant.before[k])) > _NONE * x.most
-        mine = instant.landed[number] | ((changed | instant.coupled[k]) & (size > instant.slow[k]))
-        found[number] = jnp.where(mine & instant.touches[number] & (size > 0), speed, -1.0)
+        changed = jnp.abs(stop_gradient(velocities[k] - instant.before[k])) > _NO_SPEED * x.fastest
+        acts = instant.landed[number] | ((changed | instant.coupled[k]) & (size > instant.slow[k]))
+        found[number] = jnp.where(acts & instant.touches[number] & (size > 0), speed, -1.0)
     return found
 
 
@@ -422,67 +422,67 @@ _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 _CLOSED = 1e-9
 
 
-def settle(
-    at: AppliedStep, lane: Lane, at_event: State, met: Flag, blows: dict[int, ImpactResult]
+def bring_to_rest(
+    step: AppliedStep, lane: Lane, at_event: State, met: Flag, impacts: dict[int, ImpactResult]
 ) -> Lane:
     """Return the lane at rest on those stops whose impacts were the last ones. `lane` is after the
     impacts, `at_event` the state before them, `met` whether there were any."""
     if lane.contact is None:
         return lane
-    if len(blows) == 1:
-        ((k, blow),) = blows.items()
-        sign, _ = at.plan.sign_and_gap(k, blow.struck)
-        path, alone = at.trial.paths[k], at.trial.free_machines[k]
-        speed = blow.share * jnp.maximum(sign * path.end.v, 0.0)
+    if len(impacts) == 1:
+        ((k, impact),) = impacts.items()
+        sign, _ = step.plan.sign_and_gap(k, impact.contact)
+        path, alone = step.trial.paths[k], step.trial.free_machines[k]
+        speed = impact.share * jnp.maximum(sign * path.end.v, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
-        known = k, blow, speed, lane._replace(state=at_event), growth
-        ends, left = _ends(at.plan, alone, *known)
-        rests = {k: pin_flag((blow.struck > 0) & ends, lane.s)}
-        waits = {k: left}
+        arguments = k, impact, speed, lane._replace(state=at_event), growth
+        ends, time = _remaining_chatter(step.plan, alone, *arguments)
+        rests = {k: pin_flag((impact.contact > 0) & ends, lane.s)}
+        times = {k: time}
     else:
-        lane = lane._replace(contact=_broken(at.plan, lane, at_event, met, blows))
-        rests, waits = _together(at.plan, lane, blows)
-    return _held(at.plan, at.taken, lane, rests, blows, waits)
+        lane = lane._replace(contact=_remaining_contacts(step.plan, lane, at_event, met, impacts))
+        rests, times = _resting_bodies(step.plan, lane, impacts)
+    return _hold_resting(step.plan, step.taken, lane, rests, impacts, times)
 
 
-def _held(
-    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], blows: dict[int, ImpactResult],
-    waits: dict[int, Scalar],
+def _hold_resting(
+    plan: Plan, taken: Flag, lane: Lane, rests: dict[int, Flag], impacts: dict[int, ImpactResult],
+    times: dict[int, Scalar],
 ) -> Lane:  # fmt: skip
     """Return the lane after the infinitely many last impacts, with those bodies held that come to
-    rest. For each coordinate: `rests`, whether it does; `waits`, the time until then (in s)."""
+    rest. For each coordinate: `rests`, whether it does; `times`, the time until then (in s)."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     wait = jnp.zeros_like(s)
     for k, ends in rests.items():
-        left = jnp.where(ends, waits[k], 0.0)
-        wait = left if len(rests) == 1 else jnp.maximum(wait, left)
-        contact = with_item(contact, k, jnp.where(ends, blows[k].struck, contact[k]))
-    walls, modes = {k: blow.struck for k, blow in blows.items()}, lane.modes
+        time = jnp.where(ends, times[k], 0.0)
+        wait = time if len(rests) == 1 else jnp.maximum(wait, time)
+        contact = with_item(contact, k, jnp.where(ends, impacts[k].contact, contact[k]))
+    contacts, modes = {k: impact.contact for k, impact in impacts.items()}, lane.modes
     if has_contact_friction(plan.machine):
         # The direction of slip is known after the impact.
         modes = struck_modes(plan.machine, s, state, modes, contact=contact)
-        slowed, rubbed_away = _without_rebounds(plan, s, state, modes, rests, walls)
-        still, lost = stilled(plan, s, slowed, rests, walls)
-        lost = lost + rubbed_away
+        slowed, rebound_energy = _without_rebounds(plan, s, state, modes, rests, contacts)
+        still, lost = stop_bodies(plan, s, slowed, rests, contacts)
+        lost = lost + rebound_energy
     else:
-        still, lost = stilled(plan, s, state, rests, walls)
+        still, lost = stop_bodies(plan, s, state, rests, contacts)
         if holds_anywhere(plan.machine):
             modes = struck_modes(plan.machine, s, still, modes, contact=contact)
     resting, integrals = hold_contacts(plan.machine, modes, contact), lane.record.integrals
     flow = FlowToEvent(plan, resting, lane.part, (s, still, integrals))
-    later, still, passed = flow.extrapolate(pin(wait))
+    end, still, passed = flow.extrapolate(pin(wait))
     if len(rests) > 1:  # another body may reach this one before its impacts are over
         clear = ~plan.beyond_a_stop(still)
         rests = {k: ends & clear for k, ends in rests.items()}
         contact = select(clear, contact, lane.contact)
     any_rests = any_of(taken, rests.values())
-    s, state, integrals = select(any_rests, (later, still, passed), (s, state, integrals))
+    s, state, integrals = select(any_rests, (end, still, passed), (s, state, integrals))
     lane = lane._replace(s=s, state=state, contact=contact).update_record(integrals=integrals)
     for k, ends in rests.items():
-        here, blow, count = taken & ends, blows[k], lane.record.rests
-        number = blow.struck - 1.0
-        lane = lane.log_event(here, plan.clock(s, state), EventKind.rest, number, blow.approach)
+        here, impact, count = taken & ends, impacts[k], lane.record.rests
+        number = impact.contact - 1.0
+        lane = lane.log_event(here, plan.clock(s, state), EventKind.rest, number, impact.approach)
         if count is not None:
             lane = lane.update_record(rests=count + jnp.where(here, 1.0, 0.0))
     energy = lane.record.impact_energy
@@ -494,7 +494,7 @@ def _held(
 
 def _without_rebounds(
     plan: Plan, s: Scalar, state: State, modes: Scalars, rests: dict[int, Flag],
-    walls: dict[int, Scalar],
+    contacts: dict[int, Scalar],
 ) -> tuple[State, Scalar]:  # fmt: skip
     """Return the state without the rebounds of bodies that come to rest, and the energy of these.
     The friction impulse of the rebounds is left out too: during the omitted hops friction acts on
@@ -502,7 +502,7 @@ def _without_rebounds(
     machine, zero = plan.machine, jnp.zeros_like(modes[0])
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
-        contact[k] = jnp.where(ends, walls[k], zero)
+        contact[k] = jnp.where(ends, contacts[k], zero)
     held = contact_constraints(machine, s, state, modes, contact)
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
@@ -510,36 +510,36 @@ def _without_rebounds(
         shares(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
     )
     new, pushed = added(state, amounts, held.pushes), list(amounts)
-    for row, (_, _, at, drag) in enumerate(
+    for row, (_, _, index, drag) in enumerate(
         held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
     ):
-        pushed[row] = pushed[row] + drag * amounts[at]
+        pushed[row] = pushed[row] + drag * amounts[index]
     lost = zero
     for body, amount, V in zip(bodies, pushed, before, strict=True):
         lost = lost - body.mass_at(s, state) * amount * 0.5 * (V + body.velocity(new))
     return new, lost
 
 
-def stilled(
-    plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], walls: dict[int, Scalar]
+def stop_bodies(
+    plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], contacts: dict[int, Scalar]
 ) -> tuple[State, Scalar]:
-    """Return the state with those coordinates that rest put on their stops (`walls`, as in
+    """Return the state with those coordinates that rest put on their stops (`contacts`, as in
     `Lane.contact`), without velocity, all at once; and the energy lost."""
     bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
-    slower, shifts = [-V for V in velocities], []
+    deltas, shifts = [-V for V in velocities], []
     for k, body in bodies.items():
-        sign, gap = plan.sign_and_gap(k, walls[k])
+        sign, gap = plan.sign_and_gap(k, contacts[k])
         shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
         coordinates, on = list(bodies.values()), list(rests.values())
         gains = shares(coordinates, state, [push_of(body, state) for body in coordinates])
-        slower, shifts = forces(gains, on, slower), forces(gains, on, shifts)
-    new, lost = state, jnp.zeros_like(slower[0])
-    for (k, body), change, shift, V in zip(bodies.items(), slower, shifts, velocities, strict=True):
+        deltas, shifts = forces(gains, on, deltas), forces(gains, on, shifts)
+    new, lost = state, jnp.zeros_like(deltas[0])
+    for (k, body), change, shift, V in zip(bodies.items(), deltas, shifts, velocities, strict=True):
         place, speed = body.position(new) + shift, body.velocity(new) + change
         if len(rests) == 1:
-            sign, gap = plan.sign_and_gap(k, walls[k])
+            sign, gap = plan.sign_and_gap(k, contacts[k])
             place, speed = sign * gap, jnp.zeros_like(V)
         moved = body.placed(new, place, speed)
         new = moved if len(rests) == 1 else select(rests[k], moved, new)
@@ -547,8 +547,8 @@ def stilled(
     return new, lost
 
 
-def _ends(
-    plan: Plan, free: SmoothMachine, k: int, blow: ImpactResult, speed: Scalar, lane: Lane,
+def _remaining_chatter(
+    plan: Plan, free: SmoothMachine, k: int, impact: ImpactResult, speed: Scalar, lane: Lane,
     growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
@@ -557,32 +557,32 @@ def _ends(
     s; `lane` at the impact; `growth`, the rate of the force on the body, if known.
     """
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
-    sign, gap = plan.sign_and_gap(k, blow.struck)
+    sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
-    rested = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
-    pressing = sign * rates(free.field, body.position, s, rested).a
-    force = pressing * (1 - blow.share)
+    at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
+    pressing = sign * rates(free.field, body.position, s, at_rest).a
+    force = pressing * (1 - impact.share)
     ends = force > 0
-    left = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
+    time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
     limit = stop_gradient(jnp.asarray(plan.machine.step_limit(s, state), s.dtype))
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
-    if growth is None:  # another blow of this instant may have changed it
-        growth = force_rate(free, body.position, free, s, rested)
-    not_yet, hop, wait = _before_it_presses(speed, pressing, sign * growth)
+    if growth is None:  # another impact of this instant may have changed it
+        growth = force_rate(free, body.position, free, s, at_rest)
+    not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
     flat = stop_gradient(height) <= 16 * float(jnp.finfo(s.dtype).eps) * size
-    left = jnp.where(not_yet, wait, left)
+    time = jnp.where(not_yet, wait, time)
     brief = (_BRIEF if s.dtype == jnp.float64 else _BRIEF_SINGLE) * limit
-    ends = stop_gradient(left) <= jnp.where(flat, 0.1 * limit, brief)
+    ends = stop_gradient(time) <= jnp.where(flat, 0.1 * limit, brief)
     ends = ends & (flat | ~not_yet | (hop <= brief))
     if plan.s_counts_cycles(lane.state):
-        ends = ends & (stop_gradient(s + left) < stop_gradient(plan.end(lane.part)))
-    return ends, left
+        ends = ends & (stop_gradient(s + time) < stop_gradient(plan.end(lane.part)))
+    return ends, time
 
 
-def _before_it_presses(
+def _time_until_pressed(
     rebound: Scalar, pressing: Scalar, growth: Scalar
 ) -> tuple[Flag, Scalar, Scalar]:
     """Return whether a body is not pressed on yet but will be, since its force grows; then an upper
@@ -595,24 +595,24 @@ def _before_it_presses(
     return not_yet, 3 * wait + jnp.sqrt(6 * jnp.where(not_yet, v, 0.0) / rate), wait
 
 
-def _broken(
-    plan: Plan, lane: Lane, at_event: State, met: Flag, blows: dict[int, ImpactResult]
+def _remaining_contacts(
+    plan: Plan, lane: Lane, at_event: State, met: Flag, impacts: dict[int, ImpactResult]
 ) -> Scalars:
     """Return `Lane.contact` without those contacts that the impacts struck or pulled apart;
     `at_event`: the state before them."""
     assert lane.contact is not None
     contact = list(lane.contact)
-    for k, blow in blows.items():
+    for k, impact in impacts.items():
         body = plan.machine.coordinates[k]
         V, old = (stop_gradient(body.velocity(x)) for x in (lane.state, at_event))
         _, slow = plan.rounding_bounds(k, at_event)
-        apart = met & ((blow.struck > 0) | (jnp.abs(V - old) > slow))
-        contact[k] = jnp.where(apart, 0.0, contact[k])
+        opened = met & ((impact.contact > 0) | (jnp.abs(V - old) > slow))
+        contact[k] = jnp.where(opened, 0.0, contact[k])
     return tuple(contact)
 
 
-def _together(
-    plan: Plan, lane: Lane, blows: dict[int, ImpactResult]
+def _resting_bodies(
+    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult]
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
     """Return for each coordinate that was struck whether it comes to rest, and the time until then.
     A body may be pressed on by another that comes to rest at the same instant. Therefore each is
@@ -622,34 +622,34 @@ def _together(
     free = in_modes(plan.machine, lane.modes)
     speeds = {}
     closed = list(contact)
-    for k, blow in blows.items():
-        sign, _ = plan.sign_and_gap(k, blow.struck)
+    for k, hit in impacts.items():
+        sign, _ = plan.sign_and_gap(k, hit.contact)
         speeds[k] = jnp.maximum(
             -sign * rates(free.field, plan.machine.coordinates[k].position, s, state).v, 0.0
         )
-        stays = (blow.struck > 0) & (stop_gradient(blow.share) <= _CLOSED)
-        closed[k] = jnp.where(stays, blow.struck, contact[k])
+        stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
+        closed[k] = jnp.where(stays, hit.contact, contact[k])
 
-    def tried(found):
+    def update(found):
         closed, _, _, count = found
-        new, waits = list(contact), []
-        for k, blow in blows.items():
+        new, times = list(contact), []
+        for k, hit in impacts.items():
             alone = hold_contacts(plan.machine, lane.modes, closed, but=k)
-            ends, left = _ends(plan, alone, k, blow, speeds[k], lane)
-            ends = (blow.struck > 0) & ends
-            new[k] = jnp.where(ends, blow.struck, contact[k])
-            waits.append(jnp.where(ends, left, 0.0))
+            ends, time = _remaining_chatter(plan, alone, k, hit, speeds[k], lane)
+            ends = (hit.contact > 0) & ends
+            new[k] = jnp.where(ends, hit.contact, contact[k])
+            times.append(jnp.where(ends, time, 0.0))
         changed = jnp.zeros((), bool)
         for old, x in zip(closed, new, strict=True):
             changed = changed | (old != x)
-        return tuple(new), tuple(waits), jnp.where(changed, 1.0, 0.0), count + 1.0
+        return tuple(new), tuple(times), jnp.where(changed, 1.0, 0.0), count + 1.0
 
     zero = jnp.zeros_like(s)
-    begin = tuple(closed), tuple(zero for _ in blows), zero + 1.0, zero
-    found, waits, _, _ = jax.lax.while_loop(
-        lambda x: (x[2] > 0) & (x[3] <= len(blows)), tried, begin
+    begin = tuple(closed), tuple(zero for _ in impacts), zero + 1.0, zero
+    found, times, _, _ = jax.lax.while_loop(
+        lambda x: (x[2] > 0) & (x[3] <= len(impacts)), update, begin
     )
     ends = {
-        k: pin_flag((blow.struck > 0) & (found[k] == blow.struck), s) for k, blow in blows.items()
+        k: pin_flag((hit.contact > 0) & (found[k] == hit.contact), s) for k, hit in impacts.items()
     }
-    return ends, dict(zip(blows, waits, strict=True))
+    return ends, dict(zip(impacts, times, strict=True))

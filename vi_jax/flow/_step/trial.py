@@ -78,8 +78,8 @@ def locate_release(
     # If the force is barely positive, but for long, chords hardly advance: bisect.
     share = jnp.where(lane.attempts >= _PATIENCE, 0.5, 1 - short)
     place = jnp.where(h > linear, share * place, place)
-    # Late rather than early by a rounding error, when it would be pressed on again; and no step
-    # towards the release is too short to advance the clock.
+    # The step ends late by a rounding error, lest the body be pressed on again. No step towards
+    # the release is too short to advance the clock.
     late = 8 * float(jnp.finfo(h.dtype).eps) * (plan.unit + stop_gradient(lane.s + h))
     place = jnp.maximum(place, 2 * late)
     landed, offset = pin_flag(landed, h), jnp.where(met, offset, 0.0)
