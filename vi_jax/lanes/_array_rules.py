@@ -22,25 +22,25 @@ from ._arrays import (
     Registers,
     Strided,
     addressable,
+    computed,
     contiguous,
-    counted,
     fill,
     held,
     in_lanes,
     is_cheap,
-    joined,
+    joined_cuts,
     mapped,
-    over,
-    over_all,
     plus,
-    room,
+    reserve,
     same,
     selected,
-    settled,
     stored,
     times,
     uniform,
     without_cuts,
+    write_for_each,
+    write_loop,
+    write_loops,
 )
 from ._operations import (
     ELEMENTWISE,
@@ -76,38 +76,38 @@ class _AxisMap(NamedTuple):
 
     axis: int | None
     """The corresponding axis of the new shape; `None` if the index is constant."""
-    by: int = 1
+    step: int = 1
     begin: int = 0
 
     def place(self, t: Text, index: Sequence[Index]) -> Index:
         if self.axis is None:
             return self.begin
-        return plus(t, times(t, index[self.axis], self.by), self.begin)
+        return plus(t, times(t, index[self.axis], self.step), self.begin)
 
 
-def _moved(t: Text, x: Array, shape: Sequence[int], along: Sequence[_AxisMap]) -> Array:
+def _viewed(t: Text, x: Array, shape: Sequence[int], maps: Sequence[_AxisMap]) -> Array:
     """Return a view of an array's numbers in another shape.
 
     **Arguments:** the text; the array; the new shape; the indices along each axis of the array.
     """
     cuts: dict[int, set[int]] = {}
-    if any(along[a].by != 1 for a in x.cuts):
+    if any(maps[a].step != 1 for a in x.cuts):
         x = stored(t, x)
     for a, places in x.cuts.items():
-        if (axis := along[a].axis) is not None:
-            cuts.setdefault(axis, set()).update(n - along[a].begin for n in places)
+        if (axis := maps[a].axis) is not None:
+            cuts.setdefault(axis, set()).update(n - maps[a].begin for n in places)
     if isinstance(x, Formula) and x.value is not None:
         return uniform(shape, x.value)
     if isinstance(x, Strided):
         steps, offset = [0] * len(shape), 0
-        for stride, way in zip(x.strides, along, strict=True):
-            offset += stride * way.begin
-            if way.axis is not None:
-                steps[way.axis] += stride * way.by
+        for stride, axis_map in zip(x.strides, maps, strict=True):
+            offset += stride * axis_map.begin
+            if axis_map.axis is not None:
+                steps[axis_map.axis] += stride * axis_map.step
         return x.viewed(t, shape, steps, offset)
-    known = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
-    number = lambda i: x.at(t, tuple(way.place(t, i) for way in along))
-    return Formula(tuple(shape), x.kind, number, is_cheap(x), cuts=known)
+    new_cuts = {a: frozenset(n for n in ns if 0 < n < shape[a]) for a, ns in cuts.items()}
+    number = lambda i: x.at(t, tuple(axis_map.place(t, i) for axis_map in maps))
+    return Formula(tuple(shape), x.kind, number, is_cheap(x), cuts=new_cuts)
 
 
 @structural("reshape", "squeeze", "expand_dims")
@@ -119,12 +119,12 @@ def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
     """Return an array in another shape, with its numbers in the same order."""
     if isinstance(x, Registers):
         return Registers(x.values.reshape(shape), x.kind)
-    mine, other = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
-    if [x.shape[i] for i in mine] == [shape[i] for i in other]:
-        axes = dict(zip(mine, other, strict=True))
-        return _moved(t, x, shape, [_AxisMap(axes.get(a)) for a in range(x.ndim)])
-    if not isinstance(x, Strided) or [x.strides[i] for i in mine] != [
-        contiguous(x.shape)[i] for i in mine
+    old, new = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
+    if [x.shape[i] for i in old] == [shape[i] for i in new]:
+        axes = dict(zip(old, new, strict=True))
+        return _viewed(t, x, shape, [_AxisMap(axes.get(a)) for a in range(x.ndim)])
+    if not isinstance(x, Strided) or [x.strides[i] for i in old] != [
+        contiguous(x.shape)[i] for i in old
     ]:
         x = stored(t, x)
     return x.viewed(t, shape, contiguous(shape))
@@ -137,41 +137,41 @@ def _(t, p, avals, x):
 
 def transposed(t: Text, x: Array, order: Sequence[int]) -> Array:
     order = list(order)
-    along = [_AxisMap(order.index(a)) for a in range(x.ndim)]
-    return _moved(t, x, [x.shape[a] for a in order], along)
+    maps = [_AxisMap(order.index(a)) for a in range(x.ndim)]
+    return _viewed(t, x, [x.shape[a] for a in order], maps)
 
 
 @structural("rev")
 def _(t, p, avals, x):
-    turned = p["dimensions"]
-    along = [_AxisMap(a, -1, n - 1) if a in turned else _AxisMap(a) for a, n in enumerate(x.shape)]
-    return _moved(t, x, x.shape, along)
+    axes = p["dimensions"]
+    maps = [_AxisMap(a, -1, n - 1) if a in axes else _AxisMap(a) for a, n in enumerate(x.shape)]
+    return _viewed(t, x, x.shape, maps)
 
 
 @structural("slice")
 def _(t, p, avals, x):
     # The transposes of JAX have NumPy integers here.
-    ways = zip(p["strides"] or [1] * x.ndim, p["start_indices"], strict=True)
-    along = [_AxisMap(a, int(by), int(begin)) for a, (by, begin) in enumerate(ways)]
-    return _moved(t, x, avals[0].shape, along)
+    pairs = zip(p["strides"] or [1] * x.ndim, p["start_indices"], strict=True)
+    maps = [_AxisMap(a, int(step), int(begin)) for a, (step, begin) in enumerate(pairs)]
+    return _viewed(t, x, avals[0].shape, maps)
 
 
 def part_along(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
     """Return the part of an array between two indices of an axis."""
     shape = [end - begin if a == axis else n for a, n in enumerate(x.shape)]
-    return _moved(t, x, shape, [_AxisMap(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
+    return _viewed(t, x, shape, [_AxisMap(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
 
 
 @structural("split")
 def _(t, p, avals, x):
-    x, axis = settled(t, x), p["axis"]
+    x, axis = computed(t, x), p["axis"]
     ends = np.cumsum([0, *(aval.shape[axis] for aval in avals)]).tolist()
     return tuple(part_along(t, x, axis, begin, end) for begin, end in pairwise(ends))
 
 
 @structural("unstack")
 def _(t, p, avals, x):
-    x, axis, shape = settled(t, x), p["axis"], avals[0].shape
+    x, axis, shape = computed(t, x), p["axis"], avals[0].shape
     return tuple(reshaped(t, part_along(t, x, axis, i, i + 1), shape) for i in range(len(avals)))
 
 
@@ -187,15 +187,15 @@ def _(t, p, avals, x, *sizes):
     if size > MOST_IN_REGISTERS:
         x = addressable(t, x)
     if x.size < size:  # else each number is used once
-        x = settled(t, x)
+        x = computed(t, x)
     pairs = zip(where, x.shape, strict=True)
-    return _moved(t, x, shape, [_AxisMap(a if n != 1 else None) for a, n in pairs])
+    return _viewed(t, x, shape, [_AxisMap(a if n != 1 else None) for a, n in pairs])
 
 
-def chosen(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
+def select_parts(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
     """Return the first array if a flag holds, else the second, by selecting the parts that differ,
     such as one changed number of a state. Return `None` unless one axis, and only one, has cuts."""
-    cuts = joined(a.cuts, b.cuts)
+    cuts = joined_cuts(a.cuts, b.cuts)
     if len(cuts) != 1:
         return None
     ((axis, places),) = cuts.items()
@@ -279,7 +279,7 @@ def _(t, p, avals, *sizes):
 # --- indices that depend on data
 
 
-def _within(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Value]:
+def _clipped(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Value]:
     """Return an index clipped to the range from 0 to `greatest`, and whether it was in it."""
     place = convert(t, given, "i64", is_unsigned(dtype))
     if place.number is not None:
@@ -295,7 +295,7 @@ def _within(t: Text, given: Value, dtype: Any, greatest: int) -> tuple[Index, Va
 def _starts(t: Text, starts, dtypes, sizes, shape) -> list[Index]:
     """Return the first indices of a block of `sizes`, clipped so that it lies in the array."""
     return [
-        _within(t, s.at(t, ()), d, n - m)[0]
+        _clipped(t, s.at(t, ()), d, n - m)[0]
         for s, d, m, n in zip(starts, dtypes, sizes, shape, strict=True)
     ]
 
@@ -311,7 +311,7 @@ def _(t, p, avals, d, x, *starts):
 def _(t, p, avals, d, x, update, *starts):
     begin, axes = _starts(t, starts, d[2:], update.shape, x.shape), range(x.ndim)
     if all(isinstance(i, int) for i in begin):
-        update = settled(t, update)
+        update = computed(t, update)
     inside = t.constant(True, "i1")
     return _with_blocks(t, x, update, axes, axes, lambda _: ([*begin], inside))
 
@@ -365,8 +365,8 @@ class _IndexedBlocks(NamedTuple):
         inside = t.constant(True, "i1")
         for k, a in enumerate(self.axes):
             given = self.indices.at(t, (*batch, k))
-            place[a], here = _within(t, given, self.dtype, self.greatest[a])
-            inside = inside if self.clipped else t.both(inside, here)
+            place[a], is_inside = _clipped(t, given, self.dtype, self.greatest[a])
+            inside = inside if self.clipped else t.both(inside, is_inside)
         return place, inside
 
 
@@ -378,27 +378,27 @@ def _(t, p, avals, d, x, indices):
         without_cuts(t, x),
         without_cuts(t, indices),
     )
-    gone = (*n.collapsed_slice_dims, *n.operand_batching_dims)
-    inner = [a for a in range(x.ndim) if a not in gone]
+    removed = (*n.collapsed_slice_dims, *n.operand_batching_dims)
+    inner = [a for a in range(x.ndim) if a not in removed]
 
-    asked = _IndexedBlocks(
+    blocks = _IndexedBlocks(
         indices, d[1], n.start_index_map,
         tuple(zip(n.operand_batching_dims, n.start_indices_batching_dims, strict=True)),
-        [size - own for size, own in zip(x.shape, p["slice_sizes"], strict=True)],
+        [size - length for size, length in zip(x.shape, p["slice_sizes"], strict=True)],
         "FILL" not in str(p["mode"]),
     )  # fmt: skip
 
     def number(index: tuple[Index, ...]) -> Value:
-        place, inside = asked.corner(t, [i for a, i in enumerate(index) if a not in n.offset_dims])
+        place, inside = blocks.corner(t, [i for a, i in enumerate(index) if a not in n.offset_dims])
         for a, i in zip(inner, [index[o] for o in n.offset_dims], strict=True):
             place[a] = plus(t, place[a], i)
-        outside = t.constant(_filling(p["fill_value"], aval.dtype), x.kind)
+        outside = t.constant(_fill_value(p["fill_value"], aval.dtype), x.kind)
         return t.select(inside, x.at(t, place), outside)
 
     return Formula(tuple(aval.shape), x.kind, number)
 
 
-def _filling(given, dtype):
+def _fill_value(given, dtype):
     """Return JAX's value for a number from outside an array."""
     if given is not None:
         return given
@@ -414,16 +414,16 @@ def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices
     """Return an array with numbers written at indices that depend on data, or combined by the rule
     `how`. Numbers outside the array are dropped, unless the mode is to clip."""
     d = p["dimension_numbers"]
-    gone = (*d.inserted_window_dims, *d.operand_batching_dims)
-    inner, axes = [a for a in range(x.ndim) if a not in gone], d.update_window_dims
+    removed = (*d.inserted_window_dims, *d.operand_batching_dims)
+    inner, axes = [a for a in range(x.ndim) if a not in removed], d.update_window_dims
     sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
-    asked = _IndexedBlocks(
+    blocks = _IndexedBlocks(
         without_cuts(t, indices), dtypes[1], d.scatter_dims_to_operand_dims,
         tuple(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True)),
         [n - sizes.get(a, 1) for a, n in enumerate(x.shape)], "CLIP" in str(p["mode"]),
     )  # fmt: skip
     combined = partial(ELEMENTWISE[how], t, {}, dtypes) if how else None
-    return _with_blocks(t, x, settled(t, update), inner, axes, partial(asked.corner, t), combined)
+    return _with_blocks(t, x, computed(t, update), inner, axes, partial(blocks.corner, t), combined)
 
 
 def _with_blocks(
@@ -445,13 +445,13 @@ def _with_blocks(
             window = [(i, sizes.get(a, 1)) for a, i in enumerate(first)]
 
             def changed(index: tuple[Index, ...]) -> Value:
-                given: list[Index] = [0] * update.ndim
+                place_in_update: list[Index] = [0] * update.ndim
                 for a, o in zip(inner, axes, strict=True):
-                    given[o] = index[a]
+                    place_in_update[o] = index[a]
                 if combined is None:
-                    return update.at(t, given)
+                    return update.at(t, place_in_update)
                 old = x.at(t, [plus(t, i, b) for i, (b, _) in zip(index, window, strict=True)])
-                return combined(old, update.at(t, given))
+                return combined(old, update.at(t, place_in_update))
 
             found = _patched(t, x, window, changed)
             if found is not None:
@@ -466,7 +466,7 @@ def _with_blocks(
         new = lambda old: value if combined is None else combined(old, value)
         put_at(t, out, place, lambda old: t.select(inside, new(old), old))
 
-    over_all(t, update, put)
+    write_for_each(t, update, put)
     return out
 
 
@@ -477,16 +477,16 @@ def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callabl
     """
     if isinstance(x, Strided):
         return x.put(t, place, new(x.at(t, place)))
-    for way in np.ndindex(x.shape):
-        here = t.constant(True, "i1")
-        for i, n in zip(place, way, strict=True):
+    for candidate in np.ndindex(x.shape):
+        match = t.constant(True, "i1")
+        for i, n in zip(place, candidate, strict=True):
             if isinstance(i, int):
-                here = t.both(here, t.constant(i == n, "i1"))
+                match = t.both(match, t.constant(i == n, "i1"))
             else:
-                asked = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
-                here = t.both(here, asked)
-        if here.number is None or here.number:
-            x.values[way] = t.select(here, new(x.values[way]), x.values[way])
+                equal = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
+                match = t.both(match, equal)
+        if match.number is None or match.number:
+            x.values[candidate] = t.select(match, new(x.values[candidate]), x.values[candidate])
 
 
 PLACED["scatter"] = partial(_scatter, None)
@@ -504,11 +504,11 @@ _SUMS = 8
 
 
 # The greatest number of loops written in place. It bounds the text's length and its compile time.
-_FEW = 4
+_MOST_LOOPS = 4
 
 
 def reduced(
-    t: Text, number: int, term: Callable[[Index], Value], how: Callable, empty: Value,
+    t: Text, number: int, term: Callable[[Index], Value], combine: Callable, empty: Value,
     *, in_order: bool = False,
 ) -> Value:  # fmt: skip
     """Return a reduction of all terms, in several partial results.
@@ -519,27 +519,27 @@ def reduced(
     if number == 0:
         return empty
     if in_order:
-        return functools.reduce(how, map(term, range(number)))
+        return functools.reduce(combine, map(term, range(number)))
     chains = _SUMS if number >= 2 * _SUMS else 1
-    turns, rest = divmod(number, chains)
+    iterations, rest = divmod(number, chains)
     first = [term(j) for j in range(chains)]
 
-    def turn(i: Index, carry: list[Value]) -> list[Value]:
+    def iteration(i: Index, carry: list[Value]) -> list[Value]:
         begin = times(t, plus(t, i, 1), chains)
-        return [how(c, term(plus(t, begin, j))) for j, c in enumerate(carry)]
+        return [combine(c, term(plus(t, begin, j))) for j, c in enumerate(carry)]
 
-    found = counted(t, turns - 1, turn, first)
-    found = [*found, *(term(turns * chains + j) for j in range(rest))]
+    found = write_loop(t, iterations - 1, iteration, first)
+    found = [*found, *(term(iterations * chains + j) for j in range(rest))]
     while len(found) > 1:
-        pairs = [how(a, b) for a, b in zip(found[::2], found[1::2], strict=False)]
+        pairs = [combine(a, b) for a, b in zip(found[::2], found[1::2], strict=False)]
         found = pairs + found[len(pairs) * 2 :]
     return found[0]
 
 
-def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
-    """Reduce an array along some axes by the rule `how`; `empty` is the result for no numbers."""
+def _reduce(rule: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
+    """Reduce an array along some axes by `rule`; `empty` is the result for no numbers."""
     ((aval,), axes), in_order = (avals, tuple(map(int, p["axes"]))), isinstance(x, Registers)
-    kind, both = kind_of(aval.dtype), partial(ELEMENTWISE[how], t, {}, [aval.dtype])
+    kind, both = kind_of(aval.dtype), partial(ELEMENTWISE[rule], t, {}, [aval.dtype])
     x = _grouped(t, x, (*([a] for a in range(x.ndim) if a not in axes), axes))
 
     def number(index):
@@ -550,7 +550,7 @@ def _reduce(how: str, empty: int, t: Text, p: dict, avals, x: Array) -> Array:
         return Registers.of(aval.shape, kind, number)
     # Each number is a loop. A few loops are written at the places of use.
     formula = Formula(tuple(aval.shape), kind, number)
-    return formula if formula.size <= _FEW else stored(t, formula)
+    return formula if formula.size <= _MOST_LOOPS else stored(t, formula)
 
 
 def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
@@ -566,33 +566,33 @@ def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
 
 def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
     """Return the cumulative results of a rule along an axis."""
-    how = partial(ELEMENTWISE[name], t, {}, [avals[0].dtype])
+    combine = partial(ELEMENTWISE[name], t, {}, [avals[0].dtype])
     if isinstance(x, Registers):
         out = np.moveaxis(x.values, p["axis"], 0).copy()
         out = out[::-1] if p["reverse"] else out
         for i in range(1, len(out)):
             before, here = (Registers(out[n : n + 1], x.kind) for n in (i - 1, i))
-            out[i : i + 1] = mapped(t, how, before, here).values
+            out[i : i + 1] = mapped(t, combine, before, here).values
         out = out[::-1] if p["reverse"] else out
         return Registers(np.moveaxis(out, 0, p["axis"]), x.kind)
     x = without_cuts(t, x)
-    axis, out = p["axis"], room(t, x.shape, x.kind)
+    axis, out = p["axis"], reserve(t, x.shape, x.kind)
     length = x.shape[axis]
     others = [1 if a == axis else n for a, n in enumerate(x.shape)]
 
-    def along(index: tuple[Index, ...]) -> None:
+    def cumulate(index: tuple[Index, ...]) -> None:
         def put(i: Index, before: Value | None) -> Value:
             place = plus(t, length - 1, times(t, i, -1)) if p["reverse"] else i
             whole = (*index[:axis], place, *index[axis + 1 :])
             value = x.at(t, whole)
-            value = value if before is None else how(before, value)
+            value = value if before is None else combine(before, value)
             out.put(t, whole, value)
             return value
 
         first = put(0, None)
-        counted(t, length - 1, lambda i, carry: [put(plus(t, i, 1), carry[0])], [first])
+        write_loop(t, length - 1, lambda i, carry: [put(plus(t, i, 1), carry[0])], [first])
 
-    over(t, others, along)
+    write_loops(t, others, cumulate)
     return out
 
 
@@ -627,7 +627,7 @@ def _dot(t: Text, p: dict, avals, a: Array, b: Array, product: Callable) -> Arra
         for x, free in ((b, free_b), (a, free_a))
     )
     left, right = (
-        _grouped(t, x if in_order else addressable(t, x if once else settled(t, x)), group)
+        _grouped(t, x if in_order else addressable(t, x if once else computed(t, x)), group)
         for x, once, group in zip((a, b), (once_a, once_b), groups, strict=True)
     )
     shape, length = (left.shape[0], left.shape[1], right.shape[1]), left.shape[2]
@@ -651,11 +651,11 @@ def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Call
     """Multiply arrays of shapes (batch, n, k) and (batch, m, k), several rows at once. Their sums
     do not wait for each other, and a number of the other factor is read once for all these rows."""
     batch, rows, columns = shape
-    turned = columns > rows
-    if turned:
+    swapped = columns > rows
+    if swapped:
         left, right, rows, columns = right, left, columns, rows
-    multiplied = (lambda x, y: product(t, y, x)) if turned else partial(product, t)
-    out, length, zero = room(t, shape, kind), left.shape[2], t.zero(kind)
+    multiplied = (lambda x, y: product(t, y, x)) if swapped else partial(product, t)
+    out, length, zero = reserve(t, shape, kind), left.shape[2], t.zero(kind)
 
     def block(first: Index, number: int, z: Index, column: Index) -> None:
         if number < _SUMS // 2 and length >= 2 * _SUMS:
@@ -668,27 +668,27 @@ def _product(t: Text, left: Array, right: Array, shape, kind: str, product: Call
                 sums.append(reduced(t, length, term, partial(add, t), zero))
         else:
 
-            def turn(i: Index, carry: list[Value]) -> list[Value]:
+            def iteration(i: Index, carry: list[Value]) -> list[Value]:
                 other = right.at(t, (z, column, i))
                 return [
                     add(t, c, multiplied(left.at(t, (z, plus(t, first, j), i)), other))
                     for j, c in enumerate(carry)
                 ]
 
-            sums = counted(t, length, turn, [zero] * number)
+            sums = write_loop(t, length, iteration, [zero] * number)
         for j, value in enumerate(sums):
             row = plus(t, first, j)
-            index = (z, column, row) if turned else (z, row, column)
+            index = (z, column, row) if swapped else (z, row, column)
             out.put(t, index, value)
 
     whole, rest = divmod(rows, _SUMS)
-    for number, first, turns in ((_SUMS, 0, whole), (rest, whole * _SUMS, 1)):
+    for number, first, blocks in ((_SUMS, 0, whole), (rest, whole * _SUMS, 1)):
 
         def part(i: tuple[Index, ...], number: int = number, first: int = first) -> None:
             block(plus(t, times(t, i[2], _SUMS), first), number, i[0], i[1])
 
         if number:
-            over(t, (batch, columns, turns), part)
+            write_loops(t, (batch, columns, blocks), part)
     return out
 
 

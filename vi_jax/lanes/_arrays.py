@@ -76,10 +76,10 @@ def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(int(np.prod(shape[i + 1 :], dtype=int)) for i in range(len(shape)))
 
 
-def counted(
+def write_loop(
     t: Text,
     number: int,
-    turn: Callable[[Index, list[Value]], list[Value]],
+    body: Callable[[Index, list[Value]], list[Value]],
     first: list[Value],
 ) -> list[Value]:
     """Write a loop with a known number of iterations and a scalar counter.
@@ -90,7 +90,7 @@ def counted(
     **Returns:** the final carry.
     """
     if number < 2:
-        return turn(0, first) if number else first
+        return body(0, first) if number else first
     inside, after = t.label(), t.label()
     before = t.block
     t.line(f"br label %{inside}")
@@ -99,7 +99,7 @@ def counted(
     carry = [Value(t.fresh(), a.kind) for a in first]
     count, following = t.fresh(), t.fresh()
     t.ranges[count] = 0, number - 1
-    new = turn(count, carry)
+    new = body(count, carry)
     end = t.block
     t.line(f"{following} = add i64 {count}, 1")
     more = t.raw(f"icmp slt i64 {following}, {number}")
@@ -117,7 +117,7 @@ Cuts = Mapping[int, frozenset[int]]
 NO_CUTS: Cuts = MappingProxyType({})
 
 
-def over(
+def write_loops(
     t: Text,
     shape: Sequence[int],
     body: Callable[[tuple[Index, ...]], None],
@@ -131,11 +131,11 @@ def over(
         return body(index)
     for begin, end in pairwise(sorted({0, shape[axis], *cuts.get(axis, ())})):
 
-        def turn(i: Index, _: list[Value], begin: int = begin) -> list[Value]:
-            over(t, shape, body, cuts, (*index, plus(t, i, begin)))
+        def iteration(i: Index, _: list[Value], begin: int = begin) -> list[Value]:
+            write_loops(t, shape, body, cuts, (*index, plus(t, i, begin)))
             return []
 
-        counted(t, end - begin, turn, [])
+        write_loop(t, end - begin, iteration, [])
 
 
 def range_of(t: Text, i: Index, size: int) -> tuple[int, int]:
@@ -208,11 +208,11 @@ class Registers(Array):
     def at(self, t: Text, index: Sequence[Index]) -> Value:
         for axis, i in enumerate(index):
             if not isinstance(i, int):
-                ways = [(*index[:axis], n, *index[axis + 1 :]) for n in range(self.shape[axis])]
-                found = self.at(t, ways[0])
-                for n, way in enumerate(ways[1:], start=1):
-                    here = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
-                    found = t.select(here, self.at(t, way), found)
+                choices = [(*index[:axis], n, *index[axis + 1 :]) for n in range(self.shape[axis])]
+                found = self.at(t, choices[0])
+                for n, choice in enumerate(choices[1:], start=1):
+                    match = t.binary("icmp eq", in_lanes(t, i), t.constant(n, "i64"), "i1")
+                    found = t.select(match, self.at(t, choice), found)
                 return found
         return self.values[tuple(index)]
 
@@ -272,24 +272,24 @@ class Pieces(Array):
             size = part.shape[self.axis]
             if begin > high or begin + size <= low:
                 continue
-            alone = begin <= low and high < begin + size
-            place = plus(t, i, -begin) if alone else _clamped(t, plus(t, i, -begin), size - 1)
+            is_sure = begin <= low and high < begin + size
+            place = plus(t, i, -begin) if is_sure else _clamped(t, plus(t, i, -begin), size - 1)
             value = part.at(t, (*index[: self.axis], place, *index[self.axis + 1 :]))
             if found is not None:
-                there = t.binary("icmp sge", in_lanes(t, i), t.constant(begin, "i64"), "i1")
-                value = t.select(there, value, found)
+                is_reached = t.binary("icmp sge", in_lanes(t, i), t.constant(begin, "i64"), "i1")
+                value = t.select(is_reached, value, found)
             found = value
         assert found is not None
         return found
 
 
 def _clamped(t: Text, place: Index, last: int) -> Value:
-    wide, zero, end = in_lanes(t, place), t.zero("i64"), t.constant(last, "i64")
-    wide = t.select(t.binary("icmp slt", wide, zero, "i1"), zero, wide)
-    return t.select(t.binary("icmp sgt", wide, end, "i1"), end, wide)
+    index, zero, end = in_lanes(t, place), t.zero("i64"), t.constant(last, "i64")
+    index = t.select(t.binary("icmp slt", index, zero, "i1"), zero, index)
+    return t.select(t.binary("icmp sgt", index, end, "i1"), end, index)
 
 
-def joined(*cuts: Cuts) -> Cuts:
+def joined_cuts(*cuts: Cuts) -> Cuts:
     """Return the union of the cuts of several arrays of one shape."""
     axes = {axis for c in cuts for axis in c}
     return {a: frozenset().union(*(c.get(a, frozenset()) for c in cuts)) for a in axes}
@@ -356,8 +356,8 @@ class Memory:
     def _of_slots(self, t: Text, place: Value) -> Value:
         """Return the index of each slot's number among those of all slots."""
         slots = ", ".join(f"i64 {i}" for i in range(t.width))
-        own = Value(f"<{slots}>", "i64")
-        return t.binary("add", t.binary("mul", place, t.constant(t.width, "i64")), own)
+        slot = Value(f"<{slots}>", "i64")
+        return t.binary("add", t.binary("mul", place, t.constant(t.width, "i64")), slot)
 
 
 @dataclass(eq=False)
@@ -469,19 +469,19 @@ def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | 
         out.flat = [function(*each) for each in numbers]
         return Registers(out, kind)
     number = lambda i: function(*(x.at(t, i) for x in arrays))
-    return Formula(first.shape, kind, number, cuts=joined(*(x.cuts for x in arrays)))
+    return Formula(first.shape, kind, number, cuts=joined_cuts(*(x.cuts for x in arrays)))
 
 
-def over_all(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> None:
+def write_for_each(t: Text, x: Array, body: Callable[[tuple[Index, ...]], None]) -> None:
     """Write `body` for each element: in sequence if the array is in registers, else in loops."""
     if isinstance(x, Registers):
         for i in np.ndindex(x.shape):
             body(i)
     else:
-        over(t, x.shape, body, x.cuts)
+        write_loops(t, x.shape, body, x.cuts)
 
 
-def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
+def reserve(t: Text, shape: Sequence[int], kind: str) -> Strided:
     """Allocate an array in memory. Its numbers must be stored before use."""
     numbers = int(np.prod(shape, dtype=int))
     source = Memory(t.arena.take(max(1, numbers)))
@@ -490,24 +490,24 @@ def room(t: Text, shape: Sequence[int], kind: str) -> Strided:
 
 def fill(t: Text, out: Strided, x: Array) -> None:
     """Store the numbers of an array in allocated memory."""
-    over_all(t, x, lambda i: out.put(t, i, x.at(t, i)))
+    write_for_each(t, x, lambda i: out.put(t, i, x.at(t, i)))
 
 
 def stored(t: Text, x: Array) -> Strided:
     """Return a copy of an array in memory."""
-    out = room(t, x.shape, x.kind)
+    out = reserve(t, x.shape, x.kind)
     fill(t, out, x)
     return out
 
 
-def settled(t: Text, x: Array) -> Array:
+def computed(t: Text, x: Array) -> Array:
     """Return an array whose numbers are computed; a formula that is not cheap is stored."""
     return x if is_cheap(x) else stored(t, x)
 
 
 def without_cuts(t: Text, x: Array) -> Array:
     """Return an array without cuts, for indices known only at run time."""
-    return stored(t, x) if x.cuts else settled(t, x)
+    return stored(t, x) if x.cuts else computed(t, x)
 
 
 def is_cheap(x: Array) -> bool:
@@ -530,13 +530,13 @@ def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | N
     ]
     blocks = [a.source.block for a, _ in pairs if isinstance(a.source, Memory)]
 
-    def apart(x: Array) -> Array:
-        free = isinstance(x, Strided) and not (
+    def separate(x: Array) -> Array:
+        is_separate = isinstance(x, Strided) and not (
             isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
         )
-        return x if free else stored(t, x)
+        return x if is_separate else stored(t, x)
 
-    for a, b in [(a, apart(b)) for a, b in pairs]:
+    for a, b in [(a, separate(b)) for a, b in pairs]:
         fill(t, a, b if mask is None else selected(t, mask, b, a))
 
 
@@ -546,20 +546,20 @@ def same(a: Array, b: Array) -> bool:
         return True
     if not (isinstance(a, Strided) and isinstance(b, Strided)):
         return False
-    mine = isinstance(a.source, Memory) and isinstance(b.source, Memory)
-    alike = a.source.block is b.source.block if mine else a.source == b.source  # pyright: ignore[reportAttributeAccessIssue]
-    return alike and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
+    in_memory = isinstance(a.source, Memory) and isinstance(b.source, Memory)
+    same_source = a.source.block is b.source.block if in_memory else a.source == b.source  # pyright: ignore[reportAttributeAccessIssue]
+    return same_source and (a.shape, a.strides, a.offset) == (b.shape, b.strides, b.offset)
 
 
 def table(t: Text, array: object, kind: str) -> Array:
     """Return a large constant array, stored in the module's text."""
     array = np.asarray(array)
     numbers = array.reshape(-1)
-    word = stored_kind(kind)
+    stored_type = stored_kind(kind)
     if all(x.tobytes() == numbers[0].tobytes() for x in numbers):
         return uniform(array.shape, t.constant(numbers[0], kind))
-    body = ", ".join(f"{word} {literal(x, word)}" for x in numbers)
-    content = f"private unnamed_addr constant [{numbers.size} x {word}] [{body}], align 64"
+    body = ", ".join(f"{stored_type} {literal(x, stored_type)}" for x in numbers)
+    content = f"private unnamed_addr constant [{numbers.size} x {stored_type}] [{body}], align 64"
     name = f"@table{hashlib.blake2b(content.encode(), digest_size=8).hexdigest()}"
     t.declared[name] = f"{name} = {content}"
     return Strided(array.shape, kind, Table(name), contiguous(array.shape))

@@ -30,14 +30,14 @@ from ._arrays import (
     held,
     in_lanes,
     mapped,
-    over_all,
     place_of,
     replace,
-    room,
+    reserve,
     scattered,
     selected,
     splat,
     uniform,
+    write_for_each,
 )
 from ._operations import kind_of
 from ._program import LaneProgram
@@ -126,9 +126,9 @@ class _Writer:
         for i, aval in enumerate((*program.in_avals, *program.carry_avals)):
             found = None
             if i < len(self.inputs) and self.one_for_all[i] and aval.size > MOST_IN_REGISTERS:
-                found = shared(self.inputs[i], aval)
+                found = shared_input(self.inputs[i], aval)
             elif aval.size > MOST_IN_REGISTERS:
-                found = room(t, aval.shape, kind_of(aval.dtype))
+                found = reserve(t, aval.shape, kind_of(aval.dtype))
             self.large.append(found)
         t.line("br label %refill")
 
@@ -228,14 +228,14 @@ class _Writer:
         t = self.t
         ones = t.cast("zext", flag, "i64")
         # Prefix sums, by shifts of 1, 2, 4, … slots.
-        v, shift, run = t.vector("i64"), 1, ones
+        v, shift, sums = t.vector("i64"), 1, ones
         while shift < t.width:
             mask = ", ".join(f"i32 {i - shift if i >= shift else t.width}" for i in range(t.width))
             mask = f"<{t.width} x i32> <{mask}>"
-            moved = t.raw(f"shufflevector {v} {run.text}, {v} zeroinitializer, {mask}")
-            run = t.binary("add", run, Value(moved, "i64"))
+            moved = t.raw(f"shufflevector {v} {sums.text}, {v} zeroinitializer, {mask}")
+            sums = t.binary("add", sums, Value(moved, "i64"))
             shift *= 2
-        return t.binary("sub", run, ones)
+        return t.binary("sub", sums, ones)
 
     def _begin(self, old: _Group, new: Value) -> tuple[_Group, str]:
         """Initialize the lanes in the slots `new`. Return the group and the last block."""
@@ -260,7 +260,7 @@ class _Writer:
 
     def _read_input(self, i: int, old: Array, lane: Value, new: Value) -> Array:
         t, base = self.t, self.t.binary("mul", lane, self.strides[i])
-        read = gathering(t, self.inputs[i], base, self.program.in_avals[i], new)
+        read = gathered_array(t, self.inputs[i], base, self.program.in_avals[i], new)
         if isinstance(old, Registers):
             return held(t, read)
         if not self.one_for_all[i]:
@@ -281,8 +281,8 @@ class _Writer:
             for a, b in zip(begun.arrays, old.arrays, strict=True)
         ]
         rows, active = either(begun.rows, old.rows), either(begun.active, old.active)
-        left = t.any(t.binary("icmp sge", old.lane, t.zero("i64"), "i1"))
-        t.fork(left, "head", "exit")
+        any_lane = t.any(t.binary("icmp sge", old.lane, t.zero("i64"), "i1"))
+        t.fork(any_lane, "head", "exit")
         return _Group(arrays, old.lane, rows, active)
 
     def _run(
@@ -343,7 +343,7 @@ def load_stride(t: Text, i: int) -> Value:
     return splat(t, t.raw(f"load i64, ptr {place}"), "i64")
 
 
-def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
+def gathered_array(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
     """Return an array of each slot, read at each use where `mask` holds, else zero.
 
     **Arguments:** the address of all lanes' arrays; for each slot the index of its first number;
@@ -358,7 +358,7 @@ def gathering(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> For
     return Formula(tuple(aval.shape), kind, number)
 
 
-def shared(pointer: str, aval: Any) -> Strided:
+def shared_input(pointer: str, aval: Any) -> Strided:
     """Return an input that all lanes share, at its place in XLA's memory."""
     return Strided(aval.shape, kind_of(aval.dtype), Table(pointer), contiguous(aval.shape))
 
@@ -377,7 +377,7 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
         place = t.binary("add", base, in_lanes(t, place_of(t, i, steps)))
         scattered(t, pointer, place, value, mask)
 
-    over_all(t, x, put)
+    write_for_each(t, x, put)
 
 
 def over_rows(
@@ -392,10 +392,10 @@ def over_rows(
     t.line(f"br label %{head}")
     t.open(head)
     at, place, following = len(t.lines), Value(t.fresh(), "i64"), Value(t.fresh(), "i64")
-    room = t.both(mask, t.binary("icmp slt", place, t.constant(number, "i64"), "i1"))
-    t.fork(t.any(room), inside, after)
+    has_row = t.both(mask, t.binary("icmp slt", place, t.constant(number, "i64"), "i1"))
+    t.fork(t.any(has_row), inside, after)
     t.open(inside)
-    body(place, room)
+    body(place, has_row)
     one = t.constant(1, "i64").text
     t.line(f"{following.text} = add {t.vector('i64')} {place.text}, {one}")
     t.join([place], ([first], before), ([following], t.block), at=at)

@@ -38,7 +38,7 @@ from ._arrays import (
     stored,
     uniform,
 )
-from ._kernel import gathering, load_pointer, load_stride, over_rows, scatter, shared
+from ._kernel import gathered_array, load_pointer, load_stride, over_rows, scatter, shared_input
 from ._operations import add, compare, kind_of
 from ._reverse import ReverseProgram
 from ._text import RARE, FixedText, Text, Value, attributes
@@ -257,7 +257,7 @@ class _Writer:
         """Return the inputs. Large ones that all lanes share are read from XLA's array."""
         own = iter(self.frame.load(t, "inputs"))
         return [
-            shared(load_pointer(t, "inputs", i), aval) if here else next(own)
+            shared_input(load_pointer(t, "inputs", i), aval) if here else next(own)
             for i, (aval, here) in enumerate(zip(self.inputs, self.shared, strict=True))
         ]
 
@@ -281,7 +281,7 @@ class _Writer:
                 row = t.binary("mul", place, t.constant(aval.size, "i64"))
                 start = t.binary("add", start, row)
             pointer = load_pointer(t, "inputs", i)
-            arrays.append(held(t, gathering(t, pointer, start, aval, mask)))
+            arrays.append(held(t, gathered_array(t, pointer, start, aval, mask)))
         return arrays
 
     def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
@@ -352,7 +352,7 @@ class _Writer:
         for i in (i for i, here in enumerate(self.shared) if not here):
             pointer = load_pointer(t, "inputs", i)
             first = t.binary("mul", lane, load_stride(t, i))
-            inputs.append(held(t, gathering(t, pointer, first, self.inputs[i], present)))
+            inputs.append(held(t, gathered_array(t, pointer, first, self.inputs[i], present)))
         self.frame.store_number(t, "lane", lane)
         self.frame.store(t, "inputs", inputs)
         inputs = self._load_inputs(t)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, any_in, chosen
+from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
@@ -20,23 +20,23 @@ from ._arrays import (
     Registers,
     Strided,
     addressable,
-    counted,
+    computed,
     fill,
     held,
-    joined,
+    joined_cuts,
     mapped,
-    over,
     plus,
     replace,
-    room,
+    reserve,
     same,
     selected,
-    settled,
     stored,
     table,
     times,
     uniform,
     without_cuts,
+    write_loop,
+    write_loops,
 )
 from ._operations import ELEMENTWISE, IDENTITY_PRIMITIVES, kind_of
 from ._program import called, inner, scan_counts, shape_of, size_of
@@ -115,7 +115,7 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     def put(variables: list[Any], values: list[Any]) -> None:
         for var, value in zip(variables, values, strict=True):
             # A value used more than once is computed once.
-            env[var] = settled(t, value) if uses.get(var, 0) > 1 else value
+            env[var] = computed(t, value) if uses.get(var, 0) > 1 else value
 
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
@@ -128,14 +128,14 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
 
 def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, list[Any]]]:
     """Return the number of uses of each variable, and the variables last used by each equation."""
-    uses, at_last = {}, {}
+    uses, last_use = {}, {}
     for number, atoms in enumerate([*(eqn.invars for eqn in needed), jaxpr.outvars]):
         for atom in atoms:
             if not isinstance(atom, Literal):
                 uses[atom] = uses.get(atom, 0) + 1
-                at_last[atom] = number
+                last_use[atom] = number
     last: dict[int, list[Any]] = {}
-    for var, number in at_last.items():
+    for var, number in last_use.items():
         last.setdefault(number, []).append(var)
     return uses, last
 
@@ -155,11 +155,11 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
     if (body := called(eqn)) is not None:
         return write(t, body, args, mask)
     if name in CONTROL:
-        return CONTROL[name](t, params, [settled(t, x) for x in args], mask)
+        return CONTROL[name](t, params, [computed(t, x) for x in args], mask)
     if name == "custom_linear_solve":
         before, _, solve, _ = np.cumsum([0, *params["const_lengths"]])[1:]
-        given = int(before + params["const_lengths"].vecmat), int(solve)
-        consts, right = args[slice(*given)], args[sum(params["const_lengths"]) :]
+        of_vecmat = int(before + params["const_lengths"].vecmat), int(solve)
+        consts, right = args[slice(*of_vecmat)], args[sum(params["const_lengths"]) :]
         return write(t, params["jaxprs"].solve, [*consts, *right], mask)
     avals = [v.aval for v in eqn.outvars]
     if name in DERIVED:
@@ -210,20 +210,20 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
         return [uniform(shape, v) for v in results(*values)]
     if name == "select_n" and len(args) == 3 and values[0] is not None:
         if values[0].kind == "i1" and args[1].shape == args[2].shape:
-            found = chosen(t, values[0], args[2], args[1])
+            found = select_parts(t, values[0], args[2], args[1])
             if found is not None:
                 return [found]
     if not several:
-        cuts = joined(*(x.cuts for x in args if x.ndim))
+        cuts = joined_cuts(*(x.cuts for x in args if x.ndim))
         # Rounding must not depend on whether the result is stored before use.
         return [Formula(shape, kinds[0], lambda i: t.opaque(results_at(i)[0]), cuts=cuts)]
-    outs = [room(t, shape, kind) for kind in kinds]
+    outs = [reserve(t, shape, kind) for kind in kinds]
 
     def put(index: tuple) -> None:
         for out, value in zip(outs, results_at(index), strict=True):
             out.put(t, index, value)
 
-    over(t, shape, put, joined(*(x.cuts for x in args)))
+    write_loops(t, shape, put, joined_cuts(*(x.cuts for x in args)))
     return list(outs)
 
 
@@ -247,24 +247,24 @@ def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 
     **Arguments:** as for `CONTROL`.
     """
-    branches, which, args = params["branches"], args[0].item(), args[1:]
+    branches, choice, args = params["branches"], args[0].item(), args[1:]
     last = len(branches) - 1
-    taken = []
+    flags = []
     for i in range(len(branches)):
-        how = "sle" if i == 0 else "sge" if i == last else "eq"
-        if which.kind == "i1":
-            flag = which if i else t.inverse(which)
+        relation = "sle" if i == 0 else "sge" if i == last else "eq"
+        if choice.kind == "i1":
+            flag = choice if i else t.inverse(choice)
         else:
-            flag = t.binary(f"icmp {how}", which, t.constant(i, which.kind), "i1")
-        taken.append(flag)
+            flag = t.binary(f"icmp {relation}", choice, t.constant(i, choice.kind), "i1")
+        flags.append(flag)
     # The smallest branch comes first. The others replace its results in their own lanes.
     order = sorted(range(len(branches)), key=lambda i: size_of(inner(branches[i])))
     result: list[Any] | None = None
     for i in order:
         if result is None and _is_cheap(inner(branches[i])):
-            result = [settled(t, x) for x in write(t, branches[i], args, mask)]
+            result = [computed(t, x) for x in write(t, branches[i], args, mask)]
             continue
-        result = _branch_if_any(t, branches[i], args, t.both(mask, taken[i]), result)
+        result = _branch_if_any(t, branches[i], args, t.both(mask, flags[i]), result)
     assert result is not None
     return [_opaque(t, x) for x in result]
 
@@ -285,27 +285,27 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
     inside, skip, after = t.label(), t.label(), t.label()
     # A large result has one address, whether or not the branch is skipped.
     avals: list[Any] = [v.aval for v in inner(jaxpr).outvars]
-    rooms = [
-        room(t, a.shape, kind_of(a.dtype)) if a.size > MOST_IN_REGISTERS else None for a in avals
+    memory = [
+        reserve(t, a.shape, kind_of(a.dtype)) if a.size > MOST_IN_REGISTERS else None for a in avals
     ]
-    in_memory = any(r is not None for r in rooms)
+    in_memory = any(r is not None for r in memory)
     before = t.block
     t.fork(t.any(mask), inside, skip if in_memory else after, rare=True)
     t.open(inside)
     found = write(t, jaxpr, args, mask)
-    laid: list[Any] = []
+    results: list[Any] = []
     others: list[Any] = [None] * len(found) if otherwise is None else otherwise
-    for x, y, r in zip(found, others, rooms, strict=True):
+    for x, y, r in zip(found, others, memory, strict=True):
         if r is not None:
-            laid.append(_branch_result(t, x, y, r, args, mask))
+            results.append(_branch_result(t, x, y, r, args, mask))
         else:
-            laid.append(x if y is None else selected(t, mask, x, y))
+            results.append(x if y is None else selected(t, mask, x, y))
     end = t.block
     t.line(f"br label %{after}")
     t.close()
     if in_memory:
         t.open(skip)
-        for x, y, r in zip(laid, others, rooms, strict=True):
+        for x, y, r in zip(results, others, memory, strict=True):
             if r is not None and y is not None and x is r:
                 fill(t, r, y)
         before = t.block
@@ -320,7 +320,7 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
 
     return [
         mapped(t, either, x, y) if r is None else x
-        for x, y, r in zip(laid, others, rooms, strict=True)
+        for x, y, r in zip(results, others, memory, strict=True)
     ]
 
 
@@ -333,12 +333,12 @@ def _branch_result(
     **Arguments:** the text; the branch's result `x`; the other lanes' `y`, or `None` if they are
     arbitrary; memory for a stored result; the branch's arguments; its lanes.
     """
-    mine, other = (a.value if isinstance(a, Formula) else None for a in (x, y))
-    if mine is not None and mine.number is not None and (y is None or mine == other):
+    value_x, value_y = (a.value if isinstance(a, Formula) else None for a in (x, y))
+    if value_x is not None and value_x.number is not None and (y is None or value_x == value_y):
         return x
     if y is not None and same(x, y):
         return y
-    if other == t.zero(r.kind):
+    if value_y == t.zero(r.kind):
         if not (isinstance(x, Strided) and any(same(x, a) for a in args)):
             fill(t, r, x)
             x = r
@@ -368,32 +368,32 @@ def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
     ]
     live = Value(t.fresh(), "i1")
     # `vmap` within a lane merges loops into one, which runs as long as one of them continues.
-    asked = settled(t, write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0])
-    going = t.both(live, any_in(t, asked))
-    t.fork(t.any(going), inside, after)
+    condition = computed(t, write(t, params["cond_jaxpr"], [*cond_args, *carry], live)[0])
+    continues = t.both(live, any_in(t, condition))
+    t.fork(t.any(continues), inside, after)
     t.open(inside)
-    new = write(t, params["body_jaxpr"], [*body_args, *carry], going)
-    if asked.ndim:
-        new = [_chosen_by(t, asked, x, y) for x, y in zip(new, carry, strict=True)]
-    replace(t, carry, new, going)
+    new = write(t, params["body_jaxpr"], [*body_args, *carry], continues)
+    if condition.ndim:
+        new = [_select_by(t, condition, x, y) for x, y in zip(new, carry, strict=True)]
+    replace(t, carry, new, continues)
     new = [
-        selected(t, going, x, y) if isinstance(x, Registers) else x
+        selected(t, continues, x, y) if isinstance(x, Registers) else x
         for x, y in zip(new, carry, strict=True)
     ]
     end = t.block
     t.line(f"br label %{head}")
     t.close()
     t.close()
-    begun, back = ([*_flat(first), mask], before), ([*_flat(new), going], end)
-    t.join([*_flat(carry), live], begun, back, at=place)
+    entry, repeat = ([*_flat(first), mask], before), ([*_flat(new), continues], end)
+    t.join([*_flat(carry), live], entry, repeat, at=place)
     t.follow(after)
     return carry
 
 
-def _chosen_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
+def _select_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
     """Return the first array where a flag of its leading axes holds, else the second."""
     number = lambda i: t.select(flags.at(t, i[: flags.ndim]), a.at(t, i), b.at(t, i))
-    return held(t, Formula(a.shape, a.kind, number, cuts=joined(a.cuts, b.cuts)))
+    return held(t, Formula(a.shape, a.kind, number, cuts=joined_cuts(a.cuts, b.cuts)))
 
 
 def _flat(arrays: list[Any]) -> list[Value]:
@@ -403,8 +403,8 @@ def _flat(arrays: list[Any]) -> list[Value]:
 
 def _unflat(t: Text, arrays: list[Any], values: list[Value]) -> list[Any]:
     """Return arrays like the given ones, with other numbers in registers."""
-    left = iter(values)
-    return [mapped(t, lambda _: next(left), x) if isinstance(x, Registers) else x for x in arrays]
+    rest = iter(values)
+    return [mapped(t, lambda _: next(rest), x) if isinstance(x, Registers) else x for x in arrays]
 
 
 def _scan(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
@@ -415,15 +415,15 @@ def _scan(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
         return _counted_loop(t, params, args, mask)
     fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
     order = range(length)[::-1] if params["reverse"] else range(length)
-    kept: dict[int, list[Any]] = {}
+    emitted: dict[int, list[Any]] = {}
     for i in order:
         row = [_row_of(t, x, i) for x in rows]
         out = write(t, params["jaxpr"], [*fixed, *carry, *row], mask)
-        carry, kept[i] = [_opaque(t, x) for x in out[:m]], [settled(t, x) for x in out[m:]]
+        carry, emitted[i] = [_opaque(t, x) for x in out[:m]], [computed(t, x) for x in out[m:]]
     columns = []
     for j, var in enumerate(body.outvars[m:]):
         aval: Any = var.aval
-        column = [kept[i][j] for i in range(length)]
+        column = [emitted[i][j] for i in range(length)]
         whole = jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)
         columns.append(held(t, STRUCTURAL["stack"](t, {"axis": 0}, [whole], *column)))
     return [*carry, *columns]
@@ -438,10 +438,10 @@ def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[A
     (n, m), length = scan_counts(params), params["length"]
     fixed, rows = args[:n], [addressable(t, without_cuts(t, x)) for x in args[n + m :]]
     first = [x if isinstance(x, Registers) else stored(t, x) for x in args[n : n + m]]
-    made: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]
-    columns = [room(t, (length, *a.shape), kind_of(a.dtype)) for a in made]
+    avals: list[Any] = [v.aval for v in inner(params["jaxpr"]).outvars[m:]]
+    columns = [reserve(t, (length, *a.shape), kind_of(a.dtype)) for a in avals]
 
-    def turn(i: Index, values: list[Value]) -> list[Value]:
+    def body(i: Index, values: list[Value]) -> list[Value]:
         carry = _unflat(t, first, values)
         place = plus(t, length - 1, times(t, i, -1)) if params["reverse"] else i
         row = [_row_of(t, x, place) for x in rows]
@@ -452,7 +452,7 @@ def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[A
         replace(t, carry, out[:m])
         return _flat(out[:m])
 
-    carry = [_opaque(t, x) for x in _unflat(t, first, counted(t, length, turn, _flat(first)))]
+    carry = [_opaque(t, x) for x in _unflat(t, first, write_loop(t, length, body, _flat(first)))]
     return [*carry, *(held(t, x) for x in columns)]
 
 
@@ -475,15 +475,15 @@ def _lu(a):
         greatest = jnp.max(column, axis=-1, keepdims=True)
         pivot = jnp.min(jnp.where(column == greatest, rows, n - 1), axis=-1, keepdims=True)
         pivots.append(pivot)
-        here = rows == pivot
+        is_pivot = rows == pivot
 
-        def exchanged(x, here=here, k=k):
+        def exchanged(x, is_pivot=is_pivot, k=k):
             """Return `x` with row k and the pivot's row exchanged."""
-            wide = here.reshape(*here.shape, *(1,) * (x.ndim - here.ndim))
-            first = x[..., k : k + 1, :] if x.ndim > here.ndim else x[..., k : k + 1]
-            other = jnp.sum(jnp.where(wide, x, 0), axis=here.ndim - 1, keepdims=True)
+            wide = is_pivot.reshape(*is_pivot.shape, *(1,) * (x.ndim - is_pivot.ndim))
+            first = x[..., k : k + 1, :] if x.ndim > is_pivot.ndim else x[..., k : k + 1]
+            other = jnp.sum(jnp.where(wide, x, 0), axis=is_pivot.ndim - 1, keepdims=True)
             moved = jnp.where(wide, first, x)
-            at_k = (rows == k).reshape(n, *(1,) * (x.ndim - here.ndim))
+            at_k = (rows == k).reshape(n, *(1,) * (x.ndim - is_pivot.ndim))
             return jnp.where(at_k, other, moved)
 
         a, order = exchanged(a), exchanged(order)
@@ -545,17 +545,17 @@ def _sort(*xs, dimension, num_keys, **_):
             )
         before = less | same & before
     rank = jnp.sum(before, axis=-1, dtype=places.dtype)
-    there = rank[..., None, :] == places[:, None]
+    matches = rank[..., None, :] == places[:, None]
 
-    def placed(x):
-        found = jnp.sum(jnp.where(there, x[..., None, :], 0), axis=-1, dtype=x.dtype)
+    def reordered(x):
+        found = jnp.sum(jnp.where(matches, x[..., None, :], 0), axis=-1, dtype=x.dtype)
         if not _is_float(x):
             return found
         # The sum loses the sign of -0.
-        negative = jnp.any(there & (1 / x < 0)[..., None, :], axis=-1)
+        negative = jnp.any(matches & (1 / x < 0)[..., None, :], axis=-1)
         return jnp.where((found == 0) & negative, -0.0, found)
 
-    sorted_ = [placed(x) for x in xs]
+    sorted_ = [reordered(x) for x in xs]
     return [jnp.moveaxis(x, -1, dimension) for x in sorted_]
 
 
@@ -568,8 +568,8 @@ def _first_extreme(extreme: Callable, x, *, axes, index_dtype, **_):
     n = x.shape[axis]
     places = lax.broadcasted_iota(index_dtype, x.shape, axis)
     best = extreme(x, axis=axis, keepdims=True)
-    here = (x == best) | (x != x)
-    return [jnp.min(jnp.where(here, places, n - 1), axis=axis)]
+    is_best = (x == best) | (x != x)
+    return [jnp.min(jnp.where(is_best, places, n - 1), axis=axis)]
 
 
 def _tile(x, *, reps):
