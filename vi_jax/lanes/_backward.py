@@ -56,25 +56,25 @@ def by_columns(
         return {i: jnp.zeros((*batch, *x.shape), x.dtype) for i, x in avals.items()}
     size = min(number, DIRECTIONS)
     units = jnp.eye(-(-number // size) * size, number)  # padded, so that one program serves all
-    along = jax.vmap(
+    run_many = jax.vmap(
         functools.partial(lanes_p.bind, program=program, backend=backend),
         [0 if i in places else None for i in range(len(args))],
         axis_size=size,
     )
-    found = []
+    weighted = []
     for first in range(0, number, size):
-        given = list(args)
+        inputs = list(args)
         for i, place in places.items():
             aval = program.in_avals[i]
-            some = units[first : first + size, place].astype(aval.dtype)
-            given[i] = some.reshape(size, *aval.shape)
-        columns = along(*given)
-        found.append(sum(_weighted(columns[k], x, 1 + len(batch)) for k, x in weights.items()))
-    each = jnp.concatenate(found)[:number]  # (numbers, *batch)
+            unit = units[first : first + size, place].astype(aval.dtype)
+            inputs[i] = unit.reshape(size, *aval.shape)
+        columns = run_many(*inputs)
+        weighted.append(sum(_weighted(columns[k], x, 1 + len(batch)) for k, x in weights.items()))
+    numbers = jnp.concatenate(weighted)[:number]  # (numbers, *batch)
     out = {}
     for i, place in places.items():
         aval = program.in_avals[i]
-        x = jnp.moveaxis(each[place], 0, -1)
+        x = jnp.moveaxis(numbers[place], 0, -1)
         out[i] = x.reshape(*batch, *aval.shape).astype(aval.dtype)
     return out
 
@@ -115,8 +115,8 @@ def _transposed(cotangents, *args, program: LaneProgram, backend: str):
     if backend != "xla" and number > _BY_COLUMNS * max(1.0, _length(program) / _SHORT) ** 2:
         found = _by_tape(program, args, linear, weights)
     if found is None:
-        given = [None if u else jnp.asarray(x) for x, u in zip(args, linear, strict=True)]
-        found = by_columns(program, backend, given, weights, batch)
+        inputs = [None if u else jnp.asarray(x) for x, u in zip(args, linear, strict=True)]
+        found = by_columns(program, backend, inputs, weights, batch)
     out: list[Any] = [None] * len(args)
     for i, x in found.items():
         out[i] = _for_argument(x, program.in_avals[i], args[i].aval)
@@ -129,11 +129,11 @@ def _length(program: LaneProgram) -> int:
     return size_of((program.base or program).step.jaxpr)
 
 
-def _for_argument(x, own, aval):
+def _for_argument(x, lane_aval, aval):
     """Return the cotangent of an argument: the sum over lanes, if all share it. Arguments: the
     cotangents with batch axes; the aval of one lane; the aval of the argument."""
-    if aval.ndim == own.ndim:
-        x = jnp.sum(x, axis=tuple(range(x.ndim - own.ndim)))
+    if aval.ndim == lane_aval.ndim:
+        x = jnp.sum(x, axis=tuple(range(x.ndim - lane_aval.ndim)))
     return x.reshape(aval.shape).astype(aval.dtype)
 
 
@@ -145,25 +145,25 @@ def _by_tape(program: LaneProgram, args, linear: list[bool], weights) -> dict[in
         return None
     places = _tangent_places(program)
     wanted = tuple(i in places and linear[places[i]] for i in range(len(base.in_avals)))
-    own = forward(base, program.varied).slopes
-    if set(weights) - set(own.values()):
+    slopes = forward(base, program.varied).slopes
+    if set(weights) - set(slopes.values()):
         return None
-    given = tuple(own.get(k, -1) in weights for k in range(len(base.result_avals)))
+    given = tuple(slopes.get(k, -1) in weights for k in range(len(base.result_avals)))
     back = reverse(base, wanted, given)
     if back is None:
         return None
     inputs = [jnp.asarray(x) for x in args[: len(base.in_avals)]]
-    some = [weights[own[k]] for k, here in enumerate(given) if here]
-    found = lanes_backward_p.bind(*inputs, *some, program=back)
-    asked = [places[i] for i, here in enumerate(wanted) if here]
-    return dict(zip(asked, found, strict=True))
+    cotangents = [weights[slopes[k]] for k, flag in enumerate(given) if flag]
+    found = lanes_backward_p.bind(*inputs, *cotangents, program=back)
+    targets = [places[i] for i, flag in enumerate(wanted) if flag]
+    return dict(zip(targets, found, strict=True))
 
 
 def _tangent_places(program: LaneProgram) -> dict[int, int]:
     """Return a dictionary from inputs of a program's base to the places of their tangents."""
     assert program.base is not None
-    moved = [i for i, here in enumerate(program.varied) if here]
-    return {i: len(program.base.in_avals) + n for n, i in enumerate(moved)}
+    varied = [i for i, flag in enumerate(program.varied) if flag]
+    return {i: len(program.base.in_avals) + n for n, i in enumerate(varied)}
 
 
 ad.primitive_transposes[lanes_p] = _transposed
@@ -176,13 +176,13 @@ def _columns(*args, program: ReverseProgram) -> list[Any]:
     """Return the results of `lanes_backward`, computed by columns."""
     base, varied = program.program, program.varied
     n, batch = len(base.in_avals), batch_of(program, [x.shape for x in args])
-    inputs, given = list(args[:n]), args[n:]
+    inputs, weights_given = list(args[:n]), args[n:]
     inputs[0] = jnp.broadcast_to(inputs[0], (*batch, *base.in_avals[0].shape))
     derived = forward(base, varied)
-    own = derived.slopes
-    some = iter(given)
-    weights = {own[k]: next(some) for k, here in enumerate(program.given) if here}
-    tangents = [None for here in varied if here]
+    slopes = derived.slopes
+    cotangents = iter(weights_given)
+    weights = {slopes[k]: next(cotangents) for k, flag in enumerate(program.given) if flag}
+    tangents = [None for flag in varied if flag]
     found = by_columns(derived.program, "auto", [*inputs, *tangents], weights, batch)
     return [found[n + k] for k in range(len(tangents))]
 
@@ -193,10 +193,10 @@ def _batched(args, dims, *, program: ReverseProgram):
     args = [jnp.asarray(x) for x in args]
     n, (size, inner) = len(program.program.in_avals), axes_of(program, args, dims)
     number = sum(a.size for a in program.result_avals)
-    alike = all(d is None for d in dims[:n])
-    if alike and size * _COLUMNS_EACH > number:
-        over = jax.vmap(functools.partial(_columns, program=program), dims)
-        return over(*args), [0] * len(program.result_avals)
+    same_motions = all(d is None for d in dims[:n])
+    if same_motions and size * _COLUMNS_EACH > number:
+        columns = jax.vmap(functools.partial(_columns, program=program), dims)
+        return columns(*args), [0] * len(program.result_avals)
     moved = with_lane_axis(args, dims, program.in_avals, inner, size)
     out = lanes_backward_p.bind(*moved, program=program)
     return out, [0] * len(out)
@@ -211,11 +211,11 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
     inputs, cotangents = primals[:n], primals[n:]
     dc = _by_result(program, changed)
     if any(moved):
-        derived, _, places, own = forward(base, moved)
+        derived, _, places, slopes = forward(base, moved)
         c = _by_result(program, cotangents)
-        weights = {own[k]: x for k, x in c.items() if k in own}
+        weights = {slopes[k]: x for k, x in c.items() if k in slopes}
         weights |= {places[k]: x for k, x in dc.items()}
-        inputs = [*inputs, *(x for x, here in zip(tangents[:n], moved, strict=True) if here)]
+        inputs = [*inputs, *(x for x, flag in zip(tangents[:n], moved, strict=True) if flag)]
     else:
         derived, weights = base, dc
     wanted = (*program.varied, *(False for _ in inputs[n:]))
@@ -224,15 +224,15 @@ def _jvp(primals, tangents, *, program: ReverseProgram):
         return values, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
     back = reverse(derived, wanted, given)
     if back is None:
-        along = functools.partial(_columns, program=program)
-        return values, jax.jvp(along, primals, [*map(ad.instantiate_zeros, tangents)])[1]
-    some = [weights[k] for k in sorted(weights)]
-    return values, lanes_backward_p.bind(*inputs, *some, program=back)
+        columns = functools.partial(_columns, program=program)
+        return values, jax.jvp(columns, primals, [*map(ad.instantiate_zeros, tangents)])[1]
+    ordered = [weights[k] for k in sorted(weights)]
+    return values, lanes_backward_p.bind(*inputs, *ordered, program=back)
 
 
 def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, Any]:
     """Return the cotangents that exist by the places of their results or row parts."""
-    places = [k for k, here in enumerate(program.given) if here]
+    places = [k for k, flag in enumerate(program.given) if flag]
     return {k: x for k, x in zip(places, cotangents, strict=True) if x is not None}
 
 
@@ -253,33 +253,33 @@ def _transposed_back(cotangents, *args, program: ReverseProgram):
             )
         base = derived.base
     varied = program.varied[: len(base.in_avals)]
-    along, _, _, own = forward(base, varied)
+    along, _, _, slopes = forward(base, varied)
     w = [ad.instantiate_zeros(x) for x in cotangents]
     inputs = [*args[: len(base.in_avals)], *w]
-    weights = [k for k, here in enumerate(program.given) if here]
+    weights = [k for k, flag in enumerate(program.given) if flag]
     found: dict[int, Any] = {}
     if any(linear[n:]):
         values = lanes_p.bind(*inputs, program=along, backend="auto")
-        of_value = {forward(base, derived.varied).values[k] if second else k: k for k in own}
+        of_value = {forward(base, derived.varied).values[k] if second else k: k for k in slopes}
         for i, k in enumerate(weights, n):
             if linear[i] and k in of_value:
-                found[i] = values[own[of_value[k]]]
+                found[i] = values[slopes[of_value[k]]]
     if second:
-        before = {place: k for k, place in forward(base, derived.varied).slopes.items()}
-        pairs = [(before.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
-        given = {own[k]: x for k, x in pairs if k in own}
+        result_of = {place: k for k, place in forward(base, derived.varied).slopes.items()}
+        pairs = [(result_of.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
+        given = {slopes[k]: x for k, x in pairs if k in slopes}
         places = {i: k for i, k in _tangent_places(derived).items() if linear[k]}
         flags = tuple(k in given for k in range(len(along.result_avals)))
         back = reverse(along, tuple(i in places for i in range(len(along.in_avals))), flags)
         if back is None:
             raise NotImplementedError("A loop that is taken back by a tape once, but not twice.")
-        some = lanes_backward_p.bind(*inputs, *(given[k] for k in sorted(given)), program=back)
-        found |= dict(zip(places.values(), some, strict=True))
+        tangents = lanes_backward_p.bind(*inputs, *(given[k] for k in sorted(given)), program=back)
+        found |= dict(zip(places.values(), tangents, strict=True))
     out: list[Any] = [None] * len(args)
     for i, x in enumerate(args):
         if linear[i]:
-            own_aval, zero = program.in_avals[i], jnp.zeros(x.aval.shape, x.aval.dtype)
-            out[i] = _for_argument(found[i], own_aval, x.aval) if i in found else zero
+            lane_aval, zero = program.in_avals[i], jnp.zeros(x.aval.shape, x.aval.dtype)
+            out[i] = _for_argument(found[i], lane_aval, x.aval) if i in found else zero
     return out
 
 

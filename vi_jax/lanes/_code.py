@@ -60,8 +60,8 @@ def _load_or_compile(
 ) -> tuple[Any, int]:
     """Return an engine with a text's code and the address of `kernel`. The code is read from the
     folder `store` if it is there, else compiled and stored."""
-    words = (text, cpu, level, *_host(binding), binding.llvm_version_info)
-    name = f"{hashlib.blake2b(repr(words).encode(), digest_size=20).hexdigest()}.o"
+    parts = (text, cpu, level, *_host(binding), binding.llvm_version_info)
+    name = f"{hashlib.blake2b(repr(parts).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)
     if code is None:
         code = object_code(binding, text, cpu, level)
@@ -123,24 +123,24 @@ def _cache_folder() -> Path | None:
     return Path(folder) / _FOLDER
 
 
-def _read(place: Path) -> bytes | None:
+def _read(path: Path) -> bytes | None:
     """Return code from a file, or `None` if there is no file or its checksum is wrong."""
     try:
-        content = place.read_bytes()
+        content = path.read_bytes()
     except OSError:
         return None
     code = content[_DIGEST:]
     return code if content[:_DIGEST] == _digest(code) else None
 
 
-def _write(place: Path, code: bytes) -> None:
+def _write(path: Path, code: bytes) -> None:
     """Store code for other processes, if the folder is writable."""
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=place.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent)
         with open(handle, "wb") as file:
             file.write(_digest(code) + code)
-        os.replace(temporary, place)
+        os.replace(temporary, path)
     except OSError:
         pass
 

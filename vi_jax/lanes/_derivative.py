@@ -107,20 +107,20 @@ def _widened_forward(program: LaneProgram, widening: Widening, varied: tuple[boo
     """
     source, batched, number, wide = widening
     derived, has, *_ = forward(source, varied)
-    more = (*batched, *(b for b, here in zip(batched, varied, strict=True) if here))
+    batched_inputs = (*batched, *(b for b, flag in zip(batched, varied, strict=True) if flag))
     outs = len(wide.outs)
-    depend = dependent_parts(derived, more, smooth=False)._replace(
+    depend = dependent_parts(derived, batched_inputs, smooth=False)._replace(
         outs=_with_its_derivatives(wide.outs, has[:outs]),
         rows=_with_its_derivatives(wide.rows, has[outs:]),
     )
-    both = _widened(Widening(derived, more, number, depend))
-    both = dataclasses.replace(both, varied=varied, base=program)
-    return Derived.of(both, has, outs)
+    widened_program = _widened(Widening(derived, batched_inputs, number, depend))
+    widened_program = dataclasses.replace(widened_program, varied=varied, base=program)
+    return Derived.of(widened_program, has, outs)
 
 
 def _with_its_derivatives(wide: tuple[bool, ...], has: tuple[bool, ...]) -> tuple[bool, ...]:
     """Return flags of results and derivatives. A derivative has the axis if its value has it."""
-    return (*wide, *(w for w, here in zip(wide, has, strict=True) if here))
+    return (*wide, *(w for w, flag in zip(wide, has, strict=True) if flag))
 
 
 def _with_derivatives(
@@ -140,12 +140,12 @@ def _with_derivatives(
     ends = [0, len(varied) if split is None else split, len(varied)]
 
     def both(*args):
-        given = iter(args)
+        remaining = iter(args)
         primals: list[Any] = []
         tangents: list[Any] = []
         for begin, end in pairwise(ends):
-            primals += [next(given) for _ in varied[begin:end]]
-            tangents += [next(given) for here in varied[begin:end] if here]
+            primals += [next(remaining) for _ in varied[begin:end]]
+            tangents += [next(remaining) for flag in varied[begin:end] if flag]
 
         values, slopes = map(iter, values_and_slopes(function, varied, wanted, primals, tangents))
         flags, out = iter(wanted), []
@@ -175,8 +175,8 @@ def values_and_slopes(
     """
 
     def of_varied(*changing):
-        given = iter(changing)
-        out = function(*(next(given) if v else x for x, v in zip(primals, varied, strict=True)))
+        inputs = iter(changing)
+        out = function(*(next(inputs) if v else x for x, v in zip(primals, varied, strict=True)))
         return [x for x, w in zip(out, wanted, strict=True) if w], out
 
     changing = [x for x, v in zip(primals, varied, strict=True) if v]

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from ._code import engine_of
-from ._shared import Recent, made_once
+from ._shared import Recent, call_once
 
 # The answer of a handler without an error; `call_handler` below compares with it.
 SUCCESS = 1
@@ -99,7 +99,7 @@ class _Native(NamedTuple):
 
 # Programs are lowered on several threads. With two engines, the first would be freed while XLA may
 # have the address of its code.
-@made_once
+@call_once
 def _native() -> _Native:
     engine = engine_of(_TEXT)
     place, number = ctypes.c_void_p, ctypes.c_int
@@ -137,11 +137,11 @@ def install_counter() -> None:
     if not interrupt_raises():
         return
     native = _native()
-    there = native.get(signal.SIGINT)
-    if there == native.count_interrupt or native.previous.value not in (None, there):
+    current = native.get(signal.SIGINT)
+    if current == native.count_interrupt or native.previous.value not in (None, current):
         return
     if native.previous.value is None:
-        native.previous.value = there
+        native.previous.value = current
         atexit.register(_remove_counter)
     native.put(signal.SIGINT, native.count_interrupt)
 
@@ -187,14 +187,14 @@ class Watch:
         **Arguments:** XLA's number of the run; the `ctypes` number that the kernel reads.
         """
         install_counter()
-        begun = _counts_at_start.get(run)
-        if begun is None:
-            begun = interrupt_count()
-            _counts_at_start.put(run, begun)
-        if interrupt_count() != begun and interrupt_raises():
+        count_at_start = _counts_at_start.get(run)
+        if count_at_start is None:
+            count_at_start = interrupt_count()
+            _counts_at_start.put(run, count_at_start)
+        if interrupt_count() != count_at_start and interrupt_raises():
             stop.value = 1
         with self._lock:
-            self._stops[id(stop)] = (begun, stop)
+            self._stops[id(stop)] = (count_at_start, stop)
             if self._thread is None:
                 self._thread = threading.Thread(
                     target=self._poll, name="lanes-interrupts", daemon=True
@@ -213,10 +213,10 @@ class Watch:
             with self._lock:
                 if self._stops:
                     last = time.monotonic()
-                    counted = interrupt_count()
-                    late = [stop for begun, stop in self._stops.values() if counted != begun]
-                    if late and interrupt_raises():
-                        for stop in late:
+                    count = interrupt_count()
+                    stops = [stop for first, stop in self._stops.values() if count != first]
+                    if stops and interrupt_raises():
+                        for stop in stops:
                             stop.value = 1
                 elif time.monotonic() - last > _LINGER:
                     self._thread = None
@@ -242,15 +242,15 @@ def raise_interrupts_within() -> Iterator[None]:
         yield
         return
     raise_dropped()
-    before = sys.unraisablehook
+    previous = sys.unraisablehook
 
-    def noted(unraisable: Any, /) -> None:
+    def record_dropped(unraisable: Any, /) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
             _dropped.append(True)
         else:
-            before(unraisable)
+            previous(unraisable)
 
-    sys.unraisablehook = noted
+    sys.unraisablehook = record_dropped
     try:
         yield
         raise_dropped()
@@ -258,8 +258,8 @@ def raise_interrupts_within() -> Iterator[None]:
         raise_dropped()
         raise
     finally:
-        sys.unraisablehook = before
-        if getattr(before, "__module__", None) != __name__:  # the outermost context
+        sys.unraisablehook = previous
+        if getattr(previous, "__module__", None) != __name__:  # the outermost context
             _dropped.clear()
 
 

@@ -98,7 +98,7 @@ class Real:
     def with_sign_of(self, other: "Real") -> "Real":
         return self.call("copysign", other)
 
-    def negative(self) -> Value:
+    def is_negative(self) -> Value:
         """Return whether the sign bit is set, also for -0."""
         bits = self.t.cast("bitcast", self.value, "i64")
         return self.t.binary("icmp slt", bits, self.t.zero("i64"), "i1")
@@ -137,7 +137,7 @@ class Real:
             total = total * self + coefficient
         return total
 
-    def less(self, turns: "Real", parts: Sequence[float]) -> "Real":
+    def minus_multiple(self, turns: "Real", parts: Sequence[float]) -> "Real":
         """Return this number minus `turns` times the sum of `parts`."""
         found = self
         for part in parts:
@@ -217,7 +217,7 @@ def sincos(x: Real) -> tuple[Real, Real]:
         bits = t.binary("xor", t.cast("bitcast", y.value, "i64"), odd)
         return Real(t, t.cast("bitcast", bits, "double"))
 
-    rest = x.less(turns, _PI_PARTS)
+    rest = x.minus_multiple(turns, _PI_PARTS)
     square = rest * rest
     sine = flipped(rest * square.horner(_SIN))
     return sine, flipped(square.horner(_COS))
@@ -240,7 +240,7 @@ def exp(x: Real) -> Real:
     t = x.t
     y = x.at_least(-760.0).at_most(720.0)
     n = (y * (1 / ln(2))).call("roundeven")
-    value = y.less(n, _LN2).horner(_EXP)
+    value = y.minus_multiple(n, _LN2).horner(_EXP)
     # 2^n as two factors, so that neither overflows nor underflows.
     finite = x.of(0.0).choose(x.is_no_number(), n)
     whole = t.cast("fptosi", finite.value, "i64")
@@ -413,7 +413,7 @@ def atan2(y: Real, x: Real) -> Real:
     same = a.of(0.0).choose(a.equals(0.0), 1.0)
     angle = _arctangent(same.choose(a.equals(b), ratio))
     # x < 0: π minus the angle to the x axis; steep: π/2 minus the angle to the y axis.
-    left = x.negative()
+    left = x.is_negative()
     angle = (-angle).choose(x.t.binary("xor", steep, left, "i1"), angle)
     quarters = x.of(1.0).choose(steep, x.of(2.0).choose(left, 0.0))
     value = quarters * (_PI / 2) + (angle + quarters * (_PI_LOW / 2))
@@ -437,7 +437,7 @@ def asin(x: Real) -> Real:
 
 def acos(x: Real) -> Real:
     far, z, rest = _arcsine(x.size())
-    left = x.negative()
+    left = x.is_negative()
     # 2 asin(z) for large x, π minus that for large -x, π/2 minus asin(x) between.
     factor = x.of(2.0).choose(far, 1.0)
     factor = factor.choose(x.t.binary("xor", far, left, "i1"), -factor)
@@ -462,7 +462,7 @@ def tan(x: Real) -> Real:
     a = x.size()
     near, far = value.choose(even, inverse).value, a > _TURNED
     with x.t.skipped_unless(far, rare=True) as fork:  # by the C library
-        chosen = x.t.select(far, x.t.each("tan", x.value), near)
+        chosen = x.t.select(far, x.t.per_lane("tan", x.value), near)
     value = Real(x.t, fork.joined(chosen, near))
     return x.choose(a < 2.0**-30, value)
 
@@ -489,7 +489,7 @@ LIBRARY = {
     for function in (
         sin, cos, sincos, exp, log, tanh, tan, sinh, cosh, asin, acos, atan, atan2, expm1, log1p,
     )
-} | {name: lambda t, x, name=name: t.each(name, x) for name in _BY_LANE}  # fmt: skip
+} | {name: lambda t, x, name=name: t.per_lane(name, x) for name in _BY_LANE}  # fmt: skip
 
 
 _LN2_PARTS = _parts_of(ln(2), 3)
@@ -544,7 +544,7 @@ def power(x: Real, y: Real) -> Real:
     halves = 0.5 * y
     even = halves.call("trunc").equals(halves)
     odd = t.both(whole, t.inverse(even))
-    value = (-value).choose(t.both(odd, x.negative()), value)
+    value = (-value).choose(t.both(odd, x.is_negative()), value)
     undefined = t.both(t.both(x < 0.0, x > -inf), t.inverse(whole))
     value = x.of(nan).choose(undefined, value)
     one = t.both(a.equals(1.0), y.size().equals(inf))

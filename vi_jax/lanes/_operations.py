@@ -11,7 +11,7 @@ from ._library import LIBRARY, power
 from ._text import KINDS, Text, Value, is_float
 
 
-def known(t: Text, a: Value, b: Value, operation: str) -> Value | None:
+def constant_result(t: Text, a: Value, b: Value, operation: str) -> Value | None:
     """Return the result for two constant integers below 2¹⁵, such as indices of arrays."""
     if a.number is None or b.number is None or a.kind == "i1":
         return None
@@ -33,7 +33,7 @@ def compare(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
     return t.binary(f"icmp {order}", a, b, "i1")
 
 
-def of_integers(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value:
+def int_divide(t: Text, what: str, a: Value, b: Value, unsigned: bool) -> Value:
     """Return a quotient (`"div"`) or remainder (`"rem"`) of integers where a processor would trap.
     As in XLA, division by 0 gives -1 and remainder a. Division by -1, which may overflow, gives -a
     and remainder 0. A slot without a lane holds zeros."""
@@ -111,7 +111,7 @@ def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str)
     """Return a sum or product by `real` (floating-point) or `whole` (integers). A floating-point
     operand that is `neutral` is left out."""
     if not is_float(a.kind):
-        return known(t, a, b, whole) or t.binary(whole, a, b)
+        return constant_result(t, a, b, whole) or t.binary(whole, a, b)
     if a.number == neutral:
         return b
     return a if b.number == neutral else t.binary(real, *t.ordered(a, b))
@@ -119,13 +119,13 @@ def _commuting(t: Text, a: Value, b: Value, neutral: int, real: str, whole: str)
 
 def sub(t: Text, a: Value, b: Value) -> Value:
     if not is_float(a.kind):
-        return known(t, a, b, "sub") or t.binary("sub", a, b)
+        return constant_result(t, a, b, "sub") or t.binary("sub", a, b)
     return a if b.number == 0 else t.binary("fsub contract", a, b)
 
 
 def div(t: Text, a: Value, b: Value, *, unsigned: bool = False) -> Value:
     if not is_float(a.kind):
-        return of_integers(t, "div", a, b, unsigned)
+        return int_divide(t, "div", a, b, unsigned)
     return a if b.number == 1 else t.binary("fdiv contract", a, b)
 
 
@@ -294,7 +294,7 @@ def _(t, p, d, a):
 for _name, _function in LIBRARY.items():
     ELEMENTWISE[_name] = lambda t, p, d, *args, function=_function: function(t, *args)
 ELEMENTWISE["rem"] = lambda t, p, d, a, b: (
-    t.each("fmod", a, b) if is_float(a.kind) else of_integers(t, "rem", a, b, is_unsigned(d[0]))
+    t.per_lane("fmod", a, b) if is_float(a.kind) else int_divide(t, "rem", a, b, is_unsigned(d[0]))
 )
 
 
@@ -323,10 +323,10 @@ for _name, _how in {"shift_left": "shl", "shift_right_logical": "lshr"}.items():
     ELEMENTWISE[_name] = lambda t, p, d, a, b, how=_how: _shifted(t, how, a, b)
 
 
-def _shifted(t: Text, how: str, a: Value, by: Value) -> Value:
+def _shifted(t: Text, how: str, a: Value, shift: Value) -> Value:
     bits = int(a.kind[1:])
-    within = compare(t, "lt", by, t.constant(bits, a.kind), True)
-    safe = t.binary("and", by, t.constant(bits - 1, a.kind))
+    within = compare(t, "lt", shift, t.constant(bits, a.kind), True)
+    safe = t.binary("and", shift, t.constant(bits - 1, a.kind))
     return t.select(within, t.binary(how, a, safe), t.zero(a.kind))
 
 

@@ -20,7 +20,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from ._arrays import MOST_IN_REGISTERS
 from ._derivative import forward, widened
 from ._program import LaneProgram, batch_of, dependent_parts, shape_of
-from ._shared import within
+from ._shared import set_within
 from ._vector import Unsupported
 from .call import header, register_handler
 from .runtime import AnyProgram, kernel_of
@@ -31,7 +31,7 @@ _vector_only: ContextVar[bool] = ContextVar("strict", default=False)
 def vector_only() -> AbstractContextManager:
     """Raise `Unsupported` within this context for programs whose lanes cannot be vector code,
     instead of compiling them for XLA's backend."""
-    return within(_vector_only, True)
+    return set_within(_vector_only, True)
 
 
 def primitive_of_programs(name: str) -> Primitive:
@@ -63,18 +63,18 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
     """Make an axis of `jax.vmap` one of lanes, or of directions within a lane: the latter if only
     tangents have the axis and its length is at most `DIRECTIONS`."""
     args = [jnp.asarray(x) for x in args]
-    (size, inner), many = axes_of(program, args, dims), tuple(d is not None for d in dims)
-    tangents = program.tangents or (False,) * len(many)
-    if all(t or not m for t, m in zip(tangents, many, strict=True)) and 1 < size <= DIRECTIONS:
-        return _batched_directions(args, dims, inner, many, size, program, backend)
+    (size, inner), batched = axes_of(program, args, dims), tuple(d is not None for d in dims)
+    tangents = program.tangents or (False,) * len(batched)
+    if all(t or not m for t, m in zip(tangents, batched, strict=True)) and 1 < size <= DIRECTIONS:
+        return _batched_directions(args, dims, inner, batched, size, program, backend)
     moved = with_lane_axis(args, dims, program.in_avals, inner, size)
     out = lanes_p.bind(*moved, program=program, backend=backend)
-    depend = dependent_parts(program, many, smooth=False)
+    depend = dependent_parts(program, batched, smooth=False)
     wide = [depend.control or w for w in (*depend.outs, *depend.rows)]
     # Results that are equal in all lanes get no axis, as in `vmap` itself.
-    along = [w or size == 0 for w in wide]
-    return [x if w else x[0] for x, w in zip(out, along, strict=True)], [
-        0 if w else None for w in along
+    has_axis = [w or size == 0 for w in wide]
+    return [x if w else x[0] for x, w in zip(out, has_axis, strict=True)], [
+        0 if w else None for w in has_axis
     ]
 
 
@@ -97,12 +97,12 @@ def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
     """
     moved = []
     for x, d, aval in zip(args, dims, avals, strict=True):
-        own = x.ndim - (d is not None) == aval.ndim
-        if d is None and own:
+        is_single = x.ndim - (d is not None) == aval.ndim
+        if d is None and is_single:
             moved.append(x)  # shared by all lanes
             continue
         x = x[None] if d is None else jnp.moveaxis(x, d, 0)
-        if own:
+        if is_single:
             x = x.reshape(x.shape[0], *(1 for _ in inner), *aval.shape)
         moved.append(jnp.broadcast_to(x, (size, *inner, *aval.shape)))
     return moved
@@ -116,8 +116,8 @@ def _batched_directions(
     axes, moved = len(inner), []
     for x, d, aval in zip(args, dims, program.in_avals, strict=True):
         # After the batch axes, before the axes of one lane's array.
-        own = 0 if d is None or x.ndim - 1 == aval.ndim else axes
-        moved.append(x if d is None else jnp.moveaxis(x, d, own))
+        place = 0 if d is None or x.ndim - 1 == aval.ndim else axes
+        moved.append(x if d is None else jnp.moveaxis(x, d, place))
     out = lanes_p.bind(*moved, program=wide, backend=backend)
     places = [axes if w else None for w in depend.outs]
     places += [axes + 1 if w else None for w in depend.rows]
@@ -135,8 +135,8 @@ def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
     out = lanes_p.bind(*primals, *changes, program=derived.program, backend=backend)
     values = [out[place] for place in derived.values]
     return values, [
-        out[derived.slopes[k]] if here else ad.Zero(jax.typeof(values[k]).to_tangent_aval())
-        for k, here in enumerate(derived.has)
+        out[derived.slopes[k]] if flag else ad.Zero(jax.typeof(values[k]).to_tangent_aval())
+        for k, flag in enumerate(derived.has)
     ]
 
 
@@ -149,16 +149,16 @@ def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
     fails if they change.
     """
     unknown = [not t.is_known() for t in tracers]
-    alone = program.values_without(unknown, [t.aval.shape for t in tracers])
-    later = trace.default_process_primitive(
+    of_values = program.values_without(unknown, [t.aval.shape for t in tracers])
+    postponed = trace.default_process_primitive(
         lanes_p, tracers, {"program": program, "backend": backend}
     )
-    if alone is None or not any(unknown):
-        return later
-    smaller, found = alone
+    if of_values is None or not any(unknown):
+        return postponed
+    smaller, is_value = of_values
     given = [t.pval.get_known() for t in tracers[: len(smaller.in_avals)]]
     values = iter(lanes_p.bind(*given, program=smaller, backend=backend))
-    return [next(values) if known else x for known, x in zip(found, later, strict=True)]
+    return [next(values) if known else x for known, x in zip(is_value, postponed, strict=True)]
 
 
 def _partially_known_equation(saveable, unknown, instantiated, equation):
@@ -170,25 +170,25 @@ def _partially_known_equation(saveable, unknown, instantiated, equation):
     """
     program, outs = equation.params["program"], len(equation.outvars)
     shapes = [x.aval.shape for x in equation.invars]
-    alone = program, [True] * outs
+    of_values = program, [True] * outs
     if any(unknown):
-        alone = program.values_without(unknown, shapes)
+        of_values = program.values_without(unknown, shapes)
     elif _saved(saveable(lanes_p, *(x.aval for x in equation.invars), **equation.params)):
         return equation, None, [False] * outs, [False] * outs, []
     kept = [
         x
-        for x, there in zip(equation.invars, instantiated, strict=True)
-        if not there and not isinstance(x, Literal)
+        for x, flag in zip(equation.invars, instantiated, strict=True)
+        if not flag and not isinstance(x, Literal)
     ]
-    if alone is None:
+    if of_values is None:
         return None, equation, [True] * outs, [True] * outs, kept
-    smaller, found = alone
+    smaller, is_value = of_values
     now = equation.replace(
         invars=equation.invars[: len(smaller.in_avals)],
-        outvars=[x for x, known in zip(equation.outvars, found, strict=True) if known],
+        outvars=[x for x, known in zip(equation.outvars, is_value, strict=True) if known],
         params={**equation.params, "program": smaller},
     )
-    return now, equation, [not known for known in found], [True] * outs, kept
+    return now, equation, [not known for known in is_value], [True] * outs, kept
 
 
 def _saved(policy: object) -> bool:
@@ -245,22 +245,22 @@ def _run_together(
     step = jax.vmap(jaxpr_as_fun(program.step), in_axes=(*axes, *carried), axis_size=lanes)
     end = jax.vmap(jaxpr_as_fun(program.end), in_axes=(*axes, *carried), axis_size=lanes)
 
-    def stored(rows: list, filled: jax.Array, complete: jax.Array, row: list) -> list:
+    def store_rows(rows: list, filled: jax.Array, complete: jax.Array, row: list) -> list:
         # A lane without a new row writes beyond the end, which is dropped. So no two lanes write to
         # one place, and `rows` is not copied. `lax.cond` copied it at each step, which took two
         # thirds of the time on a GPU (JAX 0.11.2).
-        at = jnp.where(complete, filled, program.rows)
-        own = {"mode": "drop", "unique_indices": True, "indices_are_sorted": True}
-        return [r.at[index, at].set(x, **own) for r, x in zip(rows, row, strict=True)]
+        place = jnp.where(complete, filled, program.rows)
+        options = {"mode": "drop", "unique_indices": True, "indices_are_sorted": True}
+        return [r.at[index, place].set(x, **options) for r, x in zip(rows, row, strict=True)]
 
     def iteration(_: Any, state: tuple) -> tuple:
         carry, active, filled, rows = state
         out = step(*inputs, *carry)
         # A lane that has ended keeps its carry.
-        kept = lambda a, b: jnp.where(active.reshape(lanes, *(1,) * (a.ndim - 1)), a, b)
-        carry = [kept(a, b) for a, b in zip(out[:n], carry, strict=True)]
+        keep_ended = lambda a, b: jnp.where(active.reshape(lanes, *(1,) * (a.ndim - 1)), a, b)
+        carry = [keep_ended(a, b) for a, b in zip(out[:n], carry, strict=True)]
         complete = active & out[n + 1]
-        rows = stored(rows, filled, complete, out[n + 2 :])
+        rows = store_rows(rows, filled, complete, out[n + 2 :])
         return carry, active & out[n], filled + complete, rows
 
     rows = [
@@ -270,7 +270,7 @@ def _run_together(
     filled = jnp.zeros(lanes, jnp.int32)
     out = begin(*inputs)
     carry, active, complete, row = list(out[:n]), out[n], out[n + 1], out[n + 2 :]
-    state = (carry, active, filled + complete, stored(rows, filled, complete, row))
+    state = (carry, active, filled + complete, store_rows(rows, filled, complete, row))
     carry, _, _, rows = jax.lax.while_loop(
         lambda state: jnp.any(state[1]),
         lambda state: jax.lax.fori_loop(0, _STEPS_PER_CHECK, iteration, state),

@@ -71,7 +71,7 @@ class LaneProgram(eqx.Module):
         return [*self.out_avals, *rows]
 
     def values_without(
-        self, gone: Sequence[bool], shapes: Sequence[tuple[int, ...]]
+        self, missing: Sequence[bool], shapes: Sequence[tuple[int, ...]]
     ) -> "tuple[LaneProgram, list[bool]] | None":
         """Return the program of the values that can be computed without some of the tangents.
 
@@ -82,16 +82,16 @@ class LaneProgram(eqx.Module):
         """
         found, base = [True] * len(self.result_avals), self.base
         program, batch = self, batch_of(self, shapes)
-        while base is not None and any(gone[: len(program.in_avals)]):
+        while base is not None and any(missing[: len(program.in_avals)]):
             outs, rows = len(base.out_avals), len(base.row_avals)
             skipped = len(program.out_avals) - outs, len(program.row_avals) - rows
-            own = [True] * outs + [False] * skipped[0] + [True] * rows + [False] * skipped[1]
-            left = iter(own)
-            found = [f and next(left) for f in found]
+            returned = [True] * outs + [False] * skipped[0] + [True] * rows + [False] * skipped[1]
+            flags = iter(returned)
+            found = [f and next(flags) for f in found]
             program, base = base, base.base
         number = len(program.in_avals)
-        alike = batch_of(program, shapes[:number]) == batch
-        return (program, found) if alike and not any(gone[:number]) else None
+        same_batch = batch_of(program, shapes[:number]) == batch
+        return (program, found) if same_batch and not any(missing[:number]) else None
 
 
 def shape_of(x: Any) -> jax.ShapeDtypeStruct:
@@ -232,8 +232,8 @@ def evaluate_inlined(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
             out = evaluate_inlined(eqn.params[CALLS[name]], *given)
         elif name in OWN_DERIVATIVE:
             names = list(dict.fromkeys(a for a in eqn.invars if not isinstance(a, Literal)))
-            alone = jaxpr.replace(constvars=[], invars=names, outvars=eqn.outvars, eqns=[eqn])
-            out = eval_jaxpr(alone, (), *map(read, names))
+            single = jaxpr.replace(constvars=[], invars=names, outvars=eqn.outvars, eqns=[eqn])
+            out = eval_jaxpr(single, (), *map(read, names))
         else:
             out = eqn.primitive.bind(*given, **eqn.params)
             out = out if eqn.primitive.multiple_results else [out]
@@ -242,29 +242,29 @@ def evaluate_inlined(closed: ClosedJaxpr | Jaxpr, *args: Any) -> list[Any]:
 
 
 @functools.lru_cache(maxsize=256)
-def rewritten(closed: ClosedJaxpr, one: Callable[[Any], Any]) -> ClosedJaxpr:
-    """Return a jaxpr with each equation replaced by `one` of it, in inner jaxprs too. Bodies of
+def rewritten(closed: ClosedJaxpr, rule: Callable[[Any], Any]) -> ClosedJaxpr:
+    """Return a jaxpr with `rule(equation)` for each equation, in inner jaxprs too. Bodies of
     calls with a derivative rule are not changed."""
     # The cache keeps a jaxpr that several equations share one object, differentiated once.
-    return closed.replace(jaxpr=_rewritten(closed.jaxpr, one))
+    return closed.replace(jaxpr=_rewritten(closed.jaxpr, rule))
 
 
-def _rewritten(jaxpr: Jaxpr, one: Callable[[Any], Any]) -> Jaxpr:
+def _rewritten(jaxpr: Jaxpr, rule: Callable[[Any], Any]) -> Jaxpr:
     eqns = []
-    for eqn in map(one, jaxpr.eqns):
+    for eqn in map(rule, jaxpr.eqns):
         if eqn.primitive.name not in OWN_DERIVATIVE:
-            eqn = eqn.replace(params={k: _parameter(x, one) for k, x in eqn.params.items()})
+            eqn = eqn.replace(params={k: _parameter(x, rule) for k, x in eqn.params.items()})
         eqns.append(eqn)
     return jaxpr.replace(eqns=eqns)
 
 
-def _parameter(value: object, one: Callable[[Any], Any]) -> Any:
+def _parameter(value: object, rule: Callable[[Any], Any]) -> Any:
     if isinstance(value, ClosedJaxpr):
-        return rewritten(value, one)
+        return rewritten(value, rule)
     if isinstance(value, Jaxpr):
-        return _rewritten(value, one)
+        return _rewritten(value, rule)
     if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        found = [_parameter(x, one) for x in value]
+        found = [_parameter(x, rule) for x in value]
         return type(value)(*found) if hasattr(value, "_fields") else tuple(found)
     return value
 
@@ -332,8 +332,8 @@ def _dependent(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
     if not (smooth and name in OWN_DERIVATIVE) and (body := called(eqn)) is not None:
         return depends(inner(body), args)
     if name == "cond" and (smooth or not args[0]):
-        ways = [depends(inner(b), args[1:]) for b in params["branches"]]
-        return [any(way) for way in zip(*ways, strict=True)]
+        branches = [depends(inner(b), args[1:]) for b in params["branches"]]
+        return [any(branch) for branch in zip(*branches, strict=True)]
     if name == "scan":
         n, m = scan_counts(params)
         fixed, carry, rows = args[:n], args[n : n + m], args[n + m :]
@@ -341,10 +341,10 @@ def _dependent(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
         return fixed_point(lambda c: depends(body, [*fixed, *c, *rows]), carry)
     if name == "while":
         n, m = params["cond_nconsts"], params["body_nconsts"]
-        asked, fixed, carry = args[:n], args[n : n + m], args[n + m :]
+        cond_fixed, fixed, carry = args[:n], args[n : n + m], args[n + m :]
         body = inner(params["body_jaxpr"])
         outs = fixed_point(lambda c: depends(body, [*fixed, *c]), carry)
-        ends = depends(inner(params["cond_jaxpr"]), [*asked, *outs])
+        ends = depends(inner(params["cond_jaxpr"]), [*cond_fixed, *outs])
         return [True] * len(outs) if any(ends) else outs
     return [True] * len(eqn.outvars)
 
@@ -382,14 +382,14 @@ def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
     return len(fixed), len(carry)
 
 
-def fixed_point(turn: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
+def fixed_point(body: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
     """Return the flags of a loop body's results at their fixed point, carry first.
 
-    **Arguments:** `turn`, which maps flags of the carry to flags of a body's results; the flags of
+    **Arguments:** `body`, which maps flags of the carry to flags of a body's results; the flags of
     the carry before the first iteration.
     """
     while True:
-        outs = turn(carry)
+        outs = body(carry)
         grown = [a or b for a, b in zip(carry, outs, strict=False)]
         if grown == carry:
             return [*carry, *outs[len(carry) :]]

@@ -95,19 +95,19 @@ def _equation(eqn: Any, args: list[bool]) -> Any:
         params = {**params, "weight_first": args[0]}
         return eqn.replace(primitive=weighted_dot_p, invars=list(pair), params=params)
     if name in CALLS:
-        return eqn.replace(params=_with(params, CALLS[name], args))
+        return eqn.replace(params=_with_rewritten(params, CALLS[name], args))
     if name == "cond":
         branches = tuple(with_zero_safe_products(b, args[1:]) for b in params["branches"])
         return eqn.replace(params={**params, "branches": branches})
     if name == "scan":
-        return eqn.replace(params=_with(params, "jaxpr", dependent_in_scan(eqn, args)))
+        return eqn.replace(params=_with_rewritten(params, "jaxpr", dependent_in_scan(eqn, args)))
     return eqn
 
 
-def _with(params: dict[str, Any], key: str, weights: Sequence[bool]) -> dict[str, Any]:
-    held = params[key]
-    new = _rewritten(inner(held), weights)
-    return {**params, key: held.replace(jaxpr=new) if isinstance(held, ClosedJaxpr) else new}
+def _with_rewritten(params: dict[str, Any], key: str, weights: Sequence[bool]) -> dict[str, Any]:
+    jaxpr = params[key]
+    new = _rewritten(inner(jaxpr), weights)
+    return {**params, key: jaxpr.replace(jaxpr=new) if isinstance(jaxpr, ClosedJaxpr) else new}
 
 
 class ForwardBackward(NamedTuple):
@@ -151,13 +151,13 @@ class ReverseProgram(eqx.Module):
     @property
     def weight_avals(self) -> list[Any]:
         avals = (*self.program.out_avals, *self.program.row_avals)
-        return [a for a, here in zip(avals, self.given, strict=True) if here]
+        return [a for a, flag in zip(avals, self.given, strict=True) if flag]
 
     @property
     def in_avals(self) -> list[Any]:
         """Shapes and types of one lane's inputs, including the cotangents of all its rows."""
         weights = zip(self.program.result_avals, self.given, strict=True)
-        return [*self.program.in_avals, *(a for a, here in weights if here)]
+        return [*self.program.in_avals, *(a for a, flag in weights if flag)]
 
     @property
     def result_avals(self) -> list[Any]:
@@ -176,7 +176,7 @@ def reverse(
     """
     carried = _carried(program, varied, given)
     parts = (program.begin, varied), (program.step, (*varied, *carried))
-    if any(loop_depends(jaxpr.jaxpr, which) for jaxpr, which in parts):
+    if any(loop_depends(jaxpr.jaxpr, flags_of_part) for jaxpr, flags_of_part in parts):
         return None  # JAX has no transpose of a `while`; tracing would fail later
     outs, flags = given[: len(program.out_avals)], (False, False)
     emitted = (*carried, *flags, *given[len(program.out_avals) :])
@@ -200,18 +200,18 @@ def _carried(program: LaneProgram, varied, given) -> tuple[bool, ...]:
     depend = dependent_parts(program, varied, smooth=True)
     outs = given[: len(program.out_avals)]
     rows = given[len(program.out_avals) :]
-    needed, leads = set(), {}
+    needed, successors = set(), {}
     for i in (i for i in range(n) if depend.carry[i]):
         one = [*inputs, *(j == i for j in range(n))]
         stepped = dependent_results(program.step.jaxpr, one, smooth=True)
         ended = dependent_results(program.end.jaxpr, one, smooth=True)
-        leads[i] = {j for j in range(n) if stepped[j]}
+        successors[i] = {j for j in range(n) if stepped[j]}
         if any(g and r for g, r in zip((*outs, *rows), (*ended, *stepped[n + 2 :]), strict=True)):
             needed.add(i)
-    grown = True
-    while grown:
-        more = {i for i, to in leads.items() if to & needed} - needed
-        needed, grown = needed | more, bool(more)
+    is_growing = True
+    while is_growing:
+        more = {i for i, to in successors.items() if to & needed} - needed
+        needed, is_growing = needed | more, bool(more)
     return tuple(i in needed for i in range(n))
 
 
@@ -251,10 +251,10 @@ def _split_passes(
     shapes += [shape_of(a) for a, w in zip(closed.out_avals, weighted, strict=True) if w]
     whole = jax.make_jaxpr(both)(*shapes)
     cotangents = len(whole.out_avals) - kept
-    there = _pruned(whole, [True] * kept + [False] * cotangents)
-    back = _pruned(whole, [False] * kept + [True] * cotangents)
+    forward = _pruned(whole, [True] * kept + [False] * cotangents)
+    backward = _pruned(whole, [False] * kept + [True] * cotangents)
     return ForwardBackward(
-        there, with_zero_safe_products(back, [i >= number for i in range(len(shapes))])
+        forward, with_zero_safe_products(backward, [i >= number for i in range(len(shapes))])
     )
 
 

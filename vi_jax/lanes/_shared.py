@@ -44,24 +44,24 @@ class Recent(Generic[K, V]):
                 self._values.popitem(last=False)
 
 
-def made_once(make: Callable[[], V]) -> Callable[[], V]:
+def call_once(make: Callable[[], V]) -> Callable[[], V]:
     """Decorator: call the function once, in the first thread that needs it, and keep its value.
 
     With `functools.cache` two concurrent calls could both run the function. One of the two values
     would be dropped although it may be in use.
     """
-    lock, kept = threading.Lock(), functools.cache(make)
+    lock, cached = threading.Lock(), functools.cache(make)
 
     @functools.wraps(make)
-    def made() -> V:
+    def call() -> V:
         with lock:
-            return kept()
+            return cached()
 
-    return made
+    return call
 
 
 @contextmanager
-def within(setting: ContextVar, value: object) -> Iterator[None]:
+def set_within(setting: ContextVar, value: object) -> Iterator[None]:
     """Set `setting` to a value within this context, for this thread and task only."""
     token = setting.set(value)
     try:

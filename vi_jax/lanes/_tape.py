@@ -210,13 +210,13 @@ class _Writer:
         n = len(self.base.in_avals)
         self.inputs = program.in_avals[:n]
         self.shared = [
-            here and a.size > MOST_IN_REGISTERS
-            for here, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
+            flag and a.size > MOST_IN_REGISTERS
+            for flag, a in zip(one_for_all or (False,) * n, self.inputs, strict=False)
         ]
         self.results = sum(program.given[: len(self.base.out_avals)])
         self.varied = program.result_avals
         self.carried = [
-            a for a, here in zip(program.carry_avals, program.carried, strict=True) if here
+            a for a, flag in zip(program.carry_avals, program.carried, strict=True) if flag
         ]
         parts = {
             # An entry of the tape: the carry, and the number of rows complete before the iteration.
@@ -225,7 +225,7 @@ class _Writer:
             "lane": [_LANE],  # its number; -1 for a slot without one
             "count": [_LANE],  # its iterations
             # Inputs that differ between lanes, or that are small.
-            "inputs": [x for x, here in zip(self.inputs, self.shared, strict=True) if not here],
+            "inputs": [x for x, flag in zip(self.inputs, self.shared, strict=True) if not flag],
             "undefined": [_FLAG],  # True if a given cotangent makes all results NaN
             "to_inputs": self.varied,  # cotangents so far
             "to_carry": self.carried,
@@ -255,10 +255,10 @@ class _Writer:
 
     def _load_inputs(self, t: Text) -> list[Array]:
         """Return the inputs. Large ones that all lanes share are read from XLA's array."""
-        own = iter(self.frame.load(t, "inputs"))
+        frame_inputs = iter(self.frame.load(t, "inputs"))
         return [
-            shared_input(load_pointer(t, "inputs", i), aval) if here else next(own)
-            for i, (aval, here) in enumerate(zip(self.inputs, self.shared, strict=True))
+            shared_input(load_pointer(t, "inputs", i), aval) if flag else next(frame_inputs)
+            for i, (aval, flag) in enumerate(zip(self.inputs, self.shared, strict=True))
         ]
 
     def _lanes(self, t: Text) -> tuple[Value, Value]:
@@ -288,22 +288,22 @@ class _Writer:
         """Return the cotangents of row `place`, for the lanes that have `complete`d it. Small ones
         are not read if no lane has."""
         avals = self.program.weight_avals[self.results :]
-        none = zeros(t, avals)
+        no_weights = zeros(t, avals)
         if not avals:
-            return none
-        room = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
-        mask = t.both(complete, room)
+            return no_weights
+        has_row = t.binary("icmp slt", place, t.constant(self.base.rows, "i64"), "i1")
+        mask = t.both(complete, has_row)
 
         def read() -> list[Array]:
             found = self._weights(t, self.results, avals, lane, place, mask)
             self._undefine_by_weights(t, found)
             return found
 
-        if not all(isinstance(x, Registers) for x in none):
+        if not all(isinstance(x, Registers) for x in no_weights):
             return read()
         with t.skipped_unless(mask) as fork:
             found = read()
-        return [mapped(t, fork.joined, a, b) for a, b in zip(found, none, strict=True)]
+        return [mapped(t, fork.joined, a, b) for a, b in zip(found, no_weights, strict=True)]
 
     def _undefine_by_weights(self, t: Text, arrays: list[Array]) -> None:
         """Mark lanes with NaN or infinity as a cotangent, since 0 times it is NaN."""
@@ -326,12 +326,12 @@ class _Writer:
         if not avals:
             return
 
-        def weighs(place: Value, mask: Value) -> None:
+        def mark_lanes(place: Value, mask: Value) -> None:
             read = self._weights(t, self.results, avals, lane, place, mask)
-            weighs = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
-            self._undefine(t, [mapped(t, weighs, x, kind="i1") for x in read])
+            is_nonzero = lambda x: compare(t, "ne", x, t.zero(x.kind), False)
+            self._undefine(t, [mapped(t, is_nonzero, x, kind="i1") for x in read])
 
-        over_rows(t, rows, self.base.rows, present, weighs)
+        over_rows(t, rows, self.base.rows, present, mark_lanes)
 
     def _back(
         self, t: Text, jaxpr: ClosedJaxpr, args: list[Array], mask: Value
@@ -349,7 +349,7 @@ class _Writer:
         present = t.binary("icmp slt", lane, splat(t, "%lanes", "i64"), "i1")
         lane = t.select(present, lane, t.constant(-1, "i64"))
         inputs = []
-        for i in (i for i, here in enumerate(self.shared) if not here):
+        for i in (i for i, flag in enumerate(self.shared) if not flag):
             pointer = load_pointer(t, "inputs", i)
             first = t.binary("mul", lane, load_stride(t, i))
             inputs.append(held(t, gathered_array(t, pointer, first, self.inputs[i], present)))
@@ -380,12 +380,12 @@ class _Writer:
         more = t.binary("add", rows, t.cast("zext", complete.item(), "i64"))
         self.frame.store(t, "carry", select_all(t, mask, new, carry))
         self.frame.store_number(t, "rows", t.select(mask, more, rows))
-        over = t.both(mask, t.inverse(active.item()))
+        ended = t.both(mask, t.inverse(active.item()))
         following = t.binary("add", number, t.constant(1, "i64"))
-        count = t.select(over, following, count)
+        count = t.select(ended, following, count)
         self.frame.store_number(t, "count", count)
-        left = t.any(t.binary("icmp slt", following, count, "i1"))
-        return self._function("i1", "step", ", i64 %number", t, f"i1 {left}")
+        any_left = t.any(t.binary("icmp slt", following, count, "i1"))
+        return self._function("i1", "step", ", i64 %number", t, f"i1 {any_left}")
 
     def _end_back(self) -> str:
         t = FixedText(self.width)

@@ -34,7 +34,7 @@ class Arena:
         self.size = begin + numbers
         return Block(self, begin, numbers)
 
-    def give_back(self, begin: int, end: int) -> None:
+    def free(self, begin: int, end: int) -> None:
         """Free a range of places."""
         kept = []
         for a, b in self._free:
@@ -56,7 +56,7 @@ class Block:
     numbers: int
 
     def __del__(self) -> None:
-        self.arena.give_back(self.start, self.start + self.numbers)
+        self.arena.free(self.start, self.start + self.numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class Text:
         self._stores = 0
         self._names = 0
         # The operations in blocks that dominate the current one, a table for each open scope.
-        self._seen: list[dict[tuple, Value]] = [{}]
+        self._operations: list[dict[tuple, Value]] = [{}]
 
     def vector(self, kind: str) -> str:
         """Return LLVM's type of a vector with one number of each lane."""
@@ -160,9 +160,9 @@ class Text:
         **Arguments:** as for `value`.
         """
         key = (f"{operation}, {self._stores}", kind)
-        found = self._seen[-1].get(key)
+        found = self._operations[-1].get(key)
         if found is None:
-            found = self._seen[-1][key] = Value(self.raw(operation), kind)
+            found = self._operations[-1][key] = Value(self.raw(operation), kind)
         return found
 
     def store(self, operation: str) -> None:
@@ -177,12 +177,12 @@ class Text:
         """
         key = (operation, kind)
         if merge:
-            for seen in self._seen:
-                if key in seen:
-                    return seen[key]
+            for operations in self._operations:
+                if key in operations:
+                    return operations[key]
         result = Value(self.raw(operation), kind)
         if merge:
-            self._seen[-1][key] = result
+            self._operations[-1][key] = result
         return result
 
     def ordered(self, a: Value, b: Value) -> tuple[Value, Value]:
@@ -223,15 +223,15 @@ class Text:
 
     def intrinsic(self, name: str, *args: Value, kind: str | None = None) -> Value:
         """Call an LLVM intrinsic, such as `sqrt`, on values of one type; `kind` as in `binary`."""
-        own = args[0].kind
-        function = f"@llvm.{name}.{self.suffix(own)}"
-        result = kind or own
+        argument_kind = args[0].kind
+        function = f"@llvm.{name}.{self.suffix(argument_kind)}"
+        result = kind or argument_kind
         types = ", ".join(self.vector(a.kind) for a in args)
         self.declared[function] = f"declare {self.vector(result)} {function}({types})"
         call = ", ".join(f"{self.vector(a.kind)} {a.text}" for a in args)
         return self.value(f"call {self.vector(result)} {function}({call})", result)
 
-    def each(self, name: str, *args: Value) -> Value:
+    def per_lane(self, name: str, *args: Value) -> Value:
         """Call a function of the C library for each lane, in double precision."""
         wide = [self.cast("fpext", a, "double") if a.kind == "float" else a for a in args]
         types = ", ".join("double" for _ in args)
@@ -271,11 +271,11 @@ class Text:
     def open(self, label: str) -> None:
         """Begin a block that the current block dominates, in a scope that lasts until `close`."""
         self.follow(label)
-        self._seen.append({})
+        self._operations.append({})
 
     def close(self) -> None:
         """End the innermost scope. Following blocks do not use values from it."""
-        self._seen.pop()
+        self._operations.pop()
 
     def fork(self, condition: str, yes: str, no: str, *, rare: bool = False) -> None:
         """End the block with a branch to a label; `rare` if `yes` seldom happens."""
@@ -285,11 +285,11 @@ class Text:
     def skipped_unless(self, mask: Value, *, rare: bool = False) -> "Iterator[Skipped]":
         """Write blocks that are skipped if the mask holds in no lane; `rare` as in `fork`."""
         inside, after = self.label(), self.label()
-        way = Skipped(self, self.block)
+        skipped = Skipped(self, self.block)
         self.fork(self.any(mask), inside, after, rare=rare)
         self.open(inside)
-        yield way
-        way.end = self.block
+        yield skipped
+        skipped.end = self.block
         self.line(f"br label %{after}")
         self.close()
         self.follow(after)
@@ -305,12 +305,12 @@ class Text:
         self._names += 1
         return f"b{self._names}"
 
-    def phi(self, kind: str, *ways: tuple[str, str]) -> Value:
+    def phi(self, kind: str, *sources: tuple[str, str]) -> Value:
         """Return the value that belongs to the block from which this block was entered."""
-        return self.value(self._phi(kind, ways), kind, merge=False)
+        return self.value(self._phi(kind, sources), kind, merge=False)
 
     def join(
-        self, names: list[Value], *ways: tuple[list[Value], str], at: int | None = None
+        self, names: list[Value], *sources: tuple[list[Value], str], at: int | None = None
     ) -> None:
         """Define names by phi instructions.
 
@@ -319,14 +319,14 @@ class Text:
         loop's head are inserted later, since the head is written before the loop's body.
         """
         lines = []
-        for name, *values in zip(names, *(values for values, _ in ways), strict=True):
-            pairs = [(v.text, block) for v, (_, block) in zip(values, ways, strict=True)]
+        for name, *values in zip(names, *(values for values, _ in sources), strict=True):
+            pairs = [(v.text, block) for v, (_, block) in zip(values, sources, strict=True)]
             lines.append(f"  {name.text} = {self._phi(name.kind, pairs)}")
         at = len(self.lines) if at is None else at
         self.lines[at:at] = lines
 
-    def _phi(self, kind: str, ways: Sequence[tuple[str, str]]) -> str:
-        pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in ways)
+    def _phi(self, kind: str, sources: Sequence[tuple[str, str]]) -> str:
+        pairs = ", ".join(f"[ {text}, %{block} ]" for text, block in sources)
         return f"phi {self.vector(kind)} {pairs}"
 
 

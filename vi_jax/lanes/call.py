@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from ._interrupts import SUCCESS, HandlerResult, guard, interrupt_dropped, interrupt_raises, watch
-from ._shared import made_once
+from ._shared import call_once
 from ._tape import OUT_OF_MEMORY
 from ._vector import Unsupported
 from .runtime import KernelCall, kernel_by_key
@@ -160,13 +160,13 @@ def _answer(frame: _Frame) -> int | None:
             metadata = ctypes.cast(extension, POINTER(_MetadataExtension)).contents.metadata
             version = metadata.contents.version
             # XLA refuses a handler of version -1.
-            version.major, version.minor = (_MAJOR if _is_as_known(frame) else -1), _MINOR
+            version.major, version.minor = (_MAJOR if _has_known_sizes(frame) else -1), _MINOR
             return SUCCESS
         extension = extension.contents.next
     return _run_kernel(frame) if frame.stage == _EXECUTE else SUCCESS
 
 
-def _is_as_known(frame: _Frame) -> bool:
+def _has_known_sizes(frame: _Frame) -> bool:
     """Return whether XLA states the expected sizes. Its frame may be longer."""
     size = ctypes.sizeof(_Buffers)
     sizes = frame.arguments.struct_size, frame.results.struct_size
@@ -219,7 +219,7 @@ def _run_number(frame: _Frame) -> int:
     return run.number
 
 
-@made_once
+@call_once
 def register_handler() -> str:
     """Register the handler with XLA on first use, on any thread, and return its name.
 

@@ -21,7 +21,7 @@ from jax.extend.core import ClosedJaxpr
 from . import _backward as _backward  # registers the reverse mode of `lanes_p`
 from ._primitive import lanes_p
 from ._program import LaneProgram, shape_of
-from ._shared import Recent, within
+from ._shared import Recent, set_within
 
 BACKENDS = ("auto", "xla")
 
@@ -46,7 +46,7 @@ def backend(name: str) -> AbstractContextManager:
     """
     if name not in BACKENDS:
         raise ValueError(f"Argument `name` must be one of {BACKENDS}, but got {name!r}.")
-    return within(_backend, name)
+    return set_within(_backend, name)
 
 
 def current_backend() -> str:
@@ -87,9 +87,9 @@ def run(
     leaves = [jnp.asarray(x) for x in leaves]
     program, consts, *structures = traced(Functions(begin, step, end), treedef, leaves, rows=rows)
     backend = current_backend() if backend is None else backend
-    found = lanes_p.bind(*leaves, *consts, program=program, backend=backend)
+    out = lanes_p.bind(*leaves, *consts, program=program, backend=backend)
     n = len(program.out_avals)
-    results, row = map(jtu.tree_unflatten, structures, (found[:n], found[n:]))
+    results, row = map(jtu.tree_unflatten, structures, (out[:n], out[n:]))
     return results, row
 
 
@@ -280,19 +280,19 @@ def _consts_as_inputs(jaxprs: list[ClosedJaxpr], n: int) -> tuple[list[ClosedJax
     if not consts:
         return jaxprs, consts
 
-    def opened(jaxpr: ClosedJaxpr) -> ClosedJaxpr:
+    def with_inputs(jaxpr: ClosedJaxpr) -> ClosedJaxpr:
         rest = jaxpr.in_avals[n:]
 
         def function(*args):
-            given = args[n : n + len(consts)]
-            held = [
-                next((g for g, y in zip(given, consts, strict=True) if y is x), x)
+            values = args[n : n + len(consts)]
+            consts_in = [
+                next((g for g, y in zip(values, consts, strict=True) if y is x), x)
                 for x in jaxpr.consts
             ]
-            own = (*args[:n], *args[n + len(consts) :])
-            return eval_jaxpr(jaxpr.jaxpr, held, *own)
+            arguments = (*args[:n], *args[n + len(consts) :])
+            return eval_jaxpr(jaxpr.jaxpr, consts_in, *arguments)
 
         shapes = [*map(shape_of, jaxpr.in_avals[:n]), *map(shape_of, consts), *map(shape_of, rest)]
         return jax.make_jaxpr(function)(*shapes)
 
-    return [opened(jaxpr) for jaxpr in jaxprs], consts
+    return [with_inputs(jaxpr) for jaxpr in jaxprs], consts

@@ -19,7 +19,7 @@ from ._code import compile_in_background, llvm
 from ._kernel import kernel_text
 from ._program import LaneProgram
 from ._reverse import ReverseProgram
-from ._shared import Recent, within
+from ._shared import Recent, set_within
 from ._tape import reverse_text
 from ._vector import check
 
@@ -67,7 +67,7 @@ def threads(number: int) -> AbstractContextManager:
 
 @contextmanager
 def _threads_within(number: int) -> Iterator[None]:
-    with within(_threads, number):
+    with set_within(_threads, number):
         _entered.append(number)
         try:
             yield
@@ -78,15 +78,15 @@ def _threads_within(number: int) -> Iterator[None]:
 def processor(name: str) -> AbstractContextManager:
     """Compile kernels for this processor (LLVM's name, such as `"x86-64-v3"`) within this context.
     The processor of this machine must be able to run its code."""
-    return within(_cpu, name)
+    return set_within(_cpu, name)
 
 
 def thread_count() -> int:
     """Return the number of threads that run lanes."""
-    asked = _threads.get()
-    if asked is None:
-        asked = next(reversed(_entered), None)
-    return cores() if asked is None else asked
+    number = _threads.get()
+    if number is None:
+        number = next(reversed(_entered), None)
+    return cores() if number is None else number
 
 
 def cores() -> int:
@@ -147,16 +147,16 @@ class KernelCall:
     ):
         self._function, self._lanes = kernel.function, lanes
         self._table = (ctypes.c_void_p * max(1, len(inputs)))(*inputs)
-        self._steps = (ctypes.c_int64 * max(1, len(strides)))(*strides)
+        self._lane_strides = (ctypes.c_int64 * max(1, len(strides)))(*strides)
         self._results = (ctypes.c_void_p * max(1, len(outputs)))(*outputs)
-        self._given, self.stop = ctypes.c_int64(0), ctypes.c_int8(0)
+        self._next_lane, self.stop = ctypes.c_int64(0), ctypes.c_int8(0)
         self._arguments = (
-            ctypes.addressof(self._table), ctypes.addressof(self._steps),
-            ctypes.addressof(self._results), lanes, ctypes.addressof(self._given),
+            ctypes.addressof(self._table), ctypes.addressof(self._lane_strides),
+            ctypes.addressof(self._results), lanes, ctypes.addressof(self._next_lane),
             ctypes.addressof(self.stop),
         )  # fmt: skip
-        self._number = min(thread_count(), -(-lanes // kernel.width))
-        self._lock, self._inside = threading.Lock(), 0
+        self._threads = min(thread_count(), -(-lanes // kernel.width))
+        self._lock, self._running = threading.Lock(), 0
 
     def run(self) -> bool:
         """Run all lanes, on as many threads as have work.
@@ -165,34 +165,34 @@ class KernelCall:
 
         **Raises:** in the main thread the exceptions of signals. Then call `stop_and_wait`.
         """
-        if self._number == 1 and threading.current_thread() is not threading.main_thread():
+        if self._threads == 1 and threading.current_thread() is not threading.main_thread():
             self._run_here()
         else:
             # The main thread must stay free to handle an interrupt.
-            jobs = [_pool(self._number).submit(self._run_here) for _ in range(self._number)]
+            jobs = [_pool(self._threads).submit(self._run_here) for _ in range(self._threads)]
             for job in jobs:
                 job.result()
         # Unless stopped, a thread takes lanes until none are left, and ends when its own have
         # ended.
-        return self._given.value >= self._lanes and not self.stop.value
+        return self._next_lane.value >= self._lanes and not self.stop.value
 
     def _run_here(self) -> None:
         """Run lanes on one thread until none are left, unless the call was stopped before."""
         with self._lock:
             if self.stop.value:
                 return
-            self._inside += 1
+            self._running += 1
         try:
             self._function(*self._arguments)
         finally:
             with self._lock:
-                self._inside -= 1
+                self._running -= 1
 
     def stop_and_wait(self) -> None:
         """Stop the threads and wait for them. Call it again if a signal's exception leaves it."""
         with self._lock:
             self.stop.value = 1
-        while self._inside:
+        while self._running:
             time.sleep(_POLL)
 
 
