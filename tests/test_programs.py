@@ -113,9 +113,9 @@ def test_a_compiled_function_works_within_other_programs():
 
 
 def test_compiler_options_unknown_to_xla_are_left_out():
-    known = _programs._known(_programs.PLAIN)  # none since JAX 0.12
+    known = _programs._supported(_programs.PLAIN)  # none since JAX 0.12
     options = {"xla_no_such_option": 1, **_programs.PLAIN}
-    assert _programs._known(options) == known
+    assert _programs._supported(options) == known
     assert float(_programs.CompiledFunction(lambda x: x + 1, options)(jnp.asarray(1.0))) == 2.0
 
 

@@ -72,11 +72,11 @@ def require_ranges(part: Any) -> None:
 def in_range(tree: object) -> Bool[Array, ""]:
     """Return whether all numbers of all modules in a tree are in their ranges, traced ones
     included. Numbers that are traced or inserted by `eqx.tree_at` have passed no other check."""
-    good = jnp.asarray(True)
+    fits = jnp.asarray(True)
     for part in {id(part): part for part in _modules(tree)}.values():
         for _, range_, value in _ranged(part):
-            good = good & jnp.all(range_.holds(jnp.asarray(value)))
-    return good
+            fits = fits & jnp.all(range_.holds(jnp.asarray(value)))
+    return fits
 
 
 def _ranged(part: Any) -> Iterator[tuple[str, Range, Any]]:
@@ -279,13 +279,13 @@ def fits_records(name: str, records: int, numbers: int) -> None:
 def fits_memory(name: str, size: int | float) -> None:
     """Raise a `ValueError` if `size` bytes are more than this machine's memory."""
     try:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
         return
-    if size > there:
+    if size > memory:
         raise ValueError(
             f"Argument `{name}` must ask for results that fit into the memory, "
-            f"{math.ceil(there / 1e9):,} GB, but asks for {math.ceil(size / 1e9):,} GB."
+            f"{math.ceil(memory / 1e9):,} GB, but asks for {math.ceil(size / 1e9):,} GB."
         )
 
 
@@ -310,8 +310,8 @@ def number(name: str, value: object) -> jax.Array:
 def _type_of(value: object) -> tuple[Any, ...]:
     """Return the data type for an array of `value` as a tuple, empty to keep the value's own. A
     Python `float` would become a weakly typed array, for which JAX compiles a separate program."""
-    own = isinstance(value, np.generic) or not isinstance(value, float)
-    return () if own else (jnp.result_type(float),)
+    keeps_type = isinstance(value, np.generic) or not isinstance(value, float)
+    return () if keeps_type else (jnp.result_type(float),)
 
 
 def strongly_typed(value: object) -> Any:

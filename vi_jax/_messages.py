@@ -67,7 +67,7 @@ def at_work(
     """
     from .lanes import raise_dropped, raise_interrupts_within  # here, since it loads JAX
 
-    def tell(done: int) -> None:
+    def report(done: int) -> None:
         bar.update(done)
         raise_dropped()
 
@@ -76,7 +76,7 @@ def at_work(
             desc=what, total=total, initial=done, unit=f" {unit}", unit_scale=True,
             disable=None if progress else True,
         ) as bar:  # fmt: skip
-            yield tell
+            yield report
     except KeyboardInterrupt:
         interrupted = kept()
         if interrupted is None:
@@ -102,14 +102,14 @@ def in_parts(
 
     parts: list[Any] = []
 
-    def kept() -> Interrupted | None:
+    def interrupted() -> Interrupted | None:
         return Interrupted(what, joined(carry, parts)) if parts else None
 
-    with at_work(what, kept, **options) as tell:
+    with at_work(what, interrupted, **options) as report:
         for size, piece in pieces:
             carry, part = jax.block_until_ready(step(carry, piece))
             parts.append(part)
-            tell(size)
+            report(size)
     return joined(carry, parts)
 
 
@@ -117,7 +117,7 @@ def in_parts(
 _GIVEN: ContextVar[set[str] | None] = ContextVar("given", default=None)
 
 # Packages whose frames are skipped to find the user's line.
-_SKIPPED = {
+_LIBRARIES = {
     __name__.partition(".")[0], "beartype", "contextlib", "diffrax", "equinox", "functools", "jax",
     "jaxtyping", "lineax", "optimistix",
 }  # fmt: skip
@@ -128,7 +128,7 @@ def warning_once(function: Callable[P, R]) -> Callable[P, R]:
     that Python drops are raised (`raise_interrupts_within`)."""
 
     @functools.wraps(function)
-    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         from .lanes import raise_interrupts_within
 
         token = _GIVEN.set(set()) if _GIVEN.get() is None else None
@@ -139,20 +139,20 @@ def warning_once(function: Callable[P, R]) -> Callable[P, R]:
             if token is not None:
                 _GIVEN.reset(token)
 
-    return called
+    return wrapped
 
 
-def warn(words: str) -> None:
+def warn(message: str) -> None:
     """Give a warning at the user's line that called this package."""
     given = _GIVEN.get()
     if given is not None:
-        if words in given:
+        if message in given:
             return
-        given.add(words)
+        given.add(message)
     frame, level = sys._getframe(), 1
-    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _SKIPPED:
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:
         frame, level = frame.f_back, level + 1
-    warnings.warn(words, stacklevel=level)
+    warnings.warn(message, stacklevel=level)
 
 
 def count_of(number: int | np.integer, noun: str) -> str:

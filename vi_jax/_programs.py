@@ -44,42 +44,42 @@ class _Watch:
     def __init__(self):
         self.lock = threading.Lock()
         self.programs: dict[CompiledFunction, None] = {}
-        self.next_look = 0.0
+        self.next_count = 0.0
 
-    def called(self, program: "CompiledFunction") -> None:
+    def record_call(self, program: "CompiledFunction") -> None:
         """Record a call. Drop programs if few maps are left."""
-        if time.monotonic() < self.next_look and next(reversed(self.programs), None) is program:
+        if time.monotonic() < self.next_count and next(reversed(self.programs), None) is program:
             return
         with self.lock:
             self.programs.pop(program, None)
             self.programs[program] = None
             begin = time.monotonic()
-            if begin < self.next_look:
+            if begin < self.next_count:
                 return
-            self._look()
-            self.next_look = begin + max(_PAUSE, _SELDOM * (time.monotonic() - begin))
+            self._drop_if_full()
+            self.next_count = begin + max(_PAUSE, _SELDOM * (time.monotonic() - begin))
 
-    def _look(self) -> None:
-        used, most = maps_used(), maps_granted()
-        if used is None or most is None or used < _FULL * most:
+    def _drop_if_full(self) -> None:
+        used, granted = maps_used(), maps_granted()
+        if used is None or granted is None or used < _FULL * granted:
             return
-        left = used
+        remaining = used
         for program in list(self.programs):
             program.drop()
             gc.collect()
-            left = maps_used() or 0
-            if left < _ROOM * most:
+            remaining = maps_used() or 0
+            if remaining < _ROOM * granted:
                 break
         advice = ""
-        if left >= _FULL * most:
+        if remaining >= _FULL * granted:
             advice = (
                 " Others take the most of it: call `jax.clear_caches()` now and then, or raise "
                 f"{_MOST}, before the process dies."
             )
         warnings.warn(
-            f"This process used {used:,} of the {most:,} memory maps that Linux grants it, most of "
-            "them for compiled programs. The oldest programs were dropped (they are compiled again "
-            f"if called again), which leaves {left:,}.{advice}",
+            f"This process used {used:,} of the {granted:,} memory maps that Linux grants it, most "
+            "of them for compiled programs. The oldest programs were dropped (they are compiled "
+            f"again if called again), which leaves {remaining:,}.{advice}",
             RuntimeWarning,
             stacklevel=4,
         )
@@ -115,7 +115,7 @@ class CompiledFunction:
         self, function: Callable[..., Any], quick: Mapping[str, Any] = _QUICK, **options: Any
     ):
         functools.update_wrapper(self, function)
-        self._function, self._quick_options = _uncollected(function), quick
+        self._function, self._quick_options = _without_collection(function), quick
         self._compiled = eqx.filter_jit(self._function, **options)
         # Structures of arguments whose lanes cannot be vector code. With the quick options XLA's
         # loops would be slow.
@@ -123,17 +123,17 @@ class CompiledFunction:
 
     @functools.cached_property
     def _quick(self) -> Any:
-        options: Any = {"compiler_options": _known(self._quick_options)}
+        options: Any = {"compiler_options": _supported(self._quick_options)}
         return eqx.filter_jit(self._function, **options)
 
     def drop(self) -> None:
         """Drop the compiled programs. The next call compiles again."""
         # Equinox (0.13.8) has no public way to JAX's `clear_cache`. Dropping the wrapper is not
         # enough, since JAX keeps the programs (`tests/lanes/test_jax.py` detects a change).
-        for made in (self._compiled, vars(self).get("_quick")):
-            if made is not None:
-                cached = getattr(made, "_cached", None)
-                getattr(cached, "clear_cache", jax.clear_caches)()
+        for program in (self._compiled, vars(self).get("_quick")):
+            if program is not None:
+                inner = getattr(program, "_cached", None)
+                getattr(inner, "clear_cache", jax.clear_caches)()
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Return the function's result, computed by its compiled program. **Raises:**
@@ -142,7 +142,7 @@ class CompiledFunction:
             return self._called(arguments, keywords)
 
     def _called(self, arguments: tuple, keywords: dict[str, Any]) -> Any:
-        _watch.called(self)
+        _watch.record_call(self)
         kind = _kind_of(arguments, keywords)
         quick = kind not in self._never_quick and current_backend() != "xla"
         if quick and is_outermost(arguments, keywords):
@@ -171,7 +171,7 @@ def _kind_of(*arguments: Any) -> Any:
     return kind
 
 
-def _uncollected(function: Callable[..., Any]) -> Callable[..., Any]:
+def _without_collection(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function without garbage collection while it is traced. Tracing leaves little
     garbage but creates so many objects that the collector would run again and again."""
 
@@ -195,14 +195,14 @@ def is_outermost(*arguments: Any) -> bool:
     return not isinstance(jax.lax.full((1,), 0.0), Tracer)
 
 
-def _known(options: Mapping[str, Any]) -> dict[str, Any]:
+def _supported(options: Mapping[str, Any]) -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in options.items() if _is_known(name, value)}
+    return {name: value for name, value in options.items() if _is_supported(name, value)}
 
 
 @functools.cache
-def _is_known(name: str, value: object) -> bool:
+def _is_supported(name: str, value: object) -> bool:
     with contextlib.suppress(jax.errors.JaxRuntimeError):
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
         return True
