@@ -190,8 +190,8 @@ def _(t, p, d, a):
 def _(t, p, d, a):
     """Round to fewer bits, ties to even; infinite or zero beyond the smaller range."""
     digits, most = p["mantissa_bits"], 2 ** (p["exponent_bits"] - 1) - 1
-    own = np.finfo(d[0])
-    if digits >= own.nmant and most >= own.maxexp - 1:
+    limits = np.finfo(d[0])
+    if digits >= limits.nmant and most >= limits.maxexp - 1:
         return a
     if a.kind == "float":
         wide = ELEMENTWISE["reduce_precision"](t, p, [np.float64], t.cast("fpext", a, "double"))

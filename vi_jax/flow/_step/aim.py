@@ -470,7 +470,7 @@ class _Found(NamedTuple):
 
 def _may_have_met(plan: Plan, lane: Lane, trial: Trial, found: _Found, foreseen: bool) -> Flag:
     """Return whether a step may have met anything; if not, `_next_goal` need not be evaluated."""
-    if any(path.leaves is not None for path in trial.paths):
+    if any(path.release is not None for path in trial.paths):
         always = jnp.ones_like(trial.good)
         return always if trial.clear is None else ~trial.clear
     met = trial.good & ((lane.target != FREE) & ~is_at_turn(trial) | found.twice)
@@ -519,8 +519,8 @@ def _next_goal(plan: Plan, lane: Lane, trial: Trial, found: _Found) -> tuple[Fla
             # An event may have come before the one that was met: step to the force's extremum.
             hidden, place = force_may_turn(lane, k, path, h)
             goal = goal.cut(trial.good & hidden & ~met, place)
-        if path.leaves is not None:
-            left, place, released = path.leaves.left, path.leaves.place, path.leaves.landed
+        if path.release is not None:
+            left, place, released = path.release.left, path.release.place, path.release.landed
             goal = _Goal(
                 event=goal.event & ~released | left,
                 before=goal.before & ~left,
@@ -547,11 +547,11 @@ def _find_events(plan: Plan, lane: Lane, trial: Trial) -> _Found:
     stops_exact, twice = stops_are_exact(plan.machine, lane.state), jnp.zeros_like(good)
     eps = float(jnp.finfo(h.dtype).eps)
     for k, path in enumerate(trial.paths):
-        if path.pull is not None and path.leaves is not None:
+        if path.pull is not None and path.release is not None:
             sides.append(path.pull)
-            stays_below = (path.pull.end.x <= 0) | path.leaves.landed
+            stays_below = (path.pull.end.x <= 0) | path.release.landed
             asked = stays_below if path.pull.is_used is None else stays_below & path.pull.is_used
-            below.append(~path.leaves.left & asked)
+            below.append(~path.release.left & asked)
         end, twice = path.end, twice | may_turn_twice(plan, lane.direction[k], path, h)
         turned = good & (lane.direction[k] * end.v < 0) & ~path.at_turn
         if not stops_exact or any(x.blends for x in switches_of(plan.machine)):

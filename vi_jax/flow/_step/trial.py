@@ -98,7 +98,7 @@ class Path(NamedTuple):
     end: Rates
     at_turn: Flag
     """True if the step was aimed at a turning point of the coordinate, and met it."""
-    leaves: Release | None
+    release: Release | None
     """Its release, if it can rest."""
     force_rates: tuple[Scalar, Scalar, Scalar] | None
     """Rates of the force at both ends, and the length of the shortest step that is cut at an
@@ -280,10 +280,10 @@ def _path(
         # Such an event may be a turning point as well.
         aimed = aimed | (lane.target >= to_event(len(stops_of(plan.machine))))
     at_turn = good & aimed & met
-    leaves, force_rates, pull = None, None, None
+    release, force_rates, pull = None, None, None
     limited = any(stop.coordinate == k for stop in stops_of(plan.machine))
     if lane.contact is not None and limited:
-        leaves = locate_release(plan, lane, k, begin, end, good, h)
+        release = locate_release(plan, lane, k, begin, end, good, h)
         force_rates = (
             force_rate(free, position, smooth, lane.s, lane.state),
             force_rate(free, position, smooth, s1, new),
@@ -301,4 +301,4 @@ def _path(
                 for r, rate in ((begin, force_rates[0]), (end, force_rates[1]))
             )
             pull = Side(first, last, inner.forces[k], inner.slack[k], rests | slow)
-    return Path(begin, end, at_turn, leaves, force_rates, pull)
+    return Path(begin, end, at_turn, release, force_rates, pull)
