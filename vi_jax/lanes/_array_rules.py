@@ -1,7 +1,7 @@
 """Rules of primitives that rearrange, index, reduce or multiply whole arrays.
 
-They return arrays of any kind. The caller puts small ones into registers (`held`). Rearranging
-registers costs nothing at run time, since it is done while the text is written.
+They return arrays of any kind. The caller puts small ones into registers (`to_registers`).
+Rearranging registers costs nothing at run time, since it is done while the text is written.
 """
 
 import functools
@@ -25,7 +25,6 @@ from ._arrays import (
     computed,
     contiguous,
     fill,
-    held,
     in_lanes,
     is_cheap,
     joined_cuts,
@@ -36,6 +35,7 @@ from ._arrays import (
     selected,
     stored,
     times,
+    to_registers,
     uniform,
     without_cuts,
     write_for_each,
@@ -202,7 +202,7 @@ def select_parts(t: Text, flag: Value, a: Array, b: Array) -> Array | None:
     parts = []
     for begin, end in pairwise(sorted({0, a.shape[axis], *places})):
         x, y = (_piece(t, z, axis, begin, end) for z in (a, b))
-        part = x if same(x, y) else held(t, selected(t, flag, x, y))
+        part = x if same(x, y) else to_registers(t, selected(t, flag, x, y))
         parts.append(part)
     return Pieces(a.shape, a.kind, axis, tuple(parts))
 
@@ -260,7 +260,7 @@ def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: V
     shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
     whole = uniform(shape, number)
     if isinstance(x, Registers) and whole.size <= MOST_IN_REGISTERS:
-        out = held(t, whole)
+        out = to_registers(t, whole)
         out.values[tuple(slice(None, None, i + 1) for i in between)] = x.values
         return out
     out = stored(t, whole)
@@ -329,7 +329,7 @@ def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable
     axis, shape = axes[0], tuple(n for _, n in window)
     begin, size = window[axis]
     parts: list[Array] = [part_along(t, x, axis, 0, begin)] if begin else []
-    parts.append(held(t, Formula(shape, x.kind, new)))
+    parts.append(to_registers(t, Formula(shape, x.kind, new)))
     if begin + size < x.shape[axis]:
         parts.append(part_along(t, x, axis, begin + size, x.shape[axis]))
     return Pieces(x.shape, x.kind, axis, tuple(parts))
@@ -558,7 +558,7 @@ def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
     x = stored(t, x) if x.cuts else x
     order = [a for group in groups for a in group]
     if order != list(range(x.ndim)):
-        x = held(t, transposed(t, x, order))
+        x = to_registers(t, transposed(t, x, order))
     sizes = iter(x.shape)
     shape = tuple(int(np.prod([next(sizes) for _ in group], dtype=int)) for group in groups)
     return reshaped(t, x, shape)
@@ -608,7 +608,7 @@ def any_in(t: Text, x: Array) -> Value:
     if not x.ndim:
         return x.at(t, ())
     axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)
-    return held(t, STRUCTURAL["reduce_or"](t, axes, [flag], x)).at(t, ())
+    return to_registers(t, STRUCTURAL["reduce_or"](t, axes, [flag], x)).at(t, ())
 
 
 # --- products

@@ -448,7 +448,7 @@ def addressable(t: Text, x: Array) -> Array:
     return uniform(x.shape, x.item()) if x.size == 1 else stored(t, x)
 
 
-def held(t: Text, x: Array) -> Any:
+def to_registers(t: Text, x: Array) -> Any:
     """Return an array in registers if it is small enough, else unchanged."""
     if isinstance(x, Registers) or x.size > MOST_IN_REGISTERS:
         return x

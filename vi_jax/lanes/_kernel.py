@@ -27,7 +27,6 @@ from ._arrays import (
     contiguous,
     fill,
     gathered,
-    held,
     in_lanes,
     mapped,
     place_of,
@@ -36,6 +35,7 @@ from ._arrays import (
     scattered,
     selected,
     splat,
+    to_registers,
     uniform,
     write_for_each,
 )
@@ -262,7 +262,7 @@ class _Writer:
         t, base = self.t, self.t.binary("mul", lane, self.strides[i])
         read = gathered_array(t, self.inputs[i], base, self.program.in_avals[i], new)
         if isinstance(old, Registers):
-            return held(t, read)
+            return to_registers(t, read)
         if not self.one_for_all[i]:
             assert isinstance(old, Strided)
             fill(t, old, selected(t, new, read, old))
@@ -322,7 +322,7 @@ class _Writer:
         for aval in program.row_avals:
             kind = kind_of(aval.dtype)
             nothing = t.constant(float("nan") if is_float(kind) else 0, kind)
-            empty.append(held(t, uniform(aval.shape, nothing)))
+            empty.append(to_registers(t, uniform(aval.shape, nothing)))
         over_rows(
             t, filled, program.rows, ended, lambda n, mask: self._put_row(lane, mask, n, empty)
         )

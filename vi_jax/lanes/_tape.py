@@ -31,11 +31,11 @@ from ._arrays import (
     Strided,
     contiguous,
     fill,
-    held,
     mapped,
     selected,
     splat,
     stored,
+    to_registers,
     uniform,
 )
 from ._kernel import gathered_array, load_pointer, load_stride, over_rows, scatter, shared_input
@@ -281,7 +281,7 @@ class _Writer:
                 row = t.binary("mul", place, t.constant(aval.size, "i64"))
                 start = t.binary("add", start, row)
             pointer = load_pointer(t, "inputs", i)
-            arrays.append(held(t, gathered_array(t, pointer, start, aval, mask)))
+            arrays.append(to_registers(t, gathered_array(t, pointer, start, aval, mask)))
         return arrays
 
     def _row_weights(self, t: Text, lane: Value, place: Value, complete: Value) -> list[Array]:
@@ -351,8 +351,8 @@ class _Writer:
         inputs = []
         for i in (i for i, flag in enumerate(self.shared) if not flag):
             pointer = load_pointer(t, "inputs", i)
-            first = t.binary("mul", lane, load_stride(t, i))
-            inputs.append(held(t, gathered_array(t, pointer, first, self.inputs[i], present)))
+            at = t.binary("mul", lane, load_stride(t, i))
+            inputs.append(to_registers(t, gathered_array(t, pointer, at, self.inputs[i], present)))
         self.frame.store_number(t, "lane", lane)
         self.frame.store(t, "inputs", inputs)
         inputs = self._load_inputs(t)
@@ -462,7 +462,7 @@ def add_all(t: Text, a: list[Array], b: list[Array]) -> list[Array]:
 
 def zeros(t: Text, avals: list[Any]) -> list[Array]:
     """Return zeros of the given shapes and types."""
-    return [held(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
+    return [to_registers(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
 
 
 class Frame:
@@ -494,7 +494,7 @@ class Frame:
     def load(self, t: Text, part: str, pointer: str = "%frame") -> list[Any]:
         """Return the arrays of a part, from the frame or from a copy of it. Large ones are not
         copied."""
-        return [held(t, x) for x in self._arrays(t, part, pointer)]
+        return [to_registers(t, x) for x in self._arrays(t, part, pointer)]
 
     def store(self, t: Text, part: str, arrays: list[Array]) -> None:
         """Store the arrays of a part."""
@@ -507,7 +507,7 @@ class Frame:
         """Add arrays to those of a part. They must not depend on these."""
         places = self._arrays(t, part)
         rare: dict[Value, list[tuple[Strided, Array]]] = {}
-        sums = add_all(t, [held(t, x) for x in places], arrays)
+        sums = add_all(t, [to_registers(t, x) for x in places], arrays)
         for place, more, new in zip(places, arrays, sums, strict=True):
             if isinstance(more, Masked):
                 rare.setdefault(more.mask, []).append((place, new))

@@ -22,7 +22,6 @@ from ._arrays import (
     addressable,
     computed,
     fill,
-    held,
     joined_cuts,
     mapped,
     plus,
@@ -33,6 +32,7 @@ from ._arrays import (
     stored,
     table,
     times,
+    to_registers,
     uniform,
     without_cuts,
     write_loop,
@@ -172,7 +172,7 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
         out = PLACED[name](t, params, avals, dtypes, *args)
     else:
         out = STRUCTURAL[name](t, params, avals, *args)
-    return [held(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
+    return [to_registers(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
 
 
 def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
@@ -393,7 +393,7 @@ def _while(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
 def _select_by(t: Text, flags: Array, a: Array, b: Array) -> Array:
     """Return the first array where a flag of its leading axes holds, else the second."""
     number = lambda i: t.select(flags.at(t, i[: flags.ndim]), a.at(t, i), b.at(t, i))
-    return held(t, Formula(a.shape, a.kind, number, cuts=joined_cuts(a.cuts, b.cuts)))
+    return to_registers(t, Formula(a.shape, a.kind, number, cuts=joined_cuts(a.cuts, b.cuts)))
 
 
 def _flat(arrays: list[Any]) -> list[Value]:
@@ -425,12 +425,12 @@ def _scan(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
         aval: Any = var.aval
         column = [emitted[i][j] for i in range(length)]
         whole = jax.ShapeDtypeStruct((length, *aval.shape), aval.dtype)
-        columns.append(held(t, STRUCTURAL["stack"](t, {"axis": 0}, [whole], *column)))
+        columns.append(to_registers(t, STRUCTURAL["stack"](t, {"axis": 0}, [whole], *column)))
     return [*carry, *columns]
 
 
 def _row_of(t: Text, x: Array, i: Index) -> Array:
-    return held(t, Formula(x.shape[1:], x.kind, lambda j: x.at(t, (i, *j)), cheap=True))
+    return to_registers(t, Formula(x.shape[1:], x.kind, lambda j: x.at(t, (i, *j)), cheap=True))
 
 
 def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
@@ -453,7 +453,7 @@ def _counted_loop(t: Text, params: dict, args: list[Any], mask: Value) -> list[A
         return _flat(out[:m])
 
     carry = [_opaque(t, x) for x in _unflat(t, first, write_loop(t, length, body, _flat(first)))]
-    return [*carry, *(held(t, x) for x in columns)]
+    return [*carry, *(to_registers(t, x) for x in columns)]
 
 
 CONTROL: dict[str, Callable[..., list[Any]]] = {"cond": _cond, "while": _while, "scan": _scan}
