@@ -38,8 +38,8 @@ from .elementary import elementwise_primitive
 # Products of a cotangent and a slope that are zero if the cotangent is zero, for any slope.
 #
 # When a program selects one of two numbers, the other one has the cotangent 0. Its slope may be
-# infinite or NaN (√0, division by 0). Then 0·∞ would spoil the sum of both cotangents. Forward mode
-# has no such products, since the unselected tangent is dropped.
+# infinite or NaN (√0, division by 0). Then 0·∞ would make the sum of both cotangents NaN. Forward
+# mode has no such products, since the unselected tangent is dropped.
 
 weighted_p = elementwise_primitive(
     "weighted", lambda weight, slope: jnp.where(weight == 0, weight, weight * slope)

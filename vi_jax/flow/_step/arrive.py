@@ -477,8 +477,8 @@ def on_its_stops(plan: Plan, lane: Lane) -> State:
     """Return the state with the bodies that rest, at least one, exactly on their stops. While they
     are held, their positions are accurate to the method's error only."""
     assert lane.contact is not None
-    walls = {k: lane.contact[k] for k in limited_of(plan.machine)}
-    return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in walls.items()}, walls)[0]
+    codes = {k: lane.contact[k] for k in limited_of(plan.machine)}
+    return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in codes.items()}, codes)[0]
 
 
 def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:

@@ -432,11 +432,11 @@ def bring_to_rest(
     if len(impacts) == 1:
         ((k, impact),) = impacts.items()
         sign, _ = step.plan.sign_and_gap(k, impact.contact)
-        path, alone = step.trial.paths[k], step.trial.free_machines[k]
+        path, free = step.trial.paths[k], step.trial.free_machines[k]
         speed = impact.share * jnp.maximum(sign * path.end.v, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
         arguments = k, impact, speed, lane._replace(state=at_event), growth
-        ends, time = _remaining_chatter(step.plan, alone, *arguments)
+        ends, time = _remaining_chatter(step.plan, free, *arguments)
         rests = {k: pin_flag((impact.contact > 0) & ends, lane.s)}
         times = {k: time}
     else:
@@ -634,8 +634,8 @@ def _resting_bodies(
         closed, _, _, count = found
         new, times = list(contact), []
         for k, hit in impacts.items():
-            alone = hold_contacts(plan.machine, lane.modes, closed, but=k)
-            ends, time = _remaining_chatter(plan, alone, k, hit, speeds[k], lane)
+            free_k = hold_contacts(plan.machine, lane.modes, closed, but=k)
+            ends, time = _remaining_chatter(plan, free_k, k, hit, speeds[k], lane)
             ends = (hit.contact > 0) & ends
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
