@@ -61,7 +61,7 @@ _TRACER_ERRORS = (
 # A field whose values a cycle apart differ by more than this share has another period; with a
 # period of five digits they differ by less. They are compared at the start and at this share of a
 # cycle, where few inputs are zero.
-_APART, _INSIDE = 1e-4, 0.29
+_PERIODIC, _INNER_INSTANT = 1e-4, 0.29
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
@@ -215,7 +215,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         _warn_of_time(kind)
     paths = jtu.tree_leaves_with_path(start) if ticks else ()
     for (path, _), rates in zip(paths, fields, strict=True):
-        if np.any(abs(rates[:2] - rates[2:]) > _APART * abs(rates).max(axis=0)):
+        if np.any(abs(rates[:2] - rates[2:]) > _PERIODIC * abs(rates).max(axis=0)):
             _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", float(cycle))
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
@@ -290,7 +290,7 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     is an argument, since JAX compiles expressions of constants separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
-    instants = zero + cycle * np.array([0.0, _INSIDE, 1.0, 1.0 + _INSIDE])
+    instants = zero + cycle * np.array([0.0, _INNER_INSTANT, 1.0, 1.0 + _INNER_INSTANT])
     fields = jax.vmap(lambda s: field_in(machine, s, start, modes))(instants) if ticks else ()
     around = _states_around(zero, cycle, start, modes)
 
@@ -335,8 +335,8 @@ def _masses(machine: AbstractMachine, start: State) -> Any:
 def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:
     """Return instants, states and modes: those of the start, and random ones around it."""
     random = np.random.default_rng(0)
-    far = np.resize(_FAR, _TRIED)
-    s = zero + cycle * np.append(0.0, random.uniform(size=_TRIED))
+    distances = np.resize(_DISTANCES, _SAMPLES)
+    s = zero + cycle * np.append(0.0, random.uniform(size=_SAMPLES))
 
     def draw_around(x: Any) -> Array:
         x = jnp.asarray(x)
@@ -349,7 +349,7 @@ def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) ->
         values = np.append(_MODES, 0.0)[choices].astype(zero.dtype)
         return jnp.where(choices == len(_MODES), zero + mode, values)
 
-    return s, jtu.tree_map(spread, start), tuple(map(chosen, modes))
+    return s, jtu.tree_map(draw_around, start), tuple(map(draw_modes, modes))
 
 
 @functools.lru_cache(maxsize=64)
