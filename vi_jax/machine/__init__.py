@@ -33,8 +33,8 @@ from .contacts import constrained_rate as constrained_rate
 from .contacts import contact_constraints as contact_constraints
 from .contacts import field_in as field_in
 from .contacts import forces as forces
+from .contacts import push_gains as push_gains
 from .contacts import push_of as push_of
-from .contacts import shares as shares
 from .contacts import shown_modes as shown_modes
 from .contacts import velocity_change as velocity_change
 from .contacts import with_friction_impulse as with_friction_impulse

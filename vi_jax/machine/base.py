@@ -53,54 +53,56 @@ def listed(parts: object) -> tuple[Any, ...]:
     return (parts,) if single else tuple(parts) if isinstance(parts, list) else parts  # pyright: ignore
 
 
-def once_a_trace(found: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
+def cached_in_trace(function: Callable[[Machine], Any]) -> Callable[[Machine], Any]:
     """Cache a function of a machine while JAX traces another. A step reads the parts of a machine
     some hundred times, and each contact that a user defines takes a millisecond."""
 
-    @wraps(found)
-    def kept(machine: Machine) -> Any:
-        trace, memory = get_opaque_trace_state(), vars(machine).setdefault(_MEMORY, {})
-        known = memory.get(found)
-        if known is None or known[0] != trace:
-            known = memory[found] = trace, found(machine)
-        return known[1]
+    @wraps(function)
+    def cached(machine: Machine) -> Any:
+        trace, cache = get_opaque_trace_state(), vars(machine).setdefault(_CACHE, {})
+        entry = cache.get(function)
+        if entry is None or entry[0] != trace:
+            entry = cache[function] = trace, function(machine)
+        return entry[1]
 
-    return kept
-
-
-# The attribute with the cache of `once_a_trace`. It is not a field, and copies leave it out.
-_MEMORY = "_found_in_a_trace"
+    return cached
 
 
-@once_a_trace
+# The attribute with the cache of `cached_in_trace`. It is not a field, and copies leave it out.
+_CACHE = "_found_in_a_trace"
+
+
+@cached_in_trace
 def contacts_in(machine: Machine) -> tuple[Any, ...]:
     """Return the contacts of a machine as a tuple."""
     return listed(machine.contacts)
 
 
-@once_a_trace
+@cached_in_trace
 def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
     contacts = contacts_in(machine)
-    places = _places(contacts)
-    return tuple(_at(x, places) for x in contacts if isinstance(x, RigidStop))
+    index = _index_by_on(contacts)
+    return tuple(_indexed(x, index) for x in contacts if isinstance(x, RigidStop))
 
 
-@once_a_trace
+@cached_in_trace
 def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
     """Return the soft stops and frictions among contacts, marked `acts`, then the switches."""
     contacts, found = contacts_in(machine), []
-    places, at = _places(contacts), 0
+    index, stop_number = _index_by_on(contacts), 0
     for x in contacts:
         if isinstance(x, RigidStop):
             if x.friction is not None:
-                found.append(with_static(_friction_on(x, at, places), acts=True))
-            at += 1
+                found.append(with_static(_friction_on(x, stop_number, index), acts=True))
+            stop_number += 1
         elif isinstance(x, AbstractSwitch):
-            found.append(with_static(_at(x, places) if isinstance(x, SoftStop) else x, acts=True))
+            found.append(
+                with_static(_indexed(x, index) if isinstance(x, SoftStop) else x, acts=True)
+            )
     return *found, *(x for x in listed(machine.events) if isinstance(x, AbstractSwitch))
 
 
-@once_a_trace
+@cached_in_trace
 def _other_events(machine: Machine) -> tuple[AbstractEvent, ...]:
     """Return the events that are not switches."""
     found = []
@@ -114,35 +116,35 @@ def _coordinates_in(machine: Machine) -> tuple[Coordinate, ...]:
     contacts = contacts_in(machine)
     stops = [x for x in contacts if isinstance(x, RigidStop | SoftStop) and x.mass is not None]
     masses = {x.on: x.mass for x in reversed(stops)}
-    each = {k: on for on, k in reversed(_places(contacts).items())}
-    return tuple(machine._coordinate_on(each[k], masses.get(each[k])) for k in sorted(each))
+    on_of = {k: on for on, k in reversed(_index_by_on(contacts).items())}
+    return tuple(machine._coordinate_on(on_of[k], masses.get(on_of[k])) for k in sorted(on_of))
 
 
-def _places(contacts: tuple[Any, ...]) -> dict[Any, int]:
+def _index_by_on(contacts: tuple[Any, ...]) -> dict[Any, int]:
     """Return the index of each coordinate by its `on`: those of rigid stops, then of soft stops,
     then those along which rigid stops have friction."""
     rigid = [x for x in contacts if isinstance(x, RigidStop)]
-    named = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
-    named += [x.along for x in rigid if x.friction is not None]
-    numbers: dict[Any, int] = {}
-    return {on: numbers.setdefault(_known_as(on), len(numbers)) for on in named or [None]}
+    ons = [x.on for x in rigid] + [x.on for x in contacts if isinstance(x, SoftStop)]
+    ons += [x.along for x in rigid if x.friction is not None]
+    known: dict[Any, int] = {}
+    return {on: known.setdefault(_coordinate_key(on), len(known)) for on in ons or [None]}
 
 
-def _known_as(on: Any) -> Any:
+def _coordinate_key(on: Any) -> Any:
     """Return a key for a coordinate: its name, or the code and closure of a gap function. The same
     gap is often written for both sides, and two coordinates cost twice as much as one."""
     if not isinstance(on, FunctionType):
         return on
     code, cells = on.__code__, on.__closure__ or ()
     parts = code.co_code, repr(code.co_consts), code.co_names, code.co_varnames, code.co_freevars
-    given = (*(x.cell_contents for x in cells), *(on.__defaults__ or ()))
-    return *parts, id(on.__globals__), repr(on.__kwdefaults__), tuple(map(id, given))
+    values = (*(x.cell_contents for x in cells), *(on.__defaults__ or ()))
+    return *parts, id(on.__globals__), repr(on.__kwdefaults__), tuple(map(id, values))
 
 
 def number_on(machine: Machine, name: str) -> int | None:
     """Return the index of the coordinate that contacts name `name`, alone or as its position;
     `None` if no contact acts on it."""
-    for on, k in _places(contacts_in(machine)).items():
+    for on, k in _index_by_on(contacts_in(machine)).items():
         if on == name or (isinstance(on, tuple) and on[0] == name):
             return k
     return None
@@ -153,23 +155,23 @@ def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
     if contacts do not name them, or the machine defines `coordinates`."""
     if defines(machine, "coordinates"):
         return None
-    on = next((on for on, k in _places(contacts_in(machine)).items() if k == number), None)
+    on = next((on for on, k in _index_by_on(contacts_in(machine)).items() if k == number), None)
     return machine._names_on(on)
 
 
-def _at(stop: Any, places: dict[Any, int]) -> Any:
+def _indexed(stop: Any, index: dict[Any, int]) -> Any:
     if stop.on is None and stop.coordinate:
         return stop
-    return with_static(stop, coordinate=places[stop.on])
+    return with_static(stop, coordinate=index[stop.on])
 
 
-def _friction_on(stop: RigidStop, number: int, places: dict[Any, int]) -> ContactFriction:
-    rebound = stop.tangential_restitution
+def _friction_on(stop: RigidStop, number: int, index: dict[Any, int]) -> ContactFriction:
+    restitution = stop.tangential_restitution
     return ContactFriction(
         stop.friction,
         stop=number,
-        along=places[stop.along],
-        restitution=0.0 if rebound is None else rebound,
+        along=index[stop.along],
+        restitution=0.0 if restitution is None else restitution,
     )
 
 
@@ -199,7 +201,7 @@ def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> S
     return jtu.tree_unflatten(structure, [Y, V, *leaves[2:]][-len(leaves) :])
 
 
-def _plain(machine: "AbstractMachine") -> Coordinate:
+def _default_coordinate(machine: "AbstractMachine") -> Coordinate:
     """Return the coordinate of a state with fields `Y` and `V`, or of a machine without stops."""
     return Coordinate(*(partial(function, machine) for function in (_position, _velocity, _placed)))
 
@@ -246,16 +248,16 @@ class AbstractMachine(Shown):
             name = next((x for x in _REQUIRED if x in missing), min(missing))
             how = f": {_REQUIRED[name]}" if name in _REQUIRED else ""
             raise TypeError(f"A machine must have `{name}`, but `{cls.__name__}` has none{how}.")
-        lost = _unlisted(cls)
-        if lost is not None:
+        unlisted = _unlisted(cls)
+        if unlisted is not None:
             raise TypeError(
                 f"A machine must list its contacts as `contacts` and its events as `events`, but "
-                f"`{cls.__name__}` has only `{lost}`."
+                f"`{cls.__name__}` has only `{unlisted}`."
             )
         return super().__new__(cls, *args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: x for name, x in vars(self).items() if name != _MEMORY}
+        return {name: x for name, x in vars(self).items() if name != _CACHE}
 
     @abc.abstractmethod
     def field(self, *args: Any, **kwargs: Any) -> State:
@@ -315,18 +317,18 @@ class AbstractMachine(Shown):
     def position(self, state: State) -> Scalar:
         """Return the coordinate that stops limit: by default the first of `coordinates`, or
         `state.Y`. Without stops and `Y` it is the first component. Extremes are recorded of it."""
-        return self._first.position(state)
+        return self._first_coordinate.position(state)
 
     @by_default
     def velocity(self, state: State) -> Scalar:
         """Return the velocity that an impact reverses; it has the sign of d(position)/ds. Without
         stops and `V` it is the second component, which pictures draw over the position."""
-        return self._first.velocity(state)
+        return self._first_coordinate.velocity(state)
 
     @by_default
     def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
         """Return `state` with this position and velocity, as after a landing or a rebound."""
-        return self._first.placed(state, Y, V)
+        return self._first_coordinate.placed(state, Y, V)
 
     def observed_every(self, interval: Any) -> "AbstractMachine":
         """Return an autonomous machine observed at equal intervals of `s`, not on its section."""
@@ -400,8 +402,8 @@ class AbstractMachine(Shown):
         and each parameter and component of the state, by name. "1" is dimensionless, and "" is the
         name of all others. The defaults are those in brackets in `labels` and fields' metadata."""
         found = zip(("position", "velocity"), map(unit_in, self.labels), strict=True)
-        own = {**dict(found), **fields_with(type(self), "unit")}
-        return {x: unit for x, unit in own.items() if unit}
+        units = {**dict(found), **fields_with(type(self), "unit")}
+        return {x: unit for x, unit in units.items() if unit}
 
     # The parts by kind (see `stops_of`). Some subclasses in this package sort them in another way.
     _stops = property(_stops_in)
@@ -430,18 +432,18 @@ class AbstractMachine(Shown):
         if on is not None:
             return coordinate_by_name(on, mass)
         methods = ("position", "velocity", "placed")
-        own = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
-        return _plain(self)._replace(mass=1.0 if mass is None else mass, **own)
+        given = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
+        return _default_coordinate(self)._replace(mass=1.0 if mass is None else mass, **given)
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
         """Return the names of position and velocity in a contact's `on`, or `None`."""
         return on if isinstance(on, tuple) else None
 
     @property
-    def _first(self) -> Coordinate:
+    def _first_coordinate(self) -> Coordinate:
         """The coordinate of the default `position`, `velocity` and `placed`: the first of the
         machine's `coordinates`, if it defines some."""
-        return self.coordinates[0] if names_coordinates(self) else _plain(self)
+        return self.coordinates[0] if names_coordinates(self) else _default_coordinate(self)
 
 
 def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
@@ -450,8 +452,8 @@ def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
 
 def has_velocity(machine: AbstractMachine, state: State) -> bool:
     """Return whether `velocity` is a velocity. Without stops it may be another component."""
-    own = is_own(type(machine).velocity) or names_coordinates(machine)
-    return own or bool(stops_of(machine)) or hasattr(state, "V")
+    defined = is_own(type(machine).velocity) or names_coordinates(machine)
+    return defined or bool(stops_of(machine)) or hasattr(state, "V")
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:

@@ -41,19 +41,17 @@ def velocity_change(coordinate: Any, state: State, change: State) -> Scalar:
     return jnp.asarray(jax.jvp(coordinate.velocity, (state,), (change,))[1])
 
 
-def shares(coordinates: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
+def push_gains(bodies: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
     """Return the change of each coordinate's velocity (row) by each push (column)."""
-    return [
-        [velocity_change(coordinate, state, push) for push in pushes] for coordinate in coordinates
-    ]
+    return [[velocity_change(body, state, push) for push in pushes] for body in bodies]
 
 
 def forces(
     gains: Sequence[Sequence[Scalar]], acting: Sequence[Flag], wanted: Sequence[Scalar]
 ) -> list[Scalar]:
     """Return the amount of each push that changes the velocities of the `acting` contacts as
-    `wanted`; 0 for the others. **Arguments:** `gains`, from `shares`; `acting` and `wanted`, with
-    an entry for each contact."""
+    `wanted`; 0 for the others. **Arguments:** `gains`, from `push_gains`; `acting` and `wanted`,
+    with an entry for each contact."""
     rows = []
     for j, row in enumerate(gains):
         both = zip(row, acting, strict=True)
@@ -71,8 +69,8 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
     n = len(rows)
     for i in range(n):
         pivot = rows[i][i]
-        found = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
-        inverse = jnp.where(found, 1 / jnp.where(found, pivot, 1.0), 0.0)
+        is_independent = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
+        inverse = jnp.where(is_independent, 1 / jnp.where(is_independent, pivot, 1.0), 0.0)
         rows[i] = [x * inverse for x in rows[i]]
         for j in range(n):
             if j != i:
@@ -83,14 +81,14 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
 def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
     """Return a tree plus each change times its amount."""
 
-    def one(amount: Scalar, a: Any, b: Any) -> Any:
-        known = isinstance(b, np.ndarray)  # in a push: its positions, and its own velocity
-        if known and not b.any():
+    def add_part(amount: Scalar, a: Any, b: Any) -> Any:
+        is_constant = isinstance(b, np.ndarray)  # in a push: zeros, and 1 for its velocity
+        if is_constant and not b.any():
             return a
-        return a + (amount if known and (b == 1).all() else amount * b)
+        return a + (amount if is_constant and (b == 1).all() else amount * b)
 
     for amount, change in zip(amounts, changes, strict=True):
-        state = jtu.tree_map(partial(one, amount), state, change)
+        state = jtu.tree_map(partial(add_part, amount), state, change)
     return state
 
 
@@ -117,26 +115,26 @@ def with_friction_impulse(
     stop = stops_of(machine)[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
     push, drag = push_of(body, before), push_of(along, before)
-    gains = shares((body, along), before, (push, drag))
-    across, slip = body.velocity(before), along.velocity(before)
-    wanted = body.velocity(after) - across
-    both = jnp.ones((), bool)
-    sticking = forces(gains, (both, both), (wanted, -(1 + friction.restitution) * slip))
+    gains = push_gains((body, along), before, (push, drag))
+    normal, slip = body.velocity(before), along.velocity(before)
+    wanted = body.velocity(after) - normal
+    active = jnp.ones((), bool)
+    sticking = forces(gains, (active, active), (wanted, -(1 + friction.restitution) * slip))
     ratio = body.mass_at(s, before) / along.mass_at(s, before)
-    level, away = friction.level * ratio, -float(stop.sign)
-    slips = jnp.abs(sticking[1]) > level * jnp.maximum(away * sticking[0], 0.0)
+    level, outward = friction.level * ratio, -float(stop.sign)
+    slips = jnp.abs(sticking[1]) > level * jnp.maximum(outward * sticking[0], 0.0)
     # Friction acts against the slip after the impact, which the stop's push changes, too.
-    forward = _slipping(gains, wanted, -away * level)
-    backward = _slipping(gains, wanted, away * level)
-    left = slip + gains[1][0] * forward[0] + forward[1]
-    ahead = left > -friction.restitution * slip
+    forward = _slipping(gains, wanted, -outward * level)
+    backward = _slipping(gains, wanted, outward * level)
+    slip_after = slip + gains[1][0] * forward[0] + forward[1]
+    is_forward = slip_after > -friction.restitution * slip
     pushed, dragged = (
-        jnp.where(slips, jnp.where(ahead, x, y), z)
+        jnp.where(slips, jnp.where(is_forward, x, y), z)
         for x, y, z in zip(forward, backward, sticking, strict=True)
     )
     place, speed = body.position(after), body.velocity(after)
-    moved = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
-    return FrictionImpulse(moved, pushed, dragged)
+    state = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
+    return FrictionImpulse(state, pushed, dragged)
 
 
 def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
@@ -173,21 +171,21 @@ def contact_constraints(
     stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
     frictions = [(i, x) for i, x in enumerate(switches) if x.friction_stop is not None]
     numbers = [*limited, *(x.along for _, x in frictions)]
-    each = {k: push_of(coordinates[k], state) for k in numbers}
-    pushes, acts = [each[k] for k in numbers], [contact[k] > 0 for k in limited]
+    push_along = {k: push_of(coordinates[k], state) for k in numbers}
+    pushes, acts = [push_along[k] for k in numbers], [contact[k] > 0 for k in limited]
     masses = {k: coordinates[k].mass_at(s, state) for k in numbers} if frictions else {}
     stop_frictions = []
     for i, friction in frictions:
         stop = stops[friction.friction_stop]
-        at = limited.index(stop.coordinate)
-        here = contact[stop.coordinate] == 1.0 + friction.friction_stop
+        row = limited.index(stop.coordinate)
+        rests = contact[stop.coordinate] == 1.0 + friction.friction_stop
         # The stop pushes the body away, and friction acts against the slip.
         ratio = masses[stop.coordinate] / masses[friction.along]
         ratio = modes[i] * friction.level * stop.sign * ratio
-        slips = jnp.where(here, ratio, 0.0)
-        pushes[at] = added(pushes[at], (slips,), (each[friction.along],))
-        acts = [*acts, here & (modes[i] == 0)]
-        stop_frictions.append((i, friction, at, slips))
+        share = jnp.where(rests, ratio, 0.0)
+        pushes[row] = added(pushes[row], (share,), (push_along[friction.along],))
+        acts = [*acts, rests & (modes[i] == 0)]
+        stop_frictions.append((i, friction, row, share))
     bodies = [coordinates[k] for k in numbers]
     return ContactConstraints(
         bodies, pushes, acts, stop_frictions, [masses[k] for k in numbers if frictions]
@@ -219,14 +217,14 @@ def constrained_rate(
             pushes.append(push)
             acts.append(modes[i] == 0)
             wanted.append(-friction.slip_rate(machine, s, state, flow))
-    amounts = forces(shares(bodies, state, pushes), acts, wanted)
+    amounts = forces(push_gains(bodies, state, pushes), acts, wanted)
     pace, found = machine.pace(s, state), {}
     for (i, mass), amount in zip(dry, amounts[first:], strict=True):
         force = amount * mass
         found[i] = force if pace is None else force / pace, None, mass
-    for row, (i, friction, at, _) in enumerate(stop_frictions, start=first - len(stop_frictions)):
+    for row, (i, friction, stop, _) in enumerate(stop_frictions, start=first - len(stop_frictions)):
         sign = stops_of(machine)[friction.friction_stop].sign
-        found[i] = amounts[row] * masses[row], -sign * amounts[at] * masses[at], masses[row]
+        found[i] = amounts[row] * masses[row], -sign * amounts[stop] * masses[stop], masses[row]
     return added(flow, amounts, pushes), found
 
 
@@ -252,7 +250,7 @@ def check_takes(
         pass  # it has no signature
 
 
-def called(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
+def call_checked(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:
     """Return the result of a function of a machine's event. **Raises:** `TypeError` with the
     function's name `whose`, if it takes other arguments."""
     try:
@@ -280,24 +278,24 @@ def field_in(machine: Any, s: Scalar, state: State, modes: Scalars, first: int =
     the weighted mean of the fields on both sides. **Arguments:** `first`, the number of the first
     switch that may be in mode 0."""
     switches = switches_of(machine)
-    found = [i for i, x in enumerate(switches) if x.blends and i >= first]
-    if not found:
+    sliding = [i for i, x in enumerate(switches) if x.blends and i >= first]
+    if not sliding:
         return acting(machine, s, state, modes)
-    i = found[0]
+    i = sliding[0]
     up, down = (
         field_in(
             machine, s, state, (*modes[:i], jnp.full_like(modes[i], m), *modes[i + 1 :]), i + 1
         )
         for m in (1.0, -1.0)
     )
-    rises, falls = (rate_of(switches[i].function, machine, s, state, x) for x in (up, down))
-    apart = falls - rises
-    share = jnp.where(modes[i] == 0, falls / jnp.where(apart == 0, 1.0, apart), modes[i] > 0)
-    # Not clipped to [0, 1]: the field is smooth until the step ends, where the share leaves it.
-    return jtu.tree_map(lambda a, b: b + share * (a - b), up, down)
+    rate_up, rate_down = (rate_of(switches[i].function, machine, s, state, x) for x in (up, down))
+    delta = rate_down - rate_up
+    weight = jnp.where(modes[i] == 0, rate_down / jnp.where(delta == 0, 1.0, delta), modes[i] > 0)
+    # Not clipped to [0, 1]: the field is smooth until the step ends, where the weight leaves it.
+    return jtu.tree_map(lambda a, b: b + weight * (a - b), up, down)
 
 
 def rate_of(function: Any, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
     """Return d/ds of a function of machine, `s` and state along a flow."""
-    along = (s, state), (jnp.ones_like(s), flow)
-    return jax.jvp(lambda s, state: function(machine, s, state), *along)[1]
+    tangents = (s, state), (jnp.ones_like(s), flow)
+    return jax.jvp(lambda s, state: function(machine, s, state), *tangents)[1]

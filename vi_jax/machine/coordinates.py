@@ -12,7 +12,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Machine, Scalar, State
-from .numbers import components, split_place
+from .numbers import components, split_index
 
 
 class Coordinate(NamedTuple):
@@ -46,14 +46,14 @@ def coordinate_by_name(on: Any, mass: Any) -> Coordinate:
 
 def component(name: str, state: State) -> Any:
     """Return a component of a state by its name: `"x"`, `"v.x"`, `"x[3]"`."""
-    base, place = split_place(name)
+    base, index = split_index(name)
     found = functools.reduce(getattr, base.split("."), state)
-    if not place:
+    if not index:
         return found  # the leaf itself, so that a stop can set it exactly
     shape = jnp.shape(found)
-    if len(place) != len(shape) or any(not -n <= i < n for i, n in zip(place, shape, strict=True)):
+    if len(index) != len(shape) or any(not -n <= i < n for i, n in zip(index, shape, strict=True)):
         raise LookupError(f"The state has no component {name!r}; {base!r} has the shape {shape}.")
-    return found[place]
+    return found[index]
 
 
 def has_component(name: str, state: State) -> bool:
@@ -67,9 +67,9 @@ def has_component(name: str, state: State) -> bool:
 
 def with_component(name: str, state: State, value: Any) -> State:
     """Return the state with another value of this component."""
-    base, place = split_place(name)
-    if place:
-        value = component(base, state).at[place].set(value)
+    base, index = split_index(name)
+    if index:
+        value = component(base, state).at[index].set(value)
     return eqx.tree_at(functools.partial(component, base), state, value)
 
 
@@ -109,7 +109,7 @@ def without_turns(angle: Any) -> Any:
 
 def is_angle(machine: Machine, name: str) -> bool:
     """Return whether a component, or its array, is an angle of `wrap_angles`."""
-    return not {name, split_place(name)[0]}.isdisjoint(_angles(machine))
+    return not {name, split_index(name)[0]}.isdisjoint(_angles(machine))
 
 
 def _angles(machine: Machine) -> frozenset[str]:
@@ -124,10 +124,10 @@ def angles_in(machine: Machine, like: State) -> np.ndarray | None:
     return np.array([is_angle(machine, name) for name in components(like)])
 
 
-def nearest_images(angles: np.ndarray | None, here: Any, there: Any) -> Any:
-    """Return the images of `here`, under whole turns of angles, that are nearest to `there`.
+def nearest_images(angles: np.ndarray | None, states: Any, references: Any) -> Any:
+    """Return the images of `states`, under whole turns of angles, nearest to `references`.
     **Arguments:** `angles`, from `angles_in`; states as rows of numbers, the last axis."""
     if angles is None:
-        return here
-    moved = there + without_turns(here - there)
-    return (np if isinstance(moved, np.ndarray) else jnp).where(angles, moved, here)
+        return states
+    images = references + without_turns(states - references)
+    return (np if isinstance(images, np.ndarray) else jnp).where(angles, images, states)

@@ -102,8 +102,8 @@ class Passing(Counter):
 
     def section(self, machine: Any, state: State) -> Any:
         """Return the component or function, with the sign with which it rises at the section."""
-        where: Any = self.name
-        value: Any = where(machine, state) if callable(where) else component(where, state)
+        function: Any = self.name
+        value: Any = function(machine, state) if callable(function) else component(function, state)
         return value if self.sign > 0 else -value
 
 
@@ -176,7 +176,7 @@ def _observed_kind(kind: type) -> type:
         return jnp.minimum(original(self).step_limit(s, state), self.observed_interval / 5)
 
     def parts(name: str) -> property:
-        return property(lambda self: tuple(map(_goes_on, getattr(original(self), name))))
+        return property(lambda self: tuple(map(_without_cycle_end, getattr(original(self), name))))
 
     body: dict[str, Any] = {
         "__module__": kind.__module__,
@@ -196,5 +196,5 @@ def _observed_kind(kind: type) -> type:
     return type(kind)(kind.__name__, (kind,), body)
 
 
-def _goes_on(event: AbstractEvent) -> AbstractEvent:
+def _without_cycle_end(event: AbstractEvent) -> AbstractEvent:
     return with_static(event, ends_cycle=False) if event.ends_cycle else event

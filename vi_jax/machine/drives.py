@@ -197,12 +197,12 @@ class AbstractDrive(Shown):
         names = [part.name for part in dataclasses.fields(self.state)][2:]
         for name, value in given.items():
             if value is not None and name not in names:
-                there = ["Y", "V", *names]
-                near = [x for x in there if x.lower() == name.lower()]
-                has = f"it is called `{near[0]}`" if near else f"a state has {', '.join(there)}"
-                why = _WITHOUT.get(name, has)
+                known = ["Y", "V", *names]
+                near = [x for x in known if x.lower() == name.lower()]
+                hint = f"it is called `{near[0]}`" if near else f"a state has {', '.join(known)}"
+                reason = _WITHOUT.get(name, hint)
                 raise ValueError(
-                    f"Argument `{name}` must be left out: {why}, but got {name}={value!r}."
+                    f"Argument `{name}` must be left out: {reason}, but got {name}={value!r}."
                 )
         found: dict[str, Any] = {}
         for name in names:
@@ -367,5 +367,5 @@ class DCMotor(Motor):
     def rate(self) -> Float[Array, "..."]:
         """Return the fastest rate of shaft and armature together, with respect to τ: 1/τe of the
         current or, if that is slow, √(τ0/(w0 τe)) of the oscillation of speed and current."""
-        own = 1 / self.electrical_time
-        return jnp.maximum(own, jnp.sqrt(own * self.strength / self.no_load_speed))
+        decay = 1 / self.electrical_time
+        return jnp.maximum(decay, jnp.sqrt(decay * self.strength / self.no_load_speed))

@@ -17,15 +17,15 @@ class EventContext(NamedTuple):
 
     modes: Modes
     """All modes of the machine."""
-    own: int
+    mode_index: int
     """The index of the event's mode among them."""
     contact: Scalars
     """For each coordinate, 1 + i while it rests on stop number i, else 0; empty without rests."""
 
-    def instead(self, mode: object) -> Modes:
+    def with_mode(self, mode: object) -> Modes:
         """Return all modes, with another one in place of the event's."""
-        mode = jnp.asarray(mode, jnp.result_type(self.modes[self.own]))
-        return (*self.modes[: self.own], mode, *self.modes[self.own + 1 :])
+        mode = jnp.asarray(mode, jnp.result_type(self.modes[self.mode_index]))
+        return (*self.modes[: self.mode_index], mode, *self.modes[self.mode_index + 1 :])
 
 
 class AbstractEvent(Shown):

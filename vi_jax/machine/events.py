@@ -18,9 +18,9 @@ from jax.lax import stop_gradient
 
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
-from .contacts import called, field_in, rate_of, shown_modes, with_friction_impulse
+from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import chosen_together, frictions_in
+from .friction import choose_modes, frictions_in
 from .numbers import Shown, size_of
 from .own import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .state import changed
@@ -46,49 +46,49 @@ def guard_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalar:
     """Return the guard of an event, which rises through zero where the event happens."""
-    event, own, more = event_of(machine, number, modes, contact)
-    return event.guard(machine, s, state, *modes[own], **more)
+    event, part, keywords = event_of(machine, number, modes, contact)
+    return event.guard(machine, s, state, *modes[part], **keywords)
 
 
 def sides_of(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> Scalars:
     """Return smooth functions whose maximum is the guard of an event."""
-    event, own, more = event_of(machine, number, modes, contact)
-    return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[own], **more)))
+    event, part, keywords = event_of(machine, number, modes, contact)
+    return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[part], **keywords)))
 
 
 def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> State:
     """Return the state after an event as a smooth function of that before it
     (`AbstractEvent.jump`)."""
-    event, own, _ = event_of(machine, number, modes, ())
-    return _with_friction(machine, number, s, state, event.jump(machine, s, state, *modes[own]))
+    event, part, _ = event_of(machine, number, modes, ())
+    return _with_friction(machine, number, s, state, event.jump(machine, s, state, *modes[part]))
 
 
 def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
     """Return whether an event happens when its guard rises through zero; `None` for always."""
-    event, own, _ = event_of(machine, number, modes, ())
-    return event.happens(machine, s, state, *modes[own])
+    event, part, _ = event_of(machine, number, modes, ())
+    return event.happens(machine, s, state, *modes[part])
 
 
 def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
     """Return the value of an event in the event log."""
-    event, own, _ = event_of(machine, number, modes, ())
-    return event.value(machine, s, state, *modes[own])
+    event, part, _ = event_of(machine, number, modes, ())
+    return event.value(machine, s, state, *modes[part])
 
 
 def after_event(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> tuple[State, Modes]:
     """Return state and modes after an event."""
-    event, own, more = event_of(machine, number, modes, contact)
-    new, changed = event.after(machine, s, state, *modes[own], **more)
+    event, part, keywords = event_of(machine, number, modes, contact)
+    new, changed = event.after(machine, s, state, *modes[part], **keywords)
     if event.holds_mode:
-        changed = (*modes[: own.start], changed, *modes[own.stop :])
+        changed = (*modes[: part.start], changed, *modes[part.stop :])
         if event.is_dry and len(frictions_in(machine)) > 1:
-            changed, held = settled_modes(changed, s), modes[own.start] == 0
-            changed = chosen_together(machine, s, new, changed, contact, (own.start, held))
-    return _with_friction(machine, number, s, state, new), settled_modes(changed, s)
+            changed, was_sticking = constant_modes(changed, s), modes[part.start] == 0
+            changed = choose_modes(machine, s, new, changed, contact, (part.start, was_sticking))
+    return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
 
 
 def _with_friction(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
@@ -127,9 +127,9 @@ def event_of(
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
-    own = mode_number(machine, number)
-    more = {"around": EventContext(modes, own, contact)} if event.needs_all_modes else {}
-    return event, slice(own, own + 1), more
+    index = mode_number(machine, number)
+    keywords = {"around": EventContext(modes, index, contact)} if event.needs_all_modes else {}
+    return event, slice(index, index + 1), keywords
 
 
 def begin_modes(
@@ -138,11 +138,11 @@ def begin_modes(
     """Return the initial modes of a motion in `state`: those of events, in their order, then the
     machine's own, which are `own` if that is given."""
     state = jtu.tree_map(jnp.asarray, state)  # a start may hold Python's numbers
-    held = [event for event in events_of(machine) if event.holds_mode]
+    mode_events = [event for event in events_of(machine) if event.holds_mode]
     own = modes_at_start(machine, s, state) if own is None else own
-    modes = [*(event.begin(machine, s, state) for event in held), *own]
-    modes = settled_modes(modes, s)
-    if any(event.needs_all_modes for event in held):  # whose mode depends on the others
+    modes = [*(event.begin(machine, s, state) for event in mode_events), *own]
+    modes = constant_modes(modes, s)
+    if any(event.needs_all_modes for event in mode_events):  # their modes depend on the others
         modes = struck_modes(machine, s, state, modes)
     return modes
 
@@ -152,18 +152,18 @@ def struck_modes(
     contact: Scalars = (),
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
-    held = []
-    together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
+    event_modes = []
+    solve_together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
-        if together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
-            held.append(event.slip_sign(machine, s, state))  # pyright: ignore
+        if solve_together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
+            event_modes.append(event.slip_sign(machine, s, state))  # pyright: ignore
         elif event.holds_mode:
-            _, place, more = event_of(machine, number, modes, contact)
-            held.append(event.struck(machine, s, state, *modes[place], **more))
-    kept = modes[len(held) :] if own is None else own
-    modes = settled_modes([*held, *kept], s)
-    if together:
-        modes = settled_modes(chosen_together(machine, s, state, modes, contact), s)
+            _, part, keywords = event_of(machine, number, modes, contact)
+            event_modes.append(event.struck(machine, s, state, *modes[part], **keywords))
+    machine_modes = modes[len(event_modes) :] if own is None else own
+    modes = constant_modes([*event_modes, *machine_modes], s)
+    if solve_together:
+        modes = constant_modes(choose_modes(machine, s, state, modes, contact), s)
     return modes
 
 
@@ -201,7 +201,7 @@ def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple
     return tuple(found.get(name, old) for name, old in pairs)
 
 
-def settled_modes(modes: Sequence[Any], s: Scalar) -> Modes:
+def constant_modes(modes: Sequence[Any], s: Scalar) -> Modes:
     """Return modes as floats without derivatives, as the loop carries them."""
     return tuple(stop_gradient(jnp.asarray(mode, jnp.result_type(s))) for mode in modes)
 
@@ -259,7 +259,7 @@ def begun(machine: Machine, state: State, axes: int = 0) -> State:
 
     def begin(state: State) -> Any:
         zero = jnp.zeros_like(machine.position(state))
-        return settled_modes(modes_at_start(machine, zero, state), zero)
+        return constant_modes(modes_at_start(machine, zero, state), zero)
 
     for _ in range(axes):
         begin = jax.vmap(begin)
@@ -306,7 +306,7 @@ class Switch(AbstractSwitch):
     def begin(self, machine, s, state):
         """Return the sign of the function."""
         whose = f"The function of {self.name or 'a Switch'} of a {type(machine).__name__}"
-        value = called(self.function, whose, machine, s, state)
+        value = call_checked(self.function, whose, machine, s, state)
         rate = jnp.ones_like(value) if self.rate is None else self.rate(machine, s, state)
         positive = (value > 0) | ((value == 0) & (rate >= 0))
         return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
@@ -322,8 +322,8 @@ class Switch(AbstractSwitch):
         size = size_of(function, state, jtu.tree_map(jnp.abs, state))
         size = size + jnp.asarray(machine.cycle) / (2 * jnp.pi) * (jnp.abs(up) + jnp.abs(down))
         rounding = 64 * float(jnp.finfo(up.dtype).eps) * size
-        here = jnp.abs(stop_gradient(function(state))) <= stop_gradient(rounding)
-        return jnp.where(here & (up < 0) & (down > 0), 0.0, side)
+        on_surface = jnp.abs(stop_gradient(function(state))) <= stop_gradient(rounding)
+        return jnp.where(on_surface & (up < 0) & (down > 0), 0.0, side)
 
     def guard(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the function, with the sign for which it rises at the event. While the motion
@@ -352,7 +352,7 @@ class Switch(AbstractSwitch):
         return state, jnp.where(slides, 0.0, jnp.where(mode == 0, leaves, -mode))
 
     def _rates(self, machine: Machine, s: Scalar, state: State, around: EventContext) -> Scalars:
-        up, down = (field_in(machine, s, state, around.instead(mode)) for mode in (1.0, -1.0))
+        up, down = (field_in(machine, s, state, around.with_mode(mode)) for mode in (1.0, -1.0))
         return tuple(rate_of(self.function, machine, s, state, x) for x in (up, down))
 
 
@@ -419,20 +419,20 @@ class Reset(AbstractEvent):
 
     def guard(self, machine, s, state, *modes):
         """Return the function `guard`, with the opposite sign if the direction is falling."""
-        found = self._called("guard", self._guard, machine, s, state, modes)
+        found = self._call("guard", self._guard, machine, s, state, modes)
         return -found if self.direction == "falling" else found
 
     def one_way(self) -> "tuple[Reset, ...]":
         """Return one event for each direction."""
         if self.direction != "both":
             return (self,)
-        return tuple(with_static(self, direction=way) for way in ("rising", "falling"))
+        return tuple(with_static(self, direction=direction) for direction in ("rising", "falling"))
 
     def after(self, machine, s, state, *modes):
         """Return the results of `reset` and `modes`."""
         own = None
         if self._modes is not None:
-            found = self._called("modes", self._modes, machine, s, state, modes)
+            found = self._call("modes", self._modes, machine, s, state, modes)
             own = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
         return new, struck_modes(machine, s, new, modes, own)
@@ -441,12 +441,12 @@ class Reset(AbstractEvent):
         """Return the state after the function `reset`."""
         if self._reset is None:
             return state
-        found = self._called("reset", self._reset, machine, s, state, modes)
+        found = self._call("reset", self._reset, machine, s, state, modes)
         return changed(state, found, self._whose("reset", machine))
 
-    def _called(self, part, function, machine, s, state, modes):
+    def _call(self, part, function, machine, s, state, modes):
         whose = self._whose(part, machine)
-        return called(function, whose, machine, s, state, *shown_modes(machine, modes))
+        return call_checked(function, whose, machine, s, state, *shown_modes(machine, modes))
 
     def _whose(self, part: str, machine: Any) -> str:
         return f"`{part}` of {self.name or 'a Reset'} of a {type(machine).__name__}"
@@ -455,10 +455,10 @@ class Reset(AbstractEvent):
         """Return the result of the function `when`, or `None` without one."""
         if self._when is None:
             return None
-        return self._called("when", self._when, machine, s, state, modes)
+        return self._call("when", self._when, machine, s, state, modes)
 
     def value(self, machine, s, state, *modes):
         """Return the result of the function `value`, or NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
-        return self._called("value", self._value, machine, s, state, modes)
+        return self._call("value", self._value, machine, s, state, modes)

@@ -32,9 +32,9 @@ from .contacts import (
     constrained_rate,
     field_in,
     forces,
+    push_gains,
     push_of,
     rate_of,
-    shares,
     velocity_change,
 )
 from .event import AbstractSwitch, EventContext
@@ -44,7 +44,7 @@ from .state import with_components
 # In a tried set of modes, a force may have the wrong sign up to this share of the largest friction
 # force: a choice, far above the accuracy of an event, at which the force equals the largest
 # friction and the body does not accelerate yet.
-_STILL = 1e-6
+_FORCE_TOLERANCE = 1e-6
 
 
 class Friction(AbstractSwitch):
@@ -95,7 +95,7 @@ class Friction(AbstractSwitch):
         slips = self.slip_sign(machine, s, state)
         if not self.is_known(around):
             return slips
-        return jnp.where(slips == 0, self._from_rest(machine, s, state, around, True), slips)
+        return jnp.where(slips == 0, self._mode_at_rest(machine, s, state, around, True), slips)
 
     def guard(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard of slip that vanishes, or of a force that exceeds friction. It is
@@ -104,43 +104,43 @@ class Friction(AbstractSwitch):
 
     def sides(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard for a force forward and for one backward."""
-        slows = -mode * self.speed_of_slip(machine, s, state)
+        slip_guard = -mode * self.speed_of_slip(machine, s, state)
         if around is None or not self.is_known(around):
-            return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slows),)
+            return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
         touches = self.touches(machine, around.contact)
 
         def forces() -> tuple[Scalar, Scalar]:
-            pull, most = self._balance(machine, s, state, around, mode)
-            return pull - most, -pull - most
+            pull, largest = self._balanced_force(machine, s, state, around, mode)
+            return pull - largest, -pull - largest
 
         # Without sticking, no force is computed.
-        free = jnp.where(touches, slows, -1.0)
-        return jax.lax.cond((mode == 0) & touches, forces, lambda: (free, free))
+        without_forces = jnp.where(touches, slip_guard, -1.0)
+        return jax.lax.cond((mode == 0) & touches, forces, lambda: (without_forces, without_forces))
 
-    def _balance(
+    def _balanced_force(
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
     ) -> tuple[Any, Any]:
         """Return the force that friction balances on a body that sticks, and the largest one.
         **Arguments:** `around`, the other modes and the resting contacts; `mode`, its own."""
-        once: Any = _held
-        _, found = once(machine, s, state, around.instead(mode), around.contact)
-        force, most, _ = self.held(machine, s, state, around.contact, found[around.own])
-        return -force, most
+        solve: Any = _solve_forces
+        _, found = solve(machine, s, state, around.with_mode(mode), around.contact)
+        force, largest, _ = self.held(machine, s, state, around.contact, found[around.mode_index])
+        return -force, largest
 
-    def _from_rest(
+    def _mode_at_rest(
         self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
     ) -> Scalar:
         """Return the mode of a body without slip: sticking if the force is not too large, else the
         direction of the force. **Arguments:** `sticks`, whether the body may stick at all."""
         if not self.is_known(around):
             return jnp.zeros_like(s)
-        pull, most = self._balance(machine, s, state, around, jnp.zeros_like(s))
-        holds = sticks & (jnp.abs(pull) <= most) | ~self.touches(machine, around.contact)
+        pull, largest = self._balanced_force(machine, s, state, around, jnp.zeros_like(s))
+        holds = sticks & (jnp.abs(pull) <= largest) | ~self.touches(machine, around.contact)
         return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
 
 
 @eqx.filter_jit
-def _held(
+def _solve_forces(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
     """Return `constrained_rate`, jitted: a step calls it often, and JAX differentiates it once."""
@@ -200,7 +200,7 @@ class DryFriction(Friction):
 
     def speed_of_slip(self, machine, s, state):
         if self.slip is not None:
-            return jnp.asarray(asked(self.slip, machine, s, state))
+            return jnp.asarray(call_law(self.slip, machine, s, state))
         return machine._coordinate_on(self.on, self.mass).velocity(state)
 
     def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
@@ -236,7 +236,7 @@ class DryFriction(Friction):
         level = self.level
         if callable(level):
             level = level(mode * self.speed_of_slip(machine, s, state))
-        return level if self.load is None else level * asked(self.load, machine, s, state)
+        return level if self.load is None else level * call_law(self.load, machine, s, state)
 
     def sticking(self, machine: Machine, s: Scalar, state: State) -> Any:
         """Return the largest force that friction can balance on a body at rest."""
@@ -249,7 +249,7 @@ class DryFriction(Friction):
 
     def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         new = self.stopped(machine, s, state)
-        return new, self._from_rest(machine, s, new, around, mode != 0)
+        return new, self._mode_at_rest(machine, s, new, around, mode != 0)
 
     def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
         """Return the state with a slip of zero, where it vanishes to rounding."""
@@ -319,9 +319,9 @@ class ContactFriction(Friction):
         pushes = [push_of(body, state) for body in both]
         stops = [self.touches(machine, () if around is None else around.contact), mode != 0]
         wanted = [-body.velocity(state) for body in both]
-        amounts = forces(shares(both, state, pushes), stops, wanted)
+        amounts = forces(push_gains(both, state, pushes), stops, wanted)
         state = added(state, amounts, pushes)
-        return state, self._from_rest(machine, s, state, around, mode != 0)
+        return state, self._mode_at_rest(machine, s, state, around, mode != 0)
 
     def touches(self, machine, contact):
         if not contact:
@@ -337,21 +337,21 @@ class ContactFriction(Friction):
         return None
 
 
-def asked(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:
+def call_law(function: Callable[..., Any], machine: Machine, s: Scalar, state: State) -> Any:
     """Call a function of the state, of time and state, or of machine, time and state."""
     return function(*(machine, s, state)[3 - _argument_count(function) :])
 
 
 def _argument_count(function: Callable[..., Any]) -> int:
     try:
-        known = inspect.signature(function).parameters.values()
-        many = sum(x.default is x.empty and x.kind < x.VAR_POSITIONAL for x in known)
+        parameters = inspect.signature(function).parameters.values()
+        count = sum(x.default is x.empty and x.kind < x.VAR_POSITIONAL for x in parameters)
     except (TypeError, ValueError):  # not a Python function
-        many = 1
-    return min(max(many, 1), 3)
+        count = 1
+    return min(max(count, 1), 3)
 
 
-def chosen_together(
+def choose_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     released: tuple[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
@@ -363,30 +363,30 @@ def chosen_together(
     **Arguments:** `modes`, all of the machine; `contact`, as in `EventContext`; `released`, the
     index of a friction that does not stick again, and whether this holds.
     """
-    places = frictions_in(machine)
+    indices = frictions_in(machine)
     switches = switches_of(machine)
-    signs = [switches[i].slip_sign(machine, s, state) for i in places]
+    signs = [switches[i].slip_sign(machine, s, state) for i in indices]
     slips = [x != 0 for x in signs]
     if released is not None:  # the slip of a sticking body is rounding
         slips = [
             x & (modes[i] != 0) & (i != released[0]) if switches[i].is_dry else x
-            for i, x in zip(places, slips, strict=True)
+            for i, x in zip(indices, slips, strict=True)
         ]
-    sets = itertools.product((0.0, 1.0, -1.0), repeat=len(places))
+    sets = itertools.product((0.0, 1.0, -1.0), repeat=len(indices))
     ordered = jnp.asarray(sorted(sets, key=lambda x: sum(map(abs, x))), jnp.result_type(s))
 
-    def tried(x: tuple[Any, ...]) -> tuple[Any, ...]:
+    def try_next(x: tuple[Any, ...]) -> tuple[Any, ...]:
         _, number, _ = x
         new, chosen = list(modes), ordered[number]
-        for k, (i, slip_sign, slip) in enumerate(zip(places, signs, slips, strict=True)):
+        for k, (i, slip_sign, slip) in enumerate(zip(indices, signs, slips, strict=True)):
             new[i] = jnp.where(slip, slip_sign, chosen[k])
-        good = _consistent(machine, s, state, tuple(new), contact, places, slips, released)
+        good = _is_consistent(machine, s, state, tuple(new), contact, indices, slips, released)
         return tuple(new), number + 1, jnp.where(good, 1.0, 0.0)
 
     zero = jnp.zeros_like(s)
     begin = tuple(modes), jnp.zeros((), int), zero
     found, _, good = jax.lax.while_loop(
-        lambda x: (x[2] == 0) & (x[1] < len(ordered)), tried, stop_gradient(begin)
+        lambda x: (x[2] == 0) & (x[1] < len(ordered)), try_next, stop_gradient(begin)
     )
     return tuple(jnp.where(good > 0, new, old) for new, old in zip(found, modes, strict=True))
 
@@ -397,25 +397,25 @@ def frictions_in(machine: Machine) -> list[int]:
     return [i for i, x in switches if x.is_dry or x.friction_stop is not None]
 
 
-def _consistent(
+def _is_consistent(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    places: list[int], slips: list[Flag], released: tuple[int, Flag] | None,
+    indices: list[int], slips: list[Flag], released: tuple[int, Flag] | None,
 ) -> Flag:  # fmt: skip
     """Return whether all forces agree with these modes: sticking bodies are held, and bodies that
     begin to slip are accelerated in that direction."""
-    once: Any = _held
-    total, forces = once(machine, s, state, modes, contact)
+    solve: Any = _solve_forces
+    total, forces = solve(machine, s, state, modes, contact)
     good = jnp.ones((), bool)
-    for i, slip in zip(places, slips, strict=True):
+    for i, slip in zip(indices, slips, strict=True):
         friction, mode = switches_of(machine)[i], modes[i]
         if i not in forces:  # on a stop without a resting body
             continue
         force, holds, mass = friction.held(machine, s, state, contact, forces[i])
         rate = friction.slip_rate(machine, s, state, total)
-        stays = jnp.abs(force) <= holds
+        sticks = jnp.abs(force) <= holds
         if released is not None and released[0] == i:
-            stays = stays & ~released[1]
-        goes = mode * rate * mass >= -_STILL * holds
+            sticks = sticks & ~released[1]
+        slides = mode * rate * mass >= -_FORCE_TOLERANCE * holds
         touches = friction.touches(machine, contact)
-        good = good & (slip | ~touches | jnp.where(mode == 0, stays, goes))
+        good = good & (slip | ~touches | jnp.where(mode == 0, sticks, slides))
     return good

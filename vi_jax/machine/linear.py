@@ -37,7 +37,7 @@ _RIGID = 16
 # motion cancel in more than three digits.
 _RESONANT = 1e-3
 # The same for a constant force, κ over ω².
-_LOOSE = 1e-3
+_SOFT = 1e-3
 
 
 class Coupling(NamedTuple):
@@ -98,7 +98,7 @@ class ModalMachine(AbstractMachine):
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """The machine's coordinates as functions of the modes."""
-        return tuple(along(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
+        return tuple(coordinate(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
 
     def force(self, s: Scalar) -> Numbers:
         """Return the forces on the modes, per unit of mass."""
@@ -133,7 +133,7 @@ class ModalMachine(AbstractMachine):
         return 1 / jnp.maximum(jnp.max(jnp.abs(self.damping)), tiny)
 
 
-def along(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
+def coordinate(row: Numbers, push: Numbers, mass: Scalar) -> Coordinate:
     """Return the coordinate c·x; `row` is c, `push` M⁻¹c/(cᵀM⁻¹c), and `mass` 1/(cᵀM⁻¹c)."""
 
     def placed(state: State, Y: Scalar, V: Scalar) -> Any:
@@ -193,48 +193,48 @@ class _Basis(NamedTuple):
 def modal(machine: Any) -> Modes:
     """Return a linear machine in its natural modes (see the top of this file)."""
     loss = machine.damping
-    both = machine.mass, jnp.zeros(machine.size) if loss is None else loss, machine.stiffness
-    found = _as_it_is(*both) if all(x.ndim == 1 for x in both) else _diagonalized(*both)
+    terms = machine.mass, jnp.zeros(machine.size) if loss is None else loss, machine.stiffness
+    found = _diagonal_basis(*terms) if all(x.ndim == 1 for x in terms) else _modal_basis(*terms)
     omega = machine.frequency
 
-    def onto(f: Any) -> Any:  # a force, or a row, in modal components
+    def in_modes(f: Any) -> Any:  # a force, or a row, in modal components
         return f if f is None or found.shapes is None else f @ found.shapes
 
-    acting = [None if f is None else found.inverse * onto(f) for f in machine.forces]
-    forces = acting[0], acting[1], acting[2]
+    modal_forces = [None if f is None else found.inverse * in_modes(f) for f in machine.forces]
+    forces = modal_forces[0], modal_forces[1], modal_forces[2]
     steady, resonant = _steady(forces, found, omega)
     plain = ~resonant
     if found.coupling is not None:
         plain = plain & (found.coupling.on == 0)
-    rows = tuple(onto(c) for c in machine.rows)
-    mobile = [found.inverse * c for c in rows]
-    masses = tuple(1 / jnp.dot(c, m) for c, m in zip(rows, mobile, strict=True))
+    rows = tuple(in_modes(c) for c in machine.rows)
+    responses = [found.inverse * c for c in rows]
+    masses = tuple(1 / jnp.dot(c, m) for c, m in zip(rows, responses, strict=True))
     kappa, c = stop_gradient((found.stiffness, found.damping))
-    pace, square = jnp.sqrt(jnp.abs(kappa)), kappa - 0.25 * c * c
+    frequency, square = jnp.sqrt(jnp.abs(kappa)), kappa - 0.25 * c * c
     swing = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    made = ModalMachine(
+    modal_machine = ModalMachine(
         stops=tuple(without_row(stop) for stop in machine.contacts),
         frequency=omega,
         stiffness=found.stiffness,
         damping=found.damping,
-        modal_frequency=pace,
-        inverse_frequency=1 / jnp.where(pace > 0, pace, 1.0),
+        modal_frequency=frequency,
+        inverse_frequency=1 / jnp.where(frequency > 0, frequency, 1.0),
         swing=swing,
         swing_time=1 / swing,
-        oscillates=jnp.where(jnp.all(square > 0), 1.0, 0.0).astype(pace.dtype),
-        all_decay=jnp.where(jnp.all((square > 0) & (c >= 0)), 1.0, 0.0).astype(pace.dtype),
+        oscillates=jnp.where(jnp.all(square > 0), 1.0, 0.0).astype(frequency.dtype),
+        all_decay=jnp.where(jnp.all((square > 0) & (c >= 0)), 1.0, 0.0).astype(frequency.dtype),
         fastest=stop_gradient(jnp.maximum(found.fastest, omega)),
         coupling=found.coupling,
         forces=forces,
         steady=steady,
-        plain=jnp.where(plain, 1.0, 0.0).astype(pace.dtype),
+        plain=jnp.where(plain, 1.0, 0.0).astype(frequency.dtype),
         rows=rows,
-        pushes=tuple(m * one for m, one in zip(mobile, masses, strict=True)),
+        pushes=tuple(m * mass for m, mass in zip(responses, masses, strict=True)),
         masses=masses,
     )
     shapes, into = found.shapes, found.into
     return Modes(
-        made,
+        modal_machine,
         lambda x: x if into is None else into @ x,
         lambda q: q if shapes is None else shapes @ q,
     )
@@ -245,47 +245,47 @@ def without_row(stop: RigidStop) -> RigidStop:
     return stop if stop.at is None else eqx.tree_at(lambda x: x.at, stop, None)
 
 
-def _as_it_is(mass: Numbers, damping: Numbers, stiffness: Numbers) -> _Basis:
+def _diagonal_basis(mass: Numbers, damping: Numbers, stiffness: Numbers) -> _Basis:
     """Return the basis of a machine with diagonal matrices: its coordinates are its modes."""
     kappa, c = stiffness / mass, damping / mass
     fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.max(jnp.abs(c))
     return _Basis(None, None, 1 / mass, kappa, c, None, fastest)
 
 
-def _diagonalized(mass: Any, damping: Any, stiffness: Any) -> _Basis:
+def _modal_basis(mass: Any, damping: Any, stiffness: Any) -> _Basis:
     """Return the modes of mass and stiffness, with all coupling between them."""
     M, C, K = (jnp.diag(x) if x.ndim == 1 else x for x in (mass, damping, stiffness))
     n, eps = M.shape[0], jnp.finfo(M.dtype).eps
     L = jnp.linalg.cholesky(M)
     inverse = solve_triangular(L, jnp.eye(n, dtype=M.dtype), lower=True)
-    own, seen = inverse @ K @ inverse.T, inverse @ C @ inverse.T
-    U = stop_gradient(jnp.linalg.eigh(stop_gradient(0.5 * (own + own.T)))[1])
-    own, seen = U.T @ own @ U, U.T @ seen @ U
-    kappa, c = jnp.diag(own), jnp.diag(seen)
+    K_modal, C_modal = inverse @ K @ inverse.T, inverse @ C @ inverse.T
+    U = stop_gradient(jnp.linalg.eigh(stop_gradient(0.5 * (K_modal + K_modal.T)))[1])
+    K_modal, C_modal = U.T @ K_modal @ U, U.T @ C_modal @ U
+    kappa, c = jnp.diag(K_modal), jnp.diag(C_modal)
     rigid = jnp.abs(kappa) <= _RIGID * n * eps * jnp.max(jnp.abs(kappa))
     kappa = kappa - stop_gradient(jnp.where(rigid, kappa, 0.0))
-    aside = own - jnp.diag(jnp.diag(own))
-    rest = seen - jnp.diag(c)
-    most = jnp.max(jnp.abs(stop_gradient(seen)))
-    mixed = jnp.max(jnp.abs(stop_gradient(rest))) > _UNCOUPLED * eps * most
-    rest = rest - jnp.where(mixed, 0.0, stop_gradient(rest))
-    on = jnp.maximum(jnp.where(mixed, 1.0, 0.0), _asked(M, C, K))
-    fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.sqrt(jnp.sum(stop_gradient(seen) ** 2))
+    K_coupling = K_modal - jnp.diag(jnp.diag(K_modal))
+    C_coupling = C_modal - jnp.diag(c)
+    largest = jnp.max(jnp.abs(stop_gradient(C_modal)))
+    is_coupled = jnp.max(jnp.abs(stop_gradient(C_coupling))) > _UNCOUPLED * eps * largest
+    C_coupling = C_coupling - jnp.where(is_coupled, 0.0, stop_gradient(C_coupling))
+    on = jnp.maximum(jnp.where(is_coupled, 1.0, 0.0), _one_if_differentiated(M, C, K))
+    fastest = jnp.max(jnp.sqrt(jnp.abs(kappa))) + jnp.sqrt(jnp.sum(stop_gradient(C_modal) ** 2))
     shapes = inverse.T @ U
     scale = stop_gradient(jnp.max(jnp.abs(shapes)))
-    coupling = Coupling(aside - stop_gradient(aside), rest, on.astype(M.dtype))
+    coupling = Coupling(K_coupling - stop_gradient(K_coupling), C_coupling, on.astype(M.dtype))
     square = jnp.full((n,), scale * scale, M.dtype)
     return _Basis(shapes / scale, scale * (U.T @ L.T), square, kappa, c, coupling, fastest)
 
 
 @jax.custom_jvp
-def _asked(*matrices: Any) -> Scalar:
+def _one_if_differentiated(*matrices: Any) -> Scalar:
     """Return 1 under differentiation with respect to a machine's matrices, else 0. The modes are
     then coupled by zeros with nonzero derivatives."""
     return jnp.zeros((), matrices[0].dtype)
 
 
-@_asked.defjvp
+@_one_if_differentiated.defjvp
 def _(matrices, _):
     one = jnp.ones((), matrices[0].dtype)
     return one, jnp.zeros_like(one)
@@ -299,19 +299,19 @@ def _steady(forces: Any, found: _Basis, omega: Scalar) -> tuple[Any, Flag]:
     kappa, c = found.stiffness, found.damping
     zero = jnp.zeros_like(kappa)
     constant, cosine, sine = (zero if f is None else f for f in forces)
-    loose = stop_gradient(jnp.abs(kappa) <= _LOOSE * omega**2)
+    is_soft = stop_gradient(jnp.abs(kappa) <= _SOFT * omega**2)
     detune, drag = kappa - omega**2, omega * c
     square = detune**2 + drag**2
     size = _RESONANT * (jnp.abs(kappa) + omega**2)
-    near = stop_gradient(square <= size**2)
-    scale = jnp.where(near, 0.0, 1 / jnp.where(near, 1.0, square))
+    is_resonant = stop_gradient(square <= size**2)
+    scale = jnp.where(is_resonant, 0.0, 1 / jnp.where(is_resonant, 1.0, square))
     steady = (
-        jnp.where(loose, 0.0, constant / jnp.where(loose, 1.0, kappa)),
+        jnp.where(is_soft, 0.0, constant / jnp.where(is_soft, 1.0, kappa)),
         scale * (cosine * detune - sine * drag),
         scale * (sine * detune + cosine * drag),
     )
-    shaken = near & ((cosine != 0) | (sine != 0))
-    return steady, jnp.any(shaken | (loose & (constant != 0)))
+    is_driven = is_resonant & ((cosine != 0) | (sine != 0))
+    return steady, jnp.any(is_driven | (is_soft & (constant != 0)))
 
 
 class StructureState(Shown):
@@ -395,10 +395,10 @@ class LinearMachine(AbstractMachine):
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """One coordinate for each c: the sum c·x of displacements that stops limit."""
-        mobile = [self._accelerated(c) for c in self.rows]
-        masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, mobile, strict=True)]
-        pushes = [m * one for m, one in zip(mobile, masses, strict=True)]
-        return tuple(along(*x) for x in zip(self.rows, pushes, masses, strict=True))
+        responses = [self._accelerated(c) for c in self.rows]
+        masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, responses, strict=True)]
+        pushes = [m * mass for m, mass in zip(responses, masses, strict=True)]
+        return tuple(coordinate(*x) for x in zip(self.rows, pushes, masses, strict=True))
 
     @property
     def cycle(self) -> Scalar:
@@ -468,12 +468,12 @@ class LinearMachine(AbstractMachine):
 
     def mirrored(self, state: StructureState) -> StructureState | None:
         """Return -x half a cycle later, if no constant force acts and each stop has its image."""
-        steady, alike = self.forces[0], [without_row(stop) for stop in self.contacts]
-        pressed = None if steady is None else concrete(steady)
-        if steady is not None and (pressed is None or pressed.any()):
+        steady, stops = self.forces[0], [without_row(stop) for stop in self.contacts]
+        known = None if steady is None else concrete(steady)
+        if steady is not None and (known is None or known.any()):
             return None
-        for stop in alike:
-            others = (x for x in alike if x.coordinate == stop.coordinate)
+        for stop in stops:
+            others = (x for x in stops if x.coordinate == stop.coordinate)
             if not any(stop.mirrors(x) for x in others):
                 return None
         return StructureState(-state.displacement, -state.velocity)
@@ -485,10 +485,10 @@ class LinearMachine(AbstractMachine):
     def prepared(self) -> Prepared:
         """Return the machine in its modes, or as it is if a subclass overrides `_IN_MODES`."""
         if changed(self, LinearMachine, _IN_MODES):
-            return Prepared(self._with_known())
+            return Prepared(self._with_step_values())
         return self.prepared_modes()
 
-    def _with_known(self) -> "LinearMachine":
+    def _with_step_values(self) -> "LinearMachine":
         """Return the machine with values that its steps would compute: a lane's steps have no
         vector code for eigenvalues, and to solve by M takes n³ operations each time."""
         longest = stop_gradient(self.step_limit(jnp.zeros(()), self.start()))

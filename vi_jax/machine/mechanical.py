@@ -19,18 +19,18 @@ import numpy as np
 from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
-from .base import AbstractMachine, once_a_trace
+from .base import AbstractMachine, cached_in_trace
 from .coordinates import Coordinate, component
-from .numbers import split_place
+from .numbers import split_index
 from .state import State as Named
 from .state import like
 
 # A mass matrix as rows of numbers.
 Matrix = list[list[Any]]
 
-# Errors of the position of a prescribed coordinate decay by exp(-2π), 2e-3, in a cycle. A choice: a
-# rate of twice that takes half again as many steps.
-_FADES = 2 * pi
+# Errors of the position of a prescribed coordinate decay by exp(-2π), 2e-3, in a cycle. A choice:
+# twice that rate takes 1.5 times as many steps.
+_DECAY = 2 * pi
 
 
 class Mechanical(AbstractMachine):
@@ -101,7 +101,7 @@ class Mechanical(AbstractMachine):
                 f'A {type(self).__name__} must have `q`: write `q = ("x", "y")` in the class, the '
                 "names of its coordinates."
             )
-        return dict(map(split_place, (self.q,) if isinstance(self.q, str) else self.q))
+        return dict(map(split_index, (self.q,) if isinstance(self.q, str) else self.q))
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -130,10 +130,10 @@ class Mechanical(AbstractMachine):
         known = {x: f for x, f in given.items() if _is_zero(f)} if isinstance(given, dict) else {}
         applied = vars(applied) | known
         both = zip(applied.values(), self._inertial(q, v), strict=True)
-        left = [_less(f, 1.0, h) for f, h in both]
-        rates = dict(zip(names, solved(self.masses(q), left), strict=True))
+        net_forces = [_minus_product(f, 1.0, h) for f, h in both]
+        rates = dict(zip(names, solved(self.masses(q), net_forces), strict=True))
         if len(names) < len(self.q_names):
-            rates |= self._guided(t, q, v)
+            rates |= self._prescribed_accelerations(t, q, v)
         zero, v_rates = jax.tree.map(jnp.zeros_like, state), {x: rates[x] for x in self.q_names}
         return _in_state(zero, *self._by_s(t, state, v, Named(**v_rates)))
 
@@ -149,20 +149,20 @@ class Mechanical(AbstractMachine):
             )
         return jax.tree.map(lambda x: pace * x, rates)
 
-    def _guided(self, t: Scalar, q: Named, v: Named) -> dict[str, Any]:
+    def _prescribed_accelerations(self, t: Scalar, q: Named, v: Named) -> dict[str, Any]:
         """Return the accelerations of prescribed coordinates. They let errors of steps decay.
         Otherwise errors would add up, and an orbit would be neutrally stable in them."""
-        one, rate = jnp.ones_like(t), _FADES / self.cycle
+        one, rate = jnp.ones_like(t), _DECAY / self.cycle
 
-        def moves(t: Scalar) -> Any:
+        def motion(t: Scalar) -> Any:
             return jax.jvp(self.prescribed, (t,), (one,))
 
-        (places, speeds), (_, pulls) = jax.jvp(moves, (t,), (one,))
+        (positions, speeds), (_, accelerations) = jax.jvp(motion, (t,), (one,))
         return {
-            name: pull
+            name: acceleration
             + 2 * rate * (speeds[name] - getattr(v, name))
-            + rate**2 * (places[name] - getattr(q, name))
-            for name, pull in pulls.items()
+            + rate**2 * (positions[name] - getattr(q, name))
+            for name, acceleration in accelerations.items()
         }
 
     def places(self, state: State) -> Named:
@@ -199,9 +199,9 @@ class Mechanical(AbstractMachine):
                 continue
             speed = getattr(v, name)
             is_array = jnp.ndim(speed) > 0
-            slopes = _change(momenta, q, name, speed if is_array else jnp.ones_like(speed))
+            slopes = _rate_along(momenta, q, name, speed if is_array else jnp.ones_like(speed))
             slopes = [x if y else 0.0 for x, y in zip(slopes, acts, strict=True)]
-            pull = _slope(twice_energy, q, name) if is_array else _dot(slopes, speeds)
+            pull = _derivative(twice_energy, q, name) if is_array else _dot(slopes, speeds)
             for x, slope in zip(names, slopes, strict=True):
                 if not _is_zero(slope):
                     found[x] = _sum((found[x], slope if is_array else slope * speed))
@@ -211,30 +211,30 @@ class Mechanical(AbstractMachine):
 
     def _coordinate_on(self, on: Any, mass: Any = None) -> Coordinate:
         return Coordinate(
-            functools.partial(_place, self, on),
-            functools.partial(_speed, self, on),
+            functools.partial(_position, self, on),
+            functools.partial(_velocity, self, on),
             functools.partial(_placed, self, on),
-            functools.partial(_effective, self, on),
-            functools.partial(_pushed, self, on),
+            functools.partial(_effective_mass, self, on),
+            functools.partial(_push_state, self, on),
         )
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
-        name = _named(self, on)
+        name = _coordinate_name(self, on)
         return None if name is None else (name, f"v.{name}")
 
 
-@once_a_trace
+@cached_in_trace
 def _mass_of(machine: Any) -> Any:
     return getattr(machine, "mass", None)
 
 
-def _named(machine: Mechanical, on: Any) -> str | None:
+def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     """Return the name of a coordinate, or `None` for a gap."""
     name = machine.q_names[0] if on is None else on
     if not isinstance(name, str):
         return None
-    base, place = split_place(name)
-    if len(machine.q_shapes.get(base, (0,))) != len(place):
+    base, index = split_index(name)
+    if len(machine.q_shapes.get(base, (0,))) != len(index):
         names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine.q_shapes.items()]
         raise ValueError(
             f"Argument `on` of a contact must be one of the coordinates {tuple(names)}, or a "
@@ -243,26 +243,26 @@ def _named(machine: Mechanical, on: Any) -> str | None:
     return name
 
 
-def _place(machine: Mechanical, on: Any, state: State) -> Any:
-    name = _named(machine, on)
+def _position(machine: Mechanical, on: Any, state: State) -> Any:
+    name = _coordinate_name(machine, on)
     return on(machine.places(state)) if name is None else component(name, state)
 
 
-def _speed(machine: Mechanical, on: Any, state: State) -> Any:
-    name, v = _named(machine, on), state.v
+def _velocity(machine: Mechanical, on: Any, state: State) -> Any:
+    name, v = _coordinate_name(machine, on), state.v
     if name is not None:
         return component(name, v)
     return jax.jvp(on, (machine.places(state),), (v,))[1]
 
 
-def _slopes(machine: Mechanical, on: Any, q: Named) -> list[Any]:
+def _gradient(machine: Mechanical, on: Any, q: Named) -> list[Any]:
     """Return J, the gradient of a gap; its constant entries are plain numbers."""
-    name, names = _named(machine, on), machine.q_names
+    name, names = _coordinate_name(machine, on), machine.q_names
     if name is not None:
-        base, place = split_place(name)
-        one = jnp.zeros_like(getattr(q, base)).at[place].set(1.0) if place else 1.0
+        base, index = split_index(name)
+        one = jnp.zeros_like(getattr(q, base)).at[index].set(1.0) if index else 1.0
         return [one if x == base else 0.0 for x in names]
-    return [_slope(on, q, x) if any(acts) else 0.0 for x, acts in _dependence(on, q).items()]
+    return [_derivative(on, q, x) if any(acts) else 0.0 for x, acts in _dependence(on, q).items()]
 
 
 def _dependence(function: Callable[[Named], Any], q: Named) -> dict[str, list[bool]]:
@@ -272,15 +272,15 @@ def _dependence(function: Callable[[Named], Any], q: Named) -> dict[str, list[bo
     return {name: dependent_results(traced, x, smooth=False) for name, x in marks.items()}
 
 
-def _slope(function: Callable[[Named], Any], q: Named, name: str) -> Any:
+def _derivative(function: Callable[[Named], Any], q: Named, name: str) -> Any:
     """Return the derivative of a number with respect to a coordinate."""
-    here = getattr(q, name)
-    if jnp.ndim(here):
-        return jax.grad(lambda x: function(q.replace(**{name: x})))(here)
-    return _change(function, q, name, jnp.ones_like(here))
+    value = getattr(q, name)
+    if jnp.ndim(value):
+        return jax.grad(lambda x: function(q.replace(**{name: x})))(value)
+    return _rate_along(function, q, name, jnp.ones_like(value))
 
 
-def _change(function: Callable[[Named], Any], q: Named, name: str, speed: Any) -> Any:
+def _rate_along(function: Callable[[Named], Any], q: Named, name: str, speed: Any) -> Any:
     """Return the rate of change of a function if one coordinate moves at this speed."""
     return jax.jvp(lambda x: function(q.replace(**{name: x})), (getattr(q, name),), (speed,))[1]
 
@@ -289,7 +289,7 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
     """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity,
     and the effective mass 1/(J M⁻¹Jᵀ)."""
     names = machine.free_names
-    slopes = dict(zip(machine.q_names, _slopes(machine, on, q), strict=True))
+    slopes = dict(zip(machine.q_names, _gradient(machine, on, q), strict=True))
     slopes = [slopes[name] for name in names]
     push = solved(machine.masses(q), slopes)
     gain = _dot(slopes, push)
@@ -298,16 +298,16 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
             f"A contact of a {type(machine).__name__} is `on` no coordinate that it could move. "
             "Its gap must depend on a coordinate that is not prescribed."
         )
-    by = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
-    return [by.get(name, 0.0) for name in machine.q_names], 1 / gain
+    pushes = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
+    return [pushes.get(name, 0.0) for name in machine.q_names], 1 / gain
 
 
-def _effective(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
+def _effective_mass(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
     return _push(machine, on, machine.places(state))[1]
 
 
-def _pushed(machine: Mechanical, on: Any, state: State) -> Any:
-    q, name = machine.places(state), _named(machine, on)
+def _push_state(machine: Mechanical, on: Any, state: State) -> Any:
+    q, name = machine.places(state), _coordinate_name(machine, on)
     push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
     if name in push:
         push[name] = 1.0
@@ -321,12 +321,12 @@ def _pushed(machine: Mechanical, on: Any, state: State) -> Any:
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:
     """Return the state with another position and velocity of a gap, by the least change in the norm
     of the masses. A coordinate by name is set exactly."""
-    name, q = _named(machine, on), machine.places(state)
-    q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _with(q, name, Y)
+    name, q = _coordinate_name(machine, on), machine.places(state)
+    q = _moved(q, _push(machine, on, q)[0], Y - on(q)) if name is None else _replaced(q, name, Y)
     push, v = _push(machine, on, q)[0], state.v
-    v = _moved(v, push, V - _speed(machine, on, _in_state(state, q, v)))
+    v = _moved(v, push, V - _velocity(machine, on, _in_state(state, q, v)))
     if name is not None:
-        v = _with(v, name, V)
+        v = _replaced(v, name, V)
     return _in_state(state, q, v)
 
 
@@ -334,9 +334,9 @@ def _in_state(state: State, q: Named, v: Named) -> State:
     return state.replace(**vars(q), v=v)
 
 
-def _with(x: Named, name: str, value: Any) -> Named:
-    base, place = split_place(name)
-    return x.replace(**{base: getattr(x, base).at[place].set(value) if place else value})
+def _replaced(x: Named, name: str, value: Any) -> Named:
+    base, index = split_index(name)
+    return x.replace(**{base: getattr(x, base).at[index].set(value) if index else value})
 
 
 def _moved(x: Named, push: list[Any], amount: Any) -> Named:
@@ -396,17 +396,17 @@ def solved(M: Matrix, right: Sequence[Any]) -> list[Any]:
             if _is_zero(rows[k][i]):
                 continue
             ratio = rows[k][i] * inverses[i]
-            rows[k] = [_less(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
+            rows[k] = [_minus_product(a, ratio, b) for a, b in zip(rows[k], rows[i], strict=True)]
     found: list[Any] = [0.0] * n
     for i in reversed(range(n)):
         value = rows[i][n]
         for j in range(i + 1, n):
-            value = _less(value, rows[i][j], found[j])
+            value = _minus_product(value, rows[i][j], found[j])
         found[i] = 0.0 if _is_zero(value) else _times(inverses[i], value)
     return found
 
 
-def _less(x: Any, factor: Any, y: Any) -> Any:
+def _minus_product(x: Any, factor: Any, y: Any) -> Any:
     """Return x - factor·y, without known zeros."""
     return x if _is_zero(factor) or _is_zero(y) else x - _times(factor, y)
 

@@ -36,9 +36,9 @@ def components(state: State, lead: int = 0) -> dict[str, Any]:
     axes those of a batch of states."""
     found = {}
     for name, x in by_name(state).items():
-        for place in np.ndindex(*jnp.shape(x)[lead:]):
-            inner = str(list(place)) if place else ""
-            found[name + inner] = x[(..., *place)] if place else x
+        for index in np.ndindex(*jnp.shape(x)[lead:]):
+            inner = str(list(index)) if index else ""
+            found[name + inner] = x[(..., *index)] if index else x
     return found
 
 
@@ -78,29 +78,29 @@ def plain(x: Any, digits: int) -> str:
 
 def leaf(tree: object, name: str) -> Float[Array, "..."]:
     """Return the number with this name. **Raises:** `ValueError` that lists similar names."""
-    base, place = _place_in(tree, check_leaf(tree, name))
-    return jnp.asarray(by_name(tree)[base])[place]
+    base, index = _split_name(tree, check_leaf(tree, name))
+    return jnp.asarray(by_name(tree)[base])[index]
 
 
 def with_leaf(tree: Any, name: str, value: Any) -> Any:
     """Return the same machine with another value of this number, which may be traced."""
-    base, place = _place_in(tree, check_leaf(tree, name))
-    index = leaf_names(tree).index(base)
+    base, index = _split_name(tree, check_leaf(tree, name))
+    number = leaf_names(tree).index(base)
     leaves, treedef = jtu.tree_flatten(tree)
     arrays = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]
-    old = leaves[arrays[index]]
+    old = leaves[arrays[number]]
     kind = jnp.result_type(old)
     if jnp.issubdtype(kind, jnp.integer) and jnp.issubdtype(jnp.result_type(value), jnp.floating):
         kind = jnp.result_type(float)  # or else it would be truncated
-    if place:
-        leaves[arrays[index]] = jnp.asarray(old, kind).at[place].set(value)
+    if index:
+        leaves[arrays[number]] = jnp.asarray(old, kind).at[index].set(value)
     elif jnp.ndim(old) and not jnp.ndim(value):
         raise ValueError(
             f"A name must be that of one number of the machine, but {name!r} is an array of shape "
             f"{jnp.shape(old)}; name one of its numbers, as {name + str([0] * jnp.ndim(old))!r}."
         )
     else:
-        leaves[arrays[index]] = jnp.asarray(value, kind)
+        leaves[arrays[number]] = jnp.asarray(value, kind)
     return jtu.tree_unflatten(treedef, leaves)
 
 
@@ -111,11 +111,11 @@ def with_leaves(tree: Any, values: Mapping[str, Any]) -> Any:
     return tree
 
 
-def _place_in(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
-    return (name, ()) if name in by_name(tree) else split_place(name)
+def _split_name(tree: object, name: str) -> tuple[str, tuple[int, ...]]:
+    return (name, ()) if name in by_name(tree) else split_index(name)
 
 
-def split_place(name: str) -> tuple[str, tuple[int, ...]]:
+def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     """Return an array's name and an index in it, of `"x[1, 2]"`; `()` without brackets."""
     if not name.endswith("]"):
         return name, ()
@@ -139,10 +139,10 @@ def check_name(names: list[str], name: str, argument: str, machine: object = Non
             f"Argument `{argument}` must be a number of the machine, but {name!r} has no type in "
             f"the class. Write `{name}: float = {untyped!r}`."
         )
-    near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
+    similar = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
     ending = [other for other in names if str(name).split(".")[-1] in other]
-    near = list(dict.fromkeys(ending + near))
-    hint = f"near names: {', '.join(near)}" if near else f"its names: {', '.join(names)}"
+    similar = list(dict.fromkeys(ending + similar))
+    hint = f"near names: {', '.join(similar)}" if similar else f"its names: {', '.join(names)}"
     raise ValueError(
         f"Argument `{argument}` must be a number of the machine, but got {name!r}; {hint}."
     )
@@ -341,8 +341,8 @@ def _parts(x: object) -> tuple[str, list[tuple[str, Any]], str]:
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         values = [(f.name, getattr(x, f.name, None)) for f in dataclasses.fields(x) if f.repr]
         left_out = (type(None), tuple, str)  # absent or empty
-        there = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
-        return name, there, ")"
+        shown = [(k, part) for k, part in values if not isinstance(part, left_out) or part]
+        return name, shown, ")"
     if isinstance(x, tuple) and hasattr(x, "_fields"):
         return name, list(zip(x._fields, x, strict=True)), ")"  # pyright: ignore
     if name == "State(":

@@ -50,13 +50,13 @@ class derived:
 
     by_default = True
 
-    def __init__(self, found: Callable[[Any], Any]):
-        self.found, self.__doc__ = found, found.__doc__
+    def __init__(self, function: Callable[[Any], Any]):
+        self.function, self.__doc__ = function, function.__doc__
 
     def __get__(self, part: Any, owner: type) -> Any:
         if part is None:
             raise AttributeError(f"A {owner.__name__} has this attribute, but its class does not.")
-        return self.found(part)
+        return self.function(part)
 
 
 def defines(part: object, name: str) -> bool:

@@ -201,8 +201,8 @@ class Scene(AbstractMachine):
         Y, V = number("Y", Y), number("V", V)
         require("Y", Y)
         require("V", V)
-        own = self.drive.begin(M=M, W=W, **others)
-        return self.convert_start(self.state_type(Y, V, *own.values()))
+        drive_part = self.drive.begin(M=M, W=W, **others)
+        return self.convert_start(self.state_type(Y, V, *drive_part.values()))
 
     def is_timed(self, state: State) -> bool:
         """Return whether the angle of the shaft is part of the state."""
@@ -334,9 +334,9 @@ class Scene(AbstractMachine):
     def relaxation(self, s: Scalar, state: State) -> Scalar:
         """Return the shortest decay time: 1/2ξ of the body, or that of the drive: the time w0/τ0 in
         which a motor returns to its speed, or in which the current of a `DCMotor` settles."""
-        rate, of_drive = 2 * self.damping_ratio, self.drive.rate()
-        if of_drive is not None:
-            rate = jnp.maximum(rate, of_drive)
+        rate, drive_rate = 2 * self.damping_ratio, self.drive.rate()
+        if drive_rate is not None:
+            rate = jnp.maximum(rate, drive_rate)
         pace = self.drive.speed(state) if self.clock_name == "phase" else 1.0
         return pace / jnp.maximum(rate, 1e-6)
 
@@ -368,9 +368,9 @@ class Scene(AbstractMachine):
         """Return whether a compliant stop may press the body on a rigid one."""
         for soft in self.soft_stops:
             depth = concrete(soft.beyond(stop.place))
-            apart = depth is not None and bool((depth <= 0).all())
+            is_clear = depth is not None and bool((depth <= 0).all())
             if changed(soft, SoftStop, ("force", "contribution")) or not (
-                apart or soft.side == stop.side
+                is_clear or soft.side == stop.side
             ):
                 return True
         return False
@@ -553,19 +553,19 @@ class Parameters(Shown):
         require_ranges(self)  # again: a number may have been replaced
         omega = self.natural_frequency
         if drive == "ideal":
-            turning: IdealDrive | Motor = IdealDrive(self.control)
+            made: IdealDrive | Motor = IdealDrive(self.control)
         else:
             per_inertia = self.crank_radius**2 / self.inertia
-            free = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
+            no_load = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
             time = self.electrical_time
-            lag = {} if time is None else {"electrical_time": time * omega}
-            turning = (DCMotor if lag else Motor)(
+            electrical = {} if time is None else {"electrical_time": time * omega}
+            made = (DCMotor if electrical else Motor)(
                 strength=self.torque / (self.inertia * omega**2),
                 control=self.control,
                 coupling=self.body_mass * per_inertia,
                 slider_inertia=self.slider_mass * per_inertia,
-                no_load_speed=free,
-                **lag,
+                no_load_speed=no_load,
+                **electrical,
             )
         damping = self.damping / (2 * self.body_mass * omega)
         if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):
@@ -574,7 +574,7 @@ class Parameters(Shown):
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
             oscillator=Oscillator(damping),
-            drive=turning,
+            drive=made,
             stops=(RigidStop(_ratio(self.gap, self.crank_radius), self.restitution),),
             crank=exact or CosineCrank(),
         )
@@ -598,5 +598,5 @@ class Parameters(Shown):
 
 def _ratio(a: Any, b: Any) -> Any:
     """Return a / b as a known number if both are, inside of `jit` too."""
-    over, under = concrete(a), concrete(b)
-    return a / b if over is None or under is None else over / under
+    numerator, denominator = concrete(a), concrete(b)
+    return a / b if numerator is None or denominator is None else numerator / denominator

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .numbers import by_name, in_words, known, number_in_words, split_place, table
+from .numbers import by_name, in_words, known, number_in_words, split_index, table
 
 
 class State:
@@ -132,9 +132,9 @@ def _in_arrays(parts: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, 
     """Return components, of which some were given by single numbers such as `"x[3]"`."""
     found: dict[str, Any] = {}
     for name, value in given.items():
-        base, place = (name, ()) if name in parts else split_place(name)
-        old = found.get(base, parts.get(base)) if place else None
-        found[name if old is None else base] = value if old is None else old.at[place].set(value)
+        base, index = (name, ()) if name in parts else split_index(name)
+        old = found.get(base, parts.get(base)) if index else None
+        found[name if old is None else base] = value if old is None else old.at[index].set(value)
     return found
 
 

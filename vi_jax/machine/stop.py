@@ -154,12 +154,12 @@ class RigidStop(Wall, AbstractEvent):
     ) -> Modes:
         """Return the machine's modes after an impact. **Arguments:** `before` and `after`, the
         states; `modes`, those before."""
-        own = None
+        machine_modes = None
         if self.modes is not None:
             found = self.modes(machine, s, before, *shown_modes(machine, modes))
             whose = f"`modes` of a stop of a {type(machine).__name__}"
-            own = modes_after(machine, found, modes, whose)
-        return struck_modes(machine, s, after, modes, own)
+            machine_modes = modes_after(machine, found, modes, whose)
+        return struck_modes(machine, s, after, modes, machine_modes)
 
     def jump(self, machine, s, state, *modes):
         """Return the state after the rebound, without a correction of the position."""
@@ -202,8 +202,8 @@ class RigidStop(Wall, AbstractEvent):
         """Return the share of the speed that is left after an impact: k, or that by a `rebound`."""
         if not is_own(type(self).rebound):
             return self.coefficient(approach)
-        left = -self.approach(self.rebound(self.sign * approach))
-        return left / jnp.where(approach > 0, approach, 1.0)
+        rebound_speed = -self.approach(self.rebound(self.sign * approach))
+        return rebound_speed / jnp.where(approach > 0, approach, 1.0)
 
     def loss(self, approach: Any, share: Any = None) -> Any:
         """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `share` is k."""
@@ -454,10 +454,10 @@ class SoftStop(Wall, AbstractSwitch):
         """Return the initial mode: touching, unless the body is apart or has been released."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
-        holds = TOUCHING
+        mode = TOUCHING
         if not self.adhesive:
-            holds = jnp.where(self._pulls(machine, s, state) < 0, TOUCHING, RELEASED)
-        return jnp.where(inside, holds, APART)
+            mode = jnp.where(self._pulls(machine, s, state) < 0, TOUCHING, RELEASED)
+        return jnp.where(inside, mode, APART)
 
     def guard(self, machine, s, state, mode):
         """Return the guard of touching, leaving, or being released."""
@@ -476,8 +476,8 @@ class SoftStop(Wall, AbstractSwitch):
         pulls = self._pulls(machine, s, state)
         inside = depth > 0  # without damping the force vanishes as the body comes out
         released = jnp.where(inside & (pulls >= -depth), RELEASED, APART)
-        again = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
-        return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, again))
+        touching = jnp.where(inside & (-pulls > -depth), TOUCHING, APART)
+        return state, jnp.where(mode < 0, TOUCHING, jnp.where(mode > 0, released, touching))
 
     def longest_step(self, machine: Machine, s: Scalar, state: State) -> Any:
         """Return a fifth of the period of oscillations on the stop; infinite apart from it."""

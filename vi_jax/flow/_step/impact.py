@@ -25,8 +25,8 @@ from ...machine import (
     friction_on,
     has_contact_friction,
     holds_anywhere,
+    push_gains,
     push_of,
-    shares,
     stops_of,
     struck_modes,
     with_friction_impulse,
@@ -213,7 +213,7 @@ def _before_impacts(
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
     coordinates = list(bodies.values())
     pushes = [push_of(body, at_event) for body in coordinates]
-    gains = shares(coordinates, at_event, pushes)
+    gains = push_gains(coordinates, at_event, pushes)
     met = jnp.zeros_like(taken)
     coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
@@ -246,7 +246,7 @@ def _acting(
         friction = friction_on(machine, number)
         if friction is not None:
             along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
-            response = shares([*bodies.values()], state, [push_of(along, state)])
+            response = push_gains([*bodies.values()], state, [push_of(along, state)])
             for i, change in enumerate(shares([along], state, pushes)[0]):
                 dragged = jnp.abs(change * response[i][0])
                 both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
@@ -507,7 +507,7 @@ def _without_rebounds(
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
     amounts = forces(
-        shares(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
+        push_gains(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
     )
     new, pushed = added(state, amounts, held.pushes), list(amounts)
     for row, (_, _, index, drag) in enumerate(
@@ -533,7 +533,7 @@ def stop_bodies(
         shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
         coordinates, on = list(bodies.values()), list(rests.values())
-        gains = shares(coordinates, state, [push_of(body, state) for body in coordinates])
+        gains = push_gains(coordinates, state, [push_of(body, state) for body in coordinates])
         deltas, shifts = forces(gains, on, deltas), forces(gains, on, shifts)
     new, lost = state, jnp.zeros_like(deltas[0])
     for (k, body), change, shift, V in zip(bodies.items(), deltas, shifts, velocities, strict=True):
