@@ -48,13 +48,13 @@ def test_the_largest_ball_agrees_with_brute_force(turns):
     rng = np.random.default_rng(0)
     for _ in range(5):
         label = (rng.random((9, 12)) < 0.1).astype(int)
-        there = rng.random(label.shape) < 0.9
+        is_start = rng.random(label.shape) < 0.9
         rows = [np.linspace(0.1, 1.7, 9), np.linspace(-2.0, 0.2, 12)]
         ends = rng.random((2, 2)) < 0.7
         if turns:
             rows[0], ends[0] = 0.7 + 2 * np.pi * np.arange(9) / 9, False
         cells = Cells(rows, np.array([0.7, 1.3]), ends, np.array([turns, False]))
-        own, foreign = there & (label == 0), there & (label == 1)
+        own, foreign = is_start & (label == 0), is_start & (label == 1)
         best = 0.0
         for i, j in np.argwhere(own):
             for step in itertools.product((-0.5, 0.0, 0.5), repeat=2):
@@ -81,8 +81,8 @@ def test_entropy_of_half_planes_and_stripes():
     found = entropy_of(turns, box=6)
     assert found.total == pytest.approx(np.log(3)) and found.boundary == pytest.approx(np.log(3))
     # Missing cells do not count as an outcome.
-    there = turns != 2
-    assert entropy_of(turns, box=6, there=there).total == pytest.approx(np.log(2))
+    is_start = turns != 2
+    assert entropy_of(turns, box=6, is_start=is_start).total == pytest.approx(np.log(2))
 
 
 def test_a_smooth_boundary_has_the_exponent_one():

@@ -89,7 +89,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
 
 @pytest.mark.slow
 def test_interrupted_basins_keep_completed_starts(monkeypatch):
-    interrupt_at(monkeypatch, "scans._basins._sorted_out", after=0)
+    interrupt_at(monkeypatch, "scans._basins._find_basins", after=0)
     scene = vi.Scene.ideal(frequency_ratio=1.4, restitution=0.8, gap=2.0, damping_ratio=0.2)
     options = {"resolution": 4, "settle": 10, "longest": 4, "progress": False}
     error = interrupted_by(
@@ -116,12 +116,12 @@ def test_interrupted_exponents_use_completed_cycles(monkeypatch):
     plain = jax.vmap(lambda y: vi.lyapunov(scene, scene.start(Y=y), 1100))(jnp.zeros(1))
     np.testing.assert_allclose(whole.exponents, plain.exponents[0], rtol=1e-11)
     np.testing.assert_allclose(float(whole.state.Y), float(plain.state.Y[0]), rtol=1e-11)
-    interrupt_at(monkeypatch, "scans._lyapunov._part", after=0)
+    interrupt_at(monkeypatch, "scans._lyapunov._observe_windows", after=0)
     with pytest.raises(KeyboardInterrupt) as nothing:
         vi.lyapunov(scene, scene.start(), 1100)
     assert not isinstance(nothing.value, vi.Interrupted)
     monkeypatch.undo()
-    interrupt_at(monkeypatch, "scans._lyapunov._part", after=1)
+    interrupt_at(monkeypatch, "scans._lyapunov._observe_windows", after=1)
     error = interrupted_by(vi.Interrupted, lambda: vi.lyapunov(scene, scene.start(), 1100))
     assert float(error.partial.exponents[0]) == pytest.approx(-0.2, rel=1e-6)
 
@@ -162,7 +162,7 @@ def test_interrupted_boundaries_grazings_and_profiles(monkeypatch):
     options = {"parameter": "amplitude", "bounds": ((0.05, 0.5), (0.5, 2.0))}
     curve = interrupted_by(vi.Interrupted, lambda: vi.boundary(point, **options)).partial
     assert curve.ends == ("interrupted", "interrupted") and len(curve.parameters) > 1
-    interrupt_at(monkeypatch, "scans._basins._sorted_out", after=1)
+    interrupt_at(monkeypatch, "scans._basins._find_basins", after=1)
     asked = "gap", [1.0, 1.1], {"start.Y": (-0.5, 0.5), "start.V": (-0.5, 0.5)}
     options = {"resolution": 2, "settle": 5, "longest": 4}
     error = interrupted_by(

@@ -62,7 +62,7 @@ class ForcedMachine(PhaseMachine):
         return 1 / self.frequency
 
 
-def supported(machine: Any, pen: Any, place: float) -> float:
+def draw_supported_body(machine: Any, pen: Any, place: float) -> float:
     """Draw a body between stops, on a spring and a damper from a post; return the post's place."""
     size = pen.size
     post, back = -pen.reach - 2.6 * size, place - size / 2

@@ -38,14 +38,14 @@ def _roots(modes: int) -> np.ndarray:
 
 
 @cache
-def _tilt(modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _shape_factors(modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Return σ = (cosh β + cos β)/(sinh β + sin β) and (1 - σ)e^β of each mode, not cancelling."""
     x = _roots(modes)
     small = np.exp(-x)
-    below = 0.5 * (1 - small * small) + small * np.sin(x)
+    denominator = 0.5 * (1 - small * small) + small * np.sin(x)
     return (
-        (0.5 * (1 + small * small) + small * np.cos(x)) / below,
-        (np.sin(x) - np.cos(x) - small) / below,
+        (0.5 * (1 + small * small) + small * np.cos(x)) / denominator,
+        (np.sin(x) - np.cos(x) - small) / denominator,
     )
 
 
@@ -134,7 +134,7 @@ class Beam(LinearMachine):
         """The force on each mode: inertia due to the clamp's motion, or the force on the tip."""
         if self.shaken == "tip":
             return None, self.amplitude * self.shape(1.0), None
-        mean = jnp.asarray(2 * _tilt(self.modes)[0] / _roots(self.modes))
+        mean = jnp.asarray(2 * _shape_factors(self.modes)[0] / _roots(self.modes))
         return None, self.mass * mean * self.amplitude * self.frequency**2, None
 
     @property
@@ -145,9 +145,9 @@ class Beam(LinearMachine):
     def shape(self, place: Any) -> Float[Array, "*places modes"]:
         """Return φ of each mode at places along the beam, in [0, 1] of its length."""
         x = jnp.asarray(place)[..., None]
-        beta, (sigma, lean) = _roots(self.modes), _tilt(self.modes)
-        away = jnp.exp(beta * (x - 1)) * lean + (1 + sigma) * jnp.exp(-beta * x)
-        return 0.5 * away - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
+        beta, (sigma, growth) = _roots(self.modes), _shape_factors(self.modes)
+        exponentials = jnp.exp(beta * (x - 1)) * growth + (1 + sigma) * jnp.exp(-beta * x)
+        return 0.5 * exponentials - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
 
     def deflection(self, state: StructureState, place: Number = 1.0) -> Float[Array, "..."]:
         """Return w at places along the beam, in [0, 1] of its length: by default at its tip."""

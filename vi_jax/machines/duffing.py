@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
 from .._types import Number, Scalar
 from ..machine import OscillatorState, RigidStop
-from ._base import ForcedMachine, number_field, stops_at, supported
+from ._base import ForcedMachine, draw_supported_body, number_field, stops_at
 
 
 class Duffing(ForcedMachine):
@@ -57,7 +57,7 @@ class Duffing(ForcedMachine):
     def sketch(self, pen: Any, state: OscillatorState, phase: float) -> None:
         """Draw a body on its spring, between stops, with the force on it."""
         place, size = float(state.Y), pen.size
-        post = supported(self, pen, place)
+        post = draw_supported_body(self, pen, place)
         pull = 0.9 * size * cos(phase)
         if abs(pull) > 0.1 * size:
             pen.arrow((place, 0.75 * size), (place + pull, 0.75 * size))

@@ -72,8 +72,8 @@ class ImpactPair(PhaseMachine, Mechanical):
     def quantity_units(self) -> Mapping[str, str]:  # pyright: ignore
         """The units, with the mass of the ball as unit of mass, or that of a free box."""
         mass = "m" if self.mass_ratio is None else "M"
-        own = {"place": "a", "box": "a", "v.place": "a ω", "v.box": "a ω", "rate": "ω"}
-        return {**own, "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
+        units = {"place": "a", "box": "a", "v.place": "a ω", "v.box": "a ω", "rate": "ω"}
+        return {**units, "time": "1/ω", "energy": f"{mass} a² ω²", "power": f"{mass} a² ω³"}
 
     def start(self) -> Any:
         """Return a state with the ball in flight from the middle, and a free box at rest."""

@@ -29,20 +29,20 @@ def check_keys(given: Iterable[str], known: Iterable[str], place: str) -> None:
     known = list(known)
     for key in given:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-            hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(known)}"
+            similar = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+            hint = f"near names: {', '.join(similar)}" if similar else f"known: {', '.join(known)}"
             raise InputError(f"unknown key `{key}` in {place}; {hint}")
 
 
 def machine_of(name: object, keywords: Mapping[str, Any]) -> AbstractMachine:
     """Return the machine from a class or a function. **Raises:** `InputError`."""
-    machine = made(name, keywords, "[arguments]")
+    machine = make_object(name, keywords, "[arguments]")
     if not isinstance(machine, AbstractMachine):
         raise InputError(f"{name} must make a machine, but made {machine!r}")
     return machine
 
 
-def made(name: object, keywords: Mapping[str, Any], place: str) -> Any:
+def make_object(name: object, keywords: Mapping[str, Any], place: str) -> Any:
     """Return the result of calling a class or a function with keywords. **Raises:** `InputError`.
 
     **Arguments:** `name`, `package.module:name` or `path/to/file.py:name`. A method of a class, as
@@ -62,11 +62,11 @@ def made(name: object, keywords: Mapping[str, Any], place: str) -> Any:
         make = getattr(owner, last)
         parameters = inspect.signature(make).parameters
         if inspect.isclass(owner) and inspect.isfunction(make):
-            others = {key: x for key, x in keywords.items() if key not in parameters}
-            make = getattr(made(f"{module}:{'.'.join(outer)}", others, place), last)
+            class_keywords = {key: x for key, x in keywords.items() if key not in parameters}
+            make = getattr(make_object(f"{module}:{'.'.join(outer)}", class_keywords, place), last)
             keywords = {key: x for key, x in keywords.items() if key in parameters}
         check_keys(keywords, parameters, place)
-        return make(**{key: _fitting(parameters[key], value_of(x, place))
+        return make(**{key: _converted(parameters[key], value_of(x, place))
                        for key, x in keywords.items()})  # fmt: skip
     except InputError:
         raise
@@ -87,7 +87,7 @@ def _imported(module: str) -> Any:
     return found
 
 
-def _fitting(parameter: inspect.Parameter, value: Any) -> Any:
+def _converted(parameter: inspect.Parameter, value: Any) -> Any:
     """Return an integer as a float if the class declares one: it would be compile-time."""
     words = f"{parameter.annotation} {type(parameter.default).__name__}"
     wants_float = re.search(r"[Ff]loat|Array", words) and not re.search(r"\bint\b", words)
@@ -96,10 +96,10 @@ def _fitting(parameter: inspect.Parameter, value: Any) -> Any:
 
 def _line(error: BaseException) -> str:
     """Return the last line of user code in the traceback of an error, as text."""
-    others = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
+    libraries = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
     lines = traceback.extract_tb(error.__traceback__)
-    own = [x for x in lines if not any(other in x.filename for other in others)]
-    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+    user_lines = [x for x in lines if not any(other in x.filename for other in libraries)]
+    return f" ({user_lines[-1].filename}, line {user_lines[-1].lineno})" if user_lines else ""
 
 
 def value_of(value: Any, place: str) -> Any:
@@ -110,7 +110,7 @@ def value_of(value: Any, place: str) -> Any:
         return value
     if "class" in value:
         keywords = {key: x for key, x in value.items() if key != "class"}
-        return made(value["class"], keywords, place)
+        return make_object(value["class"], keywords, place)
     if value.keys() == {"from", "to", "count"}:
         try:
             return np.linspace(value["from"], value["to"], value["count"]).tolist()

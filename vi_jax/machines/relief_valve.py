@@ -57,13 +57,13 @@ class ReliefValve(ReadyMachine):
         """Return d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
-        leaves = state.lift * jnp.sqrt(state.pressure)
-        return ValveState(state.speed, force, self.compressibility * (self.flow_rate - leaves))
+        outflow = state.lift * jnp.sqrt(state.pressure)
+        return ValveState(state.speed, force, self.compressibility * (self.flow_rate - outflow))
 
     def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
         """Return the shorter time constant, of the motion or of the pressure."""
-        drains = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
-        return 1 / jnp.maximum(jnp.maximum(self.damping, drains), 1e-6)
+        outflow_rate = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
+        return 1 / jnp.maximum(jnp.maximum(self.damping, outflow_rate), 1e-6)
 
     def start(
         self, *, lift: Number = 1.0, speed: Number = 0.0, pressure: Number = 12.0

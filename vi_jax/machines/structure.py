@@ -24,7 +24,7 @@ from ..machine import LinearMachine, RigidStop
 from ._base import number_field
 
 # The largest asymmetry of a matrix, relative to its largest entry, that is rounding: a choice.
-_ALIKE = 1e-12
+_SYMMETRY = 1e-12
 
 
 def _numbered(contacts: object) -> tuple[RigidStop, ...]:
@@ -32,9 +32,9 @@ def _numbered(contacts: object) -> tuple[RigidStop, ...]:
     rows, found = [], []
     for stop in tuple_of("contacts", contacts, RigidStop):
         if stop.at is not None:
-            same = [k for k, row in enumerate(rows) if _same(row, stop.at)]
-            if same:
-                stop = dataclasses.replace(stop, at=None, coordinate=same[0])
+            equal = [k for k, row in enumerate(rows) if _equal_rows(row, stop.at)]
+            if equal:
+                stop = dataclasses.replace(stop, at=None, coordinate=equal[0])
             else:
                 stop = dataclasses.replace(stop, coordinate=len(rows))
                 rows.append(stop.at)
@@ -42,7 +42,7 @@ def _numbered(contacts: object) -> tuple[RigidStop, ...]:
     return tuple(found)
 
 
-def _same(a: object, b: object) -> bool:
+def _equal_rows(a: object, b: object) -> bool:
     one, other = concrete(a), concrete(b)
     return a is b or (one is not None and other is not None and np.array_equal(one, other))
 
@@ -143,11 +143,11 @@ class Structure(LinearMachine):
                     f"each mode, but has {shapes.shape}."
                 )
             require("shapes", shapes)
-            forces = {name: _onto(name, f, shapes) for name, f in forces.items()}
+            forces = {name: _in_modes(name, f, shapes) for name, f in forces.items()}
             contacts = tuple(
                 stop
                 if getattr(stop, "at", None) is None
-                else eqx.tree_at(lambda x: x.at, stop, _onto("at", stop.at, shapes))
+                else eqx.tree_at(lambda x: x.at, stop, _in_modes("at", stop.at, shapes))
                 for stop in _numbered(contacts)
             )
         return cls(
@@ -164,7 +164,7 @@ class Structure(LinearMachine):
         return self.static_force, cosine, sine
 
 
-def _onto(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
+def _in_modes(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
     """Return a force or a row of points in terms of the modes."""
     if f is None:
         return None
@@ -209,9 +209,9 @@ def _check_numbers(name: str, value: object) -> None:
         )
     if known.ndim < 2:
         return
-    apart = np.abs(known - known.T)
-    if apart.max() > _ALIKE * np.abs(known).max():
-        i, j = np.unravel_index(apart.argmax(), apart.shape)
+    asymmetry = np.abs(known - known.T)
+    if asymmetry.max() > _SYMMETRY * np.abs(known).max():
+        i, j = np.unravel_index(asymmetry.argmax(), asymmetry.shape)
         raise ValueError(
             f"Argument `{name}` must be symmetric, but its numbers [{i}, {j}] and [{j}, {i}] are "
             f"{known[i, j]:.9g} and {known[j, i]:.9g}."
@@ -219,7 +219,6 @@ def _check_numbers(name: str, value: object) -> None:
 
 
 def _check_positive(mass: object) -> None:
-    """Raise `ValueError` for known masses that are not positive definite."""
     known = concrete(mass)
     if known is None:
         return
@@ -232,7 +231,6 @@ def _check_positive(mass: object) -> None:
 
 
 def _check_vector(name: str, value: Any, n: int) -> None:
-    """Raise `ValueError` for a vector of another length, or that is not finite."""
     if value is None:
         return
     if value.shape != (n,):

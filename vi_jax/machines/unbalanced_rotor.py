@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range, number, require
 from .._types import Number, Scalar, State
 from ..machine import Mechanical, RigidStop, turn_of
-from ._base import ReadyMachine, number_field, stops_at, supported
+from ._base import ReadyMachine, draw_supported_body, number_field, stops_at
 
 
 class UnbalancedRotor(ReadyMachine, Mechanical):
@@ -116,7 +116,7 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         """Draw a body on its spring, with the unbalanced rotor in it."""
         place, size = float(state.Y), pen.size
         radius = 0.34 * size
-        post = supported(self, pen, place)
+        post = draw_supported_body(self, pen, place)
         pen.disc(place, 0.0, radius)
         heavy = place + radius * cos(state.phi), radius * sin(state.phi)
         pen.line((place, 0.0), heavy)

@@ -115,8 +115,10 @@ class Woodpecker(ReadyMachine, Mechanical):
             for side, name in (("left", "lower edge"), ("right", "upper edge"))
         )
         beak = RigidStop(self.reach, self.beak_restitution, "right", name="beak")
-        rubs = (ContactFriction(self.friction, stop=i, along=k) for i, k in enumerate((2, 2, 3)))
-        return lower, upper, beak, *rubs
+        frictions = (
+            ContactFriction(self.friction, stop=i, along=k) for i, k in enumerate((2, 2, 3))
+        )
+        return lower, upper, beak, *frictions
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -135,11 +137,11 @@ class Woodpecker(ReadyMachine, Mechanical):
     def mass(self) -> list[list[Any]]:  # pyright: ignore
         """The mass matrix; the bird hangs on both arms."""
         sleeve, bird = self.sleeve_arm, self.bird_arm
-        own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
+        J = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
         hanging = [
             [self.bird_mass * a * b for b in (1.0, sleeve, bird)] for a in (1.0, sleeve, bird)
         ]
-        return [[x + (i == j) * own[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
+        return [[x + (i == j) * J[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
         """Return the weights, and the moment of the spring, without the forces of the contacts."""

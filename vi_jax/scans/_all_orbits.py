@@ -128,11 +128,11 @@ class AllOrbits(InWords):
         where = ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.region.items())
         lines.append(f"searched from random starts, {where}:")
         for s in self.searched:
-            lost = s.starts - s.simulated
-            beyond = f" ({lost:,} could not be simulated)" if lost else ""
+            invalid = s.starts - s.simulated
+            note = f" ({invalid:,} could not be simulated)" if invalid else ""
             line = (
                 f"  {cycles_in_words(self.machine, s.cycles)}: {s.converged:,} of {s.starts:,} "
-                f"searches converged{beyond}, on {s.motions}"
+                f"searches converged{note}, on {s.motions}"
             )
             if s.still:
                 line += f", {s.still:,} ended at an equilibrium"
@@ -197,13 +197,13 @@ def all_orbits(
         return None, find_orbit(machine, guesses, n, root_finder=root_finder, method=method)
 
     def joined(_, batches: list[Orbit]) -> AllOrbits:
-        return _sorted_out(machine, batches, tolerance, ranges)
+        return _combined(machine, batches, tolerance, ranges)
 
     pieces = ((1, piece) for piece in enumerate(rows, 1))
     return in_parts("search for periodic motions", step, None, pieces, joined, progress=False)
 
 
-def _sorted_out(
+def _combined(
     machine: AbstractMachine, batches: list[Orbit], tolerance: float,
     region: dict[str, tuple[float, float]],
 ) -> AllOrbits:  # fmt: skip

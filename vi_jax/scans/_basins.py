@@ -130,7 +130,7 @@ class Basins(NamedTuple):
 
         **Raises:** `ValueError` if the starts lie on no grid, or for scales of other components.
         """
-        label, there, names = self._grid()
+        label, is_start, names = self._grid()
         scale = _scales_along(names, scales)
         at_stop = self.data["label"].attrs.get("at_stop", ())
         ends = [[f"{name} {side}" not in at_stop for side in ("low", "high")] for name in names]
@@ -141,17 +141,17 @@ class Basins(NamedTuple):
         resolution = 0.5 * float(np.linalg.norm(cells.widths / scale))
         found = []
         for a in self.attractors:
-            foreign = there & (label != a.label)
+            foreign = is_start & (label != a.label)
             points = np.stack([a.sections[name.removeprefix(START)] for name in names], axis=1)
             balls = [geometry.ball_around(cells.inside(x), foreign, cells) for x in points]
             around = np.array([x.radius for x in balls])
-            local, cut = np.nan, False
+            local, at_edge = np.nan, False
             if not np.isnan(around).all():
                 least = int(np.nanargmin(around))
-                local, cut = float(around[least]), balls[least].at_edge
-            ball = geometry.largest_ball(there & (label == a.label), foreign, cells)
+                local, at_edge = float(around[least]), balls[least].at_edge
+            ball = geometry.largest_ball(is_start & (label == a.label), foreign, cells)
             centre = dict(zip(names, ball.centre.tolist(), strict=True))
-            parts = (a.label, local, around, ball.radius, centre, cut, ball.at_edge, resolution)
+            parts = (a.label, local, around, ball.radius, centre, at_edge, ball.at_edge, resolution)
             found.append(Integrity(*parts))
         return found
 
@@ -163,9 +163,9 @@ class Basins(NamedTuple):
 
         **Raises:** `ValueError` if the starts lie on no grid, or on fewer than `box` along an axis.
         """
-        label, there, _ = self._grid()
+        label, is_start, _ = self._grid()
         box = count("box", box, least=2, most=min(label.shape))
-        return geometry.entropy_of(label, box=box, there=there)
+        return geometry.entropy_of(label, box=box, is_start=is_start)
 
     def uncertainty(self, *, confidence: float = 0.95) -> geometry.Uncertainty:
         """Return the uncertainty exponent of the basins' boundaries: the power of the error of the
@@ -179,16 +179,16 @@ class Basins(NamedTuple):
         **Raises:** `ValueError` if the starts lie on no grid, or on fewer than 16 along an axis.
         """
         require("confidence", confidence, low=0.0, high=1.0, open_low=True, open_high=True)
-        label, there, _ = self._grid()
+        label, is_start, _ = self._grid()
         if min(label.shape) < 16:
             raise ValueError(
                 "An uncertainty exponent needs 16 starts at least along each axis, but there are "
                 f"{min(label.shape)}."
             )
-        return geometry.uncertainty_of(label, confidence=float(confidence), there=there)
+        return geometry.uncertainty_of(label, confidence=float(confidence), is_start=is_start)
 
     def _grid(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
-        """Return labels on the grid, which starts are not beyond a stop, and the axes' names."""
+        """Return labels on the grid, flags of starts not beyond a stop, and names of the axes."""
         label = self.data["label"]
         names = [str(name) for name in label.dims]
         if names == ["sample"] or min(label.shape) < 2:
@@ -253,7 +253,7 @@ def _scales_along(names: Sequence[str], scales: Mapping[str, float] | None) -> n
 
 
 # Options of `scan` that the functions of this file set themselves, or that leave no period to find.
-_SET = {"measure", "paired", "cycles", "derivatives", "axes", "noise", "key"}
+_RESERVED = {"measure", "paired", "cycles", "derivatives", "axes", "noise", "key"}
 
 
 class _Mark(Sections):
@@ -315,16 +315,16 @@ def basins(
     begin = machine.start() if start is None else start
     axes = starts_in(region, machine, begin, resolution, samples, count("seed", seed))
     method = chosen(machine, method)
-    data = _scanned(
+    data = _scan_starts(
         machine, axes, longest, tolerance, start=start, settle=settle, method=method,
         paired=samples is not None, progress=progress, **options,
     )  # fmt: skip
     kept = partial(ScanInterrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
-        return _sorted_out(data, machine, begin, apart=apart, longest=longest, method=method)
+        return _find_basins(data, machine, begin, apart=apart, longest=longest, method=method)
 
 
-def _sorted_out(
+def _find_basins(
     data: "xr.Dataset",
     machine: AbstractMachine,
     begin: object,
@@ -333,32 +333,32 @@ def _sorted_out(
     longest: int,
     method: AbstractMethod,
 ) -> Basins:
-    """Return the basins in the result of `_scanned`; `begin` has all other components."""
-    label, motions = _labelled(data, machine, begin, apart, longest, method)
+    """Return the basins in the result of `_scan_starts`; `begin` has all other components."""
+    label, motions = _label_lanes(data, machine, begin, apart, longest, method)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
     for number, motion in enumerate(motions):
-        here = label == number
-        share = float(np.mean(here))
+        on_motion = label == number
+        share = float(np.mean(on_motion))
         attractors.append(Attractor(
             label=number,
             period=len(motion),
-            impacts=float(np.median(impacts[here])),
+            impacts=float(np.median(impacts[on_motion])),
             sections=dict(zip(components(begin), motion.T, strict=True)),
-            starts=int(np.sum(here)),
+            starts=int(np.sum(on_motion)),
             fraction=share,
             error=math.sqrt(share * (1 - share) / label.size),
         ))  # fmt: skip
     parts = {name: float(np.mean(label == number)) for name, number in CODES.items()}
     about = {"long_name": "motion that the start settles on", **flags(CODES)}
-    about["at_stop"] = _at_stop(data, machine, begin)
+    about["at_stop"] = _edges_at_stop(data, machine, begin)
     period = data["period"]
     kind = np.min_scalar_type(-max(4, len(motions)))
     data = data.assign(label=(period.dims, label.astype(kind).reshape(period.shape), about))
     return Basins(data, attractors, parts, machine)
 
 
-def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> list[str]:
+def _edges_at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> list[str]:
     """Return edges of the region at a stop, such as `"start.Y high"`: in the middle of each edge, a
     start just inside is possible, and one just beyond is not."""
     rows = {str(name): np.asarray(data[name]) for name in data["period"].dims}
@@ -367,9 +367,9 @@ def _at_stop(data: "xr.Dataset", machine: AbstractMachine, begin: object) -> lis
         if not name.startswith(START) or row.size < 2:
             continue
         half = 0.5 * (row[1] - row[0])
-        for side, edge, out in (("low", row[0] - half, -half), ("high", row[-1] + half, half)):
+        for side, edge, outward in (("low", row[0] - half, -half), ("high", row[-1] + half, half)):
             middle = {other: 0.5 * (x[0] + x[-1]) for other, x in rows.items()}
-            inside, beyond = ({**middle, name: edge + x * out} for x in (-1e-3, 1e-3))
+            inside, beyond = ({**middle, name: edge + x * outward} for x in (-1e-3, 1e-3))
             if _may_start(machine, begin, inside) and not _may_start(machine, begin, beyond):
                 found.append(f"{name} {side}")
     return found
@@ -390,25 +390,25 @@ def _check_options(
 ) -> None:
     """Raise `TypeError` for an option that `scan` does not have, that no function here takes, or
     that is `refused` by this one."""
-    who = verb.__name__
-    own, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
+    function = verb.__name__
+    parameters, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
-        if name in {*_SET, *refused}:
-            raise TypeError(f"Argument `{name}` must not be given to `{who}`.")
+        if name in {*_RESERVED, *refused}:
+            raise TypeError(f"Argument `{name}` must not be given to `{function}`.")
         if name not in of_scan:
-            near = difflib.get_close_matches(name, sorted(own | of_scan - _SET))
-            hint = f"near names: {', '.join(near)}" if near else f"see `help(vi_jax.{who})`"
-            raise TypeError(f"`{who}` has no argument `{name}`; {hint}.")
+            near = difflib.get_close_matches(name, sorted(parameters | of_scan - _RESERVED))
+            hint = f"near names: {', '.join(near)}" if near else f"see `help(vi_jax.{function})`"
+            raise TypeError(f"`{function}` has no argument `{name}`; {hint}.")
 
 
-def _scanned(
+def _scan_starts(
     machine: AbstractMachine,
     axes: Mapping[str, Any],
     longest: int,
     tolerance: float | None,
     **options: Any,
 ) -> "xr.Dataset":
-    """Return the data of a scan of starts, for `_sorted_out`, without a warning of failed lanes."""
+    """Return the data of a scan of starts, without a warning of failed lanes."""
     measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
@@ -455,51 +455,51 @@ def starts_in(
     return axes
 
 
-def _labelled(
+def _label_lanes(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
     method: AbstractMethod,
 ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
     """Return a label for each lane, and the section states (period, components) of each motion,
-    most lanes first; arguments as for `_sorted_out`."""
+    most lanes first; arguments as for `_find_basins`."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
     settled = np.flatnonzero(period > 0)
     if not settled.size:
         return label, []
-    places = [START + name for name in names]
-    starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in places]
+    axis_names = [START + name for name in names]
+    starts = [float(np.abs(data[x]).max()) if x in data.coords else 0.0 for x in axis_names]
     unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
     # Lanes on one motion lie in few cells. A result for one of them holds for all.
     cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
     cells = np.column_stack([period[settled].astype(np.int64), cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     motions: list[np.ndarray] = []
-    of_cell, known = np.empty(first.size, int), {}
+    motion_of_cell, known = np.empty(first.size, int), {}
     angles = angles_in(machine, begin)
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
         # The motions of this period, (motions, period, components), and their indices.
         rows, numbers = known.get(p, (np.empty((0, p, len(names))), []))
-        away = distance(nearest_images(angles, rows, state), state, unit).min(axis=1)
-        close = np.flatnonzero(away <= apart)
+        distances = distance(nearest_images(angles, rows, state), state, unit).min(axis=1)
+        close = np.flatnonzero(distances <= apart)
         if close.size:
-            of_cell[i] = numbers[close[0]]
+            motion_of_cell[i] = numbers[close[0]]
             continue
-        of_cell[i] = len(motions)
-        here = with_leaves(begin, dict(zip(names, state, strict=True)))
+        motion_of_cell[i] = len(motions)
+        section_state = with_leaves(begin, dict(zip(names, state, strict=True)))
         # The same number of cycles for all periods, for one compiled program.
-        run = simulate(machine, here, longest, method=method)
+        run = simulate(machine, section_state, longest, method=method)
         motions.append(np.asarray(in_rows(run.sections))[1 : p + 1])
-        known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, of_cell[i]]
-    found = of_cell[inverse.ravel()]
+        known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, motion_of_cell[i]]
+    found = motion_of_cell[inverse.ravel()]
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
     return label, [motions[i] for i in order]
 
 
-# From one value to the next, sections of a motion move less than this share of the region: choice.
-_MOVES = 0.25
+# Sections of a motion move less than this share of the region between two values. A choice.
+_LARGEST_MOVE = 0.25
 
 # The variables of each motion at each value, with their values if it does not exist.
 _NUMBERS = {
@@ -641,21 +641,21 @@ def integrity_profile(
         count("resolution", x.size, least=2)
     _scales_along([*axes], scales)
     method = chosen(machine, method)
-    data = _scanned(
+    data = _scan_starts(
         machine, {parameter: row, **axes}, longest, tolerance, start=start, settle=settle,
         method=method, progress=progress, **options,
     )  # fmt: skip
     found, integrity = [], []
     kept = partial(ScanInterrupted, data, options.get("store"))
-    with at_work("basins", kept, progress=progress, unit="value", total=row.size) as tell:
+    with at_work("basins", kept, progress=progress, unit="value", total=row.size) as report:
         for i, value in enumerate(row):
-            here = with_leaf(machine, parameter, value)
-            begin = here.start() if start is None else start
+            current = with_leaf(machine, parameter, value)
+            begin = current.start() if start is None else start
             part = data.isel({parameter: i}).load()
-            one = _sorted_out(part, here, begin, apart=apart, longest=longest, method=method)
-            found.append(one)
-            integrity.append(one.integrity(scales=scales))
-            tell(1)
+            result = _find_basins(part, current, begin, apart=apart, longest=longest, method=method)
+            found.append(result)
+            integrity.append(result.integrity(scales=scales))
+            report(1)
     return _profile(parameter, row, axes, found, integrity)
 
 
@@ -672,11 +672,11 @@ def _profile(
     numbers = {name: np.full(shape, absent) for name, absent in _NUMBERS.items()}
     period, impacts, resolution = np.zeros(shape[0], int), np.zeros(shape[0]), math.nan
     for motion, i in np.argwhere(label >= 0):
-        a, reach = found[i].attractors[label[motion, i]], integrity[i][label[motion, i]]
-        period[motion], impacts[motion], resolution = a.period, a.impacts, reach.resolution
+        a, measures = found[i].attractors[label[motion, i]], integrity[i][label[motion, i]]
+        period[motion], impacts[motion], resolution = a.period, a.impacts, measures.resolution
         numbers["share"][motion, i], numbers["error"][motion, i] = a.fraction, a.error
         for name in ("local", "factor", "local_at_edge", "factor_at_edge"):
-            numbers[name][motion, i] = getattr(reach, name)
+            numbers[name][motion, i] = getattr(measures, name)
     order = np.argsort(-numbers["share"].sum(axis=1), kind="stable")
     numbers = {name: x[order] for name, x in numbers.items()}
     return IntegrityProfile(
@@ -693,21 +693,21 @@ def _matched(found: list[Basins], axes: Mapping[str, np.ndarray]) -> np.ndarray:
     widths = np.array([np.ptp(x) * x.size / (x.size - 1) for x in axes.values()])
     last: list[Attractor] = []
     rows: list[np.ndarray] = []
-    for i, one in enumerate(found):
+    for i, basins_here in enumerate(found):
         pairs = sorted(
             (_distance(a, b, names, angles, widths), motion, b.label)
             for motion, a in enumerate(last)
-            for b in one.attractors
+            for b in basins_here.attractors
             if a.period == b.period and round(a.impacts) == round(b.impacts)
         )
-        free = {b.label for b in one.attractors}
-        for away, motion, label in pairs:
-            if label in free and rows[motion][i] < 0 and away < _MOVES:
+        free = {b.label for b in basins_here.attractors}
+        for step, motion, label in pairs:
+            if label in free and rows[motion][i] < 0 and step < _LARGEST_MOVE:
                 rows[motion][i] = label
-                last[motion] = one.attractors[label]
+                last[motion] = basins_here.attractors[label]
                 free.remove(label)
         for label in sorted(free):
-            last.append(one.attractors[label])
+            last.append(basins_here.attractors[label])
             rows.append(np.full(len(found), -1))
             rows[-1][i] = label
     return np.array(rows, int).reshape(len(rows), len(found))

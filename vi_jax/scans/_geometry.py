@@ -76,24 +76,24 @@ class Ball(NamedTuple):
     """True if the edge of the region limits it, so that it might be larger."""
 
 
-def entropy_of(label: np.ndarray, *, box: int, there: np.ndarray | None = None) -> BasinEntropy:
+def entropy_of(label: np.ndarray, *, box: int, is_start: np.ndarray | None = None) -> BasinEntropy:
     """Return the basin entropy of labels on a grid of any dimension, by separate boxes of `box`
-    cells along each side; remaining cells at the ends of the axes are left out. `there` is True for
-    cells with a start (all by default)."""
-    there = np.ones(label.shape, bool) if there is None else there
-    cells, held = _boxes(label, box), _boxes(there, box)
-    many = held.sum(axis=1)
-    cells, held, many = cells[many > 0], held[many > 0], many[many > 0]
-    entropy, outcomes = np.zeros(len(many)), np.zeros(len(many), int)
-    for number in np.unique(cells[held]):
-        share = np.sum((cells == number) & held, axis=1) / many
+    cells along each side; remaining cells at the ends of the axes are left out. `is_start` is True
+    for cells with a start (all by default)."""
+    is_start = np.ones(label.shape, bool) if is_start is None else is_start
+    cells, starts = _boxes(label, box), _boxes(is_start, box)
+    counts = starts.sum(axis=1)
+    cells, starts, counts = cells[counts > 0], starts[counts > 0], counts[counts > 0]
+    entropy, outcomes = np.zeros(len(counts)), np.zeros(len(counts), int)
+    for number in np.unique(cells[starts]):
+        share = np.sum((cells == number) & starts, axis=1) / counts
         entropy -= share * np.log(np.where(share > 0, share, 1.0))
         outcomes += share > 0
     mixed = outcomes > 1
     return BasinEntropy(
-        total=float(entropy.mean()) if len(many) else np.nan,
+        total=float(entropy.mean()) if len(counts) else np.nan,
         boundary=float(entropy[mixed].mean()) if mixed.any() else np.nan,
-        boxes=len(many),
+        boxes=len(counts),
         boundary_boxes=int(mixed.sum()),
         box=box,
     )
@@ -108,10 +108,10 @@ def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
 
 
 def uncertainty_of(
-    label: np.ndarray, *, confidence: float = 0.95, there: np.ndarray | None = None
+    label: np.ndarray, *, confidence: float = 0.95, is_start: np.ndarray | None = None
 ) -> Uncertainty:
     """Return the uncertainty exponents of the boundaries between labels on a grid of any dimension;
-    `there` is True for cells with a start (all by default); other cells have no outcome.
+    `is_start` is True for cells with a start (all by default); other cells have no outcome.
 
     The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, at least 3. The
     starts are those with neighbours at the largest distance. An exponent is the slope of
@@ -119,18 +119,18 @@ def uncertainty_of(
     quadrature. One is the variation of the slope if one tile of the grid at a time is left out
     (jackknife), due to the position of the region. The other is the scatter about the line.
     """
-    there = np.ones(label.shape, bool) if there is None else there
+    is_start = np.ones(label.shape, bool) if is_start is None else is_start
     farthest = max(int(min(label.shape) * _FARTHEST), 3)
     distances = np.unique(np.geomspace(1, farthest, _DISTANCES).round().astype(int))
     margin = int(distances.max())
     exponents, intervals, fractions = [], [], []
     for axis in range(label.ndim):
-        apart = (_labels_differ(label, there, axis, d) for d in distances.tolist())
-        sums = [_by_tile(found, there, margin) for found in apart]
+        differences = (_labels_differ(label, is_start, axis, d) for d in distances.tolist())
+        sums = [_by_tile(found, is_start, margin) for found in differences]
         uncertain, starts = np.stack([x for x, _ in sums]), sums[0][1]
-        exponent, half = _power(distances, uncertain, starts, confidence)
+        exponent, half_width = _power(distances, uncertain, starts, confidence)
         exponents.append(exponent)
-        intervals.append((exponent - half, exponent + half))
+        intervals.append((exponent - half_width, exponent + half_width))
         fractions.append(uncertain.sum(axis=1) / max(starts.sum(), 1))
     return Uncertainty(np.array(exponents), np.array(intervals), distances, np.array(fractions))
 
@@ -154,48 +154,48 @@ def _power(
     return exponent, quantile * float(np.hypot(spread, scatter))
 
 
-def _labels_differ(label: np.ndarray, there: np.ndarray, axis: int, distance: int) -> np.ndarray:
+def _labels_differ(label: np.ndarray, is_start: np.ndarray, axis: int, distance: int) -> np.ndarray:
     """Return which cells have another outcome at this distance along an axis, up or down."""
     found = np.zeros(label.shape, bool)
     low = (slice(None),) * axis + (slice(None, -distance),)
     high = (slice(None),) * axis + (slice(distance, None),)
-    differ = (label[low] != label[high]) & there[low] & there[high]
+    differ = (label[low] != label[high]) & is_start[low] & is_start[high]
     found[low] |= differ
     found[high] |= differ
     return found
 
 
-def _by_tile(found: np.ndarray, there: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def _by_tile(found: np.ndarray, is_start: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers of `found` cells and of starts in each tile, without the margin."""
     inner = tuple(slice(margin, size - margin) for size in found.shape)
-    found, there = found[inner] & there[inner], there[inner]
+    found, is_start = found[inner] & is_start[inner], is_start[inner]
     tiles = _TILES_OF_A_ROW if found.ndim == 1 else _TILES
-    place = np.zeros(found.shape, int)
+    tile = np.zeros(found.shape, int)
     for axis, size in enumerate(found.shape):
         row = np.arange(size) * tiles // max(size, 1)
-        place = place * tiles + row.reshape([-1 if i == axis else 1 for i in range(found.ndim)])
-    many = tiles**found.ndim
-    return np.bincount(place[found], minlength=many), np.bincount(place[there], minlength=many)
+        tile = tile * tiles + row.reshape([-1 if i == axis else 1 for i in range(found.ndim)])
+    count = tiles**found.ndim
+    return np.bincount(tile[found], minlength=count), np.bincount(tile[is_start], minlength=count)
 
 
 def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
     """Return the slope of a straight line by least squares, and its standard error."""
     x, y = across - across.mean(), up - up.mean()
     slope = float(x @ y / (x @ x))
-    rest = y - slope * x
-    return slope, float(np.sqrt(rest @ rest / max(len(x) - 2, 1) / (x @ x)))
+    residual = y - slope * x
+    return slope, float(np.sqrt(residual @ residual / max(len(x) - 2, 1) / (x @ x)))
 
 
 def _jackknife(across: np.ndarray, uncertain: np.ndarray, starts: np.ndarray) -> float:
     """Return the standard error of the slope, from its values with each tile left out."""
     slopes = []
     for tile in np.flatnonzero(starts):
-        rest = uncertain.sum(axis=1) - uncertain[:, tile]
-        if not (rest > 0).all():
+        others = uncertain.sum(axis=1) - uncertain[:, tile]
+        if not (others > 0).all():
             return np.inf  # one tile has all uncertain starts: the spread is unknown
-        slopes.append(_slope(across, np.log(rest / (starts.sum() - starts[tile])))[0])
-    several = len(slopes)
-    return float(np.sqrt((several - 1) * np.var(slopes))) if several > 1 else np.inf
+        slopes.append(_slope(across, np.log(others / (starts.sum() - starts[tile])))[0])
+    count = len(slopes)
+    return float(np.sqrt((count - 1) * np.var(slopes))) if count > 1 else np.inf
 
 
 class Cells(NamedTuple):
@@ -246,8 +246,8 @@ def ball_around(point: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     square = np.zeros(foreign.shape)
     parts = zip(cells.centres, point, cells.widths, cells.scales, cells.round, strict=True)
     for axis, (row, x, width, scale, round_) in enumerate(parts):
-        away = without_turns(row - x) if round_ else row - x
-        gap = np.maximum(np.abs(away) - width / 2, 0.0) / scale
+        offset = without_turns(row - x) if round_ else row - x
+        gap = np.maximum(np.abs(offset) - width / 2, 0.0) / scale
         square += (gap**2).reshape([-1 if i == axis else 1 for i in range(foreign.ndim)])
     nearest = float(np.sqrt(np.min(square[foreign], initial=np.inf)))
     edge = cells.to_edge(point)
@@ -261,23 +261,23 @@ def largest_ball(own: np.ndarray, foreign: np.ndarray, cells: Cells) -> Ball:
     from scipy.ndimage import distance_transform_edt  # slow to load
 
     # Angles are extended periodically by half a turn on both sides.
-    more = np.where(cells.round, np.array(own.shape) // 2 + 1, 0)
-    own = np.pad(own, [(n, n) for n in more])
-    foreign = np.pad(foreign, [(n, n) for n in more], mode="wrap")
+    padding = np.where(cells.round, np.array(own.shape) // 2 + 1, 0)
+    own = np.pad(own, [(n, n) for n in padding])
+    foreign = np.pad(foreign, [(n, n) for n in padding], mode="wrap")
     # On a lattice of half the spacing, the point of a box nearest to any node is itself a node.
     shape = tuple(2 * size + 1 for size in own.shape)
-    free, near = np.ones(shape, bool), np.zeros(shape, bool)
+    free, is_centre = np.ones(shape, bool), np.zeros(shape, bool)
     for offset in itertools.product((0, 1, 2), repeat=own.ndim):
         nodes = tuple(slice(o, o + 2 * n - 1, 2) for o, n in zip(offset, own.shape, strict=True))
         free[nodes] &= ~foreign
-        near[nodes] |= own
+        is_centre[nodes] |= own
     for axis, side in np.argwhere(cells.ends):
         free[(slice(None),) * int(axis) + (-int(side),)] = False
     low, half = cells.edges[:, 0], cells.widths / 2
     if free.all():
         return Ball(np.inf, cells.edges.mean(axis=1), False)
     distance = distance_transform_edt(free, sampling=list(half / cells.scales))
-    radius = np.where(near, np.asarray(distance, float), -1.0)
-    place = np.array(np.unravel_index(int(np.argmax(radius)), shape))
-    largest, centre = float(radius.max()), low + (place - 2 * more) * half
+    radius = np.where(is_centre, np.asarray(distance, float), -1.0)
+    node = np.array(np.unravel_index(int(np.argmax(radius)), shape))
+    largest, centre = float(radius.max()), low + (node - 2 * padding) * half
     return Ball(largest, centre, cells.to_edge(centre) <= largest * (1 + 1e-9))

@@ -101,8 +101,8 @@ class Lyapunov(Summarized):
         data = xr.Dataset(variables | present(alone, batch))
         for name in ("exponents", "spread"):
             data[name].attrs |= attributes(self.unit)
-        own = {name: name for name in self.averages}
-        return tidy(with_units(data, dict(self.units), own) if own else data, along)
+        by_name = {name: name for name in self.averages}
+        return tidy(with_units(data, dict(self.units), by_name) if by_name else data, along)
 
     def summary(self) -> str:
         """Return the exponents as text; for a batch the range of the greatest."""
@@ -180,10 +180,10 @@ def lyapunov(
         # States on a section do not show the exponent 0 along the motion.
         machine = machine.observed_every(machine.cycle)
     method = chosen(machine, method)
-    carried = cycle_map(machine, method=method)
+    the_map = cycle_map(machine, method=method)
     if rests is not None:
-        carried = dataclasses.replace(carried, rests=flag("rests", rests))
-    start = map_state(carried.machine, start, "start")
+        the_map = dataclasses.replace(the_map, rests=flag("rests", rests))
+    start = map_state(the_map.machine, start, "start")
     states = int(_is_free(machine, start).sum())
     number = states if number is None else count("number", number, least=1)
     if number > states:
@@ -191,37 +191,37 @@ def lyapunov(
             f"Argument `number` must be at most {states}, the free states of the machine, but got "
             f"{number}."
         )
-    if cycles > 2 * _AT_ONCE and is_outermost(carried, start, settle):
+    if cycles > 2 * _AT_ONCE and is_outermost(the_map, start, settle):
         window = _window(cycles) if number == 1 else 1
         pieces = (min(_AT_ONCE, cycles - done) for done in range(0, cycles, _AT_ONCE))
 
         def step(carry, windows):
-            carry, seen = _part(carried, start, carry, jnp.asarray(windows), window)
-            return carry, jtu.tree_map(lambda x: x[:windows], seen)
+            carry, observed = _observe_windows(the_map, start, carry, jnp.asarray(windows), window)
+            return carry, jtu.tree_map(lambda x: x[:windows], observed)
 
         def joined(carry, parts) -> Lyapunov:
-            seen = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-            return _ended(carried, start, carry, seen)
+            observed = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+            return _compiled_result(the_map, start, carry, observed)
 
         return in_parts(
-            "observation of exponents", step, _begun(carried, start, settle, number),
+            "observation of exponents", step, _initial_carry(the_map, start, settle, number),
             ((size, size // window) for size in pieces), joined, progress=progress, unit="cycle",
             total=cycles,
         )  # fmt: skip
-    return _lyapunov(carried, start, cycles, settle, number)
+    return _lyapunov(the_map, start, cycles, settle, number)
 
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
     """Return the exponents of one motion that begins on the section."""
-    carry = _begun(the_map, start, settle, number)
+    carry = _initial_carry(the_map, start, settle, number)
     window = _window(cycles) if number == 1 else 1
-    carry, seen = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)
-    return _summed(the_map, start, carry, seen)
+    carry, found = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)
+    return _result_of(the_map, start, carry, found)
 
 
 @compiled
-def _begun(the_map: CycleMap, start, settle, number: int) -> Any:
+def _initial_carry(the_map: CycleMap, start, settle, number: int) -> Any:
     """Return the carry where the observation begins: the state as a row with the machine's own
     modes (or `None`), the first tangent vectors, and the result of the run so far."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
@@ -248,21 +248,21 @@ def _is_free(machine: AbstractMachine, start: State) -> np.ndarray:
 
 
 @compiled
-def _part(the_map: CycleMap, start, carry, windows, window: int) -> Any:
+def _observe_windows(the_map: CycleMap, start, carry, windows, window: int) -> Any:
     """Return the observations in the first `windows` windows, and zeros up to `_AT_ONCE` cycles."""
     observe = _observer(the_map, start, window)
     absent = jtu.tree_map(jnp.zeros_like, jax.eval_shape(observe, carry, None)[1])
 
-    def one(carry, i):
+    def observe_one(carry, i):
         return jax.lax.cond(
             i < windows, lambda carry: observe(carry, None), lambda carry: (carry, absent), carry
         )
 
-    return jax.lax.scan(one, carry, jnp.arange(_AT_ONCE // window))
+    return jax.lax.scan(observe_one, carry, jnp.arange(_AT_ONCE // window))
 
 
 def _observer(the_map: CycleMap, start, window: int) -> Any:
-    """Return a function that continues from `_begun`, with rates, durations and integrals."""
+    """Return a function for `jax.lax.scan` that returns rates, durations and integrals."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(without_modes(start))[1]
     # Directions are relative to the sizes of components. With units of very different sizes,
@@ -270,8 +270,8 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
     unit = row_sizes(machine, start)
 
     # With cycles of equal duration, turning points are not needed.
-    plain = has_fixed_cycle(machine, without_modes(start)) and not has_averages(machine)
-    record = "sections" if plain else "motion"
+    fixed_cycles = has_fixed_cycle(machine, without_modes(start)) and not has_averages(machine)
+    record = "sections" if fixed_cycles else "motion"
 
     def image(x, modes):
         state = with_modes(unravel(x), modes)
@@ -286,26 +286,26 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         (x, modes), frame, result = carry
 
         def along(direction):
-            there = jax.jvp(lambda x: image(x, modes), (x,), (unit * direction,), has_aux=True)
-            return there[0], there[1] / unit, there[2]
+            images = jax.jvp(lambda x: image(x, modes), (x,), (unit * direction,), has_aux=True)
+            return images[0], images[1] / unit, images[2]
 
         new, grown, (duration, integrals, ended, modes) = jax.vmap(
             along, in_axes=1, out_axes=(None, 2, None)
         )(frame)
-        frame, sizes = _orthogonal(grown[-1])
-        alone = frame.shape[1] == 1
-        none = sizes == 0  # their logarithm has no derivative, not even times zero
-        logarithms = jnp.where(none, -jnp.inf, jnp.log(jnp.where(none, 1.0, sizes)))
-        rates = _growth(grown[..., 0])[:, None] if alone else logarithms[None]
+        frame, sizes = _orthonormalize(grown[-1])
+        is_single = frame.shape[1] == 1
+        vanished = sizes == 0  # their logarithm has no derivative, not even times zero
+        logarithms = jnp.where(vanished, -jnp.inf, jnp.log(jnp.where(vanished, 1.0, sizes)))
+        rates = _growth(grown[..., 0])[:, None] if is_single else logarithms[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
         return ((new[-1], modes), frame, result), (rates, duration, integrals)
 
     return observe
 
 
-def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
-    """Return the exponents from `carry` and `seen` in a row, results of `_observer`'s function."""
-    ((x, modes), _, result), (rates, duration, integrals) = carry, seen
+def _result_of(the_map: CycleMap, start, carry, observed) -> Lyapunov:
+    """Return the exponents. **Arguments:** `carry` and `observed`, from `_observer`'s function."""
+    ((x, modes), _, result), (rates, duration, integrals) = carry, observed
     rates, duration, machine = rates.reshape(-1, rates.shape[-1]), duration.ravel(), the_map.machine
     mean, halves = _weighted(rates, duration)
     good = result == RESULTS.successful
@@ -323,7 +323,7 @@ def _summed(the_map: CycleMap, start, carry, seen) -> Lyapunov:
     )
 
 
-_ended = compiled(_summed)
+_compiled_result = compiled(_result_of)
 
 
 def _window(cycles: int) -> int:
@@ -341,15 +341,15 @@ def _length(vector: Float[Array, " states"]) -> Scalar:
     return jnp.where(largest == 0, 0.0, unit * norm)
 
 
-def _growth(ways: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
+def _growth(directions: Float[Array, "cycles states"]) -> Float[Array, " cycles"]:
     """Return the logarithm of the growth of a direction in each cycle; it begins with length 1."""
-    sizes = jax.vmap(_length)(ways)
+    sizes = jax.vmap(_length)(directions)
     before = jnp.concatenate([jnp.ones_like(sizes[:1]), sizes[:-1]])
     # A direction that vanished stays zero.
     return jnp.where(before > 0, jnp.log(sizes / jnp.where(before > 0, before, 1.0)), -jnp.inf)
 
 
-def _orthogonal(
+def _orthonormalize(
     frame: Float[Array, "states number"],
 ) -> tuple[Float[Array, "states number"], Float[Array, " number"]]:
     """Return the frame made orthonormal (Gram and Schmidt, twice), and its lengths before that."""
@@ -360,10 +360,10 @@ def _orthogonal(
             for other in columns:
                 column = column - jnp.dot(other, column) * other
         size = _length(column)
-        # Only rounding is left of a direction that is forgotten at once, as in a rest.
-        lost = size <= _ROUNDING * jnp.finfo(size.dtype).eps * before
-        columns.append(jnp.where(lost, 0.0, column / jnp.where(lost, 1.0, size)))
-        sizes.append(jnp.where(lost, 0.0, size))
+        # A direction that vanishes, as in a rest, contains only rounding.
+        vanished = size <= _ROUNDING * jnp.finfo(size.dtype).eps * before
+        columns.append(jnp.where(vanished, 0.0, column / jnp.where(vanished, 1.0, size)))
+        sizes.append(jnp.where(vanished, 0.0, size))
     return jnp.stack(columns, axis=1), jnp.stack(sizes)
 
 
@@ -371,8 +371,8 @@ def _weighted(rates, duration):
     """Return mean rates in time, and those of the greatest exponent in both halves."""
 
     def mean(rates, duration):
-        place = (jnp.arange(duration.size, dtype=duration.dtype) + 0.5) / duration.size
-        weight = jnp.exp(-1 / (place * (1 - place)))
+        position = (jnp.arange(duration.size, dtype=duration.dtype) + 0.5) / duration.size
+        weight = jnp.exp(-1 / (position * (1 - position)))
         # At both ends weights underflow, and 0 · ∞ is NaN.
         lost = jnp.any(rates == -jnp.inf, axis=0)
         return jnp.where(lost, -jnp.inf, weight @ jnp.where(lost, 0.0, rates)) / (weight @ duration)

@@ -78,11 +78,11 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
             f"`concurrent.futures.Executor`, but got {cluster!r}."
         )
     workers = lanes.cores() if workers is None else count("workers", workers, least=1)
-    there = len(jax.local_devices())
-    devices = there if devices is None else count("devices", devices, least=1)
-    if devices > there:
+    local = len(jax.local_devices())
+    devices = local if devices is None else count("devices", devices, least=1)
+    if devices > local:
         raise ValueError(
-            f"Argument `devices` must be at most {there}, the local devices, but got {devices}."
+            f"Argument `devices` must be at most {local}, the local devices, but got {devices}."
         )
     return Workplace(workers, devices, cluster)
 
@@ -93,24 +93,24 @@ def computed(
     """Return the data of a program on a grid (`blocks`), checked before any work; `store` is the
     path of a store, `None` for memory. **Raises:** as `scan`."""
     program = check_corners(program, blocks)
-    with contextlib.closing(opened(program, blocks, store)) as kept:
-        todo = kept.open_blocks()
+    with contextlib.closing(opened(program, blocks, store)) as storage:
+        todo = storage.open_blocks()
         _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
         with at_work(
-            "scan", lambda: ScanInterrupted(kept.data(), store),
+            "scan", lambda: ScanInterrupted(storage.data(), store),
             progress=progress, unit="lane", total=blocks.total, done=done,
-        ) as tell:  # fmt: skip
+        ) as report:  # fmt: skip
 
             def write(where: Where, numbers: dict[str, np.ndarray]) -> None:
-                kept.write(where, numbers)
-                tell(_size_of(where))
+                storage.write(where, numbers)
+                report(_size_of(where))
 
             try:
                 run_blocks(program, blocks, todo, place, write)
-            except ClusterLost as lost:
-                raise ConnectionError(_how_to_go_on(kept)) from lost
-        return kept.data()
+            except ClusterLost as error:
+                raise ConnectionError(_advice_after_loss(storage)) from error
+        return storage.data()
 
 
 def _size_of(where: Where) -> int:
@@ -132,14 +132,14 @@ def in_blocks(
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
-    at_fault = "cycles" if lanes is None else "lanes"
+    argument = "cycles" if lanes is None else "lanes"
     if lanes is None:
         lanes = _block_size(total, place)
     else:  # a multiple of the step, but no larger than the grid needs
         step = _LEAST * place.devices
         lanes = math.ceil(min(count("lanes", lanes, least=1), total) / step) * step
     points = program.cycles * max(1, program.options.samples) + 1
-    fits_records(at_fault, lanes * points, 12)
+    fits_records(argument, lanes * points, 12)
     if program.lane_noise is not None and numbers is None:
         if total > 2**32:  # lanes have 32-bit numbers
             raise ValueError(
@@ -162,11 +162,11 @@ def _lanes_in(path: Path) -> int | None:
 def _block_size(total: int, place: Workplace) -> int:
     """Return the lanes in a block: few sizes, since each is a program, for blocks on every core."""
     if jax.default_backend() != "cpu":
-        most, share = _ON_ACCELERATOR * place.devices, total
+        largest, share = _ON_ACCELERATOR * place.devices, total
     else:
-        most, share = _MOST * place.devices, math.ceil(total / place.workers)
+        largest, share = _MOST * place.devices, math.ceil(total / place.workers)
     size = _LEAST * place.devices
-    while size < min(share, most):
+    while size < min(share, largest):
         size *= 2
     return size
 
@@ -192,7 +192,7 @@ def run_blocks(
     **Raises:** `ClusterLost`; errors of a block.
     """
     # As NumPy arrays it is sent with every task: shared data would be lost with their worker.
-    parcel = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
+    packed = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
     with contextlib.ExitStack() as stack:
         if place.cluster is not None:
             pool, at_once = _executor_of(place.cluster), _ON_CLUSTER
@@ -208,7 +208,7 @@ def run_blocks(
             devices, one_core = place.devices, True
         x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
         task = functools.partial(
-            _task, parcel, lanes_of_block=blocks.lanes, devices=devices, x64=x64, one_core=one_core
+            _task, packed, lanes_of_block=blocks.lanes, devices=devices, x64=x64, one_core=one_core
         )
         waiting, running = iter(todo), dict[futures.Future, Where]()
 
@@ -227,11 +227,11 @@ def run_blocks(
             except (futures.CancelledError, futures.BrokenExecutor) as error:
                 raise ClusterLost from error
             del running[future]
-            for other in [x for x in running if twice and running[x] == where]:
+            for other in [x for x in running if resubmitted and running[x] == where]:
                 other.cancel()
                 del running[other]
 
-        since, longest, twice = time.monotonic(), 0.0, False
+        since, longest, resubmitted = time.monotonic(), 0.0, False
         try:
             while True:
                 for where in itertools.islice(waiting, at_once - len(running)):
@@ -245,8 +245,8 @@ def run_blocks(
                 if done:
                     since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
                 elif _has_workers(place.cluster) and hasattr(place.cluster, "get_executor"):
-                    if not twice and waited > _LONG * (longest or _LONG * _PATIENCE):
-                        twice = True
+                    if not resubmitted and waited > _LONG * (longest or _LONG * _PATIENCE):
+                        resubmitted = True
                         for where in list(running.values()):
                             begin(where)
                 for future in done:
@@ -275,7 +275,7 @@ def _has_workers(cluster: Any) -> bool:
 
 
 def _task(
-    parcel: ScanProgram,
+    packed: ScanProgram,
     values: dict[str, np.ndarray],
     lanes_of_block: int,
     devices: int,
@@ -284,33 +284,33 @@ def _task(
 ) -> dict[str, np.ndarray]:
     threads = lanes.threads(1) if one_core else contextlib.nullcontext()
     with jax.enable_x64(x64), threads:  # each thread has its own setting
-        program = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parcel)
+        program = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, packed)
         return compute(program, values, lanes_of_block, devices)
 
 
-def _how_to_go_on(kept: MemoryStore) -> str:
+def _advice_after_loss(storage: MemoryStore) -> str:
     """Return a message about the finished part of a scan after the loss of its cluster."""
-    how = "Nothing was stored. Pass a `store`, from which the same call can continue."
-    if isinstance(kept, ZarrStore):
-        number = len(kept.blocks)
-        done = number - len(kept.open_blocks())
-        how = (
-            f"{done:,} of {number:,} blocks are computed and stored in {kept.path}. The same "
+    advice = "Nothing was stored. Pass a `store`, from which the same call can continue."
+    if isinstance(storage, ZarrStore):
+        number = len(storage.blocks)
+        done = number - len(storage.open_blocks())
+        advice = (
+            f"{done:,} of {number:,} blocks are computed and stored in {storage.path}. The same "
             "call continues from there, with a new client or without `cluster`."
         )
-    return f"The cluster was lost, or its scheduler. {how}"
+    return f"The cluster was lost, or its scheduler. {advice}"
 
 
 @functools.cache
 def _compiled(devices: int) -> Callable[..., dict[str, Array]]:
     mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("lanes",))
-    whole, split = PartitionSpec(), PartitionSpec("lanes")
+    replicated, split = PartitionSpec(), PartitionSpec("lanes")
 
     def over_devices(program, values, wanted):
         numbers, rest = eqx.partition(program, eqx.is_array)
         return jax.shard_map(
             lambda numbers, *lanes: eqx.combine(numbers, rest)(*lanes),
-            mesh=mesh, in_specs=(whole, split, split), out_specs=split, check_vma=False,
+            mesh=mesh, in_specs=(replicated, split, split), out_specs=split, check_vma=False,
         )(numbers, values, wanted)  # fmt: skip
 
     function = ScanProgram.__call__ if devices == 1 else over_devices
@@ -326,15 +326,15 @@ def compute(
     dry: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return the numbers of a block of lanes, by name. A block is padded to `lanes`, so that all
-    blocks are one program. Lanes are dealt to several devices in turn, since neighbours take
+    blocks are one program. Lanes are given to several devices in turn, since neighbours take
     similar times. With `dry`, the program is only compiled: no lane is run."""
     size = next(iter(values.values())).size
-    deal = np.arange(lanes).reshape(-1, devices).T.ravel()
-    place = np.minimum(deal, size - 1)
-    filled = {name: jnp.asarray(x[place]) for name, x in values.items()}
-    out = _compiled(devices)(program, filled, jnp.asarray((deal < size) & (not dry)))
-    back = np.argsort(deal)[:size]
-    return {name: np.asarray(x)[back] for name, x in out.items()}
+    order = np.arange(lanes).reshape(-1, devices).T.ravel()
+    lanes_here = np.minimum(order, size - 1)
+    filled = {name: jnp.asarray(x[lanes_here]) for name, x in values.items()}
+    out = _compiled(devices)(program, filled, jnp.asarray((order < size) & (not dry)))
+    inverse = np.argsort(order)[:size]
+    return {name: np.asarray(x)[inverse] for name, x in out.items()}
 
 
 class LanesFailed(UserWarning):
@@ -435,10 +435,10 @@ def scan(
 
 
 def _finer_method(program: ScanProgram) -> AbstractMethod:
-    best, mine = preset(program.machine, "reference"), program.method
-    if type(best) is type(mine) and best.steps_per_cycle <= mine.steps_per_cycle:
-        return mine.tighter()
-    steps = max(best.steps_per_cycle, 2 * mine.steps_per_cycle)
+    best, used = preset(program.machine, "reference"), program.method
+    if type(best) is type(used) and best.steps_per_cycle <= used.steps_per_cycle:
+        return used.tighter()
+    steps = max(best.steps_per_cycle, 2 * used.steps_per_cycle)
     return dataclasses.replace(best, steps_per_cycle=steps)
 
 
@@ -455,21 +455,21 @@ def _verified(
         places = (drawn,) * len(blocks.axes)
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
     numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own noise
-    again = in_blocks(program, axes, place, paired=True, numbers=numbers)
+    checked_blocks = in_blocks(program, axes, place, paired=True, numbers=numbers)
     kept = functools.partial(ScanInterrupted, data, store)
     with at_work("verification", kept, progress=False):
-        better = computed(program, again, place)
+        better = computed(program, checked_blocks, place)
     found: dict[str, Any] = {"verified_lanes": lanes}
     for name in better:
-        mine = np.asarray(data[name]).reshape(total, -1)[drawn]
-        other = np.asarray(better[name]).reshape(lanes, -1)
-        if mine.dtype.kind == "f":
-            same = (mine == other) | (np.isnan(mine) & np.isnan(other))
-            apart = np.where(same, 0.0, np.abs(mine - other))
-            worst = np.where(np.isfinite(apart), apart, np.inf).max(axis=1)
+        values = np.asarray(data[name]).reshape(total, -1)[drawn]
+        accurate = np.asarray(better[name]).reshape(lanes, -1)
+        if values.dtype.kind == "f":
+            same = (values == accurate) | (np.isnan(values) & np.isnan(accurate))
+            difference = np.where(same, 0.0, np.abs(values - accurate))
+            worst = np.where(np.isfinite(difference), difference, np.inf).max(axis=1)
             found[f"verified_error_{name}"] = float(np.quantile(worst, 0.95, method="higher"))
         else:
-            found[f"verified_changed_{name}"] = int((mine != other).any(axis=1).sum())
+            found[f"verified_changed_{name}"] = int((values != accurate).any(axis=1).sum())
     return found
 
 

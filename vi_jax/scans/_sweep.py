@@ -58,7 +58,7 @@ from .program import lane_noise_of
 
 # A jump is this many times the change at the neighbouring values, and this share of the largest
 # position, or of ζ: choices.
-_JUMP, _NOTED = 3.0, 0.01
+_JUMP, _LEAST_JUMP = 3.0, 0.01
 
 # The variables with one number at each value of every sweep.
 COLUMNS = (
@@ -123,8 +123,8 @@ class Sweep(Summarized):
         variables["result"] = each, in_names(self.result)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
         data["period"].attrs |= flags(CODES)
-        own = {name: name for name in (*self.averages, self.parameter)}
-        return tidy(with_units(data, dict(self.units), own), along)
+        by_name = {name: name for name in (*self.averages, self.parameter)}
+        return tidy(with_units(data, dict(self.units), by_name), along)
 
     def drawn(self) -> Any:
         """Return the smallest position at each value."""
@@ -180,13 +180,13 @@ class Sweep(Summarized):
                 continue
             x = np.asarray(x)
             steps = np.abs(np.diff(x))
-            beside = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
-            usual = np.maximum(beside[:-2], beside[2:])
-            most = np.abs(x) if name == speed else np.asarray(reach)
-            scale = np.maximum(most[1:], most[:-1])
-            far = (steps > _JUMP * usual) & (steps > _NOTED * scale)
-            far &= (period[1:] > 0) | (period[:-1] > 0)
-            for i in np.flatnonzero(far) + 1:
+            neighbours = np.nan_to_num(np.concatenate([[0.0], steps, [0.0]]))
+            usual = np.maximum(neighbours[:-2], neighbours[2:])
+            size = np.abs(x) if name == speed else np.asarray(reach)
+            scale = np.maximum(size[1:], size[:-1])
+            is_jump = (steps > _JUMP * usual) & (steps > _LEAST_JUMP * scale)
+            is_jump &= (period[1:] > 0) | (period[:-1] > 0)
+            for i in np.flatnonzero(is_jump) + 1:
                 found[i].append(with_unit(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}", unit))
         return found
 
@@ -303,14 +303,14 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 
 def moved_by_stops(machine: AbstractMachine, state: State) -> State:
     """Return the state with the body moved to a stop that is beyond it, at rest."""
-    here = without_modes(state)
+    new = without_modes(state)
     for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
-        Y = body.position(here)
+        Y = body.position(new)
         beyond = stop.beyond(Y) > 0
-        moved = body.placed(here, stop.place, jnp.zeros_like(Y))
-        here = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, here)
-    return replaced(state, here)
+        moved = body.placed(new, stop.place, jnp.zeros_like(Y))
+        new = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, new)
+    return replaced(state, new)
 
 
 @compiled
@@ -321,31 +321,31 @@ def _sweep(
     """Return the state after the last value, and the results at each; `start`, with noise with the
     index of the first value; `first`, the state at the first value of all."""
 
-    def one(state, value):
-        here, noise = with_leaf(machine, parameter, value), {}
+    def run_value(state, value):
+        current, noise = with_leaf(machine, parameter, value), {}
         state, number = (state, None) if lane_noise is None else state
         if lane_noise is not None:
             noise = {
                 "noise": lane_noise.noise,
                 "key": lane_key(lane_noise.key, jnp.asarray(number)),
             }
-        state = moved_by_stops(here, state)
+        state = moved_by_stops(current, state)
         run = simulate(
-            here, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
+            current, state, cycles, settle=settle, method=method, rests=rests, max_steps=max_steps,
             **noise,
         )  # fmt: skip
         state = jtu.tree_map(lambda a, b: jnp.where(run.successful, a, b), run.last, state)
-        onward = state if number is None else (state, number + jnp.uint32(1))
+        next_carry = state if number is None else (state, number + jnp.uint32(1))
         assert run.duration is not None and run.impact_energy is not None
-        found = Usual("extremes")(here, run) | regime.begun(first)(here, run)
-        return onward, Sweep(
+        found = Usual("extremes")(current, run) | regime.begun(first)(current, run)
+        return next_carry, Sweep(
             parameter=parameter,
             values=value,
             y_min=found["y_min"],
             y_max=found["y_max"],
             period=found["period"].astype(jnp.int32),
             impacts=jnp.where(run.successful, found["impacts"], jnp.nan),
-            frequency_ratio=frequency_ratio(here, jnp.mean(run.duration)),
+            frequency_ratio=frequency_ratio(current, jnp.mean(run.duration)),
             impact_speed=found["impact_speed"],
             impact_energy=jnp.mean(run.impact_energy),
             sections=jtu.tree_map(lambda x: x[1:], run.sections),
@@ -356,4 +356,4 @@ def _sweep(
             periods=tuple(cycles_in_words(machine, n) for n in range(1, cycles // 2 + 1)),
         )
 
-    return jax.lax.scan(one, start, values)
+    return jax.lax.scan(run_value, start, values)

@@ -99,15 +99,15 @@ def least_period(
     def compared(_, p):
         before = jax.lax.dynamic_slice_in_dim(rows, longest - p, count, axis=1)
         now = last if angles is None else nearest_images(angles, last.T, before.T).T
-        apart = jnp.abs(now - before)
-        return _, jnp.where(jnp.any(apart[-1] > 0), jnp.inf, jnp.max(apart[:-1] / scale))
+        difference = jnp.abs(now - before)
+        return _, jnp.where(jnp.any(difference[-1] > 0), jnp.inf, jnp.max(difference[:-1] / scale))
 
     periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
-    _, apart = jax.lax.scan(compared, None, periods)
-    least = jnp.min(apart)
+    _, difference = jax.lax.scan(compared, None, periods)
+    least = jnp.min(difference)
     noise = jnp.maximum(wander, _ROUNDINGS * float(jnp.finfo(states.dtype).eps))
     most = jnp.minimum(_SLACK * tolerance, _WORSE * jnp.maximum(least, noise))
-    period = jnp.min(jnp.where(apart <= most, periods, longest))
+    period = jnp.min(jnp.where(difference <= most, periods, longest))
     return jnp.where(least <= tolerance, period, REGIMES.unsettled)
 
 
@@ -312,10 +312,10 @@ class Exponent(AbstractMeasure):
         return jnp.asarray(True)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        found_out = lyapunov(
+        spectrum = lyapunov(
             machine, state, self.observed, settle=0, number=1, method=method, rests=rests
         )
-        return {"exponent": found_out.exponents[0]}
+        return {"exponent": spectrum.exponents[0]}
 
 
 class Regime(AbstractMeasure):
@@ -405,13 +405,13 @@ class Regime(AbstractMeasure):
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
         """Return whether it is chaotic, or at the second pass still chaotic."""
         settle = pass_number * (self.observed + self.lasting)
-        out = lyapunov(
+        spectrum = lyapunov(
             machine, state, self.observed, settle=settle, number=1, method=method, rests=rests
         )
-        chaotic = out.exponents[0] > self.threshold
+        chaotic = spectrum.exponents[0] > self.threshold
         # A lane that cannot be continued is unchanged.
-        went_on, before = out.successful & (pass_number > 0), found["period"]
-        otherwise = jnp.where(went_on, REGIMES.transient, before)
+        continued, before = spectrum.successful & (pass_number > 0), found["period"]
+        otherwise = jnp.where(continued, REGIMES.transient, before)
         return {"period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(before.dtype)}
 
 
@@ -464,19 +464,19 @@ class _Observed(AbstractMeasure):
         columns = {} if self.samples else {n: getattr(run, n) for n in _COLUMNS} | run.averages
         found = columns.get(name)
         if found is None:
-            there = [*components(run.sections, 1), *run.quantities]
-            there += [n for n, x in columns.items() if x is not None]
-            raise ValueError(f"Argument `of` must be one of {', '.join(there)}, but got {name!r}.")
+            names = [*components(run.sections, 1), *run.quantities]
+            names += [n for n, x in columns.items() if x is not None]
+            raise ValueError(f"Argument `of` must be one of {', '.join(names)}, but got {name!r}.")
         found = found.astype(jnp.result_type(float))
         return found, found
 
 
-def _checked_of(name: object) -> None:
+def _check_of(name: object) -> None:
     if not callable(name):
         instance_of("of", name, str, "the name of a quantity, or a function of machine and run")
 
 
-def _called(of: Of) -> str:
+def _name_of(of: Of) -> str:
     return of if isinstance(of, str) else of.__name__
 
 
@@ -506,7 +506,7 @@ class Statistics(_Observed):
     samples: int = eqx.field(static=True, default=0, kw_only=True)
 
     def __check_init__(self):
-        _checked_of(self.of)
+        _check_of(self.of)
         count("batches", self.batches, least=2)
         count("samples", self.samples)
 
@@ -515,7 +515,7 @@ class Statistics(_Observed):
         return self.batches
 
     def described(self, start):
-        name = _called(self.of)
+        name = _name_of(self.of)
         words = {
             "mean": f"mean of {name}", "error": f"standard error of the mean of {name}",
             "spread": f"standard deviation of {name}",
@@ -541,12 +541,12 @@ class Statistics(_Observed):
             "spread": spread,
             "spread_error": self._error(square) / halved,
         }
-        return {f"{_called(self.of)}_{k}": x for k, x in numbers.items()}
+        return {f"{_name_of(self.of)}_{k}": x for k, x in numbers.items()}
 
     def _error(self, row: Float[Array, " instants"]) -> Float[Array, ""]:
         """Return the standard error of a row's mean, from its end that has equal parts."""
-        long = row.size // self.batches
-        parts = row[row.size - long * self.batches :].reshape(self.batches, long)
+        length = row.size // self.batches
+        parts = row[row.size - length * self.batches :].reshape(self.batches, length)
         return jnp.std(jnp.mean(parts, axis=1), ddof=1) / self.batches**0.5
 
 
@@ -601,16 +601,16 @@ class Density(_Observed):
     def __call__(self, machine, run):
         rows = [self.row(machine, run, name)[1] for name in self.of]
         sizes = [edges.size - 1 for edges in self.edges]
-        place, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
+        cell, inside, area = jnp.zeros_like(rows[0], dtype=int), True, jnp.ones(())
         for row, edges, size in zip(rows, self.edges, sizes, strict=True):
-            mine = jnp.searchsorted(edges, row, side="right") - 1
+            bin_number = jnp.searchsorted(edges, row, side="right") - 1
             # The last bin includes its upper edge, on which a body may rest.
-            mine = jnp.where(row == edges[-1], size - 1, mine)
-            inside = inside & (mine >= 0) & (mine < size)
-            place = place * size + jnp.clip(mine, 0, size - 1)
+            bin_number = jnp.where(row == edges[-1], size - 1, bin_number)
+            inside = inside & (bin_number >= 0) & (bin_number < size)
+            cell = cell * size + jnp.clip(bin_number, 0, size - 1)
             area = area[..., None] * jnp.diff(edges)
         shares = jnp.where(inside, 1.0, 0.0) / rows[0].size
-        flat = jnp.zeros(int(np.prod(sizes))).at[place].add(shares)
+        flat = jnp.zeros(int(np.prod(sizes))).at[cell].add(shares)
         return {"density": flat.reshape(sizes) / area, "outside": 1.0 - jnp.sum(shares)}
 
 
@@ -639,7 +639,7 @@ class Escape(_Observed):
     samples: int = eqx.field(static=True, default=0, kw_only=True)
 
     def __check_init__(self):
-        _checked_of(self.of)
+        _check_of(self.of)
         for name in ("low", "high"):
             if not np.isinf(getattr(self, name)):
                 given_number(name, getattr(self, name))
@@ -674,9 +674,9 @@ class Escape(_Observed):
         return (value < self.low) | (value > self.high)
 
     def __call__(self, machine, run):
-        row, behind = self.row(machine, run, self.of)
+        row, later = self.row(machine, run, self.of)
         # Results for cycles begin at the end of the first cycle.
-        row = row if row.size > behind.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])
+        row = row if row.size > later.size else jnp.concatenate([jnp.zeros(1) + jnp.nan, row])
         outside = self._outside(row)
         escaped = jnp.any(outside)
         first = jnp.where(escaped, jnp.argmax(outside), row.size - 1)
@@ -726,16 +726,16 @@ def escape_rate(
     for name in names:
         one_of("over", name, tuple(dims))
     step = float(time.attrs.get("step", 1.0))
-    watched = time > after  # false for failed lanes, which are NaN
-    escaped = watched & (data["escaped"] == 1)
+    observed = time > after  # false for failed lanes, which are NaN
+    escaped = observed & (data["escaped"] == 1)
     escapes = escaped.sum(names)
-    looks = ((time - after) / step).where(watched, 0.0).sum(names)
+    observations = ((time - after) / step).where(observed, 0.0).sum(names)
     tail = 0.5 * (1.0 - confidence)
 
     def rate(number: Any) -> Any:
         """Return the rate for a number of escapes, which share the lanes left at each instant."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return -np.log1p(-np.minimum(number / looks, 1.0)) / step
+            return -np.log1p(-np.minimum(number / observations, 1.0)) / step
 
     low = xr.apply_ufunc(lambda n: np.where(n > 0, 0.5 * chi2.ppf(tail, 2 * n), 0.0), escapes)
     high = xr.apply_ufunc(lambda n: 0.5 * chi2.ppf(1 - tail, 2 * n + 2), escapes)
@@ -745,8 +745,8 @@ def escape_rate(
             "rate_low": rate(low),
             "rate_high": rate(high),
             "escapes": escapes,
-            "censored": (watched & ~escaped).sum(names),
-            "cycles": looks * step,
+            "censored": (observed & ~escaped).sum(names),
+            "cycles": observations * step,
         }
     )
     for name in ("rate", "rate_low", "rate_high"):

@@ -115,12 +115,12 @@ class Blocks:
 
     def values(self, where: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """Return the axes' values of the block's lanes, and their numbers as `LANE`."""
-        beside = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}
+        lane_numbers = {} if self.numbers is None else {LANE: self.numbers[where].ravel()}
         if self.paired:
-            return {name: x[where] for name, x in self.axes.items()} | beside
+            return {name: x[where] for name, x in self.axes.items()} | lane_numbers
         rows = [x[part] for x, part in zip(self.axes.values(), where, strict=True)]
         grid = np.meshgrid(*rows, indexing="ij")
-        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)} | beside
+        return {name: x.ravel() for name, x in zip(self.axes, grid, strict=True)} | lane_numbers
 
 
 class LaneNoise(eqx.Module):
@@ -187,11 +187,11 @@ class ScanProgram(eqx.Module):
         return self.options.method
 
     def lane(
-        self, values: Mapping[str, Any], nudge: Array | None = None
+        self, values: Mapping[str, Any], perturbation: Array | None = None
     ) -> tuple[AbstractMachine, State]:
         """Return machine and start of the lane with these values on the axes, in the scan's clock;
-        `nudge` is added to the numbers of `derivatives`. **Raises:** `TypeError` if the function in
-        argument `machine` returns another object."""
+        `perturbation` is added to the numbers of `derivatives`. **Raises:** `TypeError` if the
+        function in argument `machine` returns another object."""
         of_machine = {name: x for name, x in values.items() if part_of(name) == MACHINE}
         if self.build is not None:
             machine = self.build(**of_machine)
@@ -203,76 +203,76 @@ class ScanProgram(eqx.Module):
         else:
             assert self.machine is not None
             machine = with_leaves(self.machine, of_machine)
-        machine = self._nudged(machine, MACHINE, nudge)
+        machine = self._perturbed(machine, MACHINE, perturbation)
         if self.options.clock is not None:
             machine = in_clock(machine, self.options.clock)
         start = machine.start() if self.start is None else self.start
         of_start = {name: x for name, x in values.items() if part_of(name) == START}
         start = replaced(start, start_with(without_modes(start), of_start))
-        return machine, self._nudged(start, START, nudge)
+        return machine, self._perturbed(start, START, perturbation)
 
     def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
         """Return machine and start of the lane at this index of all axes."""
         return self.lane({name: jnp.asarray(x[place]) for name, x in blocks.axes.items()})
 
     def noise_of(
-        self, values: Mapping[str, Any], nudge: Array | None = None
+        self, values: Mapping[str, Any], perturbation: Array | None = None
     ) -> tuple[WhiteNoise, Array]:
-        """Return noise and key of a lane, whose number is among its values; `nudge`: see `lane`."""
+        """Return noise and key of a lane, whose number is in `values`. **Arguments:** as `lane`."""
         assert self.lane_noise is not None
         noise, number = self.lane_noise.noise, jnp.asarray(values[LANE], jnp.uint32)
         sizes = {name: values.get(NOISE + name, x) for name, x in noise.amplitudes.items()}
-        sizes = self._nudged(sizes, NOISE, nudge) | dict(noise.functions)
+        sizes = self._perturbed(sizes, NOISE, perturbation) | dict(noise.functions)
         return dataclasses.replace(noise, amplitudes=sizes), lane_key(self.lane_noise.key, number)
 
-    def _nudged(self, tree: Any, prefix: str, nudge: Array | None) -> Any:
-        """Return `tree` with `nudge` added to the numbers of `derivatives`."""
-        if nudge is None:
+    def _perturbed(self, tree: Any, prefix: str, perturbation: Array | None) -> Any:
+        """Return `tree` with `perturbation` added to the numbers of `derivatives`."""
+        if perturbation is None:
             return tree
-        for name, change in zip(self.derivatives, nudge, strict=True):
+        for name, change in zip(self.derivatives, perturbation, strict=True):
             if part_of(name) == prefix:
-                own, here = name.removeprefix(prefix), without_modes(tree)
-                tree = replaced(tree, with_leaf(here, own, leaf(here, own) + change))
+                key, part = name.removeprefix(prefix), without_modes(tree)
+                tree = replaced(tree, with_leaf(part, key, leaf(part, key) + change))
         return tree
 
     def __call__(
         self, values: dict[str, Shaped[Array, " lanes"]], wanted: Array
     ) -> dict[str, Array]:
         """Return the numbers of all lanes, by name, with `result` among them."""
-        found, state = self._first(values, wanted, None)
+        found, state = self._measured(values, wanted, None)
         out = dict(found)
         for measure in self.measures:
             if measure.passes == 1:
-                out = self._again(measure, values, wanted, state, out)
+                out = self._refined(measure, values, wanted, state, out)
                 continue
 
-            def again(number, out, measure=measure):
-                return self._again(measure, values, wanted, state, out, number)
+            def run_pass(number, out, measure=measure):
+                return self._refined(measure, values, wanted, state, out, number)
 
-            out = jax.lax.fori_loop(0, measure.passes, again, out)
+            out = jax.lax.fori_loop(0, measure.passes, run_pass, out)
         if self.derivatives:
             basis = jnp.eye(len(self.derivatives), dtype=jnp.result_type(float))
 
-            def floats(nudge):
-                found, _ = self._first(values, wanted, nudge)
+            def floats(perturbation):
+                found, _ = self._measured(values, wanted, perturbation)
                 return {n: x for n, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}
 
             slopes = jax.vmap(lambda e: jax.jvp(floats, (jnp.zeros_like(e),), (e,))[1])(basis)
             out |= {f"d_{n}": jnp.moveaxis(x, 0, 1) for n, x in slopes.items()}
         return out
 
-    def _first(self, values, wanted, nudge) -> tuple[Numbers, State]:
-        def lane_of(values):
-            return self.lane(values, nudge)
+    def _measured(self, values, wanted, perturbation) -> tuple[Numbers, State]:
+        def build_lane(values):
+            return self.lane(values, perturbation)
 
         options = dataclasses.replace(self.options, clock=None)  # `lane` has set the clock
         noise_of = None
         if self.lane_noise is not None:
-            noise_of = functools.partial(self.noise_of, nudge=nudge)
-        run = simulate_pool(lane_of, values, self.cycles, options, wanted, noise_of)
+            noise_of = functools.partial(self.noise_of, perturbation=perturbation)
+        run = simulate_pool(build_lane, values, self.cycles, options, wanted, noise_of)
 
         def measured(values, run):
-            machine, start = lane_of(values)
+            machine, start = build_lane(values)
             found = {}
             for measure in self.measures:
                 new = measure.begun(start)(machine, run)
@@ -289,7 +289,7 @@ class ScanProgram(eqx.Module):
 
         return jax.vmap(measured)(values, run), jax.vmap(lambda run: run.last)(run)
 
-    def _again(
+    def _refined(
         self, measure: AbstractMeasure, values, wanted, state, out: Numbers, *pass_number: Array
     ) -> Numbers:
         """Return `out` with the results of another pass of a measure, for lanes that need it:
@@ -325,14 +325,14 @@ def make_program(
 ) -> ScanProgram:
     """Return the program of a scan, with its arguments checked as far as possible without the axes'
     values; `names` are those of the axes. **Raises:** `TypeError` or `ValueError`, as `scan`."""
-    build, own = None, [name for name in names if part_of(name) == MACHINE]
+    build, machine_names = None, [name for name in names if part_of(name) == MACHINE]
     template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
     if template is not None:
-        method, _, averages = _known(template, options.method, start)
+        method, _, averages = _properties(template, options.method, start)
         rests = True  # preliminary: `check_corners` decides
     elif callable(machine):
         build = machine
-        method, rests, averages = _known_of_made(build, own, options.method, start)
+        method, rests, averages = _properties_of_made(build, machine_names, options.method, start)
     else:
         raise TypeError(
             "Argument `machine` must be a `Scene`, an `AbstractMachine` or a function that makes "
@@ -357,8 +357,8 @@ def make_program(
     measures = tuple(measure.under(method) for measure in measures)
     motion = any(measure.record == "motion" for measure in measures)
     # An escaped lane ends early if there is no other measure.
-    alone = measures[0] if len(measures) == 1 and not derivatives else None
-    stop = jtu.Partial(Escape.leaves, alone) if isinstance(alone, Escape) else None
+    only_measure = measures[0] if len(measures) == 1 and not derivatives else None
+    stop = jtu.Partial(Escape.leaves, only_measure) if isinstance(only_measure, Escape) else None
     options = dataclasses.replace(
         options, settle=settle, method=method, rests=rests,
         record="motion" if motion else "sections", samples=samples_for(measures),
@@ -377,10 +377,10 @@ def make_program(
 
 
 # Properties of all machines of a scan: method, whether a body may come to rest, names of averages.
-_Known = tuple[AbstractMethod, bool, tuple[str, ...]]
+_Properties = tuple[AbstractMethod, bool, tuple[str, ...]]
 
 
-def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known:
+def _properties(machine: AbstractMachine, method: MethodLike, start: State) -> _Properties:
     averages: tuple[str, ...] = ()
     if has_averages(machine):
         first = machine.start() if start is None else convert_start(machine, start)
@@ -388,11 +388,11 @@ def _known(machine: AbstractMachine, method: MethodLike, start: State) -> _Known
     return chosen(machine, method), may_rest(machine), averages
 
 
-def _known_of_made(
+def _properties_of_made(
     build: Callable[..., Any], names: list[str], method: MethodLike, start: State
-) -> _Known:
-    """Return `_Known` for the machines from a function, for any values. **Raises:** `ValueError` if
-    the function does not take these names."""
+) -> _Properties:
+    """Return `_Properties` of the machines that a function makes. **Raises:** `ValueError` if the
+    function does not take these names."""
     try:
         inspect.signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
@@ -402,27 +402,27 @@ def _known_of_made(
         ) from None
     except ValueError:
         pass  # its arguments are unknown
-    found: list[_Known] = []
+    found: list[_Properties] = []
 
-    def made(values):
+    def inspect_machine(values):
         machine = build(**values)
         is_one = isinstance(machine, AbstractMachine)  # else `lane` raises an error
         unknown = chosen(None, method), True, ()
-        found.append(_known(machine, method, start) if is_one else unknown)
+        found.append(_properties(machine, method, start) if is_one else unknown)
 
-    jax.eval_shape(made, {name: jnp.zeros(()) for name in names})
+    jax.eval_shape(inspect_machine, {name: jnp.zeros(()) for name in names})
     return found[0]
 
 
 def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[str]) -> None:
     """Raise `ValueError` for a name that a variable cannot have, or that is in use."""
-    who = getattr(measure, "function", measure)
-    who = getattr(who, "__name__", type(who).__name__)
+    owner = getattr(measure, "function", measure)
+    owner = getattr(owner, "__name__", type(owner).__name__)
     for name in new:
         if not isinstance(name, str) or not name or "/" in name or name.startswith("__"):
-            raise ValueError(f"Measure {who} must name its numbers by words, but has {name!r}.")
+            raise ValueError(f"Measure {owner} must name its numbers by words, but has {name!r}.")
         if name in taken:
-            raise ValueError(f"Measure {who} must not return {name!r}, a name in use.")
+            raise ValueError(f"Measure {owner} must not return {name!r}, a name in use.")
 
 
 def _as_arrays(tree: Any) -> Any:
@@ -439,8 +439,8 @@ def check_leaf_name(
     if part_of(name) == NOISE and lane_noise is not None:
         return  # checked with the noise
     of_start, names = part_of(name) == START, [START + n for n in components(without_modes(start))]
-    tree, own = (without_modes(start), name.removeprefix(START)) if of_start else (machine, name)
-    if own not in leaf_names(tree):
+    tree, key = (without_modes(start), name.removeprefix(START)) if of_start else (machine, name)
+    if key not in leaf_names(tree):
         names = names if of_start else [*components(machine), *names]
         check_name(names, name, argument, machine)
 
@@ -555,9 +555,9 @@ def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
 
 def samples_for(measures: Iterable[AbstractMeasure]) -> int:
     """Return the samples in a cycle. **Raises:** `ValueError` if measures need different ones."""
-    asked = {m.instants for m in measures if m.instants}
-    if len(asked) > 1:
+    found = {m.instants for m in measures if m.instants}
+    if len(found) > 1:
         raise ValueError(
-            f"Argument `measure` must ask for one number of samples, but asks for {sorted(asked)}."
+            f"Argument `measure` must ask for one number of samples, but asks for {sorted(found)}."
         )
-    return max(asked, default=0)
+    return max(found, default=0)

@@ -134,7 +134,7 @@ class ZarrStore(MemoryStore):
                     f"Argument `store` must be a new folder or the store of a scan, but "
                     f"{self.path} is neither."
                 )
-            _make(self.path, self.about, self.blocks, self.variables)
+            _create_store(self.path, self.about, self.blocks, self.variables)
         self._lock = _locked(self.path)
         try:
             return self._checked(new=new)
@@ -233,17 +233,17 @@ def _locked(folder: Path) -> int | None:
         return None
 
 
-def _make(
+def _create_store(
     path: Path, description: Mapping[str, Any], blocks: Blocks, variables: Mapping[str, Variable]
 ) -> None:
     """Create an empty store under another name and rename it: it exists as a whole or not."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as beside:
-        made = Path(beside) / "store"
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        new_store = Path(folder) / "store"
         about = {"scan": description, _RELEASE: installed_version()}
-        group = zarr.create_group(str(made), zarr_format=3, attributes=about)
+        group = zarr.create_group(str(new_store), zarr_format=3, attributes=about)
         compressors = [ZstdCodec(), Crc32cCodec()]
         for name, x in blocks.axes.items():
             group.create_array(
@@ -263,9 +263,9 @@ def _make(
         with warnings.catch_warnings():
             # One file then describes all arrays, and others open the store without a warning.
             warnings.filterwarnings("ignore", "Consolidated metadata")
-            zarr.consolidate_metadata(str(made), zarr_format=3)
+            zarr.consolidate_metadata(str(new_store), zarr_format=3)
         try:
-            made.rename(path)
+            new_store.rename(path)
         except OSError:
             if not (path / "zarr.json").exists():
                 raise  # else another scan made it in the meantime
@@ -300,14 +300,14 @@ def _check_writable(path: str | Path) -> None:
 def _refuse_another_scan(
     path: Path, attributes: Mapping[str, Any], wanted: Mapping[str, Any], *, new: bool
 ) -> None:
-    there = attributes.get("scan")
-    if there is None:
+    stored = attributes.get("scan")
+    if stored is None:
         raise ValueError(
             f"Argument `store` must be a new folder or the store of a scan, but {path} is another "
             "Zarr group."
         )
-    for key in dict.fromkeys([*wanted, *there]):
-        old, now = there.get(key), wanted.get(key)
+    for key in dict.fromkeys([*wanted, *stored]):
+        old, now = stored.get(key), wanted.get(key)
         if old == now:
             continue
         if isinstance(old, dict) and isinstance(now, dict):
@@ -329,16 +329,16 @@ def _description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     """Return a description for comparison with other scans, in types of JSON."""
 
     def described(tree: object) -> str:
-        return _lasting(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
+        return _cleaned(eqx.tree_pformat(tree, short_arrays=False, width=10**6))
 
     machine: dict[str, Any] = {}
     parts = {"": program.machine}
     if program.machine is None:  # a function is described by the machines that it makes
-        machine = {"made by": _lasting(getattr(program.build, "__qualname__", repr(program.build)))}
+        machine = {"made by": _cleaned(getattr(program.build, "__qualname__", repr(program.build)))}
         parts = {"first ": program.at(blocks, 0)[0], "last ": program.at(blocks, -1)[0]}
     for which, part in parts.items():
         machine |= {which + name: x for name, x in _numbers(part).items()}
-        machine[f"{which}structure"] = _lasting(str(jtu.tree_structure(part)))
+        machine[f"{which}structure"] = _cleaned(str(jtu.tree_structure(part)))
     start = "the machine's own" if program.start is None else _numbers(program.start)
     about: dict[str, Any] = {
         "machine": machine,
@@ -370,7 +370,7 @@ def _description_of(program: ScanProgram, blocks: Blocks) -> dict[str, Any]:
     return about
 
 
-def _lasting(text: str) -> str:
+def _cleaned(text: str) -> str:
     """Return a text without addresses in memory, which differ in each process."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
@@ -393,7 +393,7 @@ _LIBRARIES = {
 }  # fmt: skip
 
 # Members of a class that its author did not write.
-_MADE = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
+_GENERATED = (types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType)
 
 
 def identity(thing: object) -> str:
@@ -413,8 +413,8 @@ def identity(thing: object) -> str:
     return digest.hexdigest()[:16]
 
 
-def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """Yield the words that describe `thing`. Visited objects are in `seen`: references may form
+def _words(thing: Any, visited: dict[int, Any]) -> Iterator[str]:
+    """Yield the words that describe `thing`. Visited objects are in `visited`: references may form
     cycles."""
     if thing is None or isinstance(thing, int | float | complex | str | bytes | np.dtype):
         yield repr(thing)
@@ -423,13 +423,13 @@ def _words(thing: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}"
     elif isinstance(thing, types.ModuleType):
         yield thing.__name__
-    elif id(thing) in seen:
-        yield str(list(seen).index(id(thing)))
+    elif id(thing) in visited:
+        yield str(list(visited).index(id(thing)))
     else:
-        seen[id(thing)] = thing
+        visited[id(thing)] = thing
         yield type(thing).__qualname__
         for part in _parts(inspect.unwrap(thing) if callable(thing) else thing):
-            yield from _words(part, seen)
+            yield from _words(part, visited)
 
 
 def _parts(thing: Any) -> list[Any]:
@@ -450,11 +450,11 @@ def _parts(thing: Any) -> list[Any]:
         return [thing.fget]
     if isinstance(thing, type | types.FunctionType):
         name = [thing.__module__, thing.__qualname__]
-        own = (thing.__module__ or "").partition(".")[0] not in _LIBRARIES
+        is_users = (thing.__module__ or "").partition(".")[0] not in _LIBRARIES
         if isinstance(thing, type):
-            return [*name, *thing.__bases__, *_members(thing)] if own else name
+            return [*name, *thing.__bases__, *_members(thing)] if is_users else name
         used = inspect.getclosurevars(thing)
-        if not own:
+        if not is_users:
             return [*name, used.nonlocals]
         if inspect.getfile(thing) == "<string>":  # Python 3.13 names the source of `python -c` so
             raise OSError("it was made by `exec`")
@@ -467,9 +467,9 @@ def _members(kind: type) -> Iterator[Any]:
     """Yield the methods and plain values that the author of a class wrote, with their names."""
     for name, value in sorted(vars(kind).items()):
         code = getattr(inspect.unwrap(value) if callable(value) else value, "__code__", None)
-        is_made = isinstance(value, _MADE) or (code and code.co_filename == "<string>")
+        is_generated = isinstance(value, _GENERATED) or (code and code.co_filename == "<string>")
         is_plain = isinstance(value, int | float | complex | str | bytes) and name[:2] != "__"
-        if (hasattr(value, "__get__") and not is_made) or is_plain:
+        if (hasattr(value, "__get__") and not is_generated) or is_plain:
             yield from (name, value)
 
 
@@ -503,12 +503,12 @@ def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
         known |= measure.described(start)
     found, units = {}, units_of(machine)
     for name, shape in shapes.items():
-        by = name.startswith("d_") and name not in known and bool(program.derivatives)
-        about = dict(known.get(name.removeprefix("d_") if by else name, {}))
+        is_derivative = name.startswith("d_") and name not in known and bool(program.derivatives)
+        about = dict(known.get(name.removeprefix("d_") if is_derivative else name, {}))
         dims = tuple(about.pop("dims", ()))
         if "unit_of" in about:
             about |= attributes(unit_of(units, about.pop("unit_of")))
-        if by:
+        if is_derivative:
             dims = ("by", *dims)
             about = {
                 "long_name": f"derivative of {name.removeprefix('d_')}",

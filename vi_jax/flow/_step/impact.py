@@ -247,7 +247,7 @@ def _acting(
         if friction is not None:
             along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
             response = push_gains([*bodies.values()], state, [push_of(along, state)])
-            for i, change in enumerate(shares([along], state, pushes)[0]):
+            for i, change in enumerate(push_gains([along], state, pushes)[0]):
                 dragged = jnp.abs(change * response[i][0])
                 both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
     return [[stop_gradient(x) > _UNCOUPLED**2 for x in row] for row in both]
