@@ -55,7 +55,7 @@ def check_picture(svg, motion):
 
 def seen(subject, settle=1000, **numbers):
     names = {"zeta": ZETA, "gap": GAP, "xi": "oscillator.damping_ratio", "Y": "start.Y"}
-    values = subject.beginning() | {names.get(name, name): x for name, x in numbers.items()}
+    values = subject.first_values() | {names.get(name, name): x for name, x in numbers.items()}
     return look(*subject.at(values), settle)
 
 
@@ -103,22 +103,22 @@ def test_a_motor_lags_behind_and_may_stop(ideal):
 
 
 def test_sliders_do_not_compile_and_redraw_quickly(ideal, compilations):
-    begin, picture, took = ideal.beginning(), MotionPicture(ideal.machine.labels), []
-    picture.draw(ideal.seen(begin))
+    begin, picture, took = ideal.first_values(), MotionPicture(ideal.machine.labels), []
+    picture.draw(ideal.motion_at(begin))
     ideal.diagram(begin, K)
     compilations.clear()
     for name, control in ideal.controls.items():
         for part in (0.0, 0.4, 0.6, 1.0):
             values = {**begin, name: control.low + part * (control.high - control.low)}
             since = time.process_time()
-            picture.draw(ideal.seen(values))
+            picture.draw(ideal.motion_at(values))
             took.append(time.process_time() - since)
     ideal.diagram({**begin, GAP: 1.0}, K)
     assert not compilations and np.median(took) < 0.1
 
 
 def test_a_diagram_agrees_with_runs(ideal):
-    values = {**ideal.beginning(), "start.Y": 0.5}
+    values = {**ideal.first_values(), "start.Y": 0.5}
     found = ideal.diagram(values, K)
     assert found.values[0] == 0.0 and found.values[-1] == 1.0
     assert ideal.diagram({**values, K: 0.7, SETTLE: 3.0}, K) is found  # its axis is the slider's
@@ -134,7 +134,7 @@ def test_a_diagram_agrees_with_runs(ideal):
 
 
 def test_pictures(ideal):
-    picture, found = MotionPicture(ideal.machine.labels), ideal.seen(ideal.beginning())
+    picture, found = MotionPicture(ideal.machine.labels), ideal.motion_at(ideal.first_values())
     check_picture(first := picture.draw(found), found)
     assert picture.draw(found) == first  # the axes keep their limits
     assert len({picture.draw(found, which) for which in MAPS}) == len(MAPS)
@@ -142,7 +142,7 @@ def test_pictures(ideal):
 
 
 def test_values_outside_a_sliders_range_raise(ideal):
-    values = ideal.beginning()
+    values = ideal.first_values()
     for wrong in (1e9, -5.0, float("nan"), None, "0.9"):
         message = f"The restitution k must be a number from 0 to 1, but is {wrong!r}."
         with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
@@ -161,7 +161,7 @@ def test_slider_ranges_are_valid_for_the_machine():
             assert abs(steps - round(steps)) < 1e-9
             for end in (control.low, control.high):
                 if not isinstance(subject.machine, vi.machines.Woodpecker):  # may not fit its pole
-                    subject.at({**subject.beginning(), name: end})
+                    subject.at({**subject.first_values(), name: end})
     duffing = made["Duffing"].controls
     assert (duffing["restitution"].low, duffing["restitution"].high) == (0.0, 1.0)
     assert (duffing["amplitude"].low, duffing["amplitude"].high) == pytest.approx((0.0, 0.6))
@@ -172,8 +172,8 @@ def test_machines_of_other_kinds(name):
     """A beam with several coordinates, and a valve without a drive."""
     subject: Subject = ready()[name]()
     subject.compile(lambda step: None)
-    values = subject.beginning()
-    found = subject.seen(values)
+    values = subject.first_values()
+    found = subject.motion_at(values)
     assert not found.fault and found.regime and subject.words(found)["position"]
     assert np.isfinite(found.path.Y).all()
     check_picture(MotionPicture(subject.machine.labels).draw(found), found)

@@ -141,7 +141,7 @@ def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
     interrupt_at(monkeypatch, "robust._settling.find_orbit", after=0)
     edge = interrupted_by(vi.Interrupted, lambda: vi.edge_state(scene, two, one)).partial
     assert edge.kind == "irregular" and edge.orbit is None and edge.sections.Y.size > 0
-    interrupt_at(monkeypatch, "robust._manifold._ahead", after=3)
+    interrupt_at(monkeypatch, "robust._manifold._next_point", after=3)
     found = interrupted_by(vi.Interrupted, lambda: vi.manifold(saddle, length=0.5)).partial
     first, second = found.branches
     assert first.Y.size > 1 and second.Y.size == 1

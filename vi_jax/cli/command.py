@@ -95,30 +95,30 @@ class Verb(NamedTuple):
 
 def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
     """Return the result of a verb with the arguments of a file. **Raises:** `InputError`."""
-    before, thing = [], machine
-    what, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
+    before, subject = [], machine
+    spec, place, table = VERBS[verb], f"[{verb}]", tables.get(verb)
     if not isinstance(table, dict):
         raise InputError(f"missing table {place}, which holds the arguments")
-    what.check(table, place)
+    spec.check(table, place)
     if verb == "continue":  # checked before the search for the orbit
         with errors_in(place):
             check_leaf(machine, table.get("parameter", ""))
         found = do("orbit", machine, {"orbit": {}, **tables})
         if not found.good:
             return found
-        before, thing = found.lines, found.result
-    begin = "guess" if verb == "orbit" else "start"
-    shared = {begin: tables.get("start"), "method": tables.get("method")}
-    table = {key: x for key, x in shared.items() if x is not None and key in what.keys()} | table
+        before, subject = found.lines, found.result
+    state_key = "guess" if verb == "orbit" else "start"
+    shared = {state_key: tables.get("start"), "method": tables.get("method")}
+    table = {key: x for key, x in shared.items() if x is not None and key in spec.keys()} | table
     values = {key: value_of(x, f"{place}: `{key}`") for key, x in table.items()}
-    if begin in values:
-        values[begin] = start_of(machine, values[begin])
+    if state_key in values:
+        values[state_key] = start_of(machine, values[state_key])
     files = {key: values.pop(key) for key in _ENDINGS if key in values}
     for key, path in files.items():
         _check_path(path, _ENDINGS[key], f"`{key}` in {place}")
-    own = {key: values.pop(key) for key in what.own if key in values}
+    own = {key: values.pop(key) for key in spec.own if key in values}
     with errors_in(place), warnings.catch_warnings(record=True) as caught:
-        found = what.work(thing, values, **own)
+        found = spec.work(subject, values, **own)
         lines = [*before, *found.lines, *_write_files(found, **files)]
     return found._replace(lines=lines + sorted({f"  warning: {x.message}" for x in caught}))
 
@@ -152,7 +152,7 @@ def _write_files(found: Found, output: str | None = None, picture: str | None = 
     return lines
 
 
-def _kept(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, bool]:
+def _finished(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[Any, bool]:
     """Return the result of a function, partial after Ctrl-C, and whether that ended it. From then
     on Ctrl-C is ignored."""
     try:
@@ -166,7 +166,7 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     along, start = "sample" if options.get("samples") else "cycle", options.pop("start", None)
     if along == "sample":  # for impacts between samples in the picture
         options.setdefault("impact_log", 8)
-    run, cut = run_in_parts(machine, machine.start() if start is None else start, **options)
+    run, interrupted = run_in_parts(machine, machine.start() if start is None else start, **options)
 
     def table() -> Any:
         data = run.to_xarray(along=along)
@@ -178,17 +178,17 @@ def _simulate(machine: AbstractMachine, options: dict[str, Any]) -> Found:
     def draw(figure: Figure) -> None:
         figure.set_size_inches(11, 3.6)
         left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-        seen, shown = run, machine
+        sampled, shown = run, machine
         if run.samples is None:  # the same cycles again; autonomous ones at equal intervals
             first = jtu.tree_map(lambda x: x[0], run.sections)
             if is_autonomous(machine, first):
                 shown = machine.observed_every(machine.cycle)
-            seen = simulate(shown, first, run.impacts.size, samples=64, impact_log=8)
+            sampled = simulate(shown, first, run.impacts.size, samples=64, impact_log=8)
         unit = "cycles" if shown is machine else "time"
-        plot.plot_history(seen, machine=shown, ax=left, unit=unit)
-        plot.plot_phase_portrait(seen, shown, ax=right)
+        plot.plot_history(sampled, machine=shown, ax=left, unit=unit)
+        plot.plot_phase_portrait(sampled, shown, ax=right)
 
-    return Found([str(run)], table, draw, not bool(run.failed), cut)
+    return Found([str(run)], table, draw, not bool(run.failed), interrupted)
 
 
 def run_in_parts(
@@ -197,16 +197,16 @@ def run_in_parts(
     """Return a run of one motion, as `simulate`, and whether Ctrl-C ended it. The run then has the
     cycles recorded so far."""
     length, runs = max(1, min(_CYCLES, _SAMPLES // max(1, samples))), []
-    before = options.get("settle", 0)
+    settled = options.get("settle", 0)
     make_plan(machine, start, cycles, RunOptions(samples=samples, **options))  # checks them all
     if cycles <= length or options.keys() & {"estimate", "max_steps", "noise"}:
         return simulate(machine, start, cycles, samples=samples, **options), False
     try:
         for done in range(0, cycles, length):
-            now = min(length, cycles - done)
-            run = simulate(machine, start, now, samples=samples, **options)
+            count = min(length, cycles - done)
+            run = simulate(machine, start, count, samples=samples, **options)
             if done and run.outcome_cycle is not None and run.outcome_cycle >= 0:
-                run = dataclasses.replace(run, outcome_cycle=run.outcome_cycle + before + done)
+                run = dataclasses.replace(run, outcome_cycle=run.outcome_cycle + settled + done)
             runs.append(run)
             start, options["settle"] = run.last, 0
             if not bool(run.successful):
@@ -243,33 +243,33 @@ def _sweep(
     y: str | None = None,
 ) -> Found:  # fmt: skip
     values = options.get("values", ())
-    ways = ("up", "down") if len(values) < 2 or values[0] <= values[-1] else ("down", "up")
-    there, cut = _kept(sweep, machine, **options)
-    found: dict[str, Sweep] = {ways[0]: there}
-    if up_and_down and not cut:
-        good = np.flatnonzero(there.successful)
+    order = ("up", "down") if len(values) < 2 or values[0] <= values[-1] else ("down", "up")
+    first, ended = _finished(sweep, machine, **options)
+    found: dict[str, Sweep] = {order[0]: first}
+    if up_and_down and not ended:
+        good = np.flatnonzero(first.successful)
         if good.size:
             last = int(good[-1])
-            options["start"] = jtu.tree_map(lambda x: x[last, -1], there.sections)
+            options["start"] = jtu.tree_map(lambda x: x[last, -1], first.sections)
         try:
-            found[ways[1]], cut = _kept(sweep, machine, **options | {"values": values[::-1]})
+            found[order[1]], ended = _finished(sweep, machine, **options | {"values": values[::-1]})
         except KeyboardInterrupt:  # without any result to keep
-            cut = True
+            ended = True
 
     def table() -> Any:
-        each = [run.to_xarray(along="value").assign(direction=("value", [way] * run.values.size))
-                for way, run in found.items()]  # fmt: skip
+        each = [run.to_xarray(along="value").assign(direction=("value", [name] * run.values.size))
+                for name, run in found.items()]  # fmt: skip
         return xr.concat(each, "value")
 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
-        for way, run in found.items():
-            look = {"color": plot.BLUE, "ms": 6} if way == "up" else {"color": plot.RED, "ms": 3}
-            plot.plot_sweep(run, ax=ax, y=y, label=way, **look)
+        for name, run in found.items():
+            look = {"color": plot.BLUE, "ms": 6} if name == "up" else {"color": plot.RED, "ms": 3}
+            plot.plot_sweep(run, ax=ax, y=y, label=name, **look)
         ax.legend(frameon=False)
 
     good = any(bool(run.successful.any()) for run in found.values())
-    return Found([f"{way}: {run}" for way, run in found.items()], table, draw, good, cut)
+    return Found([f"{name}: {run}" for name, run in found.items()], table, draw, good, ended)
 
 
 def _scan(machine: AbstractMachine, options: dict[str, Any]) -> Found:
@@ -324,9 +324,9 @@ def _orbit(machine: AbstractMachine, options: dict[str, Any], *, settle: int = 0
 
 
 def _continue(orbit: Any, options: dict[str, Any], *, y: str | None = None) -> Found:
-    curve, cut = _kept(continue_orbit, orbit, **options)
+    curve, interrupted = _finished(continue_orbit, orbit, **options)
     draw = lambda figure: plot.plot_branch(curve, ax=figure.subplots(), y=y)
-    return Found([str(curve)], lambda: curve.to_xarray(along="point"), draw, True, cut)
+    return Found([str(curve)], lambda: curve.to_xarray(along="point"), draw, True, interrupted)
 
 
 VERBS: Mapping[str, Verb] = {
@@ -439,8 +439,8 @@ def _serve_page(options: argparse.Namespace) -> int:
         ranges = {name: (float(low), float(high)) for name, low, high in options.range}
         if options.machine is not None:
             name, make = options.machine, lambda: Subject(machine_of(options.machine, {}), ranges)
-        say = lambda step: print(f"{step} …", file=sys.stderr, flush=True)
-        serve(options.host, options.port, (name, make()), browser=options.browser, tell=say)
+        report = lambda step: print(f"{step} …", file=sys.stderr, flush=True)
+        serve(options.host, options.port, (name, make()), browser=options.browser, report=report)
     except ValueError as error:
         return _error(error, 2)
     except OSError as error:
@@ -471,13 +471,13 @@ def _parser() -> argparse.ArgumentParser:
         "--no-browser", dest="browser", action="store_false", help="do not open a browser"
     )
     verb.set_defaults(run=_serve_page)
-    for name, what in VERBS.items():
+    for name, spec in VERBS.items():
         verb = commands.add_parser(
             name,
-            help=what.about,
-            description=f"Computes {what.about}. FILE names a `machine`, with its [arguments], and "
+            help=spec.about,
+            description=f"Computes {spec.about}. FILE names a `machine`, with its [arguments], and "
             f"holds [{name}]; it may hold [start] and `method`.",
-            epilog=f"keys of [{name}]: {', '.join(what.keys())}",
+            epilog=f"keys of [{name}]: {', '.join(spec.keys())}",
         )
         verb.add_argument("file", metavar="FILE", help="a TOML file")
         verb.add_argument("--machine", metavar="NAME", help=f"{_MACHINE}, instead of the file's")

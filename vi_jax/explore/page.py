@@ -54,8 +54,8 @@ def _(MotionPicture, first, kinds, menu, mo, subjects):
 
 @app.cell
 def _(menu, mo, picked, shown):
-    _own, _values = picked()
-    _values = shown.beginning() | (_values if _own == menu.value else {})
+    _machine_name, _values = picked()
+    _values = shown.first_values() | (_values if _machine_name == menu.value else {})
     sliders = mo.ui.dictionary(
         {
             name: mo.ui.slider(
@@ -80,7 +80,7 @@ def _(across, listed, menu, mo, moving, tab, upwards, which):
 def _(html, mo, shown, sliders, time):
     _since, _fault, motion = time.perf_counter(), "", None
     try:
-        motion = shown.seen(sliders.value)
+        motion = shown.motion_at(sliders.value)
     except ValueError as error:
         _fault = str(error)
     mo.stop(motion is None, mo.Html(f'<p id="fault">{html.escape(_fault)}</p>'))
@@ -97,13 +97,13 @@ def _(b64encode, computed, gif_of, html, mo, motion, moving, picture, shown, tab
     else:
         _name, _kind, _drawn = "motion", "svg+xml", picture.draw(motion, which.value)
     _words = {"": motion.fault or motion.stability, **shown.words(motion)}
-    _told = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
-    _took = 1000 * (time.perf_counter() - _since)
+    _text = "; ".join(html.escape(f"{name} {text}".strip()) for name, text in _words.items())
+    _milliseconds = 1000 * (time.perf_counter() - _since)
     mo.Html(
-        f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{_told}</p>'
+        f'<p id="regime"><b>{html.escape(motion.regime)}</b><br>{_text}</p>'
         f'<img id="{_name}" style="max-width: 100%" alt="{html.escape(motion.regime)}" '
         f'src="data:image/{_kind};base64,{b64encode(_drawn).decode()}">'
-        f'<p id="took" style="opacity: 0.6"><small>redrawn in {_took:.0f} ms</small></p>'
+        f'<p id="took" style="opacity: 0.6"><small>redrawn in {_milliseconds:.0f} ms</small></p>'
     )
     return
 
@@ -131,8 +131,8 @@ def _(across, menu, pick, place, shown, sliders):
         _control = shown.controls[across.value]
         _middle = (place.value.x_min + place.value.x_max) / 2
         _steps = round((_middle - _control.low) / _control.step)
-        _there = min(max(_control.low + _steps * _control.step, _control.low), _control.high)
-        pick((menu.value, {**sliders.value, across.value: _there}))
+        _value = min(max(_control.low + _steps * _control.step, _control.low), _control.high)
+        pick((menu.value, {**sliders.value, across.value: _value}))
     return
 
 

@@ -27,9 +27,9 @@ path {{ fill: none; stroke-linecap: round; stroke-linejoin: round }} .behind {{ 
 
 # Limits are kept while the data have this margin to them and fill this share of them. The least
 # extent of data, as a share of their size, and of sections, as a share of their motion's. Choices.
-_EDGE, _FILLED, _LEAST, _WIDE = 0.02, 0.5, 0.001, 0.1
+_EDGE, _FILL, _LEAST, _WIDE = 0.02, 0.5, 0.001, 0.1
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_EXPONENTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class _Panel:
@@ -47,7 +47,7 @@ class _Panel:
             return
         low, high, (left, right) = float(values.min()), float(values.max()), self.limits[axis]
         width, middle = max(high - low, least, _LEAST * max(-low, high), 1e-12), (low + high) / 2
-        edge, filled = _EDGE * (right - left), _FILLED * (right - left)
+        edge, filled = _EDGE * (right - left), _FILL * (right - left)
         if low < left + edge or high > right - edge or width < filled:
             self.limits[axis] = middle - 0.6 * width, middle + 0.6 * width
 
@@ -92,9 +92,9 @@ class _Panel:
         places, size = places[(low <= places) & (places <= high)], max(abs(low), abs(high))
         power = 0 if 0.1 <= size < 1e5 else 3 * int(np.floor(np.log10(size) / 3))
         digits = max(5, int(np.log10(size / (high - low))) + 4)
-        words = [f"{x:.{digits}g}".replace("-", "−") for x in places / 10.0**power]
-        label = html.escape(label) + (f" × 10{str(power).translate(_RAISED)}" if power else "")
-        return list(zip(self._pixels(axis, places), words, strict=True)), label
+        texts = [f"{x:.{digits}g}".replace("-", "−") for x in places / 10.0**power]
+        label = html.escape(label) + (f" × 10{str(power).translate(_EXPONENTS)}" if power else "")
+        return list(zip(self._pixels(axis, places), texts, strict=True)), label
 
 
 class MotionPicture:
@@ -103,10 +103,10 @@ class MotionPicture:
     def __init__(self, labels: tuple[str, str]):
         """**Arguments:** `labels`, the machine's labels of position and velocity."""
         self._labels = labels
-        self._course = _Panel(66, 28, 930, 200)
+        self._history = _Panel(66, 28, 930, 200)
         lower = (_Panel(left, 312, 248, 200) for left in (66, 407, 748))
         self._portrait, self._map, self._circle = lower
-        self._course.limits[0] = (0.0, WINDOW)
+        self._history.limits[0] = (0.0, WINDOW)
         self._circle.limits = [(-1.488, 1.488), (-1.2, 1.2)]  # for a round circle
 
     def draw(self, motion: Motion, which: str = MAPS[0]) -> bytes:
@@ -119,18 +119,18 @@ class MotionPicture:
         ).encode()
 
     def _motion(self, motion: Motion) -> tuple[str, str]:
-        course, portrait, path = self._course, self._portrait, motion.path
+        history, portrait, path = self._history, self._portrait, motion.path
         places = [float(x.place) for x in stops_of(motion.machine) if x.coordinate == 0]
-        course.fit(1, np.append(path.Y, places))
+        history.fit(1, np.append(path.Y, places))
         portrait.fit(0, np.append(path.Y, places))
         portrait.fit(1, path.V)
         for place in places:
-            course.draw("stop", np.array(course.limits[0]), np.repeat(place, 2))
+            history.draw("stop", np.array(history.limits[0]), np.repeat(place, 2))
             portrait.draw("stop", np.repeat(place, 2), np.array(portrait.limits[1]))
-        course.draw("motion", path.cycles, path.Y)
+        history.draw("motion", path.cycles, path.Y)
         portrait.draw("motion", path.Y, path.V)
         portrait.draw("section", *motion.places, dots=True)
-        return course.framed(("cycles", self._labels[0])), portrait.framed(self._labels)
+        return history.framed(("cycles", self._labels[0])), portrait.framed(self._labels)
 
     def _mapped(self, motion: Motion, which: str) -> str:
         panel, note = self._map, ""
@@ -174,8 +174,8 @@ def draw_diagram(found: Diagram, chosen: float, shown: str) -> Axes:
 
 def gif_of(motion: Motion) -> bytes:
     """Return an animation of the drawn cycles as a GIF, which takes seconds."""
-    evenly = observed_evenly(motion.machine, motion.window.last)
+    machine = observed_evenly(motion.machine, motion.window.last)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "motion.gif"
-        animate(motion.window, evenly, seconds=4, fps=15).save(path)
+        animate(motion.window, machine, seconds=4, fps=15).save(path)
         return path.read_bytes()

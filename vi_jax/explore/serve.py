@@ -33,14 +33,14 @@ def missing() -> str | None:
 
 def serve(
     host: str, port: int, machine: tuple[str, Subject], *, browser: bool,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> None:  # fmt: skip
     """Serve the page until Ctrl-C, which ends the process.
 
     The reported address contains a token, which every request needs.
 
     **Arguments:** `host` and `port`, the address (port 0: any free one); `machine`, the first
-    machine and its name; `browser`, whether to open one; `tell`, called with lines of progress.
+    machine and its name; `browser`, whether to open one; `report`, called with lines of progress.
 
     **Raises:** `OSError` if the address is not available.
     """
@@ -52,19 +52,19 @@ def serve(
     with socket.create_server((host, port), family=family) as listening:
         # asyncio sets it only for its own sockets; without it a response waits up to 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        machine[1].compile(tell)
+        machine[1].compile(report)
         SERVED.append(machine)
         port, token = listening.getsockname()[1], secrets.token_urlsafe(16)
         address = f"http://{f'[{host}]' if ':' in host else host}:{port}?access_token={token}"
-        made = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
-        app: Any = made.with_app(path="", root=page).build()
+        builder = marimo.create_asgi_app(quiet=True, token=token, skew_protection=True)
+        app: Any = builder.with_app(path="", root=page).build()
         # The port is part of the cookie's name. A browser keeps one cookie of each name for all
         # ports of a host, so that two servers would overwrite each other's.
         for mounted in app.routes:
             mounted.app.state.port = port
         options: Any = {"log_level": "warning", "timeout_graceful_shutdown": 1}
         server = uvicorn.Server(uvicorn.Config(guarded(app, host), **options))
-        tell(f"serving {address} until Ctrl-C")
+        report(f"serving {address} until Ctrl-C")
         if browser:  # it waits for the response
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):

@@ -141,7 +141,7 @@ class Motion(NamedTuple):
 
 def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     """Return the motion after `settle` cycles; a start beyond a stop is moved onto it."""
-    run, window, found, multipliers, places = _seen(scene, start, jnp.asarray(float(settle)))
+    run, window, found, multipliers, places = _observe(scene, start, jnp.asarray(float(settle)))
     period = int(found["period"])
     exponent = np.nan
     if period == REGIMES.unsettled:
@@ -152,12 +152,12 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
     assert log is not None and run.y_min is not None and run.y_max is not None
     numbers = {name: x[-1] for name, x in run.quantities.items()}
     numbers |= {name: x.mean() for name, x in run.averages.items()}
-    met = np.asarray(log.stop) >= 0
+    is_logged = np.asarray(log.stop) >= 0
     return Motion(
         machine=scene,
         path=motion_path(window, machine=observed_evenly(scene, run.last)),
-        impact_phase=np.asarray(log.phase)[met],
-        impact_speed=np.asarray(log.speed)[met],
+        impact_phase=np.asarray(log.phase)[is_logged],
+        impact_speed=np.asarray(log.speed)[is_logged],
         frequency_ratio=np.full(OBSERVED, np.nan) if ratio is None else np.asarray(ratio),
         extremes=(float(np.min(run.y_min)), float(np.max(run.y_max))),
         period=period,
@@ -172,7 +172,7 @@ def look(scene: AbstractMachine, start: State, settle: int = 1000) -> Motion:
 
 
 @compiled
-def _seen(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
+def _observe(scene: AbstractMachine, start: State, settle: Any) -> tuple[Run, Run, Any, Any, Any]:
     """Return the observed run, its first cycles sampled, regime, multipliers, section points."""
     method = chosen(scene, None)
     options = {"method": method, "max_steps": _MOST_STEPS}
@@ -251,23 +251,23 @@ class Subject:
         self, machine: AbstractMachine, ranges: Mapping[str, tuple[float, float]] | None = None
     ):
         self.machine, self.start = machine, convert_start(machine, machine.start())
-        given = {**getattr(machine, "slider_ranges", {}), **(ranges or {})}
+        given_ranges = {**getattr(machine, "slider_ranges", {}), **(ranges or {})}
         real = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
         numbers = {name: float(x) for name, x in components(machine).items() if real(x)}
         begin = {f"{START}{name}": float(x) for name, x in components(self.start).items()}
-        for name in given:
+        for name in given_ranges:
             if name not in numbers and name not in begin:
                 known = ", ".join([*numbers, *begin])
                 raise ValueError(f"A range must be of a number of the machine ({known}), "
                                  f"but is of {name!r}.")  # fmt: skip
-        first = sorted(numbers, key=lambda name: name not in given)[:_MOST]
+        first = sorted(numbers, key=lambda name: name not in given_ranges)[:_MOST]
         self.names = tuple(name for name in numbers if name in first)
         """The names of the machine's numbers with sliders."""
         self.controls: dict[str, Control] = {}
         for name, value in {**{x: numbers[x] for x in self.names}, **begin}.items():
             low, high = _range_of(machine, name, value)
-            if name in given:
-                low, high = interval(f"ranges[{name!r}]", given[name])
+            if name in given_ranges:
+                low, high = interval(f"ranges[{name!r}]", given_ranges[name])
             low, high = min(low, value), max(high, value)
             low, step = _grid(low, high, value)
             self.controls[name] = Control(_label(machine, name, numbers), low, high, step, value)
@@ -291,20 +291,20 @@ class Subject:
         begin = {name: float(values[START + name]) for name in components(self.start)}
         return machine, with_leaves(self.start, begin)
 
-    def seen(self, values: Mapping[str, Any]) -> Motion:
+    def motion_at(self, values: Mapping[str, Any]) -> Motion:
         """Return the motion at these values of the sliders."""
         return look(*self.at(values), int(values[SETTLE]))
 
-    def compile(self, tell: Callable[[str], None]) -> None:
+    def compile(self, report: Callable[[str], None]) -> None:
         """Compile the programs of the sliders, and fit the number of cycles before the drawn ones
         to their speed on this computer."""
-        tell(f"compiling the {type(self.machine).__name__}")
-        start = self.at(self.beginning())[1]
+        report(f"compiling the {type(self.machine).__name__}")
+        start = self.at(self.first_values())[1]
         _exponent_of(self.machine, look(self.machine, start, 0).window.last)
-        fits = _fitting(lambda cycles: look(self.machine, start, cycles))
+        fits = _affordable_cycles(lambda cycles: look(self.machine, start, cycles))
         self.controls[SETTLE] = Control(SETTLE, 0.0, float(fits), 1.0, float(min(300, fits)))
 
-    def beginning(self) -> dict[str, float]:
+    def first_values(self) -> dict[str, float]:
         """Return the first value of each slider, by name."""
         return {name: control.value for name, control in self.controls.items()}
 
@@ -323,7 +323,7 @@ class Subject:
                 settle = jnp.asarray(float(cycles))
                 return jax.device_get(_settled(machine, self.names, rows, start, settle))
 
-            self.before = self.before or _fitting(found)
+            self.before = self.before or _affordable_cycles(found)
             self._kept = (parameter, key), Diagram(control.label, across, *found(self.before))
         return self._kept[1]
 
@@ -403,16 +403,16 @@ def _grid(low: float, high: float, value: float) -> tuple[float, float]:
     return low, (value - low) / max(1, round((value - low) / rough))
 
 
-def _fitting(do: Callable[[int], Any]) -> int:
+def _affordable_cycles(do: Callable[[int], Any]) -> int:
     """Return the number of cycles that can be computed in the time for a redrawing."""
     # Processor time, which other programs do not delay.
-    twice: Any = {"timer": time.process_time, "number": 1, "repeat": 2}
-    seconds = lambda cycles: min(timeit.repeat(lambda: do(cycles), **twice))
+    options: Any = {"timer": time.process_time, "number": 1, "repeat": 2}
+    seconds = lambda cycles: min(timeit.repeat(lambda: do(cycles), **options))
     do(0)  # compiles
-    if (none := seconds(0)) > _PATIENCE:
+    if (overhead := seconds(0)) > _PATIENCE:
         return _FEWEST
-    each = max((seconds(_TRIED) - none) / _TRIED, 1e-9)
-    return int(np.clip((_PATIENCE - none) / each, _FEWEST, _LONGEST)) // 10 * 10
+    each = max((seconds(_TRIED) - overhead) / _TRIED, 1e-9)
+    return int(np.clip((_PATIENCE - overhead) / each, _FEWEST, _LONGEST)) // 10 * 10
 
 
 @compiled

@@ -21,11 +21,11 @@ from .motion import counts_by_angle, drawn_path, motion_path, plot_history, turn
 from .schematic import pen_for, sketch
 
 # Samples of a cycle of an orbit; seconds per cycle, and at most in all.
-_SAMPLES, _UNHURRIED, _LONGEST = 128, 2.5, 12.0
+_SAMPLES, _SECONDS_PER_CYCLE, _LONGEST = 128, 2.5, 12.0
 # Frames from which the limits of the drawing are computed.
-_MEASURED = 12
+_LIMIT_FRAMES = 12
 # Inches: the width of a figure, and the height of the time history.
-_WIDE, _BELOW = 7.2, 2.1
+_WIDTH, _LOWER = 7.2, 2.1
 # The largest size of the pictures in an HTML file, MB.
 _MOST = 50.0
 
@@ -92,7 +92,7 @@ def animate(
         )
     shown = float(np.ptp(path.cycles[good]))
     if seconds is None:
-        seconds = min(_LONGEST, _UNHURRIED * shown)
+        seconds = min(_LONGEST, _SECONDS_PER_CYCLE * shown)
     seconds = given_number("seconds", seconds, low=0.0, high=3600.0, open_low=True)
     frames = _frames(motion, machine, path, good, max(2, ceil(seconds * fps)))
     return MotionAnimation(figure, machine, motion, frames, fps, history)
@@ -108,22 +108,22 @@ def _frames(
     inside = np.isfinite(time)
     low, high = path.cycles[good][[0, -1]]
     ends = np.interp([low, high], cycles[inside], time[inside])
-    at = np.interp(np.linspace(ends[0], ends[1], number), time[inside], cycles[inside])
+    frame_cycles = np.interp(np.linspace(ends[0], ends[1], number), time[inside], cycles[inside])
 
     def between(x: object) -> np.ndarray:
         x = np.asarray(x, float)[inside]
-        rows = [np.interp(at, cycles[inside], row) for row in x.reshape(len(x), -1).T]
+        rows = [np.interp(frame_cycles, cycles[inside], row) for row in x.reshape(len(x), -1).T]
         return np.stack(rows, axis=-1).reshape(-1, *x.shape[1:])
 
     states = jax.tree_util.tree_map(between, samples.state)
     # The corners of the paths at impacts, which samples do not contain.
     for k in sorted({0, *(stop.coordinate for stop in stops_of(machine))}):
-        one = motion_path(run, machine=machine, coordinate=k)
-        known = np.isfinite(one.Y)
-        Y, V = (np.interp(at, one.cycles[known], x[known]) for x in (one.Y, one.V))
+        line = motion_path(run, machine=machine, coordinate=k)
+        known = np.isfinite(line.Y)
+        Y, V = (np.interp(frame_cycles, line.cycles[known], x[known]) for x in (line.Y, line.V))
         states = jax.vmap(machine.coordinates[k].placed)(states, Y, V)
     places = [np.asarray(jax.vmap(c.position)(states), float) for c in machine.coordinates]
-    return _Frames(at, states, np.stack(places))
+    return _Frames(frame_cycles, states, np.stack(places))
 
 
 class MotionAnimation(animation.FuncAnimation):
@@ -139,20 +139,20 @@ class MotionAnimation(animation.FuncAnimation):
         self.fps = fps
         """Frames per second."""
         self._machine, self._frames = machine, frames
-        self._above = Figure().subplots()
-        self._limits = self._measured()
+        self._drawing = Figure().subplots()
+        self._limits = self._limits_of_frames()
         (left, right), (low, high) = self._limits
-        tall = float(np.clip(_WIDE * (high - low) / (right - left), 1.2, 4.2))
+        height = float(np.clip(_WIDTH * (high - low) / (right - left), 1.2, 4.2))
         if figure is None:
-            figure = Figure(figsize=(_WIDE, tall + _BELOW * history), dpi=100)
+            figure = Figure(figsize=(_WIDTH, height + _LOWER * history), dpi=100)
             FigureCanvasAgg(figure)
-        rows = figure.subplots(1 + history, 1, height_ratios=(tall, 1.3)[: 1 + history])
+        rows = figure.subplots(1 + history, 1, height_ratios=(height, 1.3)[: 1 + history])
         self._figure = figure
-        self._above, *below = np.atleast_1d(rows)
-        figure.subplots_adjust(left=0.09, right=0.98, top=0.98, bottom=0.55 / (tall + _BELOW))
+        self._drawing, *below = np.atleast_1d(rows)
+        figure.subplots_adjust(left=0.09, right=0.98, top=0.98, bottom=0.55 / (height + _LOWER))
         if not history:
             figure.subplots_adjust(bottom=0.02)
-        self._below = _History(below[0], run, machine, frames) if history else None
+        self._history = _History(below[0], run, machine, frames) if history else None
         super().__init__(
             figure, self._draw, frames=len(frames.cycles), interval=1000 / fps, repeat=True
         )
@@ -168,36 +168,36 @@ class MotionAnimation(animation.FuncAnimation):
         return self._figure
 
     def _draw(self, index: int) -> list[Any]:
-        ax = self._above
+        ax = self._drawing
         ax.clear()
-        self._sketched(index)
+        self._draw_machine(index)
         ax.axis("off")
         ax.set_aspect("equal")
         (left, right), (low, high) = self._limits
         ax.set(xlim=(left, right), ylim=(low, high))
-        if self._below is not None:
-            self._below.move(index)
+        if self._history is not None:
+            self._history.move(index)
         return []
 
-    def _sketched(self, index: int) -> None:
+    def _draw_machine(self, index: int) -> None:
         machine, frames = self._machine, self._frames
         state = jax.tree_util.tree_map(lambda x: jnp.asarray(x[index]), frames.states)
         turn = float(logged_turn(machine))
         phase = float(phase_at(machine, (frames.cycles[index] % 1.0) * turn))
-        sketch(machine, pen_for(machine, self._above, frames.positions), state, phase)
+        sketch(machine, pen_for(machine, self._drawing, frames.positions), state, phase)
 
-    def _measured(self) -> tuple[tuple[float, float], tuple[float, float]]:
+    def _limits_of_frames(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the limits of all frames, so that the picture does not move."""
         places = self._frames.positions
         number = places.shape[1]
         chosen = {int(f(row)) for row in places for f in (np.argmin, np.argmax)}
-        chosen |= {int(i) for i in np.linspace(0, number - 1, _MEASURED)}
+        chosen |= {int(i) for i in np.linspace(0, number - 1, _LIMIT_FRAMES)}
         for index in sorted(chosen):
-            self._sketched(index)
-        box = self._above.dataLim
-        wide, tall = 0.04 * box.width, 0.06 * box.height
-        self._above.clear()
-        return (box.x0 - wide, box.x1 + wide), (box.y0 - tall, box.y1 + tall)
+            self._draw_machine(index)
+        box = self._drawing.dataLim
+        width, height = 0.04 * box.width, 0.06 * box.height
+        self._drawing.clear()
+        return (box.x0 - width, box.x1 + width), (box.y0 - height, box.y1 + height)
 
     def _repr_html_(self) -> str:
         return self.to_jshtml(fps=self.fps)
@@ -226,7 +226,7 @@ class _History:
         plot_history(run, machine=machine, ax=ax, window=window, unit=unit, color="0.75", lw=1.2)
         self._factor = 2.0 if unit == "angle" else 1.0
         path = drawn_path(run, machine=machine, window=window, coordinate=0)
-        self._place, self._Y = self._factor * path.cycles, path.Y
+        self._x, self._Y = self._factor * path.cycles, path.Y
         self._frames, self._dots = frames, frames.positions[0]
         if turns(run, machine, 0):
             self._dots = without_turns(self._dots)
@@ -238,6 +238,6 @@ class _History:
     def move(self, index: int) -> None:
         """Draw the motion up to the frame with this index."""
         place, Y = self._factor * self._frames.cycles[index], self._dots[index]
-        passed = self._place <= place
-        self._line.set_data([*self._place[passed], place], [*self._Y[passed], Y])
+        passed = self._x <= place
+        self._line.set_data([*self._x[passed], place], [*self._Y[passed], Y])
         self._dot.set_data([place], [Y])

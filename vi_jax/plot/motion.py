@@ -47,8 +47,8 @@ def new_axes(ax: Axes | None) -> Axes:
         return ax
     import matplotlib.pyplot as plt  # only here: given axes need no global state
 
-    own = rcParams["figure.figsize"] != rcParamsDefault["figure.figsize"]
-    size = None if own else (7, 3.5)
+    is_set = rcParams["figure.figsize"] != rcParamsDefault["figure.figsize"]
+    size = None if is_set else (7, 3.5)
     return plt.subplots(figsize=size, layout="constrained")[1]
 
 
@@ -95,8 +95,8 @@ def motion_path(
             f"Argument `motion` must be one motion, but is a batch of shape {cycles.shape[:-1]}."
         )
     try:
-        course = _course(machine, coordinate, samples.state)
-        path = MotionPath(cycles, *(np.asarray(x, float) for x in course))
+        columns = _coordinate_path(machine, coordinate, samples.state)
+        path = MotionPath(cycles, *(np.asarray(x, float) for x in columns))
     except (AttributeError, LookupError):
         raise ValueError(
             "Argument `machine` must be given for states without `Y` and `V`: it defines the "
@@ -122,17 +122,17 @@ def drawn_path(
     if machine is None or not turns(motion, machine, about["coordinate"]):
         return path
     Y = without_turns(path.Y)
-    at = np.flatnonzero(np.abs(np.diff(Y)) > np.pi) + 1
-    gap = MotionPath(path.cycles[at - 1], *np.full((2, at.size), np.nan))
+    breaks = np.flatnonzero(np.abs(np.diff(Y)) > np.pi) + 1
+    gap = MotionPath(path.cycles[breaks - 1], *np.full((2, breaks.size), np.nan))
     pairs = zip(path._replace(Y=Y), gap, strict=True)
-    return MotionPath(*(np.insert(a, at, b) for a, b in pairs))
+    return MotionPath(*(np.insert(a, breaks, b) for a, b in pairs))
 
 
 def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str) -> bool:
     """Return whether a coordinate is an angle of `wrap_angles` or `turn_of`."""
     samples = motion.samples if isinstance(motion, Run) else motion
     assert samples is not None
-    Y = _course(machine, coordinate_of(machine, coordinate), samples.state)[0]
+    Y = _coordinate_path(machine, coordinate_of(machine, coordinate), samples.state)[0]
     counter = counter_of(machine)
     turn = counter.name if isinstance(counter, Turn) else None
     named = components(without_modes(samples.state), lead=1).items()
@@ -140,7 +140,7 @@ def turns(motion: Run | Samples, machine: AbstractMachine, coordinate: int | str
     return any(np.array_equal(Y, angle, equal_nan=True) for angle in angles)
 
 
-def _course(machine: AbstractMachine | None, k: int | str, states: Any) -> tuple[Any, Any]:
+def _coordinate_path(machine: AbstractMachine | None, k: int | str, states: Any) -> tuple[Any, Any]:
     """Return position and velocity of states by coordinate number k, or the component with that
     name; without a machine `Y` and `V`."""
     if isinstance(k, str):
@@ -173,8 +173,8 @@ def _with_impacts(
     log = run.impact_log
     assert log is not None
     stop, stops = np.asarray(log.stop), stops_of(machine)
-    own = [i for i, x in enumerate(stops) if x.coordinate == coordinate]
-    logged = np.isin(stop, own)
+    stop_numbers = [i for i, x in enumerate(stops) if x.coordinate == coordinate]
+    logged = np.isin(stop, stop_numbers)
     cycle, _ = np.nonzero(logged)
     stop = stop[logged]
     if not stop.size:
@@ -182,18 +182,18 @@ def _with_impacts(
     length = np.full(run.impacts.shape, float(logged_turn(machine)))
     if is_autonomous(machine, run.last):  # cycles of different lengths
         length = np.asarray(run.duration)
-    at = cycle + np.asarray(log.phase)[logged] / length[cycle]
+    cycles_at = cycle + np.asarray(log.phase)[logged] / length[cycle]
     speed = np.asarray(log.speed)[logged]
-    hit = [stops[i] for i in stop]
-    before = np.array([s.sign for s in hit]) * speed
-    after = [float(s.rebound(v)) for s, v in zip(hit, before, strict=True)]
-    extra = MotionPath(
-        np.repeat(at, 2),
-        np.repeat([float(s.place) for s in hit], 2),
+    stops_hit = [stops[i] for i in stop]
+    before = np.array([s.sign for s in stops_hit]) * speed
+    after = [float(s.rebound(v)) for s, v in zip(stops_hit, before, strict=True)]
+    added = MotionPath(
+        np.repeat(cycles_at, 2),
+        np.repeat([float(s.place) for s in stops_hit], 2),
         np.stack([before, after], axis=1).ravel(),
     )
-    places = np.searchsorted(path.cycles, extra.cycles)
-    return MotionPath(*(np.insert(a, places, b) for a, b in zip(path, extra, strict=True)))
+    places = np.searchsorted(path.cycles, added.cycles)
+    return MotionPath(*(np.insert(a, places, b) for a, b in zip(path, added, strict=True)))
 
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
@@ -333,9 +333,9 @@ def plot_phase_portrait(
     ax = new_axes(ax)
     (line,) = ax.plot(path.Y, path.V, **{"color": BLUE, "lw": thick(1.0), **style})
     if sections:
-        only = motion.samples if isinstance(motion, Run) else motion  # without the impacts
-        assert only is not None
-        samples = drawn_path(only, machine=machine, window=window, coordinate=coordinate)
+        unlogged = motion.samples if isinstance(motion, Run) else motion  # without the impacts
+        assert unlogged is not None
+        samples = drawn_path(unlogged, machine=machine, window=window, coordinate=coordinate)
         whole = abs(samples.cycles - samples.cycles.round()) < 1e-9
         dots = {"ms": 4, "color": line.get_color(), "zorder": 3, "label": once(ax, "section")}
         ax.plot(samples.Y[whole], samples.V[whole], "o", **dots)

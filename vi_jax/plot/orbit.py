@@ -271,7 +271,7 @@ def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> A
     **Arguments:** `found`, the result of `manifold`; `ax`, such as that of `plot_basins`, by
     default a new figure; options of `Axes.plot`.
     """
-    own = ax is None
+    is_new = ax is None
     ax = new_axes(ax)
     machine, color = found.machine, BLUE if found.which == "stable" else RED
     label: str | None = f"{found.which} manifold"
@@ -281,7 +281,7 @@ def plot_manifold(found: Manifold, *, ax: Axes | None = None, **style: Any) -> A
         label = None
     state = found.orbit.state
     ax.plot(machine.position(state), machine.velocity(state), "kX", ms=7, mec="w", zorder=4)
-    if own:
+    if is_new:
         ax.set(xlabel=machine.labels[0], ylabel=machine.labels[1])
     return ax
 

@@ -70,12 +70,12 @@ def plot_regimes(
     kind = data["period" if "period" in data else "outcome"]
     x, y = _two_axes([str(name) for name in kind.dims], x, y)
     lanes = _lanes(data.transpose(y, x, ...))
-    word = _word_of(data) if machine is None else partial(cycles_in_words, machine)
+    period_name = _period_namer(data) if machine is None else partial(cycles_in_words, machine)
     ax = new_axes(ax)
     across, up = np.asarray(data[x], float), np.asarray(data[y], float)
     outcomes = data["outcome"].attrs["flag_meanings"].split()[1:] if "outcome" in data else []
     kinds, shown = np.unique(lanes.reshape(-1, 3), axis=0, return_inverse=True)
-    entries = [_entry(kind, word, outcomes) for kind in kinds.tolist()]
+    entries = [_entry(kind, period_name, outcomes) for kind in kinds.tolist()]
     _image(ax, across, up, shown.reshape(lanes.shape[:2]), [color for _, _, color in entries])
     if legend:
         _legend(ax, [entry[1:] for entry in sorted(entries)])
@@ -96,8 +96,8 @@ def _lanes(data: xr.Dataset) -> np.ndarray:
     if "period" in data and "impacts" in data:
         impacts = np.asarray(data["impacts"], float)
         lanes[(period > 0) & (impacts < 0.5), 2] = 0
-        for number, hits in ((1, impacts >= 0.5), (2, impacts > 1.5)):
-            lanes[(period == 2) & hits, 2] = number
+        for number, selected in ((1, impacts >= 0.5), (2, impacts > 1.5)):
+            lanes[(period == 2) & selected, 2] = number
     if "outcome" in data:
         outcome = np.asarray(data["outcome"]).astype(int)
         lanes[outcome >= 0] = -1
@@ -108,7 +108,7 @@ def _lanes(data: xr.Dataset) -> np.ndarray:
 
 
 def _entry(
-    kind: Sequence[int], word: Callable[[int], str], outcomes: Sequence[str]
+    kind: Sequence[int], period_name: Callable[[int], str], outcomes: Sequence[str]
 ) -> tuple[tuple[int, ...], str, str]:
     """Return place in the legend, name and colour of lanes: periods and impacts, then outcomes."""
     outcome, period, impacts = kind
@@ -119,12 +119,12 @@ def _entry(
     if period == _GOES_ON:
         return (1, -1), "goes on", IRREGULAR[REGIMES.unsettled]
     most = len(PERIODS)
-    name = f"> {word(most - 1)}" if period == most else word(period)
+    name = f"> {period_name(most - 1)}" if period == most else period_name(period)
     name += {-1: "", 0: ", no impact", 1: ", 1 impact", 2: ", more impacts"}[impacts]
     return (0, period, impacts), name, color_of(period, None if impacts < 0 else impacts)
 
 
-def _word_of(data: xr.Dataset) -> Callable[[int], str]:
+def _period_namer(data: xr.Dataset) -> Callable[[int], str]:
     """Return the function that names periods in data from a machine of this class."""
     if data.attrs.get("machine_class", "Scene") != "Scene":
         return lambda cycles: count_of(cycles, "cycle")
@@ -192,8 +192,8 @@ def _start_name(machine: AbstractMachine, name: str) -> str:
     if name in names:  # not a number within an array
         probe = jtu.tree_unflatten(jtu.tree_structure(start), jnp.arange(len(names)) + 2.5)
         value = names.index(name) + 2.5
-        for read, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
-            if float(read(probe)) == value and not words.startswith(f"{name} = "):
+        for get, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
+            if float(get(probe)) == value and not words.startswith(f"{name} = "):
                 return f"{words} at the start"
     return by_its_name
 
@@ -281,8 +281,8 @@ def plot_integrity(
         name = profile.name_of(i) if i < _NAMED_LINES else None
         ax.plot(profile.values, percent * row, ".-", ms=4, lw=thick(1.6), color=color, label=name)
         if y != "share":
-            cut = getattr(profile, f"{y}_at_edge")[i]
-            ax.plot(profile.values[cut], row[cut], "o", ms=4, mec=color, mfc="w", zorder=3)
+            at_edge = getattr(profile, f"{y}_at_edge")[i]
+            ax.plot(profile.values[at_edge], row[at_edge], "o", ms=4, mec=color, mfc="w", zorder=3)
         ax.fill_between(profile.values, low, high, color=color, alpha=0.2, lw=0)
     irregular = sum(profile.irregular.values())
     if y == "share" and np.any(irregular):

@@ -133,9 +133,9 @@ class Pen:
 
     def _along(self, start: Point, end: Point, along: object, across: object, **look: Any) -> None:
         """Draw a line in coordinates along and across the line between two points."""
-        way = np.subtract(end, start)
-        length = np.hypot(*way)
-        unit = way / length if length else np.array([1.0, 0.0])
+        direction = np.subtract(end, start)
+        length = np.hypot(*direction)
+        unit = direction / length if length else np.array([1.0, 0.0])
         x = start[0] + np.asarray(along) * unit[0] - np.asarray(across) * unit[1]
         y = start[1] + np.asarray(along) * unit[1] + np.asarray(across) * unit[0]
         self.ax.plot(x, y, **{"color": INK, "solid_joinstyle": "round", **look})
@@ -169,9 +169,9 @@ class Pen:
 
 def sketch(machine: AbstractMachine, pen: Pen, state: State, phase: float) -> None:
     """Draw a machine in a state, by its own `sketch(pen, state, phase)` if it has one."""
-    own = getattr(machine, "sketch", None)
-    if own is not None:
-        own(pen, state, phase)
+    draw = getattr(machine, "sketch", None)
+    if draw is not None:
+        draw(pen, state, phase)
     else:
         _bodies(machine, pen, state)
 

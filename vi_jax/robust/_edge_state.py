@@ -14,8 +14,8 @@ from ..orbit import Orbit, map_state
 from ._settling import (
     ELSEWHERE,
     INADMISSIBLE,
+    RECORDED,
     RETURNS,
-    TRAIL,
     Row,
     Rows,
     Settling,
@@ -27,16 +27,16 @@ from ._settling import (
 # they reach the second, relative to the motion's size: choices. The edge lies between them.
 _CLOSE, _APART = 1e-10, 1e-5
 
-# Pieces of `TRAIL` cycles after which two neighbours are bisected again in any case: a choice.
+# Pieces of `RECORDED` cycles after which two neighbours are bisected again in any case: a choice.
 _PIECES = 16
 
 # The 0-1 test: the fewest section states, and the least correlation of time with the squared
 # distance of a walk from its origin (1 for chaos, 0 for regular motions). Choices.
-_LEAST, _GROWS = 200, 0.7
+_FEWEST, _CORRELATION = 200, 0.7
 
 # The edge's motion must recur to within the first for a search; the orbit found may be farther off
 # by the second factor. Choices; after a failed search the first becomes a tenth.
-_RECURS, _NEAR = 1e-3, 10.0
+_RECURRENCE, _NEAR = 1e-3, 10.0
 
 
 class EdgeState(Summarized):
@@ -110,9 +110,9 @@ def edge_state(
     progress = flag("progress", progress)
     longest, rounds = count("longest", longest, least=1), count("rounds", rounds, least=1)
     settling, start = settling_on(machine, inside, settle, tolerance, longest, method, "inside")
-    beyond = outside.state if isinstance(outside, Orbit) else outside
-    beyond = in_row(without_modes(map_state(settling.the_map.machine, beyond, "outside")))
-    first, second = settling.judge(np.stack([start, beyond]))
+    outside_row = outside.state if isinstance(outside, Orbit) else outside
+    outside_row = in_row(without_modes(map_state(settling.the_map.machine, outside_row, "outside")))
+    first, second = settling.judge(np.stack([start, outside_row]))
     for name, verdict, wanted in (("inside", first, RETURNS), ("outside", second, ELSEWHERE)):
         if verdict == INADMISSIBLE:
             raise ValueError(f"Argument `{name}` must be a start that can be simulated.")
@@ -131,64 +131,64 @@ def edge_state(
             else None
         )
 
-    with at_work("edge", kept, progress=progress, unit="round", total=rounds) as tell:
-        return tracked(settling, start, beyond, longest, rounds, section_states, tell)
+    with at_work("edge", kept, progress=progress, unit="round", total=rounds) as report:
+        return track_edge(settling, start, outside_row, longest, rounds, section_states, report)
 
 
-def tracked(
+def track_edge(
     settling: Settling,
     inside: Row,
     outside: Row,
     longest: int,
     rounds: int,
     section_states: list[Rows] | None = None,
-    tell: ReportProgress = silent,
+    report: ReportProgress = silent,
 ) -> EdgeState:
     """Find the edge state between a start that returns and one that does not. Extend
     `section_states`."""
-    recurs, section_states = _RECURS, [] if section_states is None else section_states
+    tolerance, section_states = _RECURRENCE, [] if section_states is None else section_states
     for _ in range(rounds):
         inside, outside = settling.bisected(inside, outside, _CLOSE)
-        pair, sections = _followed(settling, np.stack([inside, outside]))
+        pair, sections = _follow_pair(settling, np.stack([inside, outside]))
         if not len(sections):
             break
         section_states.append(sections)
-        tell(1)
+        report(1)
         inside, outside = pair
-        met = _met_again(
-            np.concatenate(section_states)[-4 * longest - 1 :], longest, recurs, settling
+        recurrence = _recurrence(
+            np.concatenate(section_states)[-4 * longest - 1 :], longest, tolerance, settling
         )
-        if met is not None:
-            orbit = settling.orbit_near(*met, _NEAR * recurs)
+        if recurrence is not None:
+            orbit = settling.orbit_near(*recurrence, _NEAR * tolerance)
             if orbit is not None and not bool(orbit.stable):
                 return _described(settling, section_states, orbit)
-            recurs *= 0.1
+            tolerance *= 0.1
     return _described(settling, section_states, None)
 
 
-def _followed(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
+def _follow_pair(settling: Settling, pair: Rows) -> tuple[Rows, Rows]:
     """Follow two neighbours until they are apart; return them and their mean section states."""
     parts = []
     for _ in range(_PIECES):
-        both = settling.section_states(pair, TRAIL)
+        both = settling.section_states(pair, RECORDED)
         both[1] = settling.near(both[1], both[0])
-        far = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or NaN
-        end = far[0] if far.size else TRAIL
+        separated = np.flatnonzero(~(settling.distance_to(both[1], both[0]) <= _APART))  # or NaN
+        end = separated[0] if separated.size else RECORDED
         end = end if np.isfinite(both[:, end]).all() else end - 1
         parts.append(both[:, 1 : end + 1].mean(axis=0))
         pair = both[:, max(end, 0)]
-        if far.size:
+        if separated.size:
             break
     return pair, np.concatenate(parts)
 
 
-def _met_again(
-    section_states: Rows, longest: int, recurs: float, settling: Settling
+def _recurrence(
+    section_states: Rows, longest: int, limit: float, settling: Settling
 ) -> tuple[Row, int] | None:
     """Return the last state if the motion has returned near to it, and the fewest cycles."""
     last = section_states[-1]
-    back = np.flatnonzero(settling.distance_to(section_states[:-1], last)[::-1][:longest] <= recurs)
-    return (last, int(back[0]) + 1) if back.size else None
+    near = np.flatnonzero(settling.distance_to(section_states[:-1], last)[::-1][:longest] <= limit)
+    return (last, int(near[0]) + 1) if near.size else None
 
 
 def _described(settling: Settling, section_states: list[Rows], orbit: Orbit | None) -> EdgeState:
@@ -211,14 +211,14 @@ def _chaotic(rows: Rows) -> bool:
     """Apply the 0-1 test for chaos (Gottwald and Melbourne 2009) to at least 200 section states: a
     walk driven by a chaotic signal diffuses like a random one, any other stays bounded."""
     count = len(rows)
-    if count < _LEAST:
+    if count < _FEWEST:
         return False
     signal = rows[:, np.argmax(np.std(rows, axis=0))]
     signal = signal - signal.mean()
-    lags, near = np.arange(1, count // 10 + 1), count - count // 10
+    lags, size = np.arange(1, count // 10 + 1), count - count // 10
     growths = []
     for rate in np.random.default_rng(0).uniform(np.pi / 5, 4 * np.pi / 5, 64):
         walk = np.cumsum(signal * np.exp(1j * rate * np.arange(1, count + 1)))
-        strays = np.array([np.mean(np.abs(walk[n : n + near] - walk[:near]) ** 2) for n in lags])
-        growths.append(np.corrcoef(lags, strays)[0, 1])
-    return bool(np.median(growths) > _GROWS)
+        spreads = np.array([np.mean(np.abs(walk[n : n + size] - walk[:size]) ** 2) for n in lags])
+        growths.append(np.corrcoef(lags, spreads)[0, 1])
+    return bool(np.median(growths) > _CORRELATION)

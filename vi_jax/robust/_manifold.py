@@ -116,19 +116,19 @@ def manifold(
     grow = _stable if which == "stable" else _unstable
     parts, lengths = ([saddle.place[None]], [saddle.place[None]]), [0.0, 0.0]
 
-    def grown() -> Manifold:
+    def result() -> Manifold:
         first, second = (jax.vmap(saddle.map.state)(saddle.states(part)) for part in parts)
         return Manifold(orbit, which, (first, second), (lengths[0], lengths[1]), orbit.machine)
 
     def kept() -> Interrupted | None:
-        return Interrupted("manifold", grown()) if any(lengths) else None
+        return Interrupted("manifold", result()) if any(lengths) else None
 
-    with at_work("manifold", kept, progress=progress, unit="point") as tell:
+    with at_work("manifold", kept, progress=progress, unit="point") as report:
         for i, side in enumerate((1.0, -1.0)):
             for rows, lengths[i] in grow(saddle, side, length, spacing):
                 parts[i].append(rows)
-                tell(len(rows))
-    return grown()
+                report(len(rows))
+    return result()
 
 
 Pieces = Iterator[tuple[Rows, float]]
@@ -157,61 +157,61 @@ class _Saddle:
         turns = 2 if growth[0] < 0 else 1
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
-    def carried(self, rows: Rows, periods: int) -> Rows:
+    def states_after(self, rows: Rows, periods: int) -> Rows:
         """Return states after some periods."""
-        return self.map.carried(rows * self.map.unit, periods * self.period) / self.map.unit
+        return self.map.states_after(rows * self.map.unit, periods * self.period) / self.map.unit
 
     def states(self, parts: list[Rows]) -> Rows:
         """Return points of a curve in original units, with NaN rows where an angle jumps a turn."""
         rows = np.concatenate(parts) * self.map.unit
         rows = self.map.near(rows, np.zeros_like(rows))
-        turned = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
-        return np.insert(rows, np.flatnonzero(turned.any(axis=1)) + 1, np.nan, axis=0)
+        jumps = np.abs(self.map.near(rows[1:], rows[:-1]) - rows[1:]) > 1
+        return np.insert(rows, np.flatnonzero(jumps.any(axis=1)) + 1, np.nan, axis=0)
 
-    def side_of(self, rows: Rows, apart: float) -> tuple[Row, Bool[np.ndarray, " _"]]:
-        """Return w·(Pⁿ(x) - xₛ) of neighbours `apart` by this, and whether Pⁿ(x) is near xₛ."""
-        most = np.log(_GROWTH) / np.log(self.growth)
-        periods = np.clip(np.log(_REACH / apart) / np.log(self.growth), 1, max(most, 1))
-        there = self.carried(rows, int(periods))
-        away = self.map.near(there, self.place) - self.place
-        return away @ self.across, np.all(np.abs(away) <= _FAR * (1 + np.abs(self.place)), axis=1)
+    def side_of(self, rows: Rows, distance: float) -> tuple[Row, Bool[np.ndarray, " _"]]:
+        """Return w·(Pⁿ(x) - xₛ) of neighbours at this `distance`, and whether Pⁿ(x) is near xₛ."""
+        largest = np.log(_GROWTH) / np.log(self.growth)
+        periods = np.clip(np.log(_REACH / distance) / np.log(self.growth), 1, max(largest, 1))
+        images = self.states_after(rows, int(periods))
+        diff = self.map.near(images, self.place) - self.place
+        return diff @ self.across, np.all(np.abs(diff) <= _FAR * (1 + np.abs(self.place)), axis=1)
 
 
 def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
-    ahead = side * saddle.stable
-    here, grown = saddle.place, 0.0
+    direction_before = side * saddle.stable
+    point, grown = saddle.place, 0.0
     step = spacing * _CLOSEST * 4
     while grown < length:
         size = min(step, length - grown + 1e-12)
-        new = _ahead(saddle, here, ahead, size)
-        direction = ahead if new is None else (new - here) / size
-        turn = np.arccos(np.clip(direction @ ahead, -1, 1))
+        new = _next_point(saddle, point, direction_before, size)
+        direction = direction_before if new is None else (new - point) / size
+        turn = np.arccos(np.clip(direction @ direction_before, -1, 1))
         if (new is None or turn > _TURN) and step > spacing * _CLOSEST:
             step = max(step / 2, spacing * _CLOSEST)
             continue
         if new is None:
             break
-        here, grown, ahead = new, grown + size, direction
+        point, grown, direction_before = new, grown + size, direction
         yield new[None], grown
         step = min(spacing, step * (1.5 if turn < _TURN / 3 else 1.0))
 
 
-def _ahead(saddle: _Saddle, here: Row, ahead: Row, size: float) -> Row | None:
-    """Return the point of the stable manifold at distance `size` ahead of `here`, or `None`."""
-    middle, low, high = np.arctan2(ahead[1], ahead[0]), -_HALF, _HALF
+def _next_point(saddle: _Saddle, point: Row, direction: Row, size: float) -> Row | None:
+    """Return the point of the stable manifold at distance `size` ahead of `point`, or `None`."""
+    middle, low, high = np.arctan2(direction[1], direction[0]), -_HALF, _HALF
     new = None
     for _ in range(_ROUNDS):
         turns = np.linspace(low, high, _ARC)
-        angles, apart = middle + turns, turns[1] - turns[0]
-        rows = here + size * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        value, near = saddle.side_of(rows, size * apart)
+        angles, spacing = middle + turns, turns[1] - turns[0]
+        rows = point + size * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        value, near = saddle.side_of(rows, size * spacing)
         # Far from the saddle the line on which w·(x - xₛ) is zero is not its manifold.
         change = np.flatnonzero((value[:-1] * value[1:] <= 0) & (near[:-1] | near[1:]))
         if not change.size:
             return None
-        at = int(change[np.argmin(np.abs(turns[change]))])
-        low, high = turns[at] - _WIDER * apart, turns[at + 1] + _WIDER * apart
-        new = rows[at]
+        best = int(change[np.argmin(np.abs(turns[change]))])
+        low, high = turns[best] - _WIDER * spacing, turns[best + 1] + _WIDER * spacing
+        new = rows[best]
     return new
 
 
@@ -221,27 +221,27 @@ def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pi
     grown, periods = 0.0, 0
     while grown < length and periods < 400:
         periods += 1
-        rows, kept = _stretch(saddle, begin, periods, spacing)
+        rows, connected = _image_of_stretch(saddle, begin, periods, spacing)
         near = saddle.map.near(rows[1:], rows[:-1])
         steps = np.linalg.norm(near - rows[:-1], axis=1)
-        steps[~kept] = 0.0
-        run = grown + np.concatenate([[0.0], np.cumsum(steps)])
-        use = int(np.searchsorted(run, length)) + 1
-        cut = np.flatnonzero(~kept[: use - 1])
-        if run[-1] - grown < _ENDED * spacing and grown > spacing:
+        steps[~connected] = 0.0
+        arc_length = grown + np.concatenate([[0.0], np.cumsum(steps)])
+        used = int(np.searchsorted(arc_length, length)) + 1
+        cut = np.flatnonzero(~connected[: used - 1])
+        if arc_length[-1] - grown < _ENDED * spacing and grown > spacing:
             break  # it has reached an attractor
-        grown = float(min(run[-1], length))
-        yield np.insert(rows[:use], cut + 1, np.nan, axis=0), grown
+        grown = float(min(arc_length[-1], length))
+        yield np.insert(rows[:used], cut + 1, np.nan, axis=0), grown
 
 
-def _stretch(
+def _image_of_stretch(
     saddle: _Saddle, begin: Row, periods: int, spacing: float
 ) -> tuple[Rows, Bool[np.ndarray, " _"]]:
     """Return images of a period's stretch along the eigenvector, and whether neighbours connect."""
 
     def images(parts):
         rows = saddle.place + begin * (saddle.growth**parts)[:, None]
-        return saddle.carried(rows, periods)
+        return saddle.states_after(rows, periods)
 
     parts = np.linspace(0, 1, 9)
     rows = images(parts)
@@ -251,10 +251,10 @@ def _stretch(
         wide = ~(sizes <= spacing)
         inner = np.sum(steps[1:] * steps[:-1], axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            turned = np.arccos(np.clip(inner / (sizes[1:] * sizes[:-1]), -1, 1)) > _TURN
+            bends = np.arccos(np.clip(inner / (sizes[1:] * sizes[:-1]), -1, 1)) > _TURN
         large = sizes > spacing * _CLOSEST
-        wide[1:] |= turned & large[1:]
-        wide[:-1] |= turned & large[:-1]
+        wide[1:] |= bends & large[1:]
+        wide[:-1] |= bends & large[:-1]
         jumps = np.diff(parts) < _JUMP
         split = np.flatnonzero(wide & ~jumps)
         if not split.size or len(parts) > _MOST:

@@ -29,7 +29,7 @@ from .._types import State
 from ..flow import MethodLike
 from ..machine import AbstractMachine, Summarized, components, in_rows, state_in_words, units_of
 from ..orbit import Orbit, cycle_map
-from ._edge_state import EdgeState, tracked
+from ._edge_state import EdgeState, track_edge
 from ._settling import ELSEWHERE, RETURNS, Row, Rows, Settling, images, settling_on
 
 Kicks = Float[np.ndarray, "..."]
@@ -74,8 +74,8 @@ class Kick(eqx.Module):
         return rows
 
     def allowed(self, z: Kicks) -> Bool[np.ndarray, "..."]:
-        there = self.rows(z)[..., self.places]
-        return np.asarray(((there >= self.low) & (there <= self.high)).all(axis=-1))
+        kicked = self.rows(z)[..., self.places]
+        return np.asarray(((kicked >= self.low) & (kicked <= self.high)).all(axis=-1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Exits:
     """The first radius that does not return; infinite if a ray ends before (a stop, a bound)."""
 
 
-def spread(count: int, size: int, seed: int) -> Kicks:
+def ray_directions(count: int, size: int, seed: int) -> Kicks:
     """Return directions: both, evenly around a circle, or at random in more dimensions."""
     if size == 1:
         return np.array([[1.0], [-1.0]])
@@ -104,7 +104,7 @@ def spread(count: int, size: int, seed: int) -> Kicks:
 def exits(
     settling: Settling, kick: Kick, directions: Kicks, inside: Any, outside: Any, points: int
 ) -> Exits:
-    """Return the first of so many points between two radii of each ray that does not return."""
+    """Return the first point of each ray that does not return, of `points` between two radii."""
     parts = np.arange(1, points + 1) / points
     inside = np.broadcast_to(inside, len(directions)).astype(float)
     outside = np.broadcast_to(outside, len(directions)).astype(float)
@@ -116,15 +116,15 @@ def exits(
     rows[~kick.allowed(z)] = kick.start
     place, leaves = settling.first_change(rows)
     leaves &= place < within
-    ends = np.concatenate([inside[:, None], radii], axis=1)
+    all_radii = np.concatenate([inside[:, None], radii], axis=1)
     rays = np.arange(len(directions))
-    last = ends[rays, np.minimum(np.where(leaves, place, 0), points)]
-    first = np.where(leaves, ends[rays, np.minimum(place + 1, points)], np.inf)
+    last = all_radii[rays, np.minimum(np.where(leaves, place, 0), points)]
+    first = np.where(leaves, all_radii[rays, np.minimum(place + 1, points)], np.inf)
     return Exits(directions, last, first)
 
 
 def narrowed(settling: Settling, kick: Kick, found: Exits, rounds: int) -> Exits:
-    """Narrow exits to more bits: the first change in each bracket, repeatedly."""
+    """Narrow the brackets of exits in several rounds."""
     good = np.isfinite(found.outside)
     inside, outside = found.inside[good], found.outside[good]
     directions = found.directions[good]
@@ -147,7 +147,7 @@ def first_exits(
     The rays grow until one leaves. Then as many points are set on the rays up to the
     shortest exit. This is repeated while it shrinks to less than half.
     """
-    rays = spread(directions, kick.size, seed)
+    rays = ray_directions(directions, kick.size, seed)
     reach = largest
     if reach is None:
         sizes = (settling.unit + np.abs(kick.start))[list(kick.places)]
@@ -191,8 +191,8 @@ def refine_direction(
         around = _around(best[0], angle, rng)
         coarse = exits(settling, kick, around, 0.0, best[2] * (1 + angle**2), 2 * AROUND)
         # At so large an angle the norm changes by its square, or decreases.
-        bits = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
-        found = narrowed(settling, kick, coarse, max(1, bits))
+        rounds_here = min(_FINE, math.ceil(-math.log2(angle**2) / 3) + 1)
+        found = narrowed(settling, kick, coarse, max(1, rounds_here))
         if len(found.outside):
             i = int(np.argmin(found.outside))
             if found.outside[i] <= best[2]:
@@ -217,7 +217,7 @@ def _around(unit: Row, angle: float, rng: np.random.Generator) -> Kicks:
 
 # Newton's method begins where the motion on the edge is this near to the saddle; it adds periods
 # until a kick moves by less than the second number, relative to its norm. Choices.
-_BEGINS, _STANDS = 0.05, 1e-11
+_NEAR_SADDLE, _CONVERGED = 0.05, 1e-11
 
 # A change below this, relative to the norm, is the method's error if it exceeds half the one
 # before: adaptive steps of 1e-11 leave some 1e-9 in a gradient. The kick is then final. A choice.
@@ -230,7 +230,7 @@ _PERIODS, _STEPS = 12, 12
 _DIFFERENCE, _STEP = 1e-5, 0.2
 
 # A kick that moves by more than this, relative to its norm, is another one than at first.
-_STRAYS = 0.5
+_FARTHEST = 0.5
 
 
 def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
@@ -248,34 +248,34 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
     growth = float(np.max(np.abs(np.asarray(saddle.multipliers))))
     longest = int(np.clip(np.log(1e14) / np.log(growth), 8, 400))
     section_states = settling.section_states(kick.rows(z)[None], longest * period)[0]
-    apart = settling.distance_to(section_states[1:, None], rows)
-    near = np.flatnonzero(apart.min(axis=1) <= _BEGINS)
+    distances = settling.distance_to(section_states[1:, None], rows)
+    near = np.flatnonzero(distances.min(axis=1) <= _NEAR_SADDLE)
     if not near.size:
         return None
-    place = int(apart[near[0]].argmin())
+    place = int(distances[near[0]].argmin())
 
     def edge(z: Kicks, cycles: int) -> tuple[Row, Kicks]:
         numbers = (jnp.asarray(x) for x in (kick.rows(z), cycles, settling.begin))
-        there, jacobian = images(settling.the_map, settling.like, *numbers)
+        ends, jacobian = images(settling.the_map, settling.like, *numbers)
         slope = normals[place] @ np.asarray(jacobian)[:, :, list(kick.places)]
-        away = settling.near(np.asarray(there), rows[place]) - rows[place]
-        return away @ normals[place], slope / kick.weights
+        offsets = settling.near(np.asarray(ends), rows[place]) - rows[place]
+        return offsets @ normals[place], slope / kick.weights
 
     first, before, last = z, None, np.inf
     for more in range(_PERIODS):
         found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + more * period), z)
-        if found is None or np.linalg.norm(found[0] - first) > _STRAYS * np.linalg.norm(first):
+        if found is None or np.linalg.norm(found[0] - first) > _FARTHEST * np.linalg.norm(first):
             return before
-        moved, z = float(np.linalg.norm(found[0] - z) / np.linalg.norm(z)), found[0]
-        if more and _stands(moved, last):
+        change, z = float(np.linalg.norm(found[0] - z) / np.linalg.norm(z)), found[0]
+        if more and _is_converged(change, last):
             return found
-        before, last = found if more else None, moved
+        before, last = found if more else None, change
     return before
 
 
-def _stands(change: float, last: float) -> bool:
+def _is_converged(change: float, last: float) -> bool:
     """Return whether a change, relative to the norm, is zero or within the method's error."""
-    return change <= _STANDS or last / 2 <= change <= _NOISE
+    return change <= _CONVERGED or last / 2 <= change <= _NOISE
 
 
 def _frame(settling: Settling, saddle: Orbit) -> tuple[Rows, Rows]:
@@ -301,8 +301,8 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
     size, multiplier, last = z.size, None, np.inf
     for _ in range(_STEPS):
         step = _DIFFERENCE * np.linalg.norm(z)
-        aside = step * np.eye(size)
-        values, slopes = edge(np.concatenate([z[None], z + aside, z - aside]))
+        offsets = step * np.eye(size)
+        values, slopes = edge(np.concatenate([z[None], z + offsets, z - offsets]))
         if not np.isfinite(slopes).all() or not np.any(slopes[0]):
             return None
         # In units in which the gradient has length one.
@@ -323,21 +323,21 @@ def _newton(edge: Callable[[Kicks], tuple[Row, Kicks]], z: Row) -> tuple[Row, fl
         change *= min(1.0, _STEP * norm / length) if length else 1.0
         z = z + change[:size]
         multiplier = None if length > _STEP * norm else multiplier + float(change[size])
-        if _stands(length / norm, last):
+        if _is_converged(length / norm, last):
             return z, float(np.max(np.abs(residual)) / norm)
         last = length / norm
     return None
 
 
 # Simulations with the kick larger and smaller by this share confirm it.
-_ASIDE = 1e-6
+_MARGIN = 1e-6
 
 # Two kicks are the same within this, relative to their norm. A choice.
 _SAME = 1e-4
 
 # Rounds of refinement around the best rays: before Newton's method, and instead of it. Choices: the
 # latter narrow a turn of 1/128 to 1e-8.
-_LOOKS, _MORE_LOOKS = 2, 14
+_FEW_ROUNDS, _MANY_ROUNDS = 2, 14
 
 # Rounds of bisection by eight that leave nothing between two numbers of double precision.
 _ROUNDING = 18
@@ -389,19 +389,19 @@ class MinimalKick(Summarized):
         units = units_of(self.machine)
         parts = state_in_words({name: np.asarray(x) for name, x in self.kick.items()}, 9, units)
         how = "exact" if self.exact else "by simulations only"
-        sure = "confirmed" if self.confirmed else "NOT confirmed"
+        confirmed = "confirmed" if self.confirmed else "NOT confirmed"
         when = f", {float(self.phase):.9g} after the section of cycle {self.cycle}"
         when = when if self.cycle or float(self.phase) else ""
-        leads = "no motion that repeats was found"
+        settles = "no motion that repeats was found"
         if self.settles is not None:
-            leads = str(self.settles).splitlines()[0]
+            settles = str(self.settles).splitlines()[0]
         edge = self.edge.summary().splitlines()
         lines = [
             f"Minimal kick of norm {float(self.norm):.9g}: {parts}",
             f"  to: {state_in_words(self.start, 9, units)}{when}",
-            f"  settles on: {leads}",
+            f"  settles on: {settles}",
             f"  edge: {edge[0] if len(edge) == 1 else f'{self.edge.kind}, {edge[1]}'}",
-            f"  residual {float(self.residual):.1g} ({how}), {sure} by simulation at 1 ± 1e-6",
+            f"  residual {float(self.residual):.1g} ({how}), {confirmed} by simulation at 1 ± 1e-6",
         ]
         lines += [f"  another: norm {float(other.norm):.9g}" for other in self.others]
         return "\n".join(lines)
@@ -477,9 +477,9 @@ def minimal_kick(
     def kept() -> Interrupted | None:
         return Interrupted("search for kicks", _smallest(kicks, settling)) if kicks else None
 
-    with at_work("minimal kick", kept, progress=progress, unit="start") as settling.tell:
+    with at_work("minimal kick", kept, progress=progress, unit="start") as settling.report:
         if phase > 0:
-            settling, start = settling.later(start, phase)
+            settling, start = settling.at_phase(start, phase)
             kick = dataclasses.replace(kick, start=start)
         rays = first_exits(settling, kick, directions, points, largest, seed)
         angle = 2 * np.pi / directions ** (1 / max(1, kick.size - 1))  # between neighbours
@@ -511,22 +511,22 @@ def _exact(
     settling: Settling, kick: Kick, unit: Row, radius: float, angle: float, longest: int, seed: int
 ) -> _Found:
     """Return the shortest kick near a ray that leaves the basin at a radius."""
-    unit, inside, outside = refine_direction(settling, kick, unit, radius, angle, _LOOKS, seed)
+    unit, inside, outside = refine_direction(settling, kick, unit, radius, angle, _FEW_ROUNDS, seed)
     line = Exits(unit[None], np.array([inside]), np.array([outside]))
     line = narrowed(settling, kick, line, _ROUNDING)
     outside = float(line.outside[0])
-    ends = kick.rows(np.array([line.inside[0], outside * (1 + _ASIDE)])[:, None] * unit)
+    ends = kick.rows(np.array([line.inside[0], outside * (1 + _MARGIN)])[:, None] * unit)
     if settling.begin > 0:
-        ends = settling.carried(ends, 1)
-    edge = tracked(settling.starting(0.0), ends[0], ends[1], longest, _ROUNDS)
+        ends = settling.states_after(ends, 1)
+    edge = track_edge(settling.starting_at(0.0), ends[0], ends[1], longest, _ROUNDS)
     if edge.kind == "saddle" and edge.orbit is not None:
         better = shortest(settling, kick, edge.orbit, unit * outside)
         longer = np.nan if better is None else np.linalg.norm(better[0]) / outside - 1
         if better is not None and -_SHORTER <= longer <= _LONGER:
             return *better, True, edge
-    narrow = angle / NARROWER**_LOOKS
+    narrow = angle / NARROWER**_FEW_ROUNDS
     unit, inside, outside = refine_direction(
-        settling, kick, unit, outside, narrow, _MORE_LOOKS, seed
+        settling, kick, unit, outside, narrow, _MANY_ROUNDS, seed
     )
     return unit * outside, (outside - inside) / outside, False, edge
 
@@ -546,21 +546,21 @@ def _kick_of(
     if not names or len({*names}) < len(names):
         raise ValueError(f"Argument `components` must be different names, but got {names!r}.")
     for argument, given in (("components", names), ("weights", weights), ("bounds", bounds)):
-        among = list(places) if argument == "components" else names
+        known = list(places) if argument == "components" else names
         for name in given:
-            if name not in among:
+            if name not in known:
                 raise ValueError(
                     f"Argument `{argument}` must name numbers of the state that are kicked, of "
-                    f"{', '.join(among)}, but names {name!r}."
+                    f"{', '.join(known)}, but names {name!r}."
                 )
-    weigh = [
+    weight_row = [
         given_number(f"weights[{name!r}]", weights.get(name, 1.0), low=0.0, open_low=True)
         for name in names
     ]
     free = (-np.inf, np.inf)
     ranges = [interval("bounds", bounds[name]) if name in bounds else free for name in names]
     low, high = np.array(ranges).T
-    kick = Kick(start, tuple(places[name] for name in names), np.array(weigh), low, high)
+    kick = Kick(start, tuple(places[name] for name in names), np.array(weight_row), low, high)
     if not kick.allowed(np.zeros(kick.size)):
         raise ValueError("Argument `bounds` must hold the state that is kicked, but does not.")
     return kick
@@ -570,8 +570,8 @@ def _described(
     settling: Settling, kick: Kick, found: _Found, longest: int, cycle: int, phase: float
 ) -> MinimalKick:
     z, residual, is_exact, edge = found
-    aside = kick.rows(np.array([1 - _ASIDE, 1 + _ASIDE])[:, None] * z)
-    verdicts = settling.judge(aside)
+    rows = kick.rows(np.array([1 - _MARGIN, 1 + _MARGIN])[:, None] * z)
+    verdicts = settling.judge(rows)
     row = kick.rows(z)
     changed = components(settling.state(row - kick.start))
     kicked = components(settling.state(np.isin(np.arange(row.size), kick.places).astype(float)))
@@ -579,7 +579,7 @@ def _described(
         kick={name: x for name, x in changed.items() if kicked[name] > 0},
         norm=float(np.linalg.norm(z)),
         start=settling.state(row),
-        settles=settling.settled_orbit(aside[1], longest),
+        settles=settling.settled_orbit(rows[1], longest),
         cycle=cycle,
         phase=phase,
         edge=edge,

@@ -54,10 +54,10 @@ _LANES = 1024
 # the first has settled, or is nearer to an unstable one than starts can be distinguished. Section
 # states a period apart are the same within the second. An orbit found from a state is its motion if
 # it lies within the third. Choices.
-_STAYS, _SAME, _NEAR = 1e-11, 1e-5, 1e-3
+_UNCHANGED, _SAME, _NEAR = 1e-11, 1e-5, 1e-3
 
-# Sections of a motion that are recorded in one run. A choice: longer ones are put together.
-TRAIL = 16
+# Sections of a motion that are recorded in one run. A choice: longer motions take several runs.
+RECORDED = 16
 
 
 class Settling:
@@ -81,10 +81,10 @@ class Settling:
         self.begin = 0.0
         """Time of the starts after the section, by the clock of a machine with a drive."""
         self._judged_so_far: list[int] = []
-        self.tell: ReportProgress = silent
+        self.report: ReportProgress = silent
         """Callback with the number of starts that are judged."""
 
-    def starting(self, begin: float) -> "Settling":
+    def starting_at(self, begin: float) -> "Settling":
         new = copy.copy(self)
         new.begin = begin
         return new
@@ -97,13 +97,13 @@ class Settling:
     def state(self, row: object) -> State:
         return ravel_pytree(self.like)[1](jnp.asarray(row))
 
-    def near(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    def near(self, states: np.ndarray, references: np.ndarray) -> np.ndarray:
         """Move states by whole turns of their angles to where they are nearest to others."""
-        return nearest_images(self.angles, here, there)
+        return nearest_images(self.angles, states, references)
 
-    def distance_to(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    def distance_to(self, states: np.ndarray, references: np.ndarray) -> np.ndarray:
         """Return the distance of states from others, up to whole turns, see `orbit.distance`."""
-        return distance(self.near(here, there), there, self.unit)
+        return distance(self.near(states, references), references, self.unit)
 
     def distance(self, rows: Rows) -> Float[np.ndarray, " lanes"]:
         """Return the distance of section states from the motion's nearest one."""
@@ -111,32 +111,32 @@ class Settling:
 
     def judge(self, rows: Rows) -> Int[np.ndarray, " lanes"]:
         """Return `RETURNS`, `ELSEWHERE` or `INADMISSIBLE` for each start."""
-        return np.concatenate([self._judged(*part) for part in _filled(rows)])
+        return np.concatenate([self._judged(*part) for part in _padded_parts(rows)])
 
-    def _judged(self, here: Rows, goes_on: Bool[np.ndarray, " lanes"]) -> Int[np.ndarray, " _"]:
+    def _judged(self, rows: Rows, is_running: Bool[np.ndarray, " lanes"]) -> Int[np.ndarray, " _"]:
         """Judge one filled program of starts; return the verdicts on those that count."""
-        count = int(goes_on.sum())
+        count = int(is_running.sum())
         self._judged_so_far.append(count)
-        self.tell(count)
+        self.report(count)
         # States on the motion need not return to it; an equilibrium meets no section at all.
-        off = self.distance(here) > 0
-        verdict = np.where(off | (self.begin > 0), ELSEWHERE, RETURNS)
-        goes_on &= verdict == ELSEWHERE
+        is_away = self.distance(rows) > 0
+        verdict = np.where(is_away | (self.begin > 0), ELSEWHERE, RETURNS)
+        is_running &= verdict == ELSEWHERE
         done, step = 0, 1
-        while done < self.settle and goes_on.any():
+        while done < self.settle and is_running.any():
             step = min(max(1, done // 4), self.settle - done)
             begin = 0.0 if done else self.begin
-            there, good, bad_start = self._advanced(here, step, goes_on, begin)
+            later, good, bad_start = self._advanced(rows, step, is_running, begin)
             if not done:
-                verdict[goes_on & bad_start] = INADMISSIBLE
+                verdict[is_running & bad_start] = INADMISSIBLE
             # A repeating state has settled: more cycles cost time, and end an equilibrium in noise.
-            moves = (self.distance_to(there, here) > _STAYS) | (begin > 0)
-            here = np.where((goes_on & good)[:, None], there, here)
-            goes_on &= good
-            returned = goes_on.copy()
-            returned[goes_on] = self.distance(here[goes_on]) <= self.tolerance
+            moves = (self.distance_to(later, rows) > _UNCHANGED) | (begin > 0)
+            rows = np.where((is_running & good)[:, None], later, rows)
+            is_running &= good
+            returned = is_running.copy()
+            returned[is_running] = self.distance(rows[is_running]) <= self.tolerance
             verdict[returned] = RETURNS
-            goes_on &= ~returned & moves
+            is_running &= ~returned & moves
             done += step
         return verdict[:count]
 
@@ -150,12 +150,12 @@ class Settling:
         _refuse_other_modes(other)
         return found
 
-    def carried(self, rows: Rows, cycles: int) -> Rows:
+    def states_after(self, rows: Rows, cycles: int) -> Rows:
         """Return states so many cycles later; NaN for a start that does not get there."""
         found = []
-        for part, wanted in _filled(rows):
-            there, good, _ = self._advanced(part, cycles, wanted, self.begin)
-            found.append(np.where(good[:, None], there, np.nan)[wanted])
+        for part, wanted in _padded_parts(rows):
+            later, good, _ = self._advanced(part, cycles, wanted, self.begin)
+            found.append(np.where(good[:, None], later, np.nan)[wanted])
         return np.concatenate(found)
 
     def first_change(self, rows: Float[np.ndarray, "rays points states"]) -> tuple[Any, Any]:
@@ -163,18 +163,18 @@ class Settling:
         points, and whether that point is elsewhere (not inadmissible)."""
         rays, points, states = rows.shape
         verdict = self.judge(rows.reshape(-1, states)).reshape(rays, points)
-        left = verdict != RETURNS
-        first = np.where(left.any(axis=1), left.argmax(axis=1), points)
-        there = verdict[np.arange(rays), np.minimum(first, points - 1)]
-        return first, (first < points) & (there == ELSEWHERE)
+        leaves = verdict != RETURNS
+        first = np.where(leaves.any(axis=1), leaves.argmax(axis=1), points)
+        first_verdict = verdict[np.arange(rays), np.minimum(first, points - 1)]
+        return first, (first < points) & (first_verdict == ELSEWHERE)
 
     def section_states(self, rows: Rows, cycles: int) -> Float[np.ndarray, "lanes sections states"]:
         """Return the section states of some motions, from their starts on."""
-        parts, here, begin = [rows[:, None]], rows, self.begin
-        for _ in range(math.ceil(cycles / TRAIL)):
-            later = _trail(self.the_map, self.like, jnp.asarray(here), jnp.asarray(begin))
+        parts, last, begin = [rows[:, None]], rows, self.begin
+        for _ in range(math.ceil(cycles / RECORDED)):
+            later = _sections_of(self.the_map, self.like, jnp.asarray(last), jnp.asarray(begin))
             parts.append(np.asarray(later)[:, 1:])
-            here, begin = parts[-1][:, -1], 0.0
+            last, begin = parts[-1][:, -1], 0.0
         return np.concatenate(parts, axis=1)[:, : cycles + 1]
 
     def bisected(self, inside: Row, outside: Row, width: float) -> tuple[Row, Row]:
@@ -192,10 +192,10 @@ class Settling:
 
     def settled_rows(self, start: Row, longest: int) -> Rows | None:
         """Return the section states of a start's final motion, one period, at most `longest`."""
-        last = self.carried(start[None], self.settle)
+        last = self.states_after(start[None], self.settle)
         if not np.isfinite(last).all():
             return None
-        rows = self.starting(0.0).section_states(last, 2 * longest)[0]
+        rows = self.starting_at(0.0).section_states(last, 2 * longest)[0]
         for period in range(1, longest + 1):
             if self.distance_to(rows[:-period], rows[period:]).max() <= _SAME:
                 return rows[:period]
@@ -215,7 +215,7 @@ class Settling:
         sections = np.asarray(in_rows(orbit.sections))
         return orbit if self.distance_to(row, sections).min() <= near else None
 
-    def later(self, start: Row, phase: float) -> tuple["Settling", Row]:
+    def at_phase(self, start: Row, phase: float) -> tuple["Settling", Row]:
         """Return a classifier of starts `phase` after a section state of the motion, and that
         state."""
         machine, method = self.the_map.machine, self.the_map.method
@@ -235,11 +235,11 @@ class Settling:
             )
         if autonomous:
             # With equal intervals it meets no section, and needs no clock.
-            every = machine.observed_every(phase)
-            run = simulate(every, state, 1, method=method, record="sections")
+            observed = machine.observed_every(phase)
+            run = simulate(observed, state, 1, method=method, record="sections")
             return self, in_row(without_modes(run.last))
-        there = _until(self.the_map, self.like, jnp.asarray(row), jnp.asarray(phase))
-        return self.starting(phase), np.asarray(there)
+        state_row = _state_at_clock(self.the_map, self.like, jnp.asarray(row), jnp.asarray(phase))
+        return self.starting_at(phase), np.asarray(state_row)
 
 
 def in_row(state: State) -> Row:
@@ -272,9 +272,9 @@ def settling_on(
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
-    here = map_state(the_map.machine, motion.state if isinstance(motion, Orbit) else motion, name)
-    _refuse_other_modes(_in_other_modes(the_map, jtu.tree_map(lambda x: x[None], here)))
-    like = without_modes(here)
+    state = map_state(the_map.machine, motion.state if isinstance(motion, Orbit) else motion, name)
+    _refuse_other_modes(_in_other_modes(the_map, jtu.tree_map(lambda x: x[None], state)))
+    like = without_modes(state)
     if isinstance(motion, Orbit):
         if not bool(one_orbit(name, motion).stable):
             raise ValueError(f"Argument `{name}` must be a stable orbit, but this one is not.")
@@ -300,12 +300,12 @@ def settling_on(
     return Settling(the_map, like, rows, settle, tolerance), start
 
 
-def _filled(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:
+def _padded_parts(rows: Rows) -> Iterator[tuple[Rows, Bool[np.ndarray, " lanes"]]]:
     """Yield rows in parts of as many as there are lanes, the last padded, and which are wanted."""
     for i in range(0, len(rows), _LANES):
         part = rows[i : i + _LANES]
-        more = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
-        yield np.concatenate([part, more]), np.arange(_LANES) < len(part)
+        padding = np.broadcast_to(part[:1], (_LANES - len(part), rows.shape[1]))
+        yield np.concatenate([part, padding]), np.arange(_LANES) < len(part)
 
 
 @compiled
@@ -352,12 +352,12 @@ def _runs(
 
 
 @compiled
-def _trail(the_map: CycleMap, like: State, rows: Array, begin: Array) -> Array:
-    return in_rows(_runs(the_map, like, rows, TRAIL, 0, begin).sections, 2)
+def _sections_of(the_map: CycleMap, like: State, rows: Array, begin: Array) -> Array:
+    return in_rows(_runs(the_map, like, rows, RECORDED, 0, begin).sections, 2)
 
 
 @compiled
-def _until(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
+def _state_at_clock(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
     """Return the state of a driven machine at a clock within the cycle that begins in a state."""
     return in_rows(_runs(the_map, like, row[None], 1, 0, None, until=clock).sections, 2)[0, -1]
 
