@@ -75,14 +75,14 @@ class Verb(NamedTuple):
     about: str
     function: Callable[..., Any]
     work: Callable[..., Found]
-    own: tuple[str, ...] = ()
+    own_keys: tuple[str, ...] = ()
     """Keys of its table that are not arguments of the function."""
 
     def keys(self) -> list[str]:
         """Return the keys of its table."""
         names = [*inspect.signature(self.function).parameters]
         names += [*inspect.signature(scan).parameters] if "options" in names else []
-        return [x for x in dict.fromkeys([*names, *self.own, *_ENDINGS]) if x not in _LEFT_OUT]
+        return [x for x in dict.fromkeys([*names, *self.own_keys, *_ENDINGS]) if x not in _LEFT_OUT]
 
     def check(self, table: Mapping[str, Any], place: str) -> None:
         """Raise `InputError` for an unknown or a missing key."""
@@ -116,9 +116,9 @@ def do(verb: str, machine: AbstractMachine, tables: Mapping[str, Any]) -> Found:
     files = {key: values.pop(key) for key in _ENDINGS if key in values}
     for key, path in files.items():
         _check_path(path, _ENDINGS[key], f"`{key}` in {place}")
-    own = {key: values.pop(key) for key in spec.own if key in values}
+    own_options = {key: values.pop(key) for key in spec.own_keys if key in values}
     with errors_in(place), warnings.catch_warnings(record=True) as caught:
-        found = spec.work(subject, values, **own)
+        found = spec.work(subject, values, **own_options)
         lines = [*before, *found.lines, *_write_files(found, **files)]
     return found._replace(lines=lines + sorted({f"  warning: {x.message}" for x in caught}))
 

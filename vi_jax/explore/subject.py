@@ -418,12 +418,12 @@ def _affordable_cycles(do: Callable[[int], Any]) -> int:
 @compiled
 def _settled(machine: Any, names: tuple[str, ...], rows: Any, start: Any, settle: Any) -> Any:
     def one(row):
-        here = with_leaves(machine, dict(zip(names, row, strict=True)))
+        current = with_leaves(machine, dict(zip(names, row, strict=True)))
         run = simulate(
-            here, moved_by_stops(here, convert_start(here, start)), CYCLES, settle=settle
+            current, moved_by_stops(current, convert_start(current, start)), CYCLES, settle=settle
         )
         assert run.y_min is not None and run.impact_speed is not None
-        Y, V = (jax.vmap(f)(run.sections)[1:] for f in (here.position, here.velocity))
+        Y, V = (jax.vmap(f)(run.sections)[1:] for f in (current.position, current.velocity))
         return Y, V, run.y_min, run.impact_speed
 
     return jax.vmap(one)(rows)

@@ -244,8 +244,8 @@ def check_takes(
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError as error:
-        more = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
-        raise TypeError(f"{whose} must take {first}{more}: {error}.") from None
+        and_modes = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
+        raise TypeError(f"{whose} must take {first}{and_modes}: {error}.") from None
     except ValueError:
         pass  # it has no signature
 

@@ -430,12 +430,12 @@ class Reset(AbstractEvent):
 
     def after(self, machine, s, state, *modes):
         """Return the results of `reset` and `modes`."""
-        own = None
+        machine_modes = None
         if self._modes is not None:
             found = self._call("modes", self._modes, machine, s, state, modes)
-            own = modes_after(machine, found, modes, self._whose("modes", machine))
+            machine_modes = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
-        return new, struck_modes(machine, s, new, modes, own)
+        return new, struck_modes(machine, s, new, modes, machine_modes)
 
     def jump(self, machine, s, state, *modes):
         """Return the state after the function `reset`."""

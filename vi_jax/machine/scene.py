@@ -553,13 +553,13 @@ class Parameters(Shown):
         require_ranges(self)  # again: a number may have been replaced
         omega = self.natural_frequency
         if drive == "ideal":
-            made: IdealDrive | Motor = IdealDrive(self.control)
+            scene_drive: IdealDrive | Motor = IdealDrive(self.control)
         else:
             per_inertia = self.crank_radius**2 / self.inertia
             no_load = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
             time = self.electrical_time
             electrical = {} if time is None else {"electrical_time": time * omega}
-            made = (DCMotor if electrical else Motor)(
+            scene_drive = (DCMotor if electrical else Motor)(
                 strength=self.torque / (self.inertia * omega**2),
                 control=self.control,
                 coupling=self.body_mass * per_inertia,
@@ -574,7 +574,7 @@ class Parameters(Shown):
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
             oscillator=Oscillator(damping),
-            drive=made,
+            drive=scene_drive,
             stops=(RigidStop(_ratio(self.gap, self.crank_radius), self.restitution),),
             crank=exact or CosineCrank(),
         )

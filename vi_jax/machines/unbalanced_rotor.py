@@ -118,9 +118,9 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         radius = 0.34 * size
         post = draw_supported_body(self, pen, place)
         pen.disc(place, 0.0, radius)
-        heavy = place + radius * cos(state.phi), radius * sin(state.phi)
-        pen.line((place, 0.0), heavy)
-        pen.ball(*heavy, 0.1 * size, color=pen.red)
+        unbalance = place + radius * cos(state.phi), radius * sin(state.phi)
+        pen.line((place, 0.0), unbalance)
+        pen.ball(*unbalance, 0.1 * size, color=pen.red)
         pen.label(place + 0.15 * size, 0.68 * size, "$m,\\ r$", color=pen.red)
         pen.label(place + 0.68 * size, 0.0, "$M$", color=pen.blue)
         pen.label((post + place) / 2, 0.7 * size, "$k,\\ c$")

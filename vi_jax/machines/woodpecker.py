@@ -138,10 +138,10 @@ class Woodpecker(ReadyMachine, Mechanical):
         """The mass matrix; the bird hangs on both arms."""
         sleeve, bird = self.sleeve_arm, self.bird_arm
         J = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
-        hanging = [
+        coupled = [
             [self.bird_mass * a * b for b in (1.0, sleeve, bird)] for a in (1.0, sleeve, bird)
         ]
-        return [[x + (i == j) * J[i] for j, x in enumerate(row)] for i, row in enumerate(hanging)]
+        return [[x + (i == j) * J[i] for j, x in enumerate(row)] for i, row in enumerate(coupled)]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
         """Return the weights, and the moment of the spring, without the forces of the contacts."""
@@ -189,7 +189,7 @@ class Woodpecker(ReadyMachine, Mechanical):
         pole, arm = float(self.pole_radius), float(self.bird_arm)
         beak = float(self.bird_arm - self.beak_arm), float(self.beak_height)
         middle, tilt = np.array([0.0, float(state.height)]), float(state.sleeve_angle)
-        hang = middle + _rotated((float(self.sleeve_arm), 0.0), tilt)
+        joint = middle + _rotated((float(self.sleeve_arm), 0.0), tilt)
 
         def filled(about: Any, points: Any, angle: float, color: str) -> None:
             shape = about + _rotated(points, angle)
@@ -203,21 +203,21 @@ class Woodpecker(ReadyMachine, Mechanical):
         for side in (-1, 1):  # the two walls of the sleeve, cut open
             x = side * inside * np.array([1.0, 1.0, 1.28, 1.28])
             filled(middle, np.stack([x, half * np.array([-1, 1, 1, -1])], -1), tilt, SLEEVE)
-        pen.spring(tuple(middle + _rotated((1.28 * inside, 0.0), tilt)), tuple(hang))
+        pen.spring(tuple(middle + _rotated((1.28 * inside, 0.0), tilt)), tuple(joint))
         # The tip of its beak and its centre of mass are the machine's.
-        lean, centre = float(state.bird_angle), np.array([arm, 0.0])
+        bird_tilt, centre = float(state.bird_angle), np.array([arm, 0.0])
         head = np.array([0.5 * (beak[0] + arm), beak[1]])
         long = float(np.hypot(*(head - centre)))
         along = float(np.arctan2(*(head - centre)[::-1]))
         thick = np.array([0.0, 0.1 * long])
-        filled(hang, [beak, head + thick, head - thick], lean, BEAK)
-        filled(hang, centre + _rotated(_oval(0.8 * long, 0.33 * long), along), lean, BIRD)
-        filled(hang, head + _oval(0.23 * long, 0.23 * long), lean, BIRD)
-        pen.line(tuple(hang), tuple(hang + _rotated(centre, lean)), lw=3.0)
-        left, up, right = -2.6 * inside, float(middle[1]), float(hang[0]) + 1.6 * arm
+        filled(joint, [beak, head + thick, head - thick], bird_tilt, BEAK)
+        filled(joint, centre + _rotated(_oval(0.8 * long, 0.33 * long), along), bird_tilt, BIRD)
+        filled(joint, head + _oval(0.23 * long, 0.23 * long), bird_tilt, BIRD)
+        pen.line(tuple(joint), tuple(joint + _rotated(centre, bird_tilt)), lw=3.0)
+        left, up, right = -2.6 * inside, float(middle[1]), float(joint[0]) + 1.6 * arm
         pen.label(left, up, "sleeve, $\\varphi_M$", ha="right")
         pen.label(left, up + 1.2 * beak[1], "pole, $\\mu$", ha="right")
-        pen.label(right, float(hang[1]), "bird, $\\varphi_S$", ha="left")
+        pen.label(right, float(joint[1]), "bird, $\\varphi_S$", ha="left")
         pen.label(1.3 * inside, up - 1.7 * arm, "spring, $c$", ha="left")
 
 

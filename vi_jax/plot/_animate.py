@@ -211,8 +211,8 @@ class MotionAnimation(animation.FuncAnimation):
         kinds = {".gif": animation.PillowWriter, ".html": animation.HTMLWriter}
         kind = kinds.get(Path(filename).suffix)
         if writer is None and kind is not None:
-            more = {"embed_frames": True, "embed_limit": _MOST} if kind is kinds[".html"] else {}
-            writer = kind(fps=self.fps, **more)
+            embed = {"embed_frames": True, "embed_limit": _MOST} if kind is kinds[".html"] else {}
+            writer = kind(fps=self.fps, **embed)
         super().save(filename, "ffmpeg" if writer is None else writer, **options)
 
 

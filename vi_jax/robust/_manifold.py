@@ -179,10 +179,10 @@ class _Saddle:
 
 def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     direction_before = side * saddle.stable
-    point, grown = saddle.place, 0.0
+    point, reached = saddle.place, 0.0
     step = spacing * _CLOSEST * 4
-    while grown < length:
-        size = min(step, length - grown + 1e-12)
+    while reached < length:
+        size = min(step, length - reached + 1e-12)
         new = _next_point(saddle, point, direction_before, size)
         direction = direction_before if new is None else (new - point) / size
         turn = np.arccos(np.clip(direction @ direction_before, -1, 1))
@@ -191,8 +191,8 @@ def _stable(saddle: _Saddle, side: float, length: float, spacing: float) -> Piec
             continue
         if new is None:
             break
-        point, grown, direction_before = new, grown + size, direction
-        yield new[None], grown
+        point, reached, direction_before = new, reached + size, direction
+        yield new[None], reached
         step = min(spacing, step * (1.5 if turn < _TURN / 3 else 1.0))
 
 
@@ -218,20 +218,20 @@ def _next_point(saddle: _Saddle, point: Row, direction: Row, size: float) -> Row
 def _unstable(saddle: _Saddle, side: float, length: float, spacing: float) -> Pieces:
     """Yield one branch of an unstable manifold, with NaN rows at jumps."""
     begin = side * _BEGIN * saddle.unstable
-    grown, periods = 0.0, 0
-    while grown < length and periods < 400:
+    reached, periods = 0.0, 0
+    while reached < length and periods < 400:
         periods += 1
         rows, connected = _image_of_stretch(saddle, begin, periods, spacing)
         near = saddle.map.near(rows[1:], rows[:-1])
         steps = np.linalg.norm(near - rows[:-1], axis=1)
         steps[~connected] = 0.0
-        arc_length = grown + np.concatenate([[0.0], np.cumsum(steps)])
+        arc_length = reached + np.concatenate([[0.0], np.cumsum(steps)])
         used = int(np.searchsorted(arc_length, length)) + 1
         cut = np.flatnonzero(~connected[: used - 1])
-        if arc_length[-1] - grown < _ENDED * spacing and grown > spacing:
+        if arc_length[-1] - reached < _ENDED * spacing and reached > spacing:
             break  # it has reached an attractor
-        grown = float(min(arc_length[-1], length))
-        yield np.insert(rows[:used], cut + 1, np.nan, axis=0), grown
+        reached = float(min(arc_length[-1], length))
+        yield np.insert(rows[:used], cut + 1, np.nan, axis=0), reached
 
 
 def _image_of_stretch(

@@ -262,14 +262,14 @@ def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row
         return offsets @ normals[place], slope / kick.weights
 
     first, before, last = z, None, np.inf
-    for more in range(_PERIODS):
-        found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + more * period), z)
+    for added in range(_PERIODS):
+        found = _newton(functools.partial(edge, cycles=int(near[0]) + 1 + added * period), z)
         if found is None or np.linalg.norm(found[0] - first) > _FARTHEST * np.linalg.norm(first):
             return before
         change, z = float(np.linalg.norm(found[0] - z) / np.linalg.norm(z)), found[0]
-        if more and _is_converged(change, last):
+        if added and _is_converged(change, last):
             return found
-        before, last = found if more else None, change
+        before, last = found if added else None, change
     return before
 
 

@@ -579,10 +579,10 @@ class IntegrityProfile(NamedTuple):
             f"{high:.6g}: {count_of(len(self.period), 'motion')}"
         ]
         for i in range(min(len(self.period), 8)):
-            here = self.values[self.share[i] > 0]
+            present = self.values[self.share[i] > 0]
             best = int(np.argmax(self.share[i]))
             text = (
-                f"  {i}: {self.name_of(i)}, {here[0]:.6g} to {here[-1]:.6g}: at most "
+                f"  {i}: {self.name_of(i)}, {present[0]:.6g} to {present[-1]:.6g}: at most "
                 f"{100 * self.share[i, best]:.1f} % at {self.values[best]:.6g}"
             )
             if not np.isnan(self.local[i]).all():

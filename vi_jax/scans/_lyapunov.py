@@ -289,14 +289,14 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
             images = jax.jvp(lambda x: image(x, modes), (x,), (unit * direction,), has_aux=True)
             return images[0], images[1] / unit, images[2]
 
-        new, grown, (duration, integrals, ended, modes) = jax.vmap(
+        new, tangents, (duration, integrals, ended, modes) = jax.vmap(
             along, in_axes=1, out_axes=(None, 2, None)
         )(frame)
-        frame, sizes = _orthonormalize(grown[-1])
+        frame, sizes = _orthonormalize(tangents[-1])
         is_single = frame.shape[1] == 1
         vanished = sizes == 0  # their logarithm has no derivative, not even times zero
         logarithms = jnp.where(vanished, -jnp.inf, jnp.log(jnp.where(vanished, 1.0, sizes)))
-        rates = _growth(grown[..., 0])[:, None] if is_single else logarithms[None]
+        rates = _growth(tangents[..., 0])[:, None] if is_single else logarithms[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
         return ((new[-1], modes), frame, result), (rates, duration, integrals)
 

@@ -52,10 +52,10 @@ class ScanInterrupted(Interrupted):
     """An interrupted scan; `data` has the finished part."""
 
     def __init__(self, data: "xr.Dataset", store: str | Path | None):
-        kept = "what was computed is in `.data`"
+        note = "what was computed is in `.data`"
         if store is not None:
-            kept = f"what was computed is in {store}, and the same call continues from there"
-        super().__init__("scan", data, kept)
+            note = f"what was computed is in {store}, and the same call continues from there"
+        super().__init__("scan", data, note)
         self.data = data
 
 

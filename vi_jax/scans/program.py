@@ -546,9 +546,9 @@ def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
     needed = max((m.cycles for m in measures), default=1)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:
-        who = next(type(m).__name__ for m in measures if m.cycles > cycles)
+        name = next(type(m).__name__ for m in measures if m.cycles > cycles)
         raise ValueError(
-            f"Argument `cycles` must be at least {needed} for the measure {who}, but got {cycles}."
+            f"Argument `cycles` must be at least {needed} for the measure {name}, but got {cycles}."
         )
     return cycles
 
