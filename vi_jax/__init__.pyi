@@ -32,7 +32,6 @@ from .machine import AbstractDrive as AbstractDrive
 from .machine import AbstractEvent as AbstractEvent
 from .machine import AbstractMachine as AbstractMachine
 from .machine import AbstractSwitch as AbstractSwitch
-from .machine import ContactFriction as ContactFriction
 from .machine import Coordinate as Coordinate
 from .machine import CosineCrank as CosineCrank
 from .machine import DCMotor as DCMotor

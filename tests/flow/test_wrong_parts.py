@@ -73,51 +73,36 @@ def test_events(event, message):
 
 
 def test_parts_are_tuples_of_their_kind():
-    with pytest.raises(TypeError, match="`events` of a Swing must be a tuple of `AbstractEvent`s"):
-        vi.simulate(Swing(event=(guard,)), START, 1)
-    with pytest.raises(TypeError, match="`contacts` of a Swing must be a tuple of contacts"):
-        vi.find_orbit(Swing(parts=(vi.Reset(guard, back),)), START)
+    stop, switch = vi.RigidStop(0.5, 0.8), vi.Switch(lambda m, t, z: z.Y)
+    for events in ((guard,), (stop,)):
+        with pytest.raises(TypeError, match="`events` of a Swing must be a tuple of `AbstractEv"):
+            vi.simulate(Swing(event=events), START, 1)
+    for contacts in (vi.Reset(guard, back), switch):
+        with pytest.raises(TypeError, match="`contacts` of a Swing must be a tuple of contacts"):
+            vi.find_orbit(Swing(parts=(contacts,)), START)
+    swapped = vi.RigidStop(9.0, 0.8, on=("V", "Y"))
+    with pytest.raises(ValueError, match="position and its velocity, in this order"):
+        vi.simulate(Swing(parts=(swapped,)), START, 1)
 
 
 class Floor(vi.AbstractMachine):
-    """A block on a floor. Each test sets one wrong parameter."""
+    """A block on a floor, with a coordinate that returns a tuple for its state."""
 
-    friction: jax.Array | float = 0.3
-    along: int = 1
-    stop: int = 0
-    tuples: bool = False
     cycle = 6.0
 
     @property
     def coordinates(self):
-        def placed(state, Y, V):
-            return (Y, V) if self.tuples else vi.OscillatorState(Y, V)
+        return (vi.Coordinate(lambda x: x.Y, lambda x: x.V, lambda state, Y, V: (Y, V)),)
 
-        one = vi.Coordinate(lambda x: x.Y, lambda x: x.V, placed)
-        return one, one
-
-    @property
-    def contacts(self):
-        floor = vi.RigidStop(0.0, 0.5, "left")
-        return floor, vi.ContactFriction(self.friction, stop=self.stop, along=self.along)
+    contacts = vi.RigidStop(0.0, 0.5, "left")
 
     def field(self, s, state):
         return vi.OscillatorState(state.V, -1.0 + 0 * state.V)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "kind", "message"),
-    [
-        ({"along": 2}, ValueError, "`along` of a ContactFriction must be the number of a coord"),
-        ({"stop": 1}, ValueError, "`stop` of a ContactFriction .* has 1, but got 1"),
-        ({"along": 0}, ValueError, "slips along the stop, but got 0, which stop 0 of the Floor"),
-        ({"friction": -0.3}, ValueError, "`level` must be .* but got -0.3"),
-        ({"tuples": True}, TypeError, "`placed` of coordinate 0 of a Floor must be like its state"),
-    ],
-)
-def test_contacts(wrong, kind, message):
-    with pytest.raises(kind, match=message):
-        vi.simulate(Floor(**wrong), START, 1)
+def test_placed_returns_a_state():
+    with pytest.raises(TypeError, match="`placed` of coordinate 0 of a Floor must be like its s"):
+        vi.simulate(Floor(), START, 1)
 
 
 class Flywheel(vi.AbstractDrive):

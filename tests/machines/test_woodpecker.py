@@ -20,10 +20,10 @@ SPEED, BIRD_RATE, PERIOD, DROP = -0.33947862236, -7.46209464263, 0.14597606514, 
 LOST = 1.245143533e-4
 MULTIPLIER = -0.8391556
 EVENTS = (
-    ("mode", 0, 0.0215692), ("mode", 0, 0.0611626), ("release", 0, 0.0669833),
-    ("impact", 1, 0.0778724), ("impact", 2, 0.0809738), ("impact", 1, 0.0815533),
-    ("rest", 1, 0.0815533), ("release", 1, 0.0834080), ("impact", 0, 0.1186964),
-    ("impact", 0, 0.1214251), ("rest", 0, 0.1214251),
+    ("mode", 2, 0.0215692), ("mode", 2, 0.0611626), ("release", 2, 0.0669833),
+    ("impact", 1, 0.0778724), ("impact", 0, 0.0809738), ("impact", 1, 0.0815533),
+    ("rest", 1, 0.0815533), ("release", 1, 0.0834080), ("impact", 2, 0.1186964),
+    ("impact", 2, 0.1214251), ("rest", 2, 0.1214251),
 )  # fmt: skip
 
 # Lanes: the cycle, and nearby starts for differences of its map.

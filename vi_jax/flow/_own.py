@@ -24,7 +24,6 @@ from ..machine import (
     AbstractMachine,
     Coordinate,
     DryFriction,
-    Friction,
     LinearMachine,
     Mechanical,
     Reset,
@@ -388,7 +387,7 @@ def _warn_of_guard(kind: type, i: int, name: str) -> None:
     )
 
 
-_CONTACTS = (RigidStop, SoftStop, Friction)
+_CONTACTS = (RigidStop, SoftStop, DryFriction)
 _KINDS = {
     "contacts": (
         lambda part: isinstance(part, _CONTACTS),
@@ -443,13 +442,16 @@ def check_parts(machine: AbstractMachine) -> None:
                 "(`vi.machines.Structure`) takes; other machines name what stops limit in "
                 "`coordinates`, and stops its number in `coordinate`."
             )
-    _check_frictions(machine)
 
 
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `ValueError` for a stop on an angle of `wrap_angles`, or with an invalid `on`."""
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
+        if isinstance(stop, RigidStop) and stop.friction is not None and stop.along == on:
+            raise ValueError(
+                f"Argument `along` of a stop must be another coordinate than `on`, but is {on!r}."
+            )
         names = (on,) if isinstance(on, str) else on if isinstance(on, tuple) else ()
         angles = [x for x in names if is_angle(machine, x)]
         if isinstance(stop, RigidStop) and angles:
@@ -469,32 +471,6 @@ def _check_names(machine: AbstractMachine) -> None:
             raise ValueError(
                 f"Argument `on` of a stop of a {type(machine).__name__} must be the names of "
                 f'position and velocity, `on=("x", "u")`, but got {on!r}.'
-            )
-
-
-def _check_frictions(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for friction across its stop, or with an invalid number."""
-    name = type(machine).__name__
-    known = {
-        "stop": ("stop", len(stops_of(machine))),
-        "along": ("coordinate", len(machine.coordinates)),
-    }
-    for switch in switches_of(machine):
-        if switch.friction_stop is None:
-            continue
-        for argument, (what, count) in known.items():
-            number = getattr(switch, argument)
-            if number >= count:
-                raise ValueError(
-                    f"Argument `{argument}` of a ContactFriction must be the number of a {what} of "
-                    f"the {name}, which has {count}, but got {number}."
-                )
-        across = stops_of(machine)[switch.friction_stop].coordinate
-        if switch.along == across:  # pyright: ignore[reportAttributeAccessIssue]
-            raise ValueError(
-                f"Argument `along` of a ContactFriction must be the number of the coordinate that "
-                f"slips along the stop, but got {across}, which stop {switch.friction_stop} of the "
-                f"{name} limits."
             )
 
 

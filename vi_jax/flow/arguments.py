@@ -123,7 +123,6 @@ def make_plan(
     this machine. **Raises:** as `simulate`."""
     machine = machine_of(machine)
     start = machine.start() if start is None else start
-    check_parts(machine)
     cycles = count("cycles", cycles, least=1)
     options = options.checked(machine)
     method, samples = options.method, options.samples
@@ -202,8 +201,9 @@ def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
 
 def machine_of(machine: Machine) -> AbstractMachine:
     """Return the machine with arrays instead of `float`s, so that other numbers do not compile
-    again. **Raises:** `TypeError` for anything else."""
+    again. **Raises:** `TypeError` for anything else, and as `check_parts`."""
     instance_of("machine", machine, AbstractMachine, "a `Scene` or an `AbstractMachine`")
+    check_parts(machine)
     return jtu.tree_map(strongly_typed, machine)
 
 

@@ -18,9 +18,7 @@ from jaxtyping import Array, Float
 from .._checks import (
     NOT_NEGATIVE,
     POSITIVE,
-    SHARE,
     Range,
-    count,
     optional_real,
     real,
     real_or_law,
@@ -262,43 +260,17 @@ class DryFriction(Friction):
 
 
 class ContactFriction(Friction):
-    """Coulomb friction between a body and a stop that it hits, or rests on.
+    """Coulomb friction between a body and a stop that it hits, or rests on (see `RigidStop`)."""
 
-    In an impact the body sticks or slips along the stop. It sticks if the required impulse is at
-    most `level` times that of the stop; its velocity along the stop is then reversed and scaled by
-    `restitution`. Otherwise it slips against `level` times the stop's impulse. A body that rests on
-    the stop slips forward or backward (mode +1, -1) against `level` times the normal force, or
-    sticks (mode 0), which may jam it. The normal force follows from all other forces and contacts.
-    The machine's field does not contain the friction.
-
-    Newton's and Coulomb's laws together may gain energy where the velocities across and along a
-    stop are coupled (T. R. Kane). Such an impact ends its lane as `RESULTS.bad_impact`.
-
-    **Arguments:**
-
-    - `level`: μ, not negative.
-    - `stop`: the index of the stop among the machine's.
-    - `along`: the index of the coordinate that the body slips along, with its `mass`. It need not
-      be limited by a stop, and its position is not used.
-    - `restitution`: along the stop, in [0, 1].
-    """
-
-    level: Float[Array, "..."] = eqx.field(converter=real("level"))
+    level: Float[Array, "..."]
     """μ, Coulomb's coefficient of friction (dimensionless)."""
     stop: int = eqx.field(static=True, kw_only=True)
+    """The index of the stop among the machine's."""
     along: int = eqx.field(static=True, kw_only=True)
-    restitution: Float[Array, "..."] = eqx.field(
-        kw_only=True, default=0.0, converter=real("restitution")
-    )
+    """The index of the coordinate that the body slips along; its position is not used."""
+    restitution: Float[Array, "..."] = eqx.field(kw_only=True)
     """Coefficient of restitution along the stop (dimensionless)."""
-    ranges: ClassVar = {"level": NOT_NEGATIVE, "restitution": SHARE}
-
     roundings: ClassVar = 16
-
-    def __check_init__(self):
-        require_ranges(self)
-        count("stop", self.stop)
-        count("along", self.along)
 
     @property
     def friction_stop(self) -> int:  # pyright: ignore

@@ -90,7 +90,12 @@ class RigidStop(Wall, AbstractEvent):
     displacements. The default is the machine's `position`.
 
     With `friction` μ, Coulomb friction acts during impacts and rest on the stop, along another
-    coordinate, `along`, which is named in the same way (see `ContactFriction`).
+    coordinate, `along`, which is named in the same way. In an impact the body sticks if the
+    required impulse is at most μ times that of the stop; its velocity along the stop is then
+    reversed and scaled by `tangential_restitution`. Otherwise it slips against μ times the stop's
+    impulse. A body that rests on the stop slips against μ times the normal force, or sticks, which
+    may jam it. Newton's and Coulomb's laws together may gain energy where the velocities across and
+    along a stop are coupled (T. R. Kane). Such an impact ends its lane as `RESULTS.bad_impact`.
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))

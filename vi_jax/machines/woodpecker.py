@@ -1,5 +1,6 @@
 """The woodpecker toy: a bird on a spring that pecks its way down a pole, jamming and slipping."""
 
+from functools import partial
 from math import pi
 from typing import Any, ClassVar
 
@@ -9,8 +10,6 @@ import numpy as np
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete
 from .._types import Scalar, State
 from ..machine import (
-    ContactFriction,
-    Coordinate,
     Mechanical,
     RigidStop,
     counter_of,
@@ -43,8 +42,8 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     Only its weight drives it. A cycle ends when φS falls through `section_angle`, after a varying
     time. Its mean speed of descent is the average `descent`. Time is the independent variable, and
-    units are SI units. The stops are, in this order, `LOWER` and `UPPER` edge of the sleeve and
-    `BEAK`; the switches are the friction on each.
+    units are SI units. The stops are, in this order, the beak, the upper and the lower edge of the
+    sleeve; the switches are the friction on each.
 
     **Arguments:**
 
@@ -84,9 +83,6 @@ class Woodpecker(ReadyMachine, Mechanical):
     }  # fmt: skip
     labels: ClassVar = ("beak towards the pole (m)", "its speed (m/s)")  # pyright: ignore
     ranges: ClassVar = {"play": POSITIVE}
-    LOWER: ClassVar[int] = 0
-    UPPER: ClassVar[int] = 1
-    BEAK: ClassVar[int] = 2
 
     def __check_init__(self):
         play = concrete(self.play)
@@ -108,30 +104,30 @@ class Woodpecker(ReadyMachine, Mechanical):
         return self.sleeve_arm + self.bird_arm - self.beak_arm - self.pole_radius
 
     @property
-    def contacts(self) -> tuple[RigidStop | ContactFriction, ...]:
-        """The pole at the lower and the upper edge of the sleeve and at the beak, with friction."""
-        lower, upper = (
-            RigidStop(self.play, self.sleeve_restitution, side, coordinate=1, name=name)
-            for side, name in (("left", "lower edge"), ("right", "upper edge"))
-        )
-        beak = RigidStop(self.reach, self.beak_restitution, "right", name="beak")
-        frictions = (
-            ContactFriction(self.friction, stop=i, along=k) for i, k in enumerate((2, 2, 3))
-        )
-        return lower, upper, beak, *frictions
+    def contacts(self) -> tuple[RigidStop, ...]:
+        """The pole at the beak and at the upper and the lower edge of the sleeve, with friction.
+        All gaps and slips are in metres, so that forces are in N."""
+        arm = self.bird_arm - self.beak_arm
 
-    @property
-    def coordinates(self) -> tuple[Coordinate, ...]:
-        """The displacements of beak and upper edge of the sleeve towards the pole, and the heights
-        of a sleeve's edge and of the beak. All are in metres, so that forces are in N."""
-        beak = self.bird_arm - self.beak_arm
-        gaps = (
-            lambda q: self.beak_height * q.bird_angle,
-            lambda q: self.sleeve_height * q.sleeve_angle,
-            lambda q: q.height + self.sleeve_radius * q.sleeve_angle,
-            lambda q: q.height + self.sleeve_arm * q.sleeve_angle + beak * q.bird_angle,
+        def beak(q: Any) -> Any:
+            return self.beak_height * q.bird_angle
+
+        def edge(q: Any) -> Any:
+            return self.sleeve_height * q.sleeve_angle
+
+        def slip_of_beak(q: Any) -> Any:
+            return q.height + self.sleeve_arm * q.sleeve_angle + arm * q.bird_angle
+
+        def slip_of_edge(q: Any) -> Any:
+            return q.height + self.sleeve_radius * q.sleeve_angle
+
+        pole = partial(RigidStop, friction=self.friction)
+        at_edge = partial(pole, self.play, self.sleeve_restitution, on=edge, along=slip_of_edge)
+        return (
+            pole(self.reach, self.beak_restitution, on=beak, along=slip_of_beak, name="beak"),
+            at_edge(side="right", name="upper edge"),
+            at_edge(side="left", name="lower edge"),
         )
-        return tuple(self._coordinate_on(gap) for gap in gaps)
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
