@@ -78,16 +78,13 @@ def test_rounding_is_estimated_under_exact_flight():
     assert 0 < float(jnp.max(run.errors.sections.Y)) < 1e-12
 
 
-@pytest.mark.parametrize("quantity", ["state", "impacts"])
-def test_suggested_for_an_ideal_drive(quantity):
-    found = vi.suggest_method(IDEAL, error=1e-9, quantity=quantity, cycles=5, lanes=4)
+def test_suggested_for_an_ideal_drive():
+    found = vi.suggest_method(IDEAL, error=1e-9, cycles=5, lanes=4)
     assert isinstance(found.method, vi.ExactFlight) and found.reached
     assert found.error < 1e-10
 
 
 def test_invalid_calibrations_raise():
-    with pytest.raises(ValueError, match="quantity"):
-        vi.suggest_method(IDEAL, quantity="speed")
     with pytest.raises(TypeError, match="outside of `jit`"):
         jax.jit(
             lambda z: vi.suggest_method(vi.Scene.ideal(frequency_ratio=z)).error

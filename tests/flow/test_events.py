@@ -1,7 +1,6 @@
 """Impacts that are easily missed, counted twice or resolved in the wrong order."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +57,7 @@ def test_failed_runs_have_a_reason():
     options = {"method": vi.ExactFlight(), "max_impacts": 60, "rests": False}
     run = vi.simulate(pressed, pressed.start(), 3, **options)
     assert bool(run.result == vi.RESULTS.chatter)
-    with pytest.raises(eqx.EquinoxRuntimeError):
+    with pytest.raises(RuntimeError, match="chatter: The impacts within one cycle exceeded"):
         vi.simulate(pressed, pressed.start(), 3, throw=True, **options)
 
 

@@ -80,9 +80,6 @@ def test_parts_are_tuples_of_their_kind():
     for contacts in (vi.Reset(guard, back), switch):
         with pytest.raises(TypeError, match="`contacts` of a Swing must be a tuple of contacts"):
             vi.find_orbit(Swing(parts=(contacts,)), START)
-    swapped = vi.RigidStop(9.0, 0.8, on=("V", "Y"))
-    with pytest.raises(ValueError, match="position and its velocity, in this order"):
-        vi.simulate(Swing(parts=(swapped,)), START, 1)
 
 
 class Floor(vi.AbstractMachine):

@@ -61,7 +61,7 @@ def test_sommerfeld_response_converges_to_the_averaged_one():
     # Below, near and beyond the peak.
     for zeta in (0.85, 0.98, 1.15):
         rotor = ROTOR(strength=0.2, coupling=0.02)
-        kappa = rotor.averaged_control(zeta)
+        kappa = zeta / rotor.no_load_speed + rotor.load(zeta) / rotor.strength
         reach = zeta**2 / ((1 - zeta**2) + 0.1j * zeta)
 
         def error(coupling, kappa=kappa, zeta=zeta, reach=reach):

@@ -42,6 +42,6 @@ for settle, delay in ((20_000, 4.0), (10**8, 1.0)):  # many short blocks, and th
     except vi.Interrupted as error:
         took = time.perf_counter() - at[0]
         np.asarray(jnp.sin(jnp.arange(3.0)))  # wait for running programs
-        done = np.asarray(error.data["result"]) >= 0
+        done = np.asarray(error.partial["result"]) >= 0
         share = int(done.sum()) if done.sum() < done.size else -1
         print(took, time.perf_counter() - at[0], share)

@@ -88,8 +88,8 @@ def test_an_interrupted_scan_in_memory_keeps_its_results(monkeypatch):
     monkeypatch.setattr(work, "compute", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:
         vi.scan(SCENE, {"start.Y": np.linspace(-1, 1, 600)}, settle=5, lanes=256, workers=2)
-    assert isinstance(caught.value, vi.ScanInterrupted)
-    codes = np.asarray(caught.value.data.result)
+    assert isinstance(caught.value, vi.Interrupted)
+    codes = np.asarray(caught.value.partial.result)
     assert (codes == 0).sum() == 256 and (codes == -1).sum() == 344
 
 

@@ -57,7 +57,7 @@ def test_the_text_of_a_sweep_reports_jumps():
         len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [-2] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1
     )
     failed = _described([-1.0, np.nan, -1.0], [1, -3, 1], [1.0, np.nan, 1.0])
-    assert [line.split(" from ")[0].strip() for line in failed][1] == "failed"
+    assert [line.split(" from ")[0].strip() for line in failed][1] == "failed: successful"
     many = _described([-1.0, -1.1] * 20, [1, 2] * 20, [1.0] * 40)
     assert len(many) == 13 and many[-1] == "  28 further changes"
 

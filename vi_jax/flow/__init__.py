@@ -15,6 +15,7 @@ from ._simulate import simulate_pool as simulate_pool
 from .arguments import RunOptions as RunOptions
 from .arguments import as_floats as as_floats
 from .arguments import check_leaves as check_leaves
+from .arguments import check_prescribed as check_prescribed
 from .arguments import check_reals as check_reals
 from .arguments import check_start as check_start
 from .arguments import check_values as check_values
@@ -56,6 +57,7 @@ from .results import batch_names as batch_names
 from .results import in_names as in_names
 from .results import number_of as number_of
 from .results import present as present
+from .results import raised as raised
 from .results import states as states
 from .results import tidy as tidy
 from .smooth import TIME as TIME

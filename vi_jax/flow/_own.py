@@ -179,7 +179,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     event's guard is not negative in any of many states. Machines of this package and machines with
     traced numbers are not checked.
 
-    **Raises:** `ValueError` for invalid masses, or a stop's velocity that is not its position's.
+    **Raises:** `ValueError` for invalid masses.
     """
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     is_builtin = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
@@ -191,12 +191,12 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
         restarts = not ticks and depends_on_time(field_in, machine, state)
         restarts = restarts and not depends_on_time(_guards, machine, state)  # of a timer
-        backward, cycle, fields, below = np.zeros(0), 0.0, (), ()
+        cycle, fields, below = 0.0, (), ()
         with jax.ensure_compile_time_eval():
             masses = np.asarray(_masses(machine, state))
             if ticks or others_of(machine):
                 found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
-                cycle, fields, below, backward = found
+                cycle, fields, below = found
     except Exception:  # the error is raised with a better message when field and guards are traced
         return
     if masses.size and not _is_definite(masses):
@@ -204,22 +204,32 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
             f"matrix, but at the start it is {masses.tolist()}."
         )
-    if backward.any():
-        raise ValueError(
-            f"A stop of a {kind.__name__} must be `on` a position and its velocity, in this order, "
-            f"but the position falls where the velocity is positive (coordinate "
-            f"{int(np.argmax(backward))})."
-        )
     if restarts:
-        _warn_of_time(kind)
+        _warn_once(
+            kind,
+            "The `field` of a {kind} depends on time, which restarts from 0 in each cycle, but an "
+            "event ends its cycles. Make the phase of its drive a component of the state.",
+        )
     paths = jtu.tree_leaves_with_path(start) if ticks else ()
     for (path, _), rates in zip(paths, fields, strict=True):
         if np.any(abs(rates[:2] - rates[2:]) > _PERIODIC * abs(rates).max(axis=0)):
-            _warn_of_period(kind, jtu.keystr(path).lstrip(".") or "state", float(cycle))
+            name = jtu.keystr(path).lstrip(".") or "state"
+            _warn_once(
+                kind,
+                f"The `field` of a {{kind}} is not the same a `cycle` = {cycle:.6g} later: the "
+                f"rate of its {name} differs. `s` restarts from 0 in each cycle, so `cycle` must "
+                "be a period of the field, unless the field is meant to jump there.",
+            )
             break
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
-        _warn_of_guard(kind, int(i), event.name or type(event).__name__)
+        _warn_once(
+            kind,
+            f"The guard of event {i} ({event.name or type(event).__name__}) of a {{kind}} was not "
+            f"below zero in any of {_SAMPLES + 1} states around the start, and an event whose "
+            "guard is never negative never happens. Return a number that is negative before the "
+            "event and positive after it: `x - 1`, not `jnp.maximum(x - 1, 0)`.",
+        )
 
 
 def _is_definite(masses: np.ndarray) -> bool:
@@ -256,7 +266,12 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
             )
         limits = AbstractMachine.step_limit, Mechanical.step_limit
         if coarse > _STEEP * extent and type(machine).step_limit in limits:
-            _warn_of_slip(type(machine), float(time))
+            _warn_once(
+                type(machine),
+                "The `slip` of a DryFriction of a {kind} changes within a thousandth of a cycle, "
+                f"at t = {time:.6g}, and steps may be too long for that. Give the machine a "
+                "`step_limit`, or let the surface's speed jump by a `Reset`.",
+            )
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
@@ -285,27 +300,20 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
     """Return the cycle; if `ticks`, the rates of each number of the state at the start, within the
     cycle and a cycle after both; for each event, whether its guard is negative in any state around
-    the start; for each coordinate, whether its velocity has the wrong sign in such a state. `zero`
-    is an argument, since JAX compiles expressions of constants separately."""
+    the start. `zero` is an argument, since JAX compiles expressions of constants separately."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     instants = zero + cycle * np.array([0.0, _INNER_INSTANT, 1.0, 1.0 + _INNER_INSTANT])
-    fields = jax.vmap(lambda s: field_in(machine, s, start, modes))(instants) if ticks else ()
+    prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
+    rates = lambda s: field_in(machine, s, prescribed(s, start), modes)
+    fields = jax.vmap(rates)(instants) if ticks else ()
     around = _states_around(zero, cycle, start, modes)
 
-    def falling(s: Scalar, state: State, modes: Scalars) -> Array:
-        rate = field_in(machine, s, state, modes)
-        moves = [jax.jvp(x.position, (state,), (rate,))[1] for x in machine.coordinates]
-        speeds = [x.velocity(state) for x in machine.coordinates]
-        return jnp.stack([v * u for v, u in zip(moves, speeds, strict=True)])
-
-    below, backward = (), jnp.zeros(0)
+    below = ()
     if others_of(machine):
         guards = lambda *here: jnp.stack(_guards(machine, *here))
         below = jnp.any(jax.vmap(guards)(*around) < 0, axis=0)
-    if contacts_in(machine) and not isinstance(machine, Mechanical):
-        backward = jnp.any(jax.vmap(falling)(*around) < 0, axis=0)
-    return cycle, jtu.tree_leaves(fields), below, backward
+    return cycle, jtu.tree_leaves(fields), below
 
 
 def _guards(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> list[Array]:
@@ -352,39 +360,8 @@ def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) ->
 
 
 @functools.lru_cache(maxsize=64)
-def _warn_of_period(kind: type, name: str, cycle: float) -> None:
-    warn(
-        f"The `field` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} later: the rate "
-        f"of its {name} differs. `s` restarts from 0 in each cycle, so `cycle` must be a period of "
-        "the field, unless the field is meant to jump there."
-    )
-
-
-@functools.lru_cache(maxsize=64)
-def _warn_of_time(kind: type) -> None:
-    warn(
-        f"The `field` of a {kind.__name__} depends on time, which restarts from 0 in each cycle, "
-        "but an event ends its cycles. Make the phase of its drive a component of the state."
-    )
-
-
-@functools.lru_cache(maxsize=64)
-def _warn_of_slip(kind: type, time: float) -> None:
-    warn(
-        f"The `slip` of a DryFriction of a {kind.__name__} changes within a thousandth of a cycle, "
-        f"at t = {time:.6g}, and steps may be too long for that. Give the machine a `step_limit`, "
-        "or let the surface's speed jump by a `Reset`."
-    )
-
-
-@functools.lru_cache(maxsize=64)
-def _warn_of_guard(kind: type, i: int, name: str) -> None:
-    warn(
-        f"The guard of event {i} ({name}) of a {kind.__name__} was not below zero in any of "
-        f"{_SAMPLES + 1} states around the start, and an event whose guard is never negative never "
-        "happens. Return a number that is negative before the event and positive after it: "
-        "`x - 1`, not `jnp.maximum(x - 1, 0)`."
-    )
+def _warn_once(kind: type, text: str) -> None:
+    warn(text.format(kind=kind.__name__))
 
 
 _CONTACTS = (RigidStop, SoftStop, DryFriction)
@@ -445,7 +422,22 @@ def check_parts(machine: AbstractMachine) -> None:
 
 
 def _check_names(machine: AbstractMachine) -> None:
-    """**Raises:** `ValueError` for a stop on an angle of `wrap_angles`, or with an invalid `on`."""
+    """**Raises:** `TypeError` for a field with the name of a method, `ValueError` for an invalid
+    coordinate, a stop on an angle of `wrap_angles`, or with an invalid `on`."""
+    kind = type(machine)
+    for field in dataclasses.fields(machine):
+        is_method = any(callable(vars(base).get(field.name)) for base in kind.__mro__[1:])
+        if is_method and not callable(getattr(machine, field.name)):
+            raise TypeError(
+                f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
+                "method of every machine."
+            )
+    if isinstance(machine, Mechanical) and not isinstance(machine.q, str):
+        if len({*machine.q}) < len(machine.q) or "v" in machine.q_names:
+            raise ValueError(
+                f"`q` of a {kind.__name__} must have different names, and none of them `v`, but is "
+                f"{machine.q}."
+            )
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
         if isinstance(stop, RigidStop) and stop.friction is not None and stop.along == on:

@@ -34,7 +34,7 @@ from .arguments import RunOptions, make_plan
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .noise import with_noise
-from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, reason_of
+from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, raised, reason_of
 from .smooth import TIME, means
 
 _CPU_OPTIONS = {
@@ -58,9 +58,6 @@ def jit(function: Callable, **options: Any) -> jax.stages.Wrapped:
 def compiling() -> dict[str, Any]:
     """Return compiler options as keyword arguments of `jax.jit` for the default backend."""
     return {"compiler_options": _CPU_OPTIONS} if jax.default_backend() == "cpu" else {}
-
-
-_FAILED = "A lane of the simulation failed; see `RESULTS` and `Run.result`."
 
 
 @warning_once
@@ -144,7 +141,7 @@ def simulate(
         tighter = dataclasses.replace(plan, method=plan.method.tighter())
         errors = _errors(run, _simulate(tighter, start, False))
         run = dataclasses.replace(run, errors=errors)
-    return eqx.error_if(run, run.failed, _FAILED) if throw else run
+    return raised(run, run.failed, "The simulation failed", run.result) if throw else run
 
 
 @compiled

@@ -33,9 +33,14 @@ from .._messages import warn
 from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
+    Mechanical,
     Scene,
+    Turn,
     begin_modes,
+    check_takes,
+    components,
     convert_start,
+    counter_of,
     field_in,
     has_velocity,
     in_clock,
@@ -43,11 +48,13 @@ from ..machine import (
     may_rest,
     modes_at_start,
     modes_of,
+    shown_modes,
     stops_of,
     without_modes,
 )
+from ..machine import State as NamedState
 from ._lane import Plan
-from ._own import average_names, check_parts, quantity_names
+from ._own import average_names, check_parts, explain_errors, quantity_names
 from ._own import check_values as check_values
 from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding_bounds
@@ -145,6 +152,8 @@ def make_plan(
         _check_scalars(machine=machine, start=start)
     _check_numbers(machine)
     check_start(machine, start)
+    if options.begin is None:
+        check_prescribed(machine, start)
     machine, start = of_one_type(machine, start)
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
@@ -268,15 +277,25 @@ def _check_numbers(machine: AbstractMachine) -> None:
 
 def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for an invalid state, which only the field can show."""
+    whose = f"`field` of a {type(machine).__name__}"
     try:
-        jax.eval_shape(
-            lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x)), jnp.zeros(()), state
-        )
+        modes = shown_modes(machine, begin_modes(machine, jnp.zeros(()), state))
+        check_takes(machine.field, whose, "`s`, the state", (0.0, state, *modes), len(modes))
+        rate = lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x))
+        with explain_errors(whose):
+            jax.eval_shape(rate, jnp.zeros(()), state)
     except (AttributeError, TypeError, ValueError, LookupError) as error:
+        if str(error).partition(" must ")[0].endswith(f"of a {type(machine).__name__}"):
+            raise
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}, whose "
             f"rate cannot be computed: {error}"
         ) from None
+
+
+# A start may differ by this share from the prescribed motion: a choice, since states at the end of
+# a run have the errors of the method.
+_PRESCRIBED = 1e-3
 
 
 def check_leaves(argument: str, state: State) -> None:
@@ -303,13 +322,40 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
         shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
     except (AttributeError, TypeError, LookupError) as error:
         raise TypeError(
-            f"Argument `{argument}` must be a state of this machine, but got {state!r}: {error} "
+            f"Argument `{argument}` must be a state of this machine, but got {state!r}: "
+            f"{str(error).rstrip('.')}. "
             'Contacts name position and velocity by `on=("x", "u")`, and act on `Y` and `V` if '
             "they name none; `position` and `velocity` of a machine pick other numbers."
         ) from None
     if not shape and not has_velocity(machine, state):
         _check_flow(argument, machine, state)
     return shape
+
+
+def _check_turn(machine: AbstractMachine, start: State) -> None:
+    counter = counter_of(machine)
+    beyond = concrete(counter.section(machine, start)) if isinstance(counter, Turn) else None
+    if counter is not None and beyond is not None and np.any(beyond >= 0):
+        raise ValueError(
+            f"Argument `start` must not have {counter.name} beyond the end of a turn, but it is "
+            f"{np.max(beyond):.6g} beyond. Subtract whole turns."
+        )
+
+
+def check_prescribed(machine: AbstractMachine, start: State) -> None:
+    """**Raises:** `ValueError` if a start does not have the prescribed motion of its machine."""
+    if not isinstance(machine, Mechanical) or not isinstance(start, NamedState):
+        return
+    given = machine.with_prescribed(0.0, start)
+    for (name, x), y in zip(components(start).items(), components(given).values(), strict=True):
+        number, wanted = concrete(x), concrete(y)
+        if number is None or wanted is None:
+            continue
+        if np.any(abs(number - wanted) > _PRESCRIBED * np.maximum(abs(number), abs(wanted))):
+            raise ValueError(
+                f"Argument `start` must have the prescribed {name} = {wanted:.6g} at time 0, but "
+                f"has {number:.6g}. `machine.at(...)` returns such a state."
+            )
 
 
 def check_start(machine: AbstractMachine, start: State) -> None:
@@ -333,6 +379,7 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         machine.check_start(start)
     if isinstance(start, eqx.Module):
         require_ranges(start)
+    _check_turn(machine, start)
     for i, stop in enumerate(stops_of(machine)):
         gap = concrete(stop.gap)
         Y = concrete(machine.coordinates[stop.coordinate].position(start))

@@ -111,6 +111,18 @@ def in_names(member: Any) -> np.ndarray:
     return np.asarray(names_of(member.kind)[np.asarray(member.number)])
 
 
+def raised(result: Any, failed: Any, what: str, member: Any) -> Any:
+    """Return a result. **Raises:** `RuntimeError` with the reasons, `member`, if any lane failed;
+    one without reasons while it is traced."""
+    if isinstance(failed, Tracer):
+        return eqx.error_if(result, failed, f"{what}; see its `result`.")
+    names = np.ravel(in_names(member))[np.ravel(failed)]
+    if names.size:
+        texts = (f"{name}: {member.kind[getattr(member.kind, name)]}" for name in sorted({*names}))
+        raise RuntimeError(f"{what}, {' '.join(texts)}")
+    return result
+
+
 def number_of(member: Any) -> Int[Array, "..."]:
     """Return the index of a member in its enumeration; one for each lane."""
     return jnp.asarray(member.number)

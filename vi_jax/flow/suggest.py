@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import count, one_of, require
+from .._checks import count, require
 from .._messages import warning_once
 from .._types import Scalar, State
 from ..machine import AbstractMachine, convert_start, in_rows, size_of, without_modes
@@ -23,8 +23,6 @@ from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .loop import row_sizes, sizes_on_host
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
-
-QUANTITIES = ("state", "extremes", "impacts", "derivative")
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.
@@ -73,7 +71,6 @@ def suggest_method(
     machine: AbstractMachine,
     *,
     error: float = 1e-6,
-    quantity: str = "state",
     start: State = None,
     cycles: int = 20,
     lanes: int = 256,
@@ -87,11 +84,8 @@ def suggest_method(
     **Arguments:**
 
     - `machine`: the machine; its parameters may not be traced.
-    - `error`: the largest error allowed, relative to the size of each number, for 95 of 100 lanes.
-    - `quantity`: the quantity to which the error refers: `"state"` (on the last section),
-      `"extremes"` (in each cycle), `"impacts"` (phase and speed of the first 32 in each cycle; a
-      missed one is an infinite error) or `"derivative"` (of the last section state with respect to
-      the first velocity).
+    - `error`: the largest error of the last section state that is allowed, relative to the size of
+      each number, for 95 of 100 lanes.
     - `start`: the first state; by default `machine.start()`.
     - `cycles`: drive cycles of the calibration; in a chaotic motion errors grow with them.
     - `lanes`: the size of the batches for which the method is needed; 1 for a single motion.
@@ -103,7 +97,6 @@ def suggest_method(
     if not isinstance(error, int | float | np.floating):
         raise TypeError(f"Argument `error` must be a number, but got {error!r}.")
     require("error", error, low=0.0, open_low=True)
-    one_of("quantity", quantity, QUANTITIES)
     cycles, lanes = count("cycles", cycles, least=1), count("lanes", lanes, least=1)
     machine = machine_of(machine)
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves((machine, start))):
@@ -115,7 +108,7 @@ def suggest_method(
         start = machine.start()
     start = convert_start(machine, start)
     check_start(machine, start)
-    bench = _Bench(machine, start, quantity, cycles, lanes)
+    bench = _Bench(machine, start, cycles, lanes)
     best = preset(machine, "reference")
     exact = isinstance(best, ExactFlight)
     stiff = not exact and _is_stiff(machine, start)
@@ -200,50 +193,25 @@ class _Bench:
     reference: np.ndarray
     sizes: np.ndarray
 
-    def __init__(
-        self, machine: AbstractMachine, start: State, quantity: str, cycles: int, lanes: int
-    ):
-        self.machine, self.start, self.quantity, self.cycles = machine, start, quantity, cycles
+    def __init__(self, machine: AbstractMachine, start: State, cycles: int, lanes: int):
+        self.machine, self.start, self.cycles = machine, start, cycles
         numbers, unravel = ravel_pytree(without_modes(start))
         sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(numbers))))
         # Stops limit everything except velocities.
-        self.speed = size_of(machine.coordinates[0].velocity, without_modes(start), sizes)
-        self.offsets = self.speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
+        speed = size_of(machine.coordinates[0].velocity, without_modes(start), sizes)
+        self.offsets = speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
     def lane(self, method: AbstractMethod, offset: Scalar) -> tuple[Array, Array]:
         """Return the compared numbers, as one vector, of the lane whose first velocity differs by
         `offset`, and their sizes. The first number is infinite if the lane failed."""
-        machine = self.machine
-
-        def measure(offset):
-            body = machine.coordinates[0]
-            velocity = body.velocity(self.start) + offset
-            start = body.placed(self.start, body.position(self.start), velocity)
-            # As users run it: if only sections are recorded, steps are different.
-            log = 32 if self.quantity == "impacts" else 0
-            run = simulate(machine, start, self.cycles, method=method, impact_log=log)
-            if self.quantity == "extremes":
-                assert run.y_min is not None and run.y_max is not None
-                found = jnp.stack([run.y_min, run.y_max])
-                sizes = jnp.full_like(found, jnp.max(jnp.abs(found)))
-            elif self.quantity == "impacts":
-                assert run.impact_log is not None
-                found = jnp.stack([run.impact_log.phase, run.impact_log.speed])
-                largest = jnp.stack([jnp.asarray(machine.cycle), jnp.nanmax(found[1], initial=0.0)])
-                sizes = jnp.broadcast_to(largest[:, None, None], found.shape)
-            else:
-                found = in_rows(without_modes(run.last), 0)
-                sizes = row_sizes(machine, start, in_rows(without_modes(run.sections)))
-            return found, (sizes, run.successful)
-
-        if self.quantity == "derivative":
-            found, (sizes, successful) = jax.jacfwd(measure, has_aux=True)(offset)
-            sizes = sizes / self.speed
-        else:
-            found, (sizes, successful) = measure(offset)
-        # The first number marks a failed lane; NaN elsewhere means that there was no impact.
-        ended = jnp.where(successful, jnp.zeros_like(offset), jnp.inf)
+        machine, body = self.machine, self.machine.coordinates[0]
+        velocity = body.velocity(self.start) + offset
+        start = body.placed(self.start, body.position(self.start), velocity)
+        run = simulate(machine, start, self.cycles, method=method)
+        found = in_rows(without_modes(run.last), 0)
+        sizes = row_sizes(machine, start, in_rows(without_modes(run.sections)))
+        ended = jnp.where(run.successful, jnp.zeros_like(offset), jnp.inf)
         return jnp.append(ended, found), jnp.append(jnp.ones_like(offset), sizes)
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:

@@ -262,13 +262,13 @@ class DryFriction(Friction):
 class ContactFriction(Friction):
     """Coulomb friction between a body and a stop that it hits, or rests on (see `RigidStop`)."""
 
-    level: Float[Array, "..."]
+    level: Any
     """μ, Coulomb's coefficient of friction (dimensionless)."""
     stop: int = eqx.field(static=True, kw_only=True)
     """The index of the stop among the machine's."""
     along: int = eqx.field(static=True, kw_only=True)
     """The index of the coordinate that the body slips along; its position is not used."""
-    restitution: Float[Array, "..."] = eqx.field(kw_only=True)
+    restitution: Any = eqx.field(kw_only=True)
     """Coefficient of restitution along the stop (dimensionless)."""
     roundings: ClassVar = 16
 

@@ -70,19 +70,29 @@ class Mechanical(AbstractMachine):
     def at(self, v: Any = None, **places: Any) -> Any:
         """Return a state with these positions, and in `v` velocities, by name. Others are 0, or for
         prescribed coordinates those at t = 0."""
-        names = self.free_names
-        wrong = [x for x in (*places, *(v or {})) if x not in names]
+        names, v = self.free_names, {} if v is None else v
+        if not isinstance(v, Mapping | Named):
+            raise TypeError(
+                f"Argument `v` must be velocities by name, dict({names[0]}=...): {v!r}."
+            )
+        v = dict(vars(v) if isinstance(v, Named) else v)
+        wrong = [x for x in (*places, *v) if x not in names]
         if wrong:
             raise ValueError(f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}.")
         zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
-        at, rate = zeros | places, zeros | dict(v or {})
+        at, rate = zeros | places, zeros | v
         for name, zero in zeros.items():
             if self.q_shapes[name]:  # one number holds for all
                 at[name], rate[name] = zero + at[name], zero + rate[name]
-        if len(names) < len(zeros):
-            given = jax.jvp(self.prescribed, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
-            at, rate = at | given[0], rate | given[1]
-        return Named(**at, v=Named(**rate))
+        return self.with_prescribed(0.0, Named(**at, v=Named(**rate)))
+
+    def with_prescribed(self, t: Any, state: Any) -> Any:
+        """Return a state with the prescribed positions and velocities at a time."""
+        if type(self).prescribed is Mechanical.prescribed:
+            return state
+        t = jnp.asarray(t, float)
+        places, rates = jax.jvp(self.prescribed, (t,), (jnp.ones_like(t),))
+        return state.replace(**places, v=state.v.replace(**rates))
 
     def start(self) -> Any:
         """Return the state at rest with all coordinates zero."""
@@ -231,9 +241,9 @@ def _mass_of(machine: Any) -> Any:
 def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     """Return the name of a coordinate, or `None` for a gap."""
     name = machine.q_names[0] if on is None else on
-    if not isinstance(name, str):
+    if callable(name):
         return None
-    base, index = split_index(name)
+    base, index = split_index(name) if isinstance(name, str) else ("", ())
     if len(machine.q_shapes.get(base, (0,))) != len(index):
         names = [x + str([0] * len(shape)) * bool(shape) for x, shape in machine.q_shapes.items()]
         raise ValueError(
@@ -357,7 +367,8 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
         given = [given[x] for x in shapes]
     elif isinstance(given, Named):
         given = [getattr(given, x) for x in shapes]
-    rows = [given] if n == 1 and _is_mass(given, *shapes.values()) else list(given)
+    alone = not isinstance(given, Sequence) and jnp.ndim(given) == 0
+    rows = [given] if alone or (n == 1 and _is_mass(given, *shapes.values())) else list(given)
     if len(rows) != n:
         raise ValueError(
             f"`mass` of a {whose} must be one for each of its {n} coordinates, or {n} rows, but "

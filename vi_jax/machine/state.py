@@ -40,7 +40,7 @@ class State:
         raise AttributeError(f"The state has no component {name!r}; it has {known}.")
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, State) and vars(self) == vars(other)
+        return isinstance(other, State) and bool(eqx.tree_equal(self, other))
 
     __hash__ = None  # pyright: ignore[reportAssignmentType]
 
@@ -118,7 +118,7 @@ def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_
     missing = [x for x in names if x not in given] if all_of_them else []
     extra = [x for x in given if x not in names]
     if missing or extra:
-        wrong = f"{missing[0]!r} is missing" if missing else f"there is no {extra[0]!r}"
+        wrong = f"there is no {extra[0]!r}" if extra else f"{missing[0]!r} is missing"
         raise TypeError(f"{whose} must return the components {', '.join(names)}, but {wrong}.")
     new = {x: _component(parts[x], given[x], whose) for x in names if x in given}
     if isinstance(state, State):

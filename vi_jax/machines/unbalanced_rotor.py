@@ -88,10 +88,6 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         detuned = (1 - z * z) ** 2 + (2 * self.damping_ratio * z) ** 2
         return self.coupling * self.damping_ratio * z**5 / detuned
 
-    def averaged_control(self, speed: Number) -> Float[Array, "..."]:
-        """Return κ of a motor at this mean speed, to first order in ε and without stops."""
-        return jnp.asarray(speed) / self.no_load_speed + self.load(speed) / self.strength
-
     def start(self, *, Y: Number = 0.0, V: Number = 0.0, W: Number | None = None) -> Any:
         """Return a state with φ = 0. The rotor's speed `W` (unit: ω) defaults to the no-load speed
         κ w0; `W=0` is a start from rest."""

@@ -22,7 +22,17 @@ from .._checks import concrete, count, flag
 from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, State, Vector
-from ..flow import MethodLike, Run, check_leaves, in_modes, means, row_sizes, shape_of, simulate
+from ..flow import (
+    MethodLike,
+    Run,
+    check_leaves,
+    in_modes,
+    means,
+    raised,
+    row_sizes,
+    shape_of,
+    simulate,
+)
 from ..machine import (
     AbstractMachine,
     HybridState,
@@ -394,7 +404,7 @@ def find_orbit(
         )
     orbit = _find(the_map, state, root_finder, impact_log, multipliers)
     if throw:
-        orbit = eqx.error_if(orbit, ~orbit.successful, "No orbit was found; see `Orbit.result`.")
+        orbit = raised(orbit, ~orbit.successful, "The search failed", orbit.result)
     return trimmed(orbit)
 
 

@@ -68,10 +68,10 @@ def plot_branch(
 
     **Arguments:** `branch`; `ax`, by default a new figure; `y` and `x`, names of columns of the
     branch (`Branch.column_names`): `"duration"`, `"section_Y"`, or one of the machine's averages
-    such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that a stop does not
-    fix); `special`, whether to mark the special points; `legend`, whether to draw one with the
-    period and the impacts of the colour (or the branch's `label`), the meaning of solid and dashed
-    lines, and the marks; options of `Axes.plot`.
+    such as `"power"` (`y` is by default the first of `"y_min"`, `"y_max"` that stops do not fix,
+    else the speed of impacts); `special`, whether to mark the special points; `legend`, whether to
+    draw one with the period and the impacts of the colour (or the branch's `label`), the meaning of
+    solid and dashed lines, and the marks; options of `Axes.plot`.
     """
     instance_of("branch", branch, Branch, "a `Branch`, from `continue_orbit`")
     y = _moving(branch) if y is None else y
@@ -116,9 +116,15 @@ def _is_angle(branch: Branch, name: str) -> bool:
 
 
 def _moving(found: Branch | Sweep) -> str:
-    """Return the name of the extreme that varies; the other one may be fixed by a stop."""
-    extremes = np.asarray(found.y_min), np.asarray(found.y_max)
-    low, high = (np.ptp(x) > 1e-9 * np.abs(extremes).max() for x in extremes)
+    """Return the name of the extreme that varies: stops may fix it. If none does, return that of
+    the greatest speed of impacts."""
+    extremes = np.stack([found.y_min, found.y_max]).reshape(2, -1)
+    extremes = extremes[:, np.isfinite(extremes).all(axis=0)]
+    if not extremes.size:
+        return "y_min"
+    low, high = np.ptp(extremes, axis=1) > 1e-9 * np.abs(extremes).max()
+    if not low and not high and np.any(np.asarray(found.impacts) > 0):
+        return "fastest_impact" if isinstance(found, Branch) else "impact_speed"
     return "y_max" if high and not low else "y_min"
 
 

@@ -14,7 +14,6 @@ from ._geometry import Uncertainty as Uncertainty
 from ._lyapunov import Lyapunov as Lyapunov
 from ._lyapunov import lyapunov as lyapunov
 from ._scan import LanesFailed as LanesFailed
-from ._scan import ScanInterrupted as ScanInterrupted
 from ._scan import scan as scan
 from ._sweep import Sweep as Sweep
 from ._sweep import moved_by_stops as moved_by_stops

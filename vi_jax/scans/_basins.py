@@ -46,7 +46,7 @@ from ..machine import (
 )
 from ..orbit import distance
 from . import _geometry as geometry
-from ._scan import LanesFailed, ScanInterrupted, scan
+from ._scan import LanesFailed, interrupted, scan
 from .measures import CODES, REGIMES, Regime, Sections, flags
 from .program import START, check_leaf_name, start_with
 
@@ -306,7 +306,7 @@ def basins(
 
     **Returns:** `Basins`.
 
-    **Raises:** as `scan`; on Ctrl-C `ScanInterrupted`, whose `data` has the final period and
+    **Raises:** as `scan`; on Ctrl-C `Interrupted`, whose `partial` has the final period and
     section state of each start that was simulated.
     """
     machine = machine_of(machine)
@@ -319,7 +319,7 @@ def basins(
         machine, axes, longest, tolerance, start=start, settle=settle, method=method,
         paired=samples is not None, progress=progress, **options,
     )  # fmt: skip
-    kept = partial(ScanInterrupted, data, options.get("store"))
+    kept = partial(interrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
         return _find_basins(data, machine, begin, apart=apart, longest=longest, method=method)
 
@@ -646,7 +646,7 @@ def integrity_profile(
         method=method, progress=progress, **options,
     )  # fmt: skip
     found, integrity = [], []
-    kept = partial(ScanInterrupted, data, options.get("store"))
+    kept = partial(interrupted, data, options.get("store"))
     with at_work("basins", kept, progress=progress, unit="value", total=row.size) as report:
         for i, value in enumerate(row):
             current = with_leaf(machine, parameter, value)

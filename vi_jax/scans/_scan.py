@@ -48,15 +48,12 @@ _PATIENCE = 10.0
 _LONG = 6
 
 
-class ScanInterrupted(Interrupted):
-    """An interrupted scan; `data` has the finished part."""
-
-    def __init__(self, data: "xr.Dataset", store: str | Path | None):
-        note = "what was computed is in `.data`"
-        if store is not None:
-            note = f"what was computed is in {store}, and the same call continues from there"
-        super().__init__("scan", data, note)
-        self.data = data
+def interrupted(data: "xr.Dataset", store: str | Path | None) -> Interrupted:
+    """Return the exception of an interrupted scan, whose `partial` is the finished part."""
+    if store is None:
+        return Interrupted("scan", data)
+    where = f"what was computed is in {store}, and the same call continues from there"
+    return Interrupted("scan", data, where)
 
 
 class Workplace(NamedTuple):
@@ -98,7 +95,7 @@ def computed(
         _ = xr.Dataset  # loaded now: an interrupt should not wait for that
         done = blocks.total - sum(map(_size_of, todo))
         with at_work(
-            "scan", lambda: ScanInterrupted(storage.data(), store),
+            "scan", lambda: interrupted(storage.data(), store),
             progress=progress, unit="lane", total=blocks.total, done=done,
         ) as report:  # fmt: skip
 
@@ -406,7 +403,7 @@ def scan(
     ended (0: completed; -1: not computed). With a `store` it is read lazily from there.
 
     **Raises:** `ValueError` or `TypeError` before any work for unusable arguments; on Ctrl-C
-    `ScanInterrupted`; `ConnectionError`, with the number of stored blocks, if the cluster is lost.
+    `Interrupted`; `ConnectionError`, with the number of stored blocks, if the cluster is lost.
     """
     grid, verify = axes_of(axes), count("verify", verify)
     progress, paired = flag("progress", progress), flag("paired", paired)
@@ -456,7 +453,7 @@ def _verified(
     axes = {name: x[i] for (name, x), i in zip(blocks.axes.items(), places, strict=True)}
     numbers = None if program.lane_noise is None else drawn.astype(np.uint32)  # their own noise
     checked_blocks = in_blocks(program, axes, place, paired=True, numbers=numbers)
-    kept = functools.partial(ScanInterrupted, data, store)
+    kept = functools.partial(interrupted, data, store)
     with at_work("verification", kept, progress=False):
         better = computed(program, checked_blocks, place)
     found: dict[str, Any] = {"verified_lanes": lanes}

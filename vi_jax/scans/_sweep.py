@@ -153,14 +153,15 @@ class Sweep(Summarized):
         return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *lines])
 
     def _motions_in_words(self) -> list[str]:
-        names: dict[int, str] = {
-            REGIMES.unsettled: "no period",
-            REGIMES.failed: REGIMES.failed.meaning,
-        }
+        special = {int(REGIMES.unsettled): "no period, or unsettled"}
+        reasons = np.broadcast_to(in_names(self.result), self.period.shape).tolist()
+        reasons = (x if x == "ended" else f"failed: {x}" for x in reasons)
         return [
-            names.get(int(p))
-            or f"{self.periods[int(p) - 1]} with {count_of(round(float(n)), 'impact')}"
-            for p, n in zip(np.asarray(self.period), np.asarray(self.impacts), strict=True)
+            special.get(int(p))
+            or (f"{self.periods[p - 1]} with {count_of(round(n), 'impact')}" if p > 0 else reason)
+            for p, n, reason in zip(
+                self.period.tolist(), self.impacts.tolist(), reasons, strict=True
+            )
         ]
 
     def _jumps(self) -> list[list[str]]:

@@ -26,6 +26,7 @@ from ..flow import (
     WhiteNoise,
     average_names,
     check_noise,
+    check_prescribed,
     check_reals,
     check_values,
     chosen,
@@ -277,11 +278,12 @@ class ScanProgram(eqx.Module):
             for measure in self.measures:
                 new = measure.begun(start)(machine, run)
                 _check_variables(measure, new, [*found, "result"])
-                found |= new
-            for name, x in found.items():
-                if jnp.issubdtype(x.dtype, jnp.floating):  # fast minima lose NaN
+                # A function may evaluate outcomes. Others lose NaN in their fast minima.
+                good = ~run.failed if isinstance(measure, Custom) else run.successful
+                for name, x in new.items():
+                    is_real = jnp.issubdtype(x.dtype, jnp.floating)
                     # Added, not selected, so that the derivative of a failed lane is NaN as well.
-                    found[name] = x + jnp.where(run.successful, 0.0, jnp.nan)
+                    found[name] = x + jnp.where(good, 0.0, jnp.nan) if is_real else x
             if run.outcome is not None:
                 found["outcome"] = run.outcome.astype(jnp.int8)
                 found |= {"outcome_cycle": run.outcome_cycle, "outcome_phase": run.outcome_phase}
@@ -483,6 +485,7 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         start = convert_start(machine, start)
         check_reals("start", start)
         check_values(machine, start)
+        check_prescribed(machine, start)
         if program.lane_noise is not None:
             check_noise(machine, start, program.noise_of({LANE: 0, **lane})[0])
     if program.build is not None:
@@ -548,7 +551,8 @@ def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
     if cycles < needed:
         name = next(type(m).__name__ for m in measures if m.cycles > cycles)
         raise ValueError(
-            f"Argument `cycles` must be at least {needed} for the measure {name}, but got {cycles}."
+            f"Argument `cycles` must be at least {needed} for the measure {name}, but got "
+            f"{cycles}. Argument `measure` chooses others."
         )
     return cycles
 
