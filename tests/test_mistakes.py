@@ -53,6 +53,51 @@ class WithIf(Machine):
         return 1.0 if x.Y > 0 else 0.0
 
 
+class Free(vi.AbstractMachine):
+    """An oscillator without contacts; subclasses make a mistake in its force."""
+
+    cycle = 2 * np.pi
+
+    def field(self, t, z):
+        return dict(x=z.u, u=self.force(t, z) - z.x)
+
+
+class FreeByNumpy(Free):
+    def force(self, t, z):
+        return np.cos(z.x)
+
+
+class FreeWithIf(Free):
+    def force(self, t, z):
+        return 1.0 if z.x > 0 else 0.0
+
+
+class HalfPeriod(Free):
+    """The force is zero at both ends of the cycle."""
+
+    cycle = np.pi
+
+    def force(self, t, z):
+        return jnp.sin(t)
+
+
+class DrivenSection(HalfPeriod):
+    cycle = vi.rising("u", usual=6.3)
+
+
+class Clocked(HalfPeriod):
+    gain: float = 0.3
+    cycle = 2 * np.pi
+    events = vi.Reset(lambda m, t, z: t - m.cycle, ends_cycle=True)
+
+    def force(self, t, z):
+        return jnp.sin(t) - self.gain * z.u
+
+
+class Method(Free):
+    velocity: float = 1.0
+
+
 class NoReturn(Machine):
     def field(self, s, x):
         vi.OscillatorState(x.V, -x.Y)
@@ -64,7 +109,8 @@ class Tuple(Machine):
 
 
 def simulate(machine):
-    return vi.simulate(machine, machine.start(), 1)
+    free = isinstance(machine, Free)
+    return vi.simulate(machine, vi.State(x=0.1, u=0.2) if free else machine.start(), 1)
 
 
 def refused(call):
@@ -109,6 +155,8 @@ def test_4_arguments_in_another_order():
 def test_5_a_field_with_another_period():
     said = warned(lambda: simulate(OtherPeriod()))
     assert "`cycle` must be a period of the field" in said
+    assert "is not the same a `cycle` = 3.14159 later" in warned(lambda: simulate(HalfPeriod()))
+    assert "but an event ends its cycles" in warned(lambda: simulate(DrivenSection()))
     assert not warned(lambda: simulate(Machine()))
 
 
@@ -120,13 +168,14 @@ def test_6_a_start_beyond_the_stop():
 
 
 def test_7_numpy_in_a_field():
-    for kind in (ByNumpy, ByMath):
+    for kind in (ByNumpy, ByMath, FreeByNumpy):
         said = refused(lambda kind=kind: simulate(kind()))
         assert "with the functions of `jax.numpy`" in said
 
 
 def test_8_an_if_on_a_traced_number():
-    assert "`jnp.where`, not `if`" in refused(lambda: simulate(WithIf()))
+    for kind in (WithIf, FreeWithIf):
+        assert "`jnp.where`, not `if`" in refused(lambda kind=kind: simulate(kind()))
 
 
 def test_9_a_field_that_returns_no_state():
@@ -154,6 +203,17 @@ class NoCycle(vi.AbstractMachine):
 class Unlisted(NoCycle):
     cycle = 1.0
     stops = (vi.RigidStop(2.0, 0.5),)
+
+
+def continue_clocked():
+    orbit = vi.find_orbit(Clocked(), vi.State(x=0.1, u=0.2))
+    return vi.continue_orbit(orbit, parameter="gain", bounds=(0.2, 0.4), progress=False)
+
+
+def kick_another():
+    other = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.1, damping_ratio=0.05)
+    settled = vi.simulate(SCENE, SCENE.start(), 1, settle=300).last
+    return vi.minimal_kick(other, vi.find_orbit(SCENE, settled), progress=False)
 
 
 def basins_of(**options):
@@ -194,6 +254,9 @@ class Spare(Machine):
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (lambda: simulate(Method()), "'velocity' of a Method must have another name"),
+        (continue_clocked, "must not have cycles that end at a given time"),
+        (kick_another, "an orbit of this machine, but its stops.0.gap is 2, not 2.1"),
         (lambda: NoCycle(), "must have `cycle`, but `NoCycle` has none: write `cycle: float"),
         (lambda: Unlisted(), "must list its contacts as `contacts`"),
         (lambda: simulate(Machine(omega=jnp.ones(3))), "with a row as omega, take `jax.vmap`"),

@@ -162,12 +162,11 @@ def test_reverse_derivatives_agree_with_forward_ones():
 
 
 def test_linearize_and_stop_gradient():
-
     def last(x):
         return logistic(x, 3.7, 6.0)[0][0]
 
     value, along = jax.linearize(last, 0.3)
     np.testing.assert_allclose(value, last(0.3))
     np.testing.assert_allclose(along(1.0), jax.jacfwd(last)(0.3))
-    slope = jax.grad(lambda x: x * jax.lax.stop_gradient(last(x)) + 0 * last(0.3 + 0 * x) ** 0)
+    slope = jax.grad(lambda x: x * jax.lax.stop_gradient(last(x)))
     np.testing.assert_allclose(slope(0.3), last(0.3))

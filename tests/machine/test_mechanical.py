@@ -379,17 +379,66 @@ def test_equal_gap_functions_share_a_coordinate():
     assert [x.coordinate for x in Between()._stops] == [0, 0, 1]
 
 
-def test_wrong_masses_and_names_raise():
-    class Wrong(Pair):
-        mass = (1.0, 2.0, 3.0)
+WRONG = [
+    ({"mass": (1.0, 2.0, 3.0)}, "`mass` of a Wrong must be one for each of its 2"),
+    ({"mass": 2.0}, "must be one for each of its 2 coordinates, or 2 rows, but has 1"),
+    ({"mass": [[1.0, 2.0], [2.0, 1.0]]}, "positive, or a symmetric and positive definite matrix"),
+    ({"mass": [[1.0, 0.1], [0.0, 1.0]]}, "positive, or a symmetric and positive definite matrix"),
+    ({"mass": lambda _, q: (q.left - 0.5, 1.0)}, "positive, or a symmetric and positive definite"),
+    ({"mass": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]}, "with 2 columns, but has a row of 3"),
+    ({"q": ("left", "left")}, "`q` of a Wrong must have different names"),
+    ({"q": ("left", "v")}, "none of them `v`"),
+    ({"contacts": vi.RigidStop(1.0, 0.5, on="left", mass=7.0)}, "whose own masses are used"),
+    ({"contacts": vi.RigidStop(1.0, 0.5, on="up")}, "`on` of a contact must be one of the coord"),
+    ({"contacts": vi.SoftStop(1.0, 9.0, on=("left", "v"))}, "must be one of the coordinates"),
+]
 
-    with pytest.raises(ValueError, match="`mass` of a Wrong must be one for each of its 2"):
-        vi.simulate(Wrong(), Wrong().at(), 1)
-    Wrong.q, Wrong.mass = ("left[2]", "right"), ((1.0, 0.0), (0.0, 1.0))
-    with pytest.raises(ValueError, match="must be a number or an array for each of its coord"):
-        Wrong().field(0.0, Wrong().at())
+
+@pytest.mark.parametrize(("members", "message"), WRONG)
+def test_invalid_masses_and_names_raise(members, message):
+    wrong = type(Pair)("Wrong", (Pair,), {"__module__": __name__, **members})
+    start = vi.State(left=0.0, right=0.5, v=vi.State(left=0.0, right=0.0))
+    with pytest.raises((TypeError, ValueError), match=message):
+        vi.simulate(wrong(), start, 1)
+
+
+class Driven(Pair):
+    """The motion of the left body is given."""
+
+    mass = (2.0,)
+    size: float = 0.4
+
+    def prescribed(self, t):
+        return dict(left=self.size * jnp.sin(t) - 0.5)
+
+    def force(self, t, q, v):
+        return dict(right=-q.right)
+
+
+def test_invalid_starts_raise():
     with pytest.raises(ValueError, match="'up' is not one of the coordinates left, right"):
         Pair().at(up=1.0)
+    with pytest.raises(TypeError, match="`v` must be velocities by name"):
+        Pair().at(v=0.3)
+    with pytest.raises(ValueError, match=r"prescribed v\.left = 0\.5 at time 0, but has 0\.4"):
+        vi.simulate(Driven(size=0.5), Driven().at(right=1.0), 1)
+    with pytest.raises(ValueError, match=r"phi beyond the end of a turn, but it is 0\.71"):
+        vi.simulate(SliderCrank(), SliderCrank().at(phi=7.0, v=dict(phi=15.0)), 1)
+
+
+def test_given_motion_has_no_exponents():
+    """The other body is an oscillator without damping."""
+    machine = Driven(restitution=1.0)
+    found = vi.lyapunov(machine, machine.at(right=0.9), 64, settle=0, progress=False)
+    assert found.exponents.shape == (2,)
+
+
+def test_missing_masses_and_forces_raise():
+    class Array(Pair):
+        q, mass = ("left[2]", "right"), ((1.0, 0.0), (0.0, 1.0))
+
+    with pytest.raises(ValueError, match="must be a number or an array for each of its coord"):
+        Array().field(0.0, Array().at())
 
     class Nameless(Pair):
         def force(self, t, q, v):
@@ -407,9 +456,3 @@ def test_wrong_masses_and_names_raise():
 
     with pytest.raises(TypeError, match="A Massless must have `mass`: one for each"):
         vi.simulate(Massless(), Massless().at(), 1)
-
-    class Named(Pair):
-        contacts = vi.RigidStop(0.0, 0.5, on="up")
-
-    with pytest.raises(ValueError, match="`on` of a contact must be one of the coordinates"):
-        vi.simulate(Named(), Named().at(), 1)

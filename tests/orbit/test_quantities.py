@@ -50,7 +50,7 @@ def test_quantities_along_a_branch(branch, orbit):
     np.testing.assert_array_equal(balance.parameter, branch.parameter)
     np.testing.assert_allclose(branch.column("section_Y"), balance.Y, atol=1e-14)
     np.testing.assert_allclose(branch.column("duration"), 2 * np.pi / branch.parameter)
-    assert (branch.column("impacts") == 2).all() == (branch.impact_speed.shape[1] == 2)
+    assert (branch.column("impacts") == branch.impact_speed.shape[1]).all()
     data = branch.to_xarray(along="point")
     assert data.taken.attrs["units"] == "W" and data.section_energy.attrs["units"] == "J"
     assert set(data) >= {"duration", "impacts", "lost", "section_V", "section_push"}

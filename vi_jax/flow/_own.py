@@ -210,8 +210,8 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             "The `field` of a {kind} depends on time, which restarts from 0 in each cycle, but an "
             "event ends its cycles. Make the phase of its drive a component of the state.",
         )
-    paths = jtu.tree_leaves_with_path(start) if ticks else ()
-    for (path, _), rates in zip(paths, fields, strict=True):
+    # A field that returns no state is refused where it is traced.
+    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=False):
         if np.any(abs(rates[:2] - rates[2:]) > _PERIODIC * abs(rates).max(axis=0)):
             name = jtu.keystr(path).lstrip(".") or "state"
             _warn_once(
