@@ -38,6 +38,7 @@ from ..machine import (
     Turn,
     begin_modes,
     check_takes,
+    component,
     components,
     convert_start,
     counter_of,
@@ -334,8 +335,11 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
 
 def _check_turn(machine: AbstractMachine, start: State) -> None:
     counter = counter_of(machine)
-    beyond = concrete(counter.section(machine, start)) if isinstance(counter, Turn) else None
-    if counter is not None and beyond is not None and np.any(beyond >= 0):
+    if not isinstance(counter, Turn):
+        return
+    angle, begin = concrete(component(counter.name, start)), concrete(counter.start)
+    beyond = None if angle is None or begin is None else angle - begin - 2 * np.pi
+    if beyond is not None and np.any(beyond >= 0):
         raise ValueError(
             f"Argument `start` must not have {counter.name} beyond the end of a turn, but it is "
             f"{np.max(beyond):.6g} beyond. Subtract whole turns."
