@@ -164,7 +164,7 @@ def test_6_a_start_beyond_the_stop():
     said = refused(lambda: vi.simulate(SCENE, SCENE.start(Y=3.0), 2))
     assert "must not lie beyond a stop, but lies 1 beyond stop 0 (right, gap 2.0)" in said
     orbit = vi.find_orbit(SCENE, SCENE.start(Y=3.0))
-    assert "as one beyond a stop or a number of the machine that is not finite" in str(orbit)
+    assert "beyond a stop, say, or a number of the machine is not finite" in str(orbit)
 
 
 def test_7_numpy_in_a_field():

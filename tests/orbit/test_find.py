@@ -66,7 +66,7 @@ def test_text_and_tables_of_orbits():
     assert "are listed" not in str(orbit)
     # A body that comes to rest has more impacts than are logged.
     more = dataclasses.replace(orbit, impacts=jnp.asarray(38))
-    assert "  only 1 of 38 impacts are listed: see `impact_log`" in str(more)
+    assert "  only 1 of 38 impacts: find it with `impact_log=38`" in str(more)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), orbit)
     data = batch.to_xarray()
     assert data["result"].values.tolist() == ["successful"] * 2

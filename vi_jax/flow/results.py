@@ -309,7 +309,7 @@ class RESULTS(NamedEnumeration):
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
     )
-    ended = "An event of the machine ended the motion; `Run.outcome` says with which outcome."
+    ended = "An event of the machine ended the motion, with the outcome `Run.outcome`."
 
 
 REASON_NAMES = tuple(names_of(RESULTS).tolist())

@@ -138,8 +138,8 @@ class ORBIT_RESULTS(NamedEnumeration):
         "equations of a motion with any period."
     )
     not_simulated = (
-        "The guess cannot be simulated, as one beyond a stop or a number of the machine that is "
-        "not finite: `simulate` says why."
+        "The guess cannot be simulated: it lies beyond a stop, say, or a number of the machine is "
+        "not finite. Simulate from it to see the reason."
     )
     other_modes = (
         "No orbit was found: the motion comes back to its state in other modes of the machine. Its "
@@ -348,7 +348,7 @@ class Orbit(Summarized):
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(jnp.sum(self.impact_stop >= 0))
         if listed < count:
-            lines.append(f"  only {listed} of {count} impacts are listed: see `impact_log`")
+            lines.append(f"  only {listed} of {count} impacts: find it with `impact_log={count}`")
         if self.stability != STABILITY.unknown:
             values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
             lines.append(f"  multipliers: {', '.join(first_few(values))}")

@@ -651,7 +651,7 @@ class Escape(_Observed):
         count("samples", self.samples)
 
     def described(self, start):
-        words, step = "cycles until it escapes, or was watched", 1.0 / max(1, self.samples)
+        words, step = "cycles until it escapes, or of observation", 1.0 / max(1, self.samples)
         return {
             "escape_cycle": {"units": "cycle", "long_name": words, "step": step},
             "escaped": {"units": "1", "long_name": "whether it escapes"},
