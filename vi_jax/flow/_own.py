@@ -424,9 +424,9 @@ def check_parts(machine: AbstractMachine) -> None:
 def _check_names(machine: AbstractMachine) -> None:
     """**Raises:** `TypeError` for a field with the name of a method, `ValueError` for an invalid
     coordinate, a stop on an angle of `wrap_angles`, or with an invalid `on`."""
-    kind = type(machine)
+    kind, base = type(machine), Mechanical if isinstance(machine, Mechanical) else AbstractMachine
     for field in dataclasses.fields(machine):
-        is_method = any(callable(vars(base).get(field.name)) for base in kind.__mro__[1:])
+        is_method = callable(getattr(base, field.name, None))
         if is_method and not callable(getattr(machine, field.name)):
             raise TypeError(
                 f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
