@@ -335,7 +335,7 @@ _SLOW = 0.02
 @warning_once
 def find_orbit(
     machine: AbstractMachine,
-    guess: State,
+    guess: State = None,
     cycles: int | Int[Array, ""] = 1,
     *,
     root_finder: AbstractRootFinder | None = None,
@@ -355,8 +355,8 @@ def find_orbit(
 
     - `machine`: a `Scene` (ideal drive or motor, any crank, any stops), or another machine whose
       independent variable counts its cycles.
-    - `guess`: a state on the section from `machine.start(...)`, or another `Orbit`. If its arrays
-      have one leading axis, one compiled call searches from every guess.
+    - `guess`: a state on the section, by default the machine's own start, or another `Orbit`. If
+      its arrays have one leading axis, one compiled call searches from every guess.
     - `cycles`: period in drive cycles; static.
     - `root_finder`: `Newton()` (default) or `Gradient(optax_optimiser)`.
     - `method`: integration method: by default the `"standard"` preset, as in `simulate`, except
@@ -394,6 +394,7 @@ def find_orbit(
             "Argument `root_finder` must have a number of arcs that divides the "
             f"{cycles} cycles, but has {root_finder.arcs} arcs."
         )
+    guess = the_map.machine.start() if guess is None else guess
     guess = guess.state if isinstance(guess, Orbit) else guess
     state = map_state(the_map.machine, guess, "guess")
     _check_guess(the_map.machine, state)

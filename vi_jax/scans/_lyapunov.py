@@ -24,6 +24,7 @@ from ..flow import (
     has_averages,
     has_fixed_cycle,
     in_names,
+    machine_of,
     means,
     present,
     row_sizes,
@@ -133,7 +134,7 @@ _ROUNDING = 16
 @warning_once
 def lyapunov(
     machine: AbstractMachine,
-    start: State,
+    start: State = None,
     cycles: int = 400,
     *,
     settle: object = 200,
@@ -155,7 +156,8 @@ def lyapunov(
 
     **Arguments:**
 
-    - `machine`, `start`: as for `simulate`; runs in the phase clock.
+    - `machine`, `start`: as for `simulate`, by default the machine's own start; runs in the phase
+      clock.
     - `cycles`: the number of observed drive cycles, at least 8; static.
     - `settle`: the number of drive cycles before that.
     - `number`: the number of exponents, greatest first; all by default, but none of coordinates
@@ -170,6 +172,7 @@ def lyapunov(
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
+    start = machine_of(machine).start() if start is None else start
     if is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(
