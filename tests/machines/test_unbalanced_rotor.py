@@ -61,8 +61,9 @@ def test_sommerfeld_response_converges_to_the_averaged_one():
     # Below, near and beyond the peak.
     for zeta in (0.85, 0.98, 1.15):
         rotor = ROTOR(strength=0.2, coupling=0.02)
-        kappa = zeta / rotor.no_load_speed + rotor.load(zeta) / rotor.strength
         reach = zeta**2 / ((1 - zeta**2) + 0.1j * zeta)
+        load = rotor.coupling * rotor.damping_ratio * zeta * abs(reach) ** 2
+        kappa = zeta / rotor.no_load_speed + load / rotor.strength
 
         def error(coupling, kappa=kappa, zeta=zeta, reach=reach):
             weak = ROTOR(strength=10 * coupling, control=kappa, coupling=coupling)

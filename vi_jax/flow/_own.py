@@ -191,28 +191,33 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
         restarts = not ticks and depends_on_time(field_in, machine, state)
         restarts = restarts and not depends_on_time(_guards, machine, state)  # of a timer
-        cycle, fields, below = 0.0, (), ()
+        masses, cycle, fields, below = np.zeros(0), 0.0, [], ()
         with jax.ensure_compile_time_eval():
-            masses = np.asarray(_masses(machine, state))
-            if ticks or others_of(machine):
-                found = jtu.tree_map(np.asarray, _values(machine, zero, state, ticks))
-                cycle, fields, below = found
-    except Exception:  # the error is raised with a better message when field and guards are traced
+            masses = _masses(machine, state)
+            if ticks or restarts or others_of(machine):
+                found = _values(machine, zero, state, ticks or restarts)
+                cycle, fields, below = jtu.tree_map(np.asarray, found)
+    except Exception as error:  # others are raised with a better message in the trace
+        if isinstance(error, ValueError) and str(error).startswith("`mass` of a"):
+            raise
         return
     if masses.size and not _is_definite(masses):
         raise ValueError(
             f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
             f"matrix, but at the start it is {masses.tolist()}."
         )
-    if restarts:
+    if restarts and any(np.any(rates[0] != rates[1]) for rates in fields):
         _warn_once(
             kind,
             "The `field` of a {kind} depends on time, which restarts from 0 in each cycle, but an "
-            "event ends its cycles. Make the phase of its drive a component of the state.",
+            "event ends its cycles. If the time of a drive is meant, make its phase a component of "
+            "the state.",
         )
     # A field that returns no state is refused where it is traced.
+    longer = any(not _different(fields, 1, k) for k in (4, 5, 6))  # the period is several cycles
+    pair = (1, 3) if longer and _different(fields, 1, 3) else (0, 2)
     for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=False):
-        if np.any(abs(rates[:2] - rates[2:]) > _PERIODIC * abs(rates).max(axis=0)):
+        if ticks and _different([rates], *pair):
             name = jtu.keystr(path).lstrip(".") or "state"
             _warn_once(
                 kind,
@@ -232,10 +237,19 @@ def check_values(machine: AbstractMachine, start: State) -> None:
         )
 
 
+def _different(fields: list[np.ndarray], a: int, b: int) -> bool:
+    """Return whether the fields at two instants differ."""
+    sizes = (np.maximum(abs(x[1]), abs(x[a]) + abs(x[b])) for x in fields)
+    pairs = zip(fields, sizes, strict=True)
+    return any(np.any(abs(x[a] - x[b]) > _PERIODIC * size) for x, size in pairs)
+
+
 def _is_definite(masses: np.ndarray) -> bool:
     """Return whether a matrix is symmetric, to rounding, and positive definite."""
-    even = np.allclose(masses, masses.T, rtol=0, atol=1e-9 * abs(masses).max())
-    return bool(np.isfinite(masses).all() and even and np.linalg.eigvalsh(masses).min() > 0)
+    sizes = np.sqrt(np.diag(masses))
+    scaled = masses / np.outer(sizes, sizes)
+    even = np.allclose(scaled, scaled.T, rtol=0, atol=1e-9)
+    return bool(np.isfinite(scaled).all() and even and np.linalg.eigvalsh(scaled).min() > 0)
 
 
 # A slip is evaluated at this many instants of a cycle. Then the interval of its greatest change is
@@ -298,12 +312,13 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """Return the cycle; if `ticks`, the rates of each number of the state at the start, within the
-    cycle and a cycle after both; for each event, whether its guard is negative in any state around
-    the start. `zero` is an argument, since JAX compiles expressions of constants separately."""
+    """Return the cycle; if `ticks`, the rates at the start, within the cycle, a cycle after both
+    and up to four cycles after the second; for each event, whether its guard is negative in any
+    state around the start. `zero` is an argument: JAX compiles expressions of constants alone."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
-    instants = zero + cycle * np.array([0.0, _INNER_INSTANT, 1.0, 1.0 + _INNER_INSTANT])
+    later = np.arange(1, 5) + _INNER_INSTANT
+    instants = zero + cycle * np.array([0.0, _INNER_INSTANT, 1.0, *later])
     prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
     rates = lambda s: field_in(machine, s, prescribed(s, start), modes)
     fields = jax.vmap(rates)(instants) if ticks else ()
@@ -331,12 +346,13 @@ def depends_on_time(function: Callable[..., Any], machine: AbstractMachine, stat
 
 
 def _masses(machine: AbstractMachine, start: State) -> Any:
-    """Return the mass matrix at the start; an empty array if the machine has none."""
-    if not isinstance(machine, Mechanical) or any(machine.q_shapes.values()):
+    """Return the mass matrix at the start; an empty array if the machine has none. **Raises:**
+    `ValueError` for masses that are not positive."""
+    if not isinstance(machine, Mechanical):
         return np.zeros(0)
     matrix = lambda state: machine.masses(machine.places(state))
-    varies = callable(machine.mass)
-    return np.array(eqx.filter_jit(matrix)(start) if varies else matrix(start), float)
+    found = eqx.filter_jit(matrix)(start) if callable(machine.mass) else matrix(start)
+    return np.zeros(0) if any(machine.q_shapes.values()) else np.array(found, float)
 
 
 def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:
@@ -433,7 +449,7 @@ def _check_names(machine: AbstractMachine) -> None:
                 "method of every machine."
             )
     if isinstance(machine, Mechanical) and not isinstance(machine.q, str):
-        if len({*machine.q}) < len(machine.q) or "v" in machine.q_names:
+        if len(machine.q_names) < len(machine.q) or "v" in machine.q_names:
             raise ValueError(
                 f"`q` of a {kind.__name__} must have different names, and none of them `v`, but is "
                 f"{machine.q}."

@@ -294,9 +294,9 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
         ) from None
 
 
-# A start may differ by this share from the prescribed motion: a choice, since states at the end of
-# a run have the errors of the method.
-_PRESCRIBED = 1e-3
+# A start may differ by this share of the prescribed motion from it: a choice, since states at the
+# end of a run have the errors of the method. The motion is evaluated at this share of a cycle too.
+_PRESCRIBED, _INNER_INSTANT = 1e-3, 0.29
 
 
 def check_leaves(argument: str, state: State) -> None:
@@ -339,7 +339,7 @@ def _check_turn(machine: AbstractMachine, start: State) -> None:
         return
     angle, begin = concrete(component(counter.name, start)), concrete(counter.start)
     beyond = None if angle is None or begin is None else angle - begin - 2 * np.pi
-    if beyond is not None and np.any(beyond >= 0):
+    if beyond is not None and np.any(beyond > 1e-9):  # rounding
         raise ValueError(
             f"Argument `start` must not have {counter.name} beyond the end of a turn, but it is "
             f"{np.max(beyond):.6g} beyond. Subtract whole turns."
@@ -350,12 +350,13 @@ def check_prescribed(machine: AbstractMachine, start: State) -> None:
     """**Raises:** `ValueError` if a start does not have the prescribed motion of its machine."""
     if not isinstance(machine, Mechanical) or not isinstance(start, NamedState):
         return
-    given = machine.with_prescribed(0.0, start)
-    for (name, x), y in zip(components(start).items(), components(given).values(), strict=True):
-        number, wanted = concrete(x), concrete(y)
-        if number is None or wanted is None:
+    times = 0.0, _INNER_INSTANT * machine.cycle
+    given, later = (components(machine.with_prescribed(t, start)) for t in times)
+    for name, x in components(start).items():
+        number, wanted, other = concrete(x), concrete(given[name]), concrete(later[name])
+        if number is None or wanted is None or other is None:
             continue
-        if np.any(abs(number - wanted) > _PRESCRIBED * np.maximum(abs(number), abs(wanted))):
+        if np.any(abs(number - wanted) > _PRESCRIBED * np.maximum(abs(wanted), abs(other))):
             raise ValueError(
                 f"Argument `start` must have the prescribed {name} = {wanted:.6g} at time 0, but "
                 f"has {number:.6g}. `machine.at(...)` returns such a state."

@@ -5,7 +5,6 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range, number, require
 from .._types import Number, Scalar, State
@@ -81,12 +80,6 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         if self.gap is None:
             return ()
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided, on="Y")
-
-    def load(self, speed: Number) -> Float[Array, "..."]:
-        """Return ε ξ ζ⁵/D, the averaged load of the vibration at this rotor speed (unit: J ω²)."""
-        z = jnp.asarray(speed)
-        detuned = (1 - z * z) ** 2 + (2 * self.damping_ratio * z) ** 2
-        return self.coupling * self.damping_ratio * z**5 / detuned
 
     def start(self, *, Y: Number = 0.0, V: Number = 0.0, W: Number | None = None) -> Any:
         """Return a state with φ = 0. The rotor's speed `W` (unit: ω) defaults to the no-load speed

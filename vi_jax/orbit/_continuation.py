@@ -15,6 +15,7 @@ from ._conditions import Special, hold_values, is_defective, known_names, rates_
 from ._follow import check_walk, follow_both_ways, rescaled
 from ._motion_table import MotionTable
 from ._problem import (
+    ADVICE,
     check_parameter,
     cycles_to_fly,
     problem_of,
@@ -262,11 +263,6 @@ def _refine(problem: Shooting, x: np.ndarray, tangent: np.ndarray) -> tuple[Step
 # this component along that parameter: a choice.
 _STEEP = 1e-3
 
-_ADVICE = (
-    "Such a point is found value by value of the second parameter: `find_orbit` with another one, "
-    "from this motion, and `continue_orbit` from there locates it again."
-)
-
 
 def boundary(
     point: Point,
@@ -339,13 +335,13 @@ def _check_point(point: Point) -> None:
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
             "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "
             "bifurcation at which something is touched, but is "
-            f"{with_article(point.kind)}. {_ADVICE}"
+            f"{with_article(point.kind)}. {ADVICE}"
         )
     vanishes = point.kind in SLIDING and change_at(point.problem, point.step) is not None
     if point.kind in TOUCHING and not (point.touches or vanishes):
         raise ValueError(
             "Argument `point` must be a grazing or a sliding bifurcation at which something is "
-            f"touched, but is {with_article(point.kind)}: {point.detail}. {_ADVICE}"
+            f"touched, but is {with_article(point.kind)}: {point.detail}. {ADVICE}"
         )
 
 

@@ -439,7 +439,7 @@ _EARLIER = 1e-7
 # A hop longer than a fifth of a cycle, the longest step of a simulation, is not part of a chatter.
 _SHORT = 5
 
-_ADVICE = "Find such motions value by value: `find_orbit` with another parameter, from this motion."
+ADVICE = "Find such motions value by value: `find_orbit` with another parameter, from this motion."
 
 # A body this close to its stop (relative to the motion, see `distance`) is on it: a choice.
 _ON = 1e-9
@@ -458,7 +458,7 @@ def resting_problem_of(
         raise ValueError(
             f"Argument `orbit` rests on a stop of a {type(machine).__name__}, which has `renewed`, "
             "friction on a stop or cycles that another event than a turn ends, and cannot be "
-            f"followed. {_ADVICE}"
+            f"followed. {ADVICE}"
         )
     run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LOGGED, rests=True)
     begins = _cycle_begins(run, machine, autonomous)
@@ -470,7 +470,7 @@ def resting_problem_of(
         raise ValueError(
             "Argument `orbit` must come to rest on its stops after chatters of one body at a time, "
             "in whose last hops no switch changes, but several bodies chatter together or a switch "
-            f"changes. {_ADVICE}"
+            f"changes. {ADVICE}"
         )
     corners = [with_leaf(machine, parameter, end) for end in bounds]
     order, steps = tuple(event for _, event in events), steps_of(stepper, corners, state, cycles)

@@ -120,7 +120,7 @@ def _moving(found: Branch | Sweep) -> str:
     the greatest speed of impacts."""
     extremes = np.stack([found.y_min, found.y_max]).reshape(2, -1)
     extremes = extremes[:, np.isfinite(extremes).all(axis=0)]
-    if not extremes.size:
+    if extremes.shape[1] < 2:
         return "y_min"
     low, high = np.ptp(extremes, axis=1) > 1e-9 * np.abs(extremes).max()
     if not low and not high and np.any(np.asarray(found.impacts) > 0):

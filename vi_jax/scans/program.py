@@ -26,7 +26,6 @@ from ..flow import (
     WhiteNoise,
     average_names,
     check_noise,
-    check_prescribed,
     check_reals,
     check_values,
     chosen,
@@ -39,6 +38,7 @@ from ..flow import (
 )
 from ..machine import (
     AbstractMachine,
+    Mechanical,
     check_again,
     check_name,
     components,
@@ -208,6 +208,8 @@ class ScanProgram(eqx.Module):
         if self.options.clock is not None:
             machine = in_clock(machine, self.options.clock)
         start = machine.start() if self.start is None else self.start
+        if isinstance(machine, Mechanical) and self.start is not None:  # another lane's, perhaps
+            start = replaced(start, machine.with_prescribed(0.0, without_modes(start)))
         of_start = {name: x for name, x in values.items() if part_of(name) == START}
         start = replaced(start, start_with(without_modes(start), of_start))
         return machine, self._perturbed(start, START, perturbation)
@@ -485,7 +487,6 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
         start = convert_start(machine, start)
         check_reals("start", start)
         check_values(machine, start)
-        check_prescribed(machine, start)
         if program.lane_noise is not None:
             check_noise(machine, start, program.noise_of({LANE: 0, **lane})[0])
     if program.build is not None:
