@@ -189,14 +189,14 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     try:
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
-        restarts = not ticks and depends_on_time(field_in, machine, state)
-        restarts = restarts and not depends_on_time(_guards, machine, state)  # of a timer
-        masses, cycle, fields, below = np.zeros(0), 0.0, [], ()
+        no_timer = lambda: not depends_on_time(_guards, machine, state)
+        timed = ticks or (depends_on_time(field_in, machine, state) and no_timer())
+        found = 0.0, [], ()
         with jax.ensure_compile_time_eval():
             masses = _masses(machine, state)
-            if ticks or restarts or others_of(machine):
-                found = _values(machine, zero, state, ticks or restarts)
-                cycle, fields, below = jtu.tree_map(np.asarray, found)
+            if timed or others_of(machine):
+                found = _values(machine, zero, state, timed)
+        cycle, fields, below = jtu.tree_map(np.asarray, found)
     except Exception as error:  # others are raised with a better message in the trace
         if isinstance(error, ValueError) and str(error).startswith("`mass` of a"):
             raise
@@ -206,48 +206,50 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
             f"matrix, but at the start it is {masses.tolist()}."
         )
-    if restarts and any(np.any(rates[0] != rates[1]) for rates in fields):
+    if ticks:
+        _check_period(kind, start, fields, cycle)
+    elif any(np.any(rates[0] != rates[1]) for rates in fields):
         _warn_once(
             kind,
-            "The `field` of a {kind} depends on time, which restarts from 0 in each cycle, but an "
-            "event ends its cycles. If the time of a drive is meant, make its phase a component of "
-            "the state.",
+            f"The `field` of a {kind.__name__} depends on time, which restarts from 0 in each "
+            "cycle, but an event ends its cycles. Make the phase of a drive a component of the "
+            "state.",
         )
-    # A field that returns no state is refused where it is traced.
-    longer = any(not _different(fields, 1, k) for k in (4, 5, 6))  # the period is several cycles
-    pair = (1, 3) if longer and _different(fields, 1, 3) else (0, 2)
-    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=False):
-        if ticks and _different([rates], *pair):
-            name = jtu.keystr(path).lstrip(".") or "state"
-            _warn_once(
-                kind,
-                f"The `field` of a {{kind}} is not the same a `cycle` = {cycle:.6g} later: the "
-                f"rate of its {name} differs. `s` restarts from 0 in each cycle, so `cycle` must "
-                "be a period of the field, unless the field is meant to jump there.",
-            )
-            break
     for i in np.flatnonzero(~np.asarray(below, bool)):
         event = others_of(machine)[i]
         _warn_once(
             kind,
-            f"The guard of event {i} ({event.name or type(event).__name__}) of a {{kind}} was not "
-            f"below zero in any of {_SAMPLES + 1} states around the start, and an event whose "
-            "guard is never negative never happens. Return a number that is negative before the "
-            "event and positive after it: `x - 1`, not `jnp.maximum(x - 1, 0)`.",
+            f"The guard of event {i} ({event.name or type(event).__name__}) of a {kind.__name__} "
+            f"was not below zero in any of {_SAMPLES + 1} states around the start. Return a number "
+            "that is negative before the event: `x - 1`, not `jnp.maximum(x - 1, 0)`.",
         )
 
 
-def _different(fields: list[np.ndarray], a: int, b: int) -> bool:
-    """Return whether the fields at two instants differ."""
-    sizes = (np.maximum(abs(x[1]), abs(x[a]) + abs(x[b])) for x in fields)
-    pairs = zip(fields, sizes, strict=True)
-    return any(np.any(abs(x[a] - x[b]) > _PERIODIC * size) for x, size in pairs)
+def _check_period(kind: type, start: State, fields: list[np.ndarray], cycle: Any) -> None:
+    """Warn once if a cycle is no period of the field: its ends differ, or several are one."""
+
+    def differ(rates: np.ndarray, a: int, b: int) -> bool:
+        size = np.maximum(abs(rates[1]), abs(rates[a]) + abs(rates[b]))
+        return bool(np.any(abs(rates[a] - rates[b]) > _PERIODIC * size))
+
+    several = any(not any(differ(x, 1, k) for x in fields) for k in (4, 5, 6))
+    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=False):
+        if differ(rates, 0, 2) or (several and differ(rates, 1, 3)):
+            _warn_once(
+                kind,
+                f"The `field` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} later: "
+                f"the rate of its {jtu.keystr(path).lstrip('.') or 'state'} differs. Time restarts "
+                "from 0 in each cycle: `cycle` must be a period of the field, unless it jumps.",
+            )
+            return
 
 
 def _is_definite(masses: np.ndarray) -> bool:
     """Return whether a matrix is symmetric, to rounding, and positive definite."""
-    sizes = np.sqrt(np.diag(masses))
-    scaled = masses / np.outer(sizes, sizes)
+    diagonal = np.diag(masses)
+    if not (diagonal > 0).all():
+        return False
+    scaled = masses / np.sqrt(np.outer(diagonal, diagonal))
     even = np.allclose(scaled, scaled.T, rtol=0, atol=1e-9)
     return bool(np.isfinite(scaled).all() and even and np.linalg.eigvalsh(scaled).min() > 0)
 
@@ -282,9 +284,9 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
         if coarse > _STEEP * extent and type(machine).step_limit in limits:
             _warn_once(
                 type(machine),
-                "The `slip` of a DryFriction of a {kind} changes within a thousandth of a cycle, "
-                f"at t = {time:.6g}, and steps may be too long for that. Give the machine a "
-                "`step_limit`, or let the surface's speed jump by a `Reset`.",
+                f"The `slip` of a DryFriction of a {type(machine).__name__} changes within a "
+                f"thousandth of a cycle, at t = {time:.6g}: steps may be too long. Give it "
+                "a `step_limit`, or let the surface's speed jump by a `Reset`.",
             )
 
 
@@ -346,8 +348,7 @@ def depends_on_time(function: Callable[..., Any], machine: AbstractMachine, stat
 
 
 def _masses(machine: AbstractMachine, start: State) -> Any:
-    """Return the mass matrix at the start; an empty array if the machine has none. **Raises:**
-    `ValueError` for masses that are not positive."""
+    """Return the mass matrix at the start; an empty array if the machine has none."""
     if not isinstance(machine, Mechanical):
         return np.zeros(0)
     matrix = lambda state: machine.masses(machine.places(state))
@@ -377,7 +378,7 @@ def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) ->
 
 @functools.lru_cache(maxsize=64)
 def _warn_once(kind: type, text: str) -> None:
-    warn(text.format(kind=kind.__name__))
+    warn(text)
 
 
 _CONTACTS = (RigidStop, SoftStop, DryFriction)
