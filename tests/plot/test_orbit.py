@@ -58,15 +58,15 @@ def test_legend_names_marks_and_begins_with_a_solid_line(branch):
             assert again == ["2π", "2π, 1 impact", *named[1:]]
 
 
-def test_a_branch_with_constant_extremes_is_drawn_by_its_minimum(branch):
-    """The maximum varies by rounding only, and must not be chosen."""
+def test_a_branch_with_constant_extremes_is_drawn_by_its_impacts(branch):
+    """The maximum varies by rounding only, and must not be chosen: stops fix both extremes."""
     noisy = [{"y_min": -1.3, "y_max": 1.3 + i % 2 * 1e-15} for i in range(len(branch.steps))]
     steps = [
         step._replace(observed=step.observed._replace(**at))
         for step, at in zip(branch.steps, noisy, strict=True)
     ]
     drawn = vi.plot_branch(dataclasses.replace(branch, steps=steps), ax=_axes())
-    assert drawn.get_ylabel() == "min Y (a)"
+    assert drawn.get_ylabel() == "fastest_impact (a ω)"
 
 
 def test_a_sweep_lies_above_branches_and_below_marks(branch):
