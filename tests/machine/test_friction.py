@@ -281,5 +281,5 @@ def test_surfaces_whose_speed_jumps():
     assert float(run.sections.v[1]) == pytest.approx(0.1 - 2 / 21, abs=1e-12)  # turns at t = 10/21
     with pytest.raises(ValueError, match=r"jumps by 2 at t = 0\.5\. Let it jump where"):
         vi.simulate(Shaken(lambda t, w: jnp.where(t < 0.5, 1.0, -1.0)), start, 1)
-    with pytest.warns(UserWarning, match="within a thousandth of a cycle, at t = 0.5,"):
+    with pytest.warns(UserWarning, match="within a thousandth of a cycle, at t = 0.5:"):
         vi.simulate(Shaken(lambda t, w: jnp.tanh(1e4 * (t - 0.5))), start, 1)
