@@ -60,7 +60,7 @@ _TRACER_ERRORS = (
 # A field whose values a cycle apart differ by more than this share has another period; with a
 # period of five digits they differ by less. They are compared at the start and at this share of a
 # cycle, where few inputs are zero.
-_PERIODIC, _INNER_INSTANT = 1e-4, 0.29
+_PERIODIC, INNER_INSTANT = 1e-4, 0.29
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
@@ -189,10 +189,9 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     try:
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
-        no_timer = lambda: not depends_on_time(_guards, machine, state)
-        timed = ticks or (depends_on_time(field_in, machine, state) and no_timer())
         found = 0.0, [], ()
         with jax.ensure_compile_time_eval():
+            timed = ticks or _has_timed_field(machine, state)
             masses = _masses(machine, state)
             if timed or others_of(machine):
                 found = _values(machine, zero, state, timed)
@@ -319,8 +318,8 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     state around the start. `zero` is an argument: JAX compiles expressions of constants alone."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
-    later = np.arange(1, 5) + _INNER_INSTANT
-    instants = zero + cycle * np.array([0.0, _INNER_INSTANT, 1.0, *later])
+    later = np.arange(1, 5) + INNER_INSTANT
+    instants = zero + cycle * np.array([0.0, INNER_INSTANT, 1.0, *later])
     prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
     rates = lambda s: field_in(machine, s, prescribed(s, start), modes)
     fields = jax.vmap(rates)(instants) if ticks else ()
@@ -347,13 +346,22 @@ def depends_on_time(function: Callable[..., Any], machine: AbstractMachine, stat
     return any(dependent_results(traced, sources, smooth=False))
 
 
+@eqx.filter_jit
+def _has_timed_field(machine: AbstractMachine, x: State) -> bool:
+    """Return whether the field may depend on time, but no guard, as of a timer; traced once."""
+    return depends_on_time(field_in, machine, x) and not depends_on_time(_guards, machine, x)
+
+
 def _masses(machine: AbstractMachine, start: State) -> Any:
     """Return the mass matrix at the start; an empty array if the machine has none."""
     if not isinstance(machine, Mechanical):
         return np.zeros(0)
-    matrix = lambda state: machine.masses(machine.places(state))
-    found = eqx.filter_jit(matrix)(start) if callable(machine.mass) else matrix(start)
+    places = machine.places(start)
+    found = _masses_at(machine, places) if callable(machine.mass) else machine.masses(places)
     return np.zeros(0) if any(machine.q_shapes.values()) else np.array(found, float)
+
+
+_masses_at = eqx.filter_jit(lambda machine, q: machine.masses(q))
 
 
 def _states_around(zero: Scalar, cycle: Scalar, start: State, modes: Scalars) -> Any:

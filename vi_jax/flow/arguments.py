@@ -55,7 +55,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._lane import Plan
-from ._own import average_names, check_parts, explain_errors, quantity_names
+from ._own import INNER_INSTANT, average_names, check_parts, explain_errors, quantity_names
 from ._own import check_values as check_values
 from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding_bounds
@@ -295,8 +295,8 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
 
 
 # A start may differ by this share of the prescribed motion from it: a choice, since states at the
-# end of a run have the errors of the method. The motion is evaluated at this share of a cycle too.
-_PRESCRIBED, _INNER_INSTANT = 1e-3, 0.29
+# end of a run have the errors of the method.
+_PRESCRIBED = 1e-3
 
 
 def check_leaves(argument: str, state: State) -> None:
@@ -350,7 +350,7 @@ def check_prescribed(machine: AbstractMachine, start: State) -> None:
     """**Raises:** `ValueError` if a start does not have the prescribed motion of its machine."""
     if not isinstance(machine, Mechanical) or not isinstance(start, NamedState):
         return
-    times = 0.0, _INNER_INSTANT * machine.cycle
+    times = 0.0, INNER_INSTANT * machine.cycle
     given, later = (components(machine.with_prescribed(t, start)) for t in times)
     for name, x in components(start).items():
         number, wanted, other = concrete(x), concrete(given[name]), concrete(later[name])

@@ -108,19 +108,10 @@ class Woodpecker(ReadyMachine, Mechanical):
         """The pole at the beak and at the upper and the lower edge of the sleeve, with friction.
         All gaps and slips are in metres, so that forces are in N."""
         arm = self.bird_arm - self.beak_arm
-
-        def beak(q: Any) -> Any:
-            return self.beak_height * q.bird_angle
-
-        def edge(q: Any) -> Any:
-            return self.sleeve_height * q.sleeve_angle
-
-        def slip_of_beak(q: Any) -> Any:
-            return q.height + self.sleeve_arm * q.sleeve_angle + arm * q.bird_angle
-
-        def slip_of_edge(q: Any) -> Any:
-            return q.height + self.sleeve_radius * q.sleeve_angle
-
+        beak = lambda q: self.beak_height * q.bird_angle
+        edge = lambda q: self.sleeve_height * q.sleeve_angle
+        slip_of_beak = lambda q: q.height + self.sleeve_arm * q.sleeve_angle + arm * q.bird_angle
+        slip_of_edge = lambda q: q.height + self.sleeve_radius * q.sleeve_angle
         pole = partial(RigidStop, friction=self.friction)
         at_edge = partial(pole, self.play, self.sleeve_restitution, on=edge, along=slip_of_edge)
         return (
