@@ -28,6 +28,7 @@ from ..machine import (
     Mechanical,
     Reset,
     RigidStop,
+    Scene,
     SoftStop,
     begin_modes,
     check_takes,
@@ -279,8 +280,8 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
                 "cycle begins, or make the surface's speed a component of the state, which a "
                 "`Reset` changes."
             )
-        limits = AbstractMachine.step_limit, Mechanical.step_limit
-        if coarse > _STEEP * extent and type(machine).step_limit in limits:
+        limit = type(machine).step_limit
+        if coarse > _STEEP * extent and limit is AbstractMachine.step_limit:
             _warn_once(
                 type(machine),
                 f"The `slip` of a DryFriction of a {type(machine).__name__} changes within a "
@@ -424,8 +425,14 @@ def check_parts(machine: AbstractMachine) -> None:
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
-    count = len(machine.coordinates)
+    count, has_own_stops = len(machine.coordinates), isinstance(machine, LinearMachine | Scene)
     for i, stop in enumerate(stops_of(machine)):
+        ignored = [x for x in ("on", "mass", "friction") if getattr(stop, x) is not None]
+        if has_own_stops and ignored:
+            raise ValueError(
+                f"Stop {i} of a {name} must have no `{ignored[0]}`. Write a `vi.Mechanical` for a "
+                "machine whose stops have one."
+            )
         for part in ("gap", "restitution"):
             shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))
             if shape:
@@ -555,7 +562,7 @@ def _check_event(
     if not event.holds_mode and number != len(modes):
         raise TypeError(
             f"The modes after {label} must be {len(modes)} in number, as many as the machine has "
-            f"(those of its switches, then those of its `begin`), but are {tree_text(changed)}."
+            f"(those of its switches, then its own `modes`), but are {tree_text(changed)}."
         )
 
 

@@ -29,6 +29,7 @@ from ..machine import (
     holds_anywhere,
     in_rows,
     is_in_range,
+    longest_step,
     mode_number,
     modes_of,
     outcomes_of,
@@ -111,7 +112,7 @@ def _known_sizes(
     slips = (jnp.where(x == 0, 1.0, x) if y else x for x, y in zip(modes, sticks, strict=False))
     smooth = in_modes(machine, tuple(slips))
     s, start = stop_gradient((s, start))
-    longest = 5 * jnp.asarray(machine.step_limit(s, start)) / (2 * pi)
+    longest = 5 * jnp.asarray(longest_step(machine, s, start)) / (2 * pi)
     unit = stop_gradient(jnp.minimum(jnp.asarray(machine.cycle) / (2 * pi), longest))
     instants = s + jnp.asarray(machine.cycle) * np.arange(_INSTANTS) / _INSTANTS
     rates = jax.vmap(smooth.field, (0, None))(instants, start)

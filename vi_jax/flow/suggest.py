@@ -18,7 +18,14 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._messages import warning_once
 from .._types import Scalar, State
-from ..machine import AbstractMachine, convert_start, in_rows, size_of, without_modes
+from ..machine import (
+    AbstractMachine,
+    convert_start,
+    in_rows,
+    longest_step,
+    size_of,
+    without_modes,
+)  # fmt: skip
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .loop import row_sizes, sizes_on_host
@@ -147,7 +154,7 @@ def _is_stiff(machine: AbstractMachine, start: State) -> bool:
     """Return whether something decays much faster than the motion, at its start."""
     s = jnp.zeros(())
     decay_time = machine.relaxation(s, start)
-    return decay_time is not None and bool(machine.step_limit(s, start) > _STIFF * decay_time)
+    return decay_time is not None and bool(longest_step(machine, s, start) > _STIFF * decay_time)
 
 
 def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMethod]]) -> list[Tried]:

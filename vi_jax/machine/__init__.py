@@ -7,6 +7,7 @@ from .base import contacts_in as contacts_in
 from .base import has_velocity as has_velocity
 from .base import jumps_on_section as jumps_on_section
 from .base import listed as listed
+from .base import longest_step as longest_step
 from .base import names_on as names_on
 from .base import number_on as number_on
 from .base import renews as renews

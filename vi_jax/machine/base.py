@@ -159,6 +159,16 @@ def names_on(machine: Machine, number: int) -> tuple[str, str] | None:
     return machine._names_on(on)
 
 
+def longest_step(machine: Machine, s: Scalar, state: State) -> Scalar | float:
+    """Return the longest step from a state: the machine's `step_limit`, less near a soft stop."""
+    limit = machine.step_limit(s, state)
+    for stop in switches_of(machine):
+        if stop.acts and isinstance(stop, SoftStop):
+            pace, length = machine.pace(s, state), stop.longest_step(machine, s, state)
+            limit = jnp.minimum(limit, length if pace is None else length / pace)
+    return limit
+
+
 def _indexed(stop: Any, index: dict[Any, int]) -> Any:
     if stop.on is None and stop.coordinate:
         return stop
@@ -372,14 +382,9 @@ class AbstractMachine(Shown):
 
     def step_limit(self, s: Scalar, state: State) -> Scalar | float:
         """Return the longest step in which the motion has at most one extremum: by default
-        `cycle`/5, less near a soft stop."""
+        `cycle`/5. Steps near a soft stop are shorter in any case."""
         counter = counter_of(self)
-        limit = counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
-        for stop in switches_of(self):
-            if stop.acts and isinstance(stop, SoftStop):
-                pace, length = self.pace(s, state), stop.longest_step(self, s, state)
-                limit = jnp.minimum(limit, length if pace is None else length / pace)
-        return limit
+        return counter.longest_step(self, state) if isinstance(counter, Turn) else self.cycle / 5
 
     def relaxation(self, s: Scalar, state: State) -> Scalar | None:
         """Return the shortest time constant of a decay (in `s`), or `None` if nothing decays.

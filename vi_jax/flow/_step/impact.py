@@ -25,6 +25,7 @@ from ...machine import (
     friction_on,
     has_contact_friction,
     holds_anywhere,
+    longest_step,
     push_gains,
     push_of,
     stops_of,
@@ -564,7 +565,7 @@ def _remaining_chatter(
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
-    limit = stop_gradient(jnp.asarray(plan.machine.step_limit(s, state), s.dtype))
+    limit = stop_gradient(jnp.asarray(longest_step(plan.machine, s, state), s.dtype))
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     if growth is None:  # another impact of this instant may have changed it

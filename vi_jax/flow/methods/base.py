@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._types import Scalar, State
-from ...machine import AbstractMachine
+from ...machine import AbstractMachine, longest_step
 from ..smooth import Integrals, SmoothMachine
 
 # Places, as shares of a step, where guards are evaluated for a method without stages.
@@ -110,7 +110,7 @@ class AbstractMethod(eqx.Module):
         is shorter. With the fewest, five, a step may be as long as 0.8π relaxation times: up to
         that explicit Runge–Kutta methods are stable, and the series of `ExactFlight` accurate.
         """
-        limit = machine.step_limit(s, state)
+        limit = longest_step(machine, s, state)
         decay_time = machine.relaxation(s, state) if self.is_limited_by_decay else None
         if decay_time is not None:
             limit = jnp.minimum(limit, 0.8 * pi * decay_time)
