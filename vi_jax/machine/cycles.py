@@ -85,11 +85,9 @@ class Turn(Counter):
         return 0.2 * usual / jnp.maximum(1.0, usual * jnp.abs(speed) / (2 * pi))
 
     def section(self, machine: Any, state: State) -> Any:
-        """Return the angle beyond the end of the turn."""
         return component(self.name, state) - (self.start + 2 * pi)
 
     def with_earlier_angle(self, state: State) -> State:
-        """Return the state with a full turn subtracted from the angle."""
         return with_component(self.name, state, component(self.name, state) - 2 * pi)
 
 
@@ -101,7 +99,6 @@ class Passing(Counter):
         self.sign = sign
 
     def section(self, machine: Any, state: State) -> Any:
-        """Return the component or function, with the sign with which it rises at the section."""
         function: Any = self.name
         value: Any = function(machine, state) if callable(function) else component(function, state)
         return value if self.sign > 0 else -value

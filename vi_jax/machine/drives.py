@@ -96,7 +96,6 @@ class CosineCrank(AbstractCrank):
 
     @property
     def is_odd(self):
-        """True, unless a subclass has another `slide`."""
         return not is_own(type(self).slide)
 
     @by_default
@@ -118,7 +117,6 @@ class SliderCrank(AbstractCrank):
 
     @property
     def drawn_rod(self):
-        """The length of the rod in crank radii, 1/λ, for drawings."""
         return 1 / self.ratio
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
@@ -301,7 +299,6 @@ class Motor(AbstractDrive):
         return self.line(state.W, pace), ()
 
     def usual(self, name, known):
-        """Return the default of `W`, the no-load speed κ w0."""
         return self.control * self.no_load_speed
 
     def rate(self):
@@ -353,11 +350,9 @@ class DCMotor(Motor):
     timed_state: ClassVar = TimedDCMotorState
 
     def torque(self, state, pace, paced):
-        """Return the torque M of the state, and its rate."""
         return paced(state.M), (paced(self.build_up(state.W, state.M)),)
 
     def usual(self, name, known):
-        """Return the default of `W`, or of `M` the steady torque at that speed."""
         return self.line(known["W"]) if name == "M" else super().usual(name, known)
 
     def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -141,7 +141,6 @@ class AbstractSwitch(AbstractEvent):
         """Return the initial mode of a motion that begins in `state`."""
 
     def jump(self, machine, s, state, mode):
-        """Return the state unchanged: a switch changes only a mode."""
         return state
 
     def push_in(
@@ -159,7 +158,6 @@ class Section(AbstractEvent):
     ends_cycle: bool = eqx.field(static=True, kw_only=True, default=True, repr=False)
 
     def guard(self, machine, s, state, *modes):
-        """Return the function of `rising` or `falling`, or the clock minus a cycle's length."""
         rises = machine._section(state)
         if rises is not None:
             return rises
@@ -167,7 +165,6 @@ class Section(AbstractEvent):
         return (s if clock is None else clock) - jnp.asarray(machine.cycle, jnp.result_type(s))
 
     def after(self, machine, s, state, *modes):
-        """Return the state at the beginning of the next cycle."""
         return machine.renewed(machine._with_earlier_clock(state)), modes
 
 

@@ -290,21 +290,17 @@ class Switch(AbstractSwitch):
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
-        """True if the switch has no mode for sliding."""
         return not self.slides
 
     @property
     def blends(self) -> bool:  # pyright: ignore
-        """True if mode 0 is sliding along the surface."""
         return self.slides
 
     @property
     def needs_all_modes(self) -> bool:  # pyright: ignore
-        """True if it slides: the fields on both sides depend on the other modes."""
         return self.slides
 
     def begin(self, machine, s, state):
-        """Return the sign of the function."""
         whose = f"The function of {self.name or 'a Switch'} of a {type(machine).__name__}"
         value = call_checked(self.function, whose, machine, s, state)
         rate = jnp.ones_like(value) if self.rate is None else self.rate(machine, s, state)
@@ -343,7 +339,6 @@ class Switch(AbstractSwitch):
         return jnp.where(mode == 0, up, value), jnp.where(mode == 0, -down, value)
 
     def after(self, machine, s, state, mode, *, around: EventContext | None = None):
-        """Return the state, and the mode of the other side or of sliding along the surface."""
         if around is None:
             return state, -mode
         up, down = self._rates(machine, s, state, around)
@@ -429,7 +424,6 @@ class Reset(AbstractEvent):
         return tuple(with_static(self, direction=direction) for direction in ("rising", "falling"))
 
     def after(self, machine, s, state, *modes):
-        """Return the results of `reset` and `modes`."""
         machine_modes = None
         if self._modes is not None:
             found = self._call("modes", self._modes, machine, s, state, modes)
@@ -438,7 +432,6 @@ class Reset(AbstractEvent):
         return new, struck_modes(machine, s, new, modes, machine_modes)
 
     def jump(self, machine, s, state, *modes):
-        """Return the state after the function `reset`."""
         if self._reset is None:
             return state
         found = self._call("reset", self._reset, machine, s, state, modes)
@@ -452,13 +445,11 @@ class Reset(AbstractEvent):
         return f"`{part}` of {self.name or 'a Reset'} of a {type(machine).__name__}"
 
     def happens(self, machine, s, state, *modes):
-        """Return the result of the function `when`, or `None` without one."""
         if self._when is None:
             return None
         return self._call("when", self._when, machine, s, state, modes)
 
     def value(self, machine, s, state, *modes):
-        """Return the result of the function `value`, or NaN without one."""
         if self._value is None:
             return super().value(machine, s, state, *modes)
         return self._call("value", self._value, machine, s, state, modes)

@@ -85,11 +85,9 @@ class Friction(AbstractSwitch):
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
-        """Return the initial mode: the sign of the slip, sticking without slip."""
         return self.slip_sign(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
-        """Return the mode after an impact or another jump: the direction of slip or its onset."""
         slips = self.slip_sign(machine, s, state)
         if not self.is_known(around):
             return slips
@@ -101,7 +99,6 @@ class Friction(AbstractSwitch):
         return functools.reduce(jnp.maximum, self.sides(machine, s, state, mode, around=around))
 
     def sides(self, machine, s, state, mode, *, around: EventContext | None = None):
-        """Return the guard for a force forward and for one backward."""
         slip_guard = -mode * self.speed_of_slip(machine, s, state)
         if around is None or not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
@@ -274,11 +271,9 @@ class ContactFriction(Friction):
 
     @property
     def friction_stop(self) -> int:  # pyright: ignore
-        """The index of the stop that it is friction on."""
         return self.stop
 
     def is_known(self, around):
-        """Return whether the resting contacts are known."""
         return around is not None and bool(around.contact)
 
     def speed_of_slip(self, machine, s, state):

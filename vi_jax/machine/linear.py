@@ -88,7 +88,6 @@ class ModalMachine(AbstractMachine):
 
     @property
     def cycle(self) -> Scalar:
-        """The period 2π/ω of the force."""
         return 2 * jnp.pi / self.frequency
 
     @property
@@ -97,7 +96,6 @@ class ModalMachine(AbstractMachine):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """The machine's coordinates as functions of the modes."""
         return tuple(coordinate(*x) for x in zip(self.rows, self.pushes, self.masses, strict=True))
 
     def force(self, s: Scalar) -> Numbers:
@@ -117,7 +115,6 @@ class ModalMachine(AbstractMachine):
         )  # fmt: skip
 
     def field(self, s: Scalar, state: State) -> Any:
-        """Return d(state)/ds between impacts."""
         q, p = state.displacement, state.velocity
         pull = self.force(s) - self.stiffness * q - self.damping * p - self.coupled(q, p)
         return type(state)(p, pull)
@@ -128,7 +125,6 @@ class ModalMachine(AbstractMachine):
         return 0.4 * jnp.pi / jnp.maximum(jnp.max(self.modal_frequency), self.frequency)
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
-        """Return the shortest time constant of a mode's decay."""
         tiny = 1e-6 / self.cycle
         return 1 / jnp.maximum(jnp.max(jnp.abs(self.damping)), tiny)
 
@@ -394,7 +390,6 @@ class LinearMachine(AbstractMachine):
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """One coordinate for each c: the sum c·x of displacements that stops limit."""
         responses = [self._accelerated(c) for c in self.rows]
         masses = [1 / jnp.dot(c, m) for c, m in zip(self.rows, responses, strict=True)]
         pushes = [m * mass for m, mass in zip(responses, masses, strict=True)]
@@ -402,16 +397,13 @@ class LinearMachine(AbstractMachine):
 
     @property
     def cycle(self) -> Scalar:
-        """The period 2π/ω of the force."""
         return 2 * jnp.pi / self.frequency
 
     @property
     def labels(self) -> tuple[str, str]:
-        """The axis labels of position and velocity."""
         return ("x of contact 0", "dx/ds") if self.contacts else ("x[0]", "dx[0]/ds")
 
     def field(self, s: Scalar, state: StructureState) -> StructureState:
-        """Return d(state)/ds between impacts."""
         x, v = state.displacement, state.velocity
         pull = harmonic(self.forces, self.frequency * s, x) - times(self.stiffness, x)
         if self.damping is not None:

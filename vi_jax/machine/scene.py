@@ -385,7 +385,6 @@ class Scene(AbstractMachine):
         return one + other
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw the crank with its slider, the spring and the body between its stops."""
         crank = self.crank
         size = pen.size = max(0.8, 0.25 * pen.reach)  # the crank has radius 1
         rod = float(crank.drawn_rod)
@@ -536,7 +535,6 @@ class Parameters(Shown):
 
     @property
     def units(self) -> dict[str, str]:
-        """The SI unit of each parameter."""
         written = ((f.name, f.metadata["unit"]) for f in dataclasses.fields(self))
         return {name: unit.replace("**2", "²").replace("*", "·") for name, unit in written}
 

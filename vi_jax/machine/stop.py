@@ -145,11 +145,9 @@ class RigidStop(Wall, AbstractEvent):
         count("coordinate", self.coordinate)
 
     def guard(self, machine, s, state, *modes):
-        """Return the depth of the coordinate beyond the stop."""
         return self.beyond(machine.coordinates[self.coordinate].position(state))
 
     def after(self, machine, s, state, *modes):
-        """Return the state of the rebound, exactly on the stop, and the modes after an impact."""
         body = machine.coordinates[self.coordinate]
         new = body.placed(state, self.place, self.velocity_after(body.velocity(state)))
         return new, self.modes_after(machine, s, state, new, modes)
@@ -167,7 +165,6 @@ class RigidStop(Wall, AbstractEvent):
         return struck_modes(machine, s, after, modes, machine_modes)
 
     def jump(self, machine, s, state, *modes):
-        """Return the state after the rebound, without a correction of the position."""
         body = machine.coordinates[self.coordinate]
         return body.placed(state, body.position(state), self.velocity_after(body.velocity(state)))
 
@@ -451,12 +448,10 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode > 0, push if _is_one(mass) else push / mass, 0.0)
 
     def push_in(self, machine, s, state, mode):
-        """Return the acceleration of the coordinate during contact, and its push."""
         body = machine.coordinates[self.coordinate]
         return self.contribution(machine, s, state, mode), push_of(body, state)
 
     def begin(self, machine, s, state):
-        """Return the initial mode: touching, unless the body is apart or has been released."""
         depth, rate = self.depth(machine, state)
         inside = (depth > 0) | ((depth == 0) & (rate > 0))
         mode = TOUCHING
@@ -465,7 +460,6 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(inside, mode, APART)
 
     def guard(self, machine, s, state, mode):
-        """Return the guard of touching, leaving, or being released."""
         depth, _ = self.depth(machine, state)
         if self.adhesive:
             return -mode * depth
@@ -474,7 +468,6 @@ class SoftStop(Wall, AbstractSwitch):
         return jnp.where(mode < 0, depth, jnp.maximum(ends, -depth))
 
     def after(self, machine, s, state, mode):
-        """Return the mode (touching, released or apart) after its guard rose to zero."""
         if self.adhesive:
             return state, -mode
         depth, _ = self.depth(machine, state)

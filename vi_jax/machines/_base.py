@@ -38,7 +38,6 @@ class ReadyMachine(AbstractMachine):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """The units of its numbers and states."""
         return {**super().units, **self.quantity_units, "": "1"}
 
 
@@ -47,7 +46,6 @@ class PhaseMachine(ReadyMachine):
 
     @property
     def cycle(self) -> float:
-        """The cycle, 2π of the drive's phase."""
         return 2 * pi
 
 

@@ -108,22 +108,18 @@ class Beam(LinearMachine):
 
     @property
     def mass(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """The mass ρA L of each mode."""
         return jnp.full((self.modes,), self.mass_per_length * self.length)
 
     @property
     def stiffness(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """The stiffness ρA L ω² of each mode."""
         return self.mass * self.natural_frequencies**2
 
     @property
     def damping(self) -> Float[Array, " modes"]:  # pyright: ignore
-        """The damping 2ξω ρA L of each mode."""
         return 2 * self.damping_ratio * self.natural_frequencies * self.mass
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:  # pyright: ignore
-        """The stop at `place`, or one on each side; empty without a gap."""
         if self.gap is None:
             return ()
         first, *other = stops_at(self.gap, self.restitution, two_sided=self.two_sided)
@@ -139,7 +135,6 @@ class Beam(LinearMachine):
 
     @property
     def labels(self) -> tuple[str, str]:
-        """The axis labels of position and velocity."""
         return "w at the stop" if self.contacts else "q of mode 1", "its rate"
 
     def shape(self, place: Any) -> Float[Array, "*places modes"]:

@@ -33,7 +33,6 @@ class BouncingBall(PhaseMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """The table, below the ball."""
         return (RigidStop(0.0, self.restitution, "left", on=("height", "speed")),)
 
     def field(self, s: Scalar, state: Any) -> dict[str, Scalar]:
@@ -45,7 +44,6 @@ class BouncingBall(PhaseMachine):
         return State(height=number("height", height), speed=number("speed", speed))
 
     def sketch(self, pen: Any, state: Any, phase: float) -> None:
-        """Draw a ball above its table."""
         radius, table = 0.3 * pen.size, -float(self.acceleration) * cos(phase)
         wide = 2.4 * pen.size
         pen.body(0.0, table - 0.15 * pen.size, width=wide, height=0.3 * pen.size, color=pen.green)

@@ -62,7 +62,6 @@ class Capsule(ForcedMachine, Mechanical):
 
     @property
     def contacts(self) -> tuple[RigidStop, DryFriction]:
-        """The stop in the capsule, on the right of the mass, and the ground under the capsule."""
         return (
             RigidStop(self.gap, self.restitution, on="place"),
             DryFriction(self.friction, static_ratio=self.static_ratio, on="travel"),
@@ -74,9 +73,7 @@ class Capsule(ForcedMachine, Mechanical):
         return 0.4 * pi * jnp.minimum(1.0, self.frequency / stiffness)
 
     def averages(self, s: Scalar, state: State, *modes: Scalar) -> dict[str, Scalar]:
-        """Return the speed of the capsule."""
         return {"progress": state.v.travel}
 
     def renewed(self, state: State) -> State:
-        """Return the state with the capsule's travel set back to zero."""
         return state.replace(travel=jnp.zeros_like(state.travel))

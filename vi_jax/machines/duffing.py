@@ -36,7 +36,6 @@ class Duffing(ForcedMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """The stop on the right, and one on the left of a two-sided machine."""
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided)
 
     def field(self, s: Scalar, state: OscillatorState) -> OscillatorState:
@@ -47,15 +46,12 @@ class Duffing(ForcedMachine):
         return OscillatorState(v / self.frequency, force / self.frequency)
 
     def start(self, *, Y: Number = 0.0, V: Number = 0.0) -> OscillatorState:
-        """Return a state; by default at rest in the middle."""
         return OscillatorState(number("Y", Y), number("V", V))
 
     def mirrored(self, state: OscillatorState) -> OscillatorState | None:
-        """Return -x half a cycle later, if there are two stops."""
         return OscillatorState(-state.Y, -state.V) if self.two_sided else None
 
     def sketch(self, pen: Any, state: OscillatorState, phase: float) -> None:
-        """Draw a body on its spring, between stops, with the force on it."""
         place, size = float(state.Y), pen.size
         post = draw_supported_body(self, pen, place)
         pull = 0.9 * size * cos(phase)

@@ -47,17 +47,14 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def q(self) -> tuple[str, ...]:  # pyright: ignore
-        """The coordinates: the ball relative to the box, and the box if it is free."""
         return ("place",) if self.mass_ratio is None else ("place", "box")
 
     @property
     def mass(self) -> Any:  # pyright: ignore
-        """The mass of the ball, or the mass matrix of the ball and a free box."""
         ball = self.mass_ratio
         return (1.0,) if ball is None else [[ball, ball], [ball, 1 + ball]]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """Return the forces on the ball relative to a prescribed box, or on ball and box."""
         if self.mass_ratio is None:
             return {"place": jnp.sin(t)}
         pull = -self.frequency * (self.frequency * q.box + 2 * self.damping_ratio * v.box)
@@ -65,7 +62,6 @@ class ImpactPair(PhaseMachine, Mechanical):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """Both walls, the right one first."""
         return stops_at(self.half_gap, self.restitution, on="place")
 
     @property
@@ -80,11 +76,9 @@ class ImpactPair(PhaseMachine, Mechanical):
         return self.at(v={"place": 0.5})
 
     def mirrored(self, state: State) -> State:
-        """Return the state with left and right exchanged, half a cycle later."""
         return jax.tree.map(jnp.negative, state)
 
     def sketch(self, pen: Any, state: Any, phase: float) -> None:
-        """Draw a box with a ball in it."""
         free = self.mass_ratio is not None
         box = float(state.box) if free else sin(phase)
         radius, wall, half = 0.4 * pen.size, 0.25 * pen.size, float(self.half_gap)

@@ -50,11 +50,9 @@ class ReliefValve(ReadyMachine):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """The seat, below the body."""
         return (RigidStop(0.0, self.restitution, "left", on=("lift", "speed")),)
 
     def field(self, s: Scalar, state: ValveState) -> ValveState:
-        """Return d(state)/dt between impacts on the seat."""
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         outflow = state.lift * jnp.sqrt(state.pressure)

@@ -157,7 +157,6 @@ class Structure(LinearMachine):
 
     @property
     def forces(self) -> tuple[Any, Any, Any]:
-        """The vectors f₀, A f₁ and A f₂."""
         cosine, sine = (
             None if f is None else self.amplitude * f for f in (self.force, self.sine_force)
         )

@@ -70,13 +70,11 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         return [[1.0, across], [across, 1 / self.coupling]]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """Return the force of spring and damper, and the torque of the motor."""
         torque = self.strength * (self.control - v.phi / self.no_load_speed)
         return dict(Y=-q.Y - 2 * self.damping_ratio * v.Y, phi=torque / self.coupling)
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """The stop on the right, and one on the left if two-sided; empty without `gap`."""
         if self.gap is None:
             return ()
         return stops_at(self.gap, self.restitution, two_sided=self.two_sided, on="Y")
@@ -91,7 +89,6 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         return self.at(Y=given["Y"], v={"Y": given["V"], "phi": given["W"]})
 
     def mirrored(self, state: Any) -> Any:
-        """Return -Y half a turn later, unless there is a stop on one side only."""
         if self.gap is not None and not self.two_sided:
             return None
         return state.replace(Y=-state.Y, phi=state.phi + pi, v=state.v.replace(Y=-state.v.Y))
@@ -102,7 +99,6 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         return (1 - self.coupling) / jnp.maximum(rate, 1e-6)
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw a body on its spring, with the unbalanced rotor in it."""
         place, size = float(state.Y), pen.size
         radius = 0.34 * size
         post = draw_supported_body(self, pen, place)

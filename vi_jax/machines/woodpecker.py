@@ -122,7 +122,6 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        """The mass matrix; the bird hangs on both arms."""
         sleeve, bird = self.sleeve_arm, self.bird_arm
         J = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
         coupled = [
@@ -131,7 +130,6 @@ class Woodpecker(ReadyMachine, Mechanical):
         return [[x + (i == j) * J[i] for j, x in enumerate(row)] for i, row in enumerate(coupled)]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
-        """Return the weights, and the moment of the spring, without the forces of the contacts."""
         moment = self.stiffness * (q.sleeve_angle - q.bird_angle)
         weight = self.bird_mass * self.gravity
         return {
@@ -153,7 +151,6 @@ class Woodpecker(ReadyMachine, Mechanical):
     cycle: ClassVar = rising(lambda m, z: m.section_angle - z.bird_angle, usual=_usual)
 
     def averages(self, s: Scalar, state: State, *modes: Scalar) -> dict[str, Scalar]:
-        """Return the downward speed of the sleeve."""
         return {"descent": -state.v.height}
 
     def renewed(self, state: State) -> State:
@@ -171,7 +168,6 @@ class Woodpecker(ReadyMachine, Mechanical):
         return self.at(sleeve_angle=jammed, bird_angle=self.section_angle, v=speeds)
 
     def sketch(self, pen: Any, state: State, phase: float) -> None:
-        """Draw pole, sleeve, spring and bird to scale."""
         inside, half = float(self.sleeve_radius), float(self.sleeve_height)
         pole, arm = float(self.pole_radius), float(self.bird_arm)
         beak = float(self.bird_arm - self.beak_arm), float(self.beak_height)

@@ -292,7 +292,6 @@ class ExactFlight(AbstractMethod):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
 
     def tighter(self):
-        """Return the method with twice as many arcs: the difference is accumulated rounding."""
         return ExactFlight(2 * self.steps_per_cycle)
 
     def holds(self, machine):

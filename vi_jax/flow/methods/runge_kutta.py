@@ -340,7 +340,6 @@ class Adaptive(_RungeKutta):
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     def with_sizes(self, sizes):
-        """Return the method with errors relative to these sizes, unless `atol` is given."""
         return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
 
     @property
@@ -390,7 +389,6 @@ class Adaptive(_RungeKutta):
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
 
     def tighter(self):
-        """Return the method with a hundredth of the tolerances, and steps at most half as long."""
         steps, atol = 2 * self.steps_per_cycle, None if self.atol is None else self.atol / 100
         return Adaptive(self.solver, rtol=self.rtol / 100, atol=atol, steps_per_cycle=steps)
 
@@ -469,7 +467,6 @@ class FixedStep(_RungeKutta):
         return jax.lax.cond(is_long, unstable, lambda size, h, slopes: jnp.zeros_like(h), *values)
 
     def tighter(self):
-        """Return the method with twice as many steps in a cycle."""
         return FixedStep(self.solver, 2 * self.steps_per_cycle)
 
 
@@ -483,7 +480,6 @@ class ImplicitSteps(FixedStep):
     """The sizes of the state's numbers, set by `with_sizes`."""
 
     def with_sizes(self, sizes):
-        """Return the method with stages solved relative to these sizes."""
         return dataclasses.replace(self, sizes=sizes)
 
     @property
@@ -500,5 +496,4 @@ class ImplicitSteps(FixedStep):
         return new, beside, jnp.zeros_like(s0), stages
 
     def tighter(self):
-        """Return the method with twice as many steps in a cycle."""
         return ImplicitSteps(self.solver, 2 * self.steps_per_cycle)

@@ -587,11 +587,9 @@ class Taylor(AbstractMethod):
 
     @property
     def wander(self):
-        """The greatest difference between two periods: the tolerance; 0 for fixed steps."""
         return 0.0 if self.rtol is None else self.rtol
 
     def tighter(self):
-        """Return the method with twice the steps, and a hundredth of the tolerance, if any."""
         steps = 2 * self.steps_per_cycle
         if self.rtol is None:
             return Taylor(self.order, steps)
@@ -636,6 +634,5 @@ class Taylor(AbstractMethod):
         return min((8 * pi / self.steps_per_cycle) ** self.order / factorial(self.order), 0.1)
 
     def step(self, smooth, s0, s1, state, beside):
-        """Return the sum of the series at `s1`."""
         new, beside = self.foresee(smooth, s0, state, beside).at(s1 - s0)
         return new, beside, jnp.zeros_like(s0)
