@@ -92,7 +92,7 @@ def test_energy_and_momentum_of_an_impact():
     stop, body = machine.contacts[2], machine.coordinates[1]
     v = jnp.asarray([0.3, -0.2, 0.5, 0.1])
     state = machine.start(velocity=v)
-    new = body.placed(state, body.position(state), stop.rebound(body.velocity(state)))
+    new = body.placed(state, body.position(state), stop.velocity_after(body.velocity(state)))
     mass, row = np.asarray(machine.mass), np.asarray(stop.at)
     gained = mass @ np.asarray(new.velocity - v)
     np.testing.assert_allclose(gained / row, gained[0] / row[0], rtol=1e-10)

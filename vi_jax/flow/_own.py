@@ -41,11 +41,11 @@ from ..machine import (
     guard_of,
     is_angle,
     is_autonomous,
-    is_own,
     leaf_names,
     like,
     listed,
     others_of,
+    overridden,
     section_in,
     shown_modes,
     stops_of,
@@ -156,7 +156,7 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
             continue
         label = f"The restitution law of stop {i} of a {type(machine).__name__}"
         try:
-            got = _output_shapes(label, stop.rebound, speed)
+            got = _output_shapes(label, stop.velocity_after, speed)
         except TypeError as error:
             if str(error).startswith(label):
                 raise
@@ -589,11 +589,11 @@ _RESERVED = frozenset(
 
 
 def has_averages(machine: AbstractMachine) -> bool:
-    return is_own(type(machine).averages)
+    return overridden(machine, AbstractMachine, "averages") is not None
 
 
 def has_quantities(machine: AbstractMachine) -> bool:
-    return is_own(type(machine).quantities)
+    return overridden(machine, AbstractMachine, "quantities") is not None
 
 
 def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:

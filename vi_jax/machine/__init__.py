@@ -137,12 +137,10 @@ from .numbers import with_leaf as with_leaf
 from .numbers import with_leaves as with_leaves
 from .numbers import with_unit as with_unit
 from .numbers import with_units as with_units
-from .own import by_default as by_default
-from .own import changed as changed
 from .own import clock_of as clock_of
-from .own import is_own as is_own
 from .own import others_of as others_of
 from .own import outcomes_of as outcomes_of
+from .own import overridden as overridden
 from .own import section_in as section_in
 from .own import stops_of as stops_of
 from .own import switches_of as switches_of

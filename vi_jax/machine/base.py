@@ -29,10 +29,9 @@ from .events import Reset
 from .friction import ContactFriction
 from .numbers import PLAIN, Shown, unit_in
 from .own import (
-    by_default,
     defines,
     derived,
-    is_own,
+    overridden,
     stops_of,
     switches_of,
     with_own_defaults,
@@ -323,19 +322,16 @@ class AbstractMachine(Shown):
             "state, or write `def start(self): return vi.State(...)` in the class."
         )
 
-    @by_default
     def position(self, state: State) -> Scalar:
         """Return the coordinate that stops limit: by default the first of `coordinates`, or
         `state.Y`. Without stops and `Y` it is the first component. Extremes are recorded of it."""
         return self._first_coordinate.position(state)
 
-    @by_default
     def velocity(self, state: State) -> Scalar:
         """Return the velocity that an impact reverses; it has the sign of d(position)/ds. Without
         stops and `V` it is the second component, which pictures draw over the position."""
         return self._first_coordinate.velocity(state)
 
-    @by_default
     def placed(self, state: State, Y: Scalar, V: Scalar) -> State:
         """Return `state` with this position and velocity, as after a landing or a rebound."""
         return self._first_coordinate.placed(state, Y, V)
@@ -348,9 +344,8 @@ class AbstractMachine(Shown):
                 "driven."
             )
         require("interval", number("interval", interval), low=0.0, open_low=True)
-        return at_intervals(self, interval)
+        return at_intervals(self, interval, renews(self))
 
-    @by_default
     def averages(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Return quantities, by name, whose means over time are computed: `averages(s, state)`.
 
@@ -362,14 +357,12 @@ class AbstractMachine(Shown):
         """
         return {}
 
-    @by_default
     def quantities(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Return functions of the state, by name, that results include: `quantities(s, state)`.
         They are evaluated on sections, in samples and along branches. `s` counts from the section;
         it is 0 for autonomous machines, and if the state contains the clock."""
         return {}
 
-    @by_default
     def renewed(self, state: State) -> State:
         """Return the state at the beginning of the next cycle. A drifting component that is set to
         zero here is the progress in each cycle."""
@@ -399,7 +392,8 @@ class AbstractMachine(Shown):
     def labels(self) -> tuple[str, str]:
         """The labels of position and velocity in pictures, with units; by default their names in
         the state, if contacts name the first coordinate by them."""
-        return (not is_own(type(self).position) and names_on(self, 0)) or PLAIN
+        own = overridden(self, AbstractMachine, "position")
+        return PLAIN if own else names_on(self, 0) or PLAIN
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -437,7 +431,8 @@ class AbstractMachine(Shown):
         if on is not None:
             return coordinate_by_name(on, mass)
         methods = ("position", "velocity", "placed")
-        given = {name: getattr(self, name) for name in methods if is_own(getattr(type(self), name))}
+        own = [name for name in methods if overridden(self, AbstractMachine, name)]
+        given = {name: getattr(self, name) for name in own}
         return _default_coordinate(self)._replace(mass=1.0 if mass is None else mass, **given)
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
@@ -457,8 +452,8 @@ def _events_in(machine: AbstractMachine) -> tuple[AbstractEvent, ...]:
 
 def has_velocity(machine: AbstractMachine, state: State) -> bool:
     """Return whether `velocity` is a velocity. Without stops it may be another component."""
-    defined = is_own(type(machine).velocity) or names_coordinates(machine)
-    return defined or bool(stops_of(machine)) or hasattr(state, "V")
+    defined = overridden(machine, AbstractMachine, "velocity") or names_coordinates(machine)
+    return bool(defined) or bool(stops_of(machine)) or hasattr(state, "V")
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:
@@ -471,7 +466,7 @@ def names_coordinates(machine: AbstractMachine) -> bool:
 
 def renews(machine: AbstractMachine) -> bool:
     """Return whether a machine defines `renewed`."""
-    return is_own(type(machine).renewed)
+    return overridden(machine, AbstractMachine, "renewed") is not None
 
 
 def jumps_on_section(machine: AbstractMachine) -> bool:

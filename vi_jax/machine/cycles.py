@@ -15,7 +15,7 @@ from .._checks import concrete
 from .._types import Scalar, State
 from .coordinates import component, has_component, with_component, wrap_angles
 from .event import AbstractEvent, Section, TurnEnd
-from .own import is_own, with_static
+from .own import with_static
 
 
 class Counter(abc.ABC):
@@ -145,11 +145,12 @@ def counts_turns(machine: Any) -> bool:
     return isinstance(counter_of(machine), Turn)
 
 
-def at_intervals(machine: Any, interval: Any) -> Any:
-    """Return the same machine with cycles of equal length, which no event ends."""
+def at_intervals(machine: Any, interval: Any, renews: bool) -> Any:
+    """Return the same machine with cycles of equal length, which no event ends; `renews`, whether
+    it defines `renewed`."""
     kind = type(machine)
     observed = {"observed_usual": machine.cycle, "observed_interval": interval}
-    return _as_kind(_observed_kind(kind), kind, machine, interval, **observed)
+    return _as_kind(_observed_kind(kind, renews), kind, machine, interval, **observed)
 
 
 def _as_kind(new_kind: type, kind: type, machine: Any, cycle: Any, **others: Any) -> Any:
@@ -165,7 +166,7 @@ def _fields(kind: Any) -> list[str]:
 
 
 @functools.lru_cache(maxsize=64)
-def _observed_kind(kind: type) -> type:
+def _observed_kind(kind: type, renews: bool) -> type:
     def original(self: Any) -> Any:
         return _as_kind(kind, kind, self, self.observed_usual)
 
@@ -186,7 +187,7 @@ def _observed_kind(kind: type) -> type:
         **{name: parts(name) for name in ("_stops", "_switches", "_others")},
     }
     counter: Any = getattr(kind, "cycle", None)
-    if isinstance(counter, Turn) and not is_own(kind.renewed):
+    if isinstance(counter, Turn) and not renews:
         body["renewed"] = wrap_angles(counter.name)
     if "cycle" not in _fields(kind):
         body["cycle"] = property(lambda self: self.observed_interval)

@@ -14,7 +14,7 @@ from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, number, real, require
 from .._types import Scalar, State
 from ..lanes import sincos
 from .numbers import Shown
-from .own import by_default, is_own
+from .own import overridden
 
 # The units of the paper's scene, by the names of quantities, components and parameters.
 UNITS: Mapping[str, str] = MappingProxyType({
@@ -96,9 +96,8 @@ class CosineCrank(AbstractCrank):
 
     @property
     def is_odd(self):
-        return not is_own(type(self).slide)
+        return overridden(self, CosineCrank, "slide") is None
 
-    @by_default
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Return U = cos φ and its derivatives (dimensionless)."""
         sine, cosine = sincos(phase)

@@ -21,7 +21,7 @@ from .._checks import concrete, number
 from .._types import Flag, Number, Scalar, Scalars, State
 from .base import AbstractMachine, Coordinate
 from .numbers import Shown
-from .own import changed
+from .own import overridden
 from .stop import RigidStop
 
 Numbers = Float[Array, " n"]
@@ -476,7 +476,7 @@ class LinearMachine(AbstractMachine):
 
     def prepared(self) -> Prepared:
         """Return the machine in its modes, or as it is if a subclass overrides `_IN_MODES`."""
-        if changed(self, LinearMachine, _IN_MODES):
+        if overridden(self, LinearMachine, *_IN_MODES):
             return Prepared(self._with_step_values())
         return self.prepared_modes()
 

@@ -3,27 +3,15 @@
 import copy
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable, Mapping
+from operator import attrgetter
+from typing import Any, ClassVar
 
 from .._types import Machine, Scalar, State
 
-Method = TypeVar("Method", bound=Callable[..., Any])
 
-
-def by_default(method: Method) -> Method:
-    """Mark a method as a default, which subclasses may replace."""
-    method.by_default = True  # pyright: ignore[reportFunctionMemberAccess]
-    return method
-
-
-def is_own(method: object) -> bool:
-    """Return whether a method or property of a class is not a default (`by_default`)."""
-    return not hasattr(getattr(method, "fget", method), "by_default")
-
-
-def changed(part: object, base: type, names: Iterable[str]) -> str | None:
-    """Return the first of these members that the class of `part` overrides, or `None`."""
+def overridden(part: object, base: type, *names: str) -> str | None:
+    """Return the first of these members of `base` that the class of `part` overrides, or `None`."""
     kind = type(part)
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x, None)), None)
 
@@ -47,8 +35,6 @@ def with_own_defaults(kind: type) -> None:
 class derived:
     """A property that a field of the same name in a subclass replaces, also one without a default.
     The class does not have the attribute; instances do."""
-
-    by_default = True
 
     def __init__(self, function: Callable[[Any], Any]):
         self.function, self.__doc__ = function, function.__doc__
@@ -83,19 +69,9 @@ def has_own_modes(machine: Any) -> bool:
     return bool(declared_modes(machine)) or callable(machine.modes)
 
 
-def stops_of(machine: Machine) -> tuple[Any, ...]:
-    """Return the rigid stops of a machine, in the order in which logs number them."""
-    return machine._stops
-
-
-def switches_of(machine: Machine) -> tuple[Any, ...]:
-    """Return the parts of a machine that have a mode: soft stops, frictions, switches."""
-    return machine._switches
-
-
-def others_of(machine: Machine) -> tuple[Any, ...]:
-    """Return the events of a machine that are not switches."""
-    return machine._others
+# The members of a machine that only this package uses. Rigid stops are in the order in which logs
+# number them; switches are the parts with a mode: soft stops, frictions, switches.
+stops_of, switches_of, others_of = map(attrgetter, ("_stops", "_switches", "_others"))
 
 
 def clock_of(machine: Machine, state: State) -> Scalar | None:

@@ -46,7 +46,7 @@ from .drives import (
     SliderCrank,
 )
 from .numbers import Shown
-from .own import changed
+from .own import overridden
 from .stop import RigidStop, SoftStop
 
 # The largest error of a state on the section. In single precision, that of a turn is 5e-7.
@@ -361,7 +361,7 @@ class Scene(AbstractMachine):
         return (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
-            and changed(self, Scene, ("field", "pull", "_pushes", "_switches")) is None
+            and overridden(self, Scene, "field", "pull", "_pushes", "_switches") is None
         )
 
     def _may_be_pressed(self, stop: RigidStop) -> bool:
@@ -369,7 +369,7 @@ class Scene(AbstractMachine):
         for soft in self.soft_stops:
             depth = concrete(soft.beyond(stop.place))
             is_clear = depth is not None and bool((depth <= 0).all())
-            if changed(soft, SoftStop, ("force", "contribution")) or not (
+            if overridden(soft, SoftStop, "force", "contribution") or not (
                 is_clear or soft.side == stop.side
             ):
                 return True

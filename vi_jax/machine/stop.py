@@ -33,7 +33,6 @@ from .contacts import push_of, shown_modes
 from .event import AbstractEvent, AbstractSwitch, Modes
 from .events import modes_after, struck_modes
 from .numbers import Shown
-from .own import by_default, is_own
 
 
 def _unless_tiny(V: Number) -> Any:
@@ -174,43 +173,30 @@ class RigidStop(Wall, AbstractEvent):
 
     @property
     def is_one_number(self) -> bool:
-        """True if the law is Newton's with one number, so that its range is known beforehand."""
-        return type(self) is RigidStop and not callable(self.restitution)
+        """True if the restitution is one number, so that its range is known beforehand."""
+        return not callable(self.restitution)
 
     def coefficient(self, approach: object) -> Any:
         """Return k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 
-    @by_default
-    def rebound(self, V: Number) -> Any:
-        """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper)."""
+    def velocity_after(self, V: Number) -> Any:
+        """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper). It is zero
+        for a speed whose square is below the smallest number, so that a body may come to rest."""
+        V = _unless_tiny(V)
         return -self.coefficient(self.approach(V)) * V
 
-    def velocity_after(self, V: Number) -> Any:
-        """Return the velocity after an impact: the `rebound`, but zero for a speed whose square is
-        below the smallest number, so that a body may come to rest on the stop."""
-        return self.rebound(_unless_tiny(V))
+    def velocity_and_coefficient(self, approach: Any) -> tuple[Any, Any]:
+        """Return the velocity after an impact at this speed of approach, and the coefficient of
+        restitution. The law, which may be a network, is evaluated once for both."""
+        k = self.coefficient(approach)
+        return -k * _unless_tiny(self.sign * approach), k
 
-    def velocity_and_ratio(self, approach: Any) -> tuple[Any, Any]:
-        """Return the velocity (`velocity_after`) and the `share` of the speed after an impact at
-        this speed of approach. The law, which may be a network, is evaluated once for both."""
-        V = self.sign * approach
-        if not is_own(type(self).rebound):
-            k = self.coefficient(approach)
-            return -k * _unless_tiny(V), k
-        return self.velocity_after(V), self.share(approach)
-
-    def share(self, approach: Any) -> Any:
-        """Return the share of the speed that is left after an impact: k, or that by a `rebound`."""
-        if not is_own(type(self).rebound):
-            return self.coefficient(approach)
-        rebound_speed = -self.approach(self.rebound(self.sign * approach))
-        return rebound_speed / jnp.where(approach > 0, approach, 1.0)
-
-    def loss(self, approach: Any, share: Any = None) -> Any:
-        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `share` is k."""
-        share = self.share(approach) if share is None else share
-        return 0.5 * (1 - share**2) * approach**2
+    def loss(self, approach: Any, coefficient: Any = None) -> Any:
+        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `coefficient` is
+        k."""
+        k = self.coefficient(approach) if coefficient is None else coefficient
+        return 0.5 * (1 - k**2) * approach**2
 
 
 class AbstractContactLaw(Shown):

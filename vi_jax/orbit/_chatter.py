@@ -127,7 +127,7 @@ def remaining(free: Flight, number: int, hops: Chatter) -> Scalar:
     """Estimate the remaining time of a chatter; infinite if the force pulls the body off."""
     stop = stops_of(free.machine)[number]
     here, body = _rates(free, stop, hops.s, hops.u), free.machine.coordinates[stop.coordinate]
-    share = stop.share(stop.approach(-body.velocity(free.unravel(hops.u))))
+    share = stop.coefficient(stop.approach(-body.velocity(free.unravel(hops.u))))
     slowing = (1 - share) * here.a
     return jnp.where(slowing > 0, -2 * here.v / jnp.where(slowing > 0, slowing, 1.0), jnp.inf)
 
@@ -173,9 +173,9 @@ def escape_margin(held: Flight, number: int, hops: Chatter, s: Scalar, u: Vector
     bend = jax.jvp(lambda x: free.smooth.field(s, x), (state,), (push,))[1]
     p = jax.jvp(lambda x: force(s, x), (state,), (bend,))[1] + c**2
     speed_after = stop.approach(-body.velocity(held.unravel(hops.u)))
-    share, slope = jax.jvp(stop.share, (speed_after,), (jnp.ones_like(speed_after),))
+    share, slope = jax.jvp(stop.coefficient, (speed_after,), (jnp.ones_like(speed_after),))
     speed_before = speed_after / jnp.where(share > 0, share, 1.0)
-    share, slope = jax.jvp(stop.share, (speed_before,), (jnp.ones_like(speed_after),))
+    share, slope = jax.jvp(stop.coefficient, (speed_before,), (jnp.ones_like(speed_after),))
     k, k1 = share - slope * speed_before, slope * jnp.abs(unit)
     limit = _manifold(k, time_left, mu / beta, nu / beta, c, p, beta * k1)
     height = speed / (beta * limit)

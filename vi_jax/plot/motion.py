@@ -186,7 +186,7 @@ def _with_impacts(
     speed = np.asarray(log.speed)[logged]
     stops_hit = [stops[i] for i in stop]
     before = np.array([s.sign for s in stops_hit]) * speed
-    after = [float(s.rebound(v)) for s, v in zip(stops_hit, before, strict=True)]
+    after = [float(s.velocity_after(v)) for s, v in zip(stops_hit, before, strict=True)]
     added = MotionPath(
         np.repeat(cycles_at, 2),
         np.repeat([float(s.place) for s in stops_hit], 2),

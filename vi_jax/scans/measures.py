@@ -21,7 +21,6 @@ from ..flow import AbstractMethod, Run, has_quantities, row_sizes
 from ..machine import (
     AbstractMachine,
     angles_in,
-    by_default,
     components,
     frequency_ratio,
     in_rows,
@@ -166,7 +165,6 @@ class AbstractMeasure(eqx.Module):
         """Return whether a lane needs `refine` at pass `pass_number`; `None` for no lane ever."""
         return None
 
-    @by_default
     def refine(
         self,
         machine: AbstractMachine,

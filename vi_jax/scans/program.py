@@ -44,10 +44,10 @@ from ..machine import (
     components,
     convert_start,
     in_clock,
-    is_own,
     leaf,
     leaf_names,
     may_rest,
+    overridden,
     replaced,
     with_leaf,
     with_leaves,
@@ -346,7 +346,7 @@ def make_program(
     derivatives = tuple_of_names("derivatives", derivatives)
     lane_noise = lane_noise_of(noise, key, names, derivatives)
     for measure in measures if lane_noise is not None else ():
-        if is_own(type(measure).refine):
+        if overridden(measure, AbstractMeasure, "refine"):
             raise ValueError(
                 f"Argument `measure` must not contain {type(measure).__name__} with noise: a "
                 "motion under noise has no period, and the cycles that the measure adds have no "

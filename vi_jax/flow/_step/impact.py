@@ -99,17 +99,17 @@ def resolve_impact(
     for number, met in landed.items():
         stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
-        rebound, share = stop.velocity_and_ratio(approach)
+        rebound, coefficient = stop.velocity_and_coefficient(approach)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
         lane = log_impact(plan, lane._replace(state=state), at_event, taken & met, number, approach)
         energy = lane.record.impact_energy
         if energy is not None:
-            lost = stop.loss(approach, share)
+            lost = stop.loss(approach, coefficient)
             if not (isinstance(body.mass, float) and body.mass == 1.0):
                 lost = body.mass_at(lane.s, at_event) * lost
             lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
-        new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, share)
+        new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, coefficient)
         result = new if len(landed) == 1 else select(met, new, result)
     return lane, {k: result}
 

@@ -23,9 +23,9 @@ from ...machine import (
     OscillatorState,
     Prepared,
     Scene,
-    changed,
     forces,
     horner,
+    overridden,
     phase_at,
     sincos,
     stops_of,
@@ -385,14 +385,14 @@ def lack_of_closed_form(machine: AbstractMachine) -> str | None:
         drive = type(machine.drive if isinstance(machine, Scene) else machine).__name__
         return f"`Scene` with an `IdealDrive`, but got a `{drive}`"
     crank = machine.crank
-    if not isinstance(crank, CosineCrank) or changed(crank, CosineCrank, ("slide",)):
+    if not isinstance(crank, CosineCrank) or overridden(crank, CosineCrank, "slide"):
         return f"`CosineCrank`, but the machine has a `{type(crank).__name__}`"
     equations = (
         (machine, Scene, ("field", "pull", "_pushes", "phase_at", "damping_ratio")),
         (machine.drive, IdealDrive, ("field", "fixed_speed")),
     )
     for part, base, names in equations:
-        override = changed(part, base, names)
+        override = overridden(part, base, *names)
         if override is not None:
             return (
                 f"`{base.__name__}` with its own equations, but a `{type(part).__name__}` has "
@@ -408,7 +408,7 @@ def _lack_of_linear(machine: AbstractMachine) -> str | None:
     name = type(machine).__name__
     if isinstance(machine, LinearMachine):
         # Resting bodies are held by the rows of the matrices' own coordinates.
-        override = changed(machine, LinearMachine, ("field", "_accelerated", "coordinates"))
+        override = overridden(machine, LinearMachine, "field", "_accelerated", "coordinates")
         if override is not None:
             return f"linear machine as its matrices say, but a `{name}` has another `{override}`"
     if switches_of(machine):
