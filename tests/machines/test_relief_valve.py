@@ -86,10 +86,3 @@ def test_derivatives_of_returns():
         return (run.last.lift, run.last.pressure, run.duration.sum()), run.impacts
 
     check_derivatives(last, [4.0], step=1e-6, impacts=0)
-
-
-def test_pressure_that_is_not_positive_raises():
-    with pytest.raises(ValueError, match=r"`pressure` must be finite and in \(0, inf\)"):
-        vi.simulate(VALVE(), VALVE().start(pressure=0.0), 1)
-    run = vi.jit(lambda p: vi.simulate(VALVE(), VALVE().start(pressure=p), 1))(-1.0)
-    assert bool(run.result == vi.RESULTS.bad_start)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax.flow.methods.exact import clear, modal_flight
+from vi_jax.machine import modal
 
 from linear_truth import Chatters
 from structures import KINDS, machine_and_truth
@@ -272,7 +273,7 @@ def test_no_stop_is_met_within_the_clear_length():
     """Sample flights from random states finely, over the length that `clear` returns."""
     random = np.random.default_rng(0)
     machine, *_ = machine_and_truth(0, 4, "proportional")
-    way = machine.prepared_modes()
+    way = modal(machine)
     states = vi.machines.StructureState(
         jnp.asarray(0.2 * random.normal(size=(200, 4))), jnp.asarray(random.normal(size=(200, 4)))
     )

@@ -14,7 +14,7 @@ WRONG = [
     (M.Capsule, "restitution", 1.1), (M.Capsule, "damping_ratio", "x"),
     (ROTOR, "coupling", 1.0), (ROTOR, "strength", -1.0), (ROTOR, "no_load_speed", 0.0),
     (ROTOR, "gap", 0.0), (ROTOR, "restitution", 1.5), (ROTOR, "damping_ratio", -0.1),
-    (ROTOR, "control", NAN), (ROTOR, "coupling", 0.0), (ROTOR().start, "Y", float("inf")),
+    (ROTOR, "control", NAN), (ROTOR, "coupling", 0.0),
     (M.ReliefValve, "flow_rate", 0.0), (M.ReliefValve, "compressibility", -1.0),
     (M.Woodpecker, "friction", -0.1), (M.Woodpecker, "bird_mass", 0.0),
     (M.Woodpecker, "sleeve_radius", 0.0025),

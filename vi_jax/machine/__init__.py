@@ -79,7 +79,6 @@ from .events import event_of as event_of
 from .events import events_of as events_of
 from .events import friction_on as friction_on
 from .events import guard_of as guard_of
-from .events import happens_at as happens_at
 from .events import has_contact_friction as has_contact_friction
 from .events import holds_anywhere as holds_anywhere
 from .events import is_autonomous as is_autonomous
@@ -93,7 +92,6 @@ from .events import replaced as replaced
 from .events import section_number as section_number
 from .events import sides_of as sides_of
 from .events import struck_modes as struck_modes
-from .events import value_of as value_of
 from .events import with_modes as with_modes
 from .events import without_modes as without_modes
 from .friction import ContactFriction as ContactFriction
@@ -101,9 +99,9 @@ from .friction import DryFriction as DryFriction
 from .friction import Friction as Friction
 from .linear import LinearMachine as LinearMachine
 from .linear import ModalMachine as ModalMachine
-from .linear import Modes as Modes
 from .linear import Prepared as Prepared
 from .linear import StructureState as StructureState
+from .linear import modal as modal
 from .mechanical import Mechanical as Mechanical
 from .mechanical import solved as solved
 from .numbers import PLAIN as PLAIN

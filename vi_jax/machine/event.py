@@ -128,8 +128,6 @@ class AbstractSwitch(AbstractEvent):
     holds_mode: ClassVar[bool] = True
     from_below: ClassVar[bool] = False  # after the event the guard is that of another mode
     may_slide: ClassVar[bool] = True  # the mode differs on either side of the surface
-    analytic: ClassVar[bool] = True
-    """True if the force of a mode has a power series up to the event that ends it."""
     friction_stop: ClassVar[int | None] = None
     """The index of the stop on which this is friction, also in impacts (see `ContactFriction`)."""
     blends: ClassVar[bool] = False

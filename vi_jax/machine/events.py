@@ -65,18 +65,6 @@ def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes
     return _with_friction(machine, number, s, state, event.jump(machine, s, state, *modes[part]))
 
 
-def happens_at(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """Return whether an event happens when its guard rises through zero; `None` for always."""
-    event, part, _ = event_of(machine, number, modes, ())
-    return event.happens(machine, s, state, *modes[part])
-
-
-def value_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes) -> Any:
-    """Return the value of an event in the event log."""
-    event, part, _ = event_of(machine, number, modes, ())
-    return event.value(machine, s, state, *modes[part])
-
-
 def after_event(
     machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
 ) -> tuple[State, Modes]:
@@ -273,9 +261,7 @@ def raveled(state: State) -> tuple[Vector, Callable[[Vector], State]]:
 
 
 class Switch(AbstractSwitch):
-    """A mode that is the sign of a function: +1 where `function(machine, s, state)` is positive.
-
-    At zero it is the sign of `rate(machine, s, state)`, its derivative, or +1 without it.
+    """A mode that is the sign of a function, +1 where `function(machine, s, state)` is zero.
 
     If the fields of both modes point at the surface on which the function vanishes, the motion
     cannot leave it. With `slides=True` it slides along the surface (mode 0) by Filippov's rule. Its
@@ -285,7 +271,6 @@ class Switch(AbstractSwitch):
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
-    rate: Callable[..., Any] | None = eqx.field(static=True, default=None)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @property
@@ -303,9 +288,7 @@ class Switch(AbstractSwitch):
     def begin(self, machine, s, state):
         whose = f"The function of {self.name or 'a Switch'} of a {type(machine).__name__}"
         value = call_checked(self.function, whose, machine, s, state)
-        rate = jnp.ones_like(value) if self.rate is None else self.rate(machine, s, state)
-        positive = (value > 0) | ((value == 0) & (rate >= 0))
-        return jnp.where(positive, 1.0, -1.0).astype(value.dtype)
+        return jnp.where(value >= 0, 1.0, -1.0).astype(value.dtype)
 
     def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the mode after an impact or another jump: the sign of the function, or 0 on a

@@ -163,13 +163,12 @@ def solved(matrix: Any, x: Numbers) -> Numbers:
     return x / matrix if matrix.ndim == 1 else jnp.linalg.solve(matrix, x)
 
 
-class Modes(NamedTuple):
-    """A linear machine in its modes, and the transformations to them and back."""
+class Prepared(NamedTuple):
+    """A machine in the form for a run, and the conversions of its states to that form and back."""
 
-    machine: ModalMachine
-    into: Callable[[Numbers], Numbers]
-    """Returns modal components of displacements, or of velocities."""
-    out_of: Callable[[Numbers], Numbers]
+    machine: Any
+    inward: Callable[[State], State] = lambda state: state
+    outward: Callable[[State], State] = lambda state: state
 
 
 class _Basis(NamedTuple):
@@ -186,7 +185,7 @@ class _Basis(NamedTuple):
     fastest: Scalar
 
 
-def modal(machine: Any) -> Modes:
+def modal(machine: Any) -> Prepared:
     """Return a linear machine in its natural modes (see the top of this file)."""
     loss = machine.damping
     terms = machine.mass, jnp.zeros(machine.size) if loss is None else loss, machine.stiffness
@@ -229,11 +228,16 @@ def modal(machine: Any) -> Modes:
         masses=masses,
     )
     shapes, into = found.shapes, found.into
-    return Modes(
-        modal_machine,
-        lambda x: x if into is None else into @ x,
-        lambda q: q if shapes is None else shapes @ q,
-    )
+
+    def inward(state: StructureState) -> StructureState:
+        return state if into is None else StructureState(*(into @ x for x in vars(state).values()))
+
+    def outward(state: StructureState) -> StructureState:
+        if shapes is None:
+            return state
+        return StructureState(*(shapes @ x for x in vars(state).values()))
+
+    return Prepared(modal_machine, inward, outward)
 
 
 def without_row(stop: RigidStop) -> RigidStop:
@@ -317,14 +321,6 @@ class StructureState(Shown):
     """x, one number for each degree of freedom."""
     velocity: Float[Array, "..."]
     """dx/ds, one number for each degree of freedom."""
-
-
-class Prepared(NamedTuple):
-    """A machine in the form for a run, and the conversions of its states to that form and back."""
-
-    machine: Any
-    inward: Callable[[State], State] = lambda state: state
-    outward: Callable[[State], State] = lambda state: state
 
 
 class _Known(NamedTuple):
@@ -456,7 +452,7 @@ class LinearMachine(AbstractMachine):
         """Return a fifth of the shortest period, of the modes or the force."""
         if self._known is not None:
             return self._known.longest
-        return self.natural_modes().machine.step_limit(s, state)
+        return modal(self).machine.step_limit(s, state)
 
     def mirrored(self, state: StructureState) -> StructureState | None:
         """Return -x half a cycle later, if no constant force acts and each stop has its image."""
@@ -470,15 +466,11 @@ class LinearMachine(AbstractMachine):
                 return None
         return StructureState(-state.displacement, -state.velocity)
 
-    def natural_modes(self) -> Modes:
-        """Return the machine in its natural modes."""
-        return modal(self)
-
     def prepared(self) -> Prepared:
         """Return the machine in its modes, or as it is if a subclass overrides `_IN_MODES`."""
         if overridden(self, LinearMachine, *_IN_MODES):
             return Prepared(self._with_step_values())
-        return self.prepared_modes()
+        return modal(self)
 
     def _with_step_values(self) -> "LinearMachine":
         """Return the machine with values that its steps would compute: a lane's steps have no
@@ -487,15 +479,3 @@ class LinearMachine(AbstractMachine):
         inverse = None if self.mass.ndim == 1 else jnp.linalg.inv(self.mass)
         known = _Known(inverse, longest)
         return eqx.tree_at(lambda m: m._known, self, known, is_leaf=lambda x: x is None)
-
-    def prepared_modes(self) -> Prepared:
-        """Return the machine in its natural modes, with the conversions of states."""
-        found = self.natural_modes()
-
-        def inward(state: StructureState) -> StructureState:
-            return StructureState(found.into(state.displacement), found.into(state.velocity))
-
-        def outward(state: StructureState) -> StructureState:
-            return StructureState(found.out_of(state.displacement), found.out_of(state.velocity))
-
-        return Prepared(found.machine, inward, outward)

@@ -212,11 +212,6 @@ class AbstractContactLaw(Shown):
     def __check_init__(self):
         require("exponent", self.exponent, low=1.0)
 
-    @property
-    def is_analytic(self) -> bool:
-        """True if the force has a power series at first touch."""
-        return self.exponent == 1
-
     @abc.abstractmethod
     def force(self, stiffness: Any, damping: Any, depth: Any, rate: Any) -> Any:
         """Return the force away from the stop during contact, without prestress; it may pull."""
@@ -405,11 +400,6 @@ class SoftStop(Wall, AbstractSwitch):
         self.coordinate = count("coordinate", coordinate)
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
-
-    @property
-    def analytic(self) -> bool:  # pyright: ignore
-        """True if the force has a power series at first touch: a linear one, without kink."""
-        return self.law.is_analytic
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore

@@ -7,7 +7,6 @@ from .capsule import Capsule as Capsule
 from .duffing import Duffing as Duffing
 from .impact_pair import ImpactPair as ImpactPair
 from .relief_valve import ReliefValve as ReliefValve
-from .relief_valve import ValveState as ValveState
 from .structure import Structure as Structure
 from .unbalanced_rotor import UnbalancedRotor as UnbalancedRotor
 from .woodpecker import Woodpecker as Woodpecker

@@ -41,19 +41,12 @@ class ReadyMachine(AbstractMachine):
         return {**super().units, **self.quantity_units, "": "1"}
 
 
-class PhaseMachine(ReadyMachine):
-    """A machine whose independent variable is the phase of its drive."""
-
-    @property
-    def cycle(self) -> float:
-        return 2 * pi
-
-
-class ForcedMachine(PhaseMachine):
+class ForcedMachine(ReadyMachine):
     """A machine driven at an angular frequency ω, its field `frequency`, with the phase ωt as the
     independent variable."""
 
     frequency: eqx.AbstractVar[Scalar]
+    cycle: ClassVar = 2 * pi
 
     def pace(self, s: Scalar, state: State) -> Scalar:
         """Return dt/ds = 1/ω, the duration of a unit of phase."""

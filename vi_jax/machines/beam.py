@@ -22,8 +22,8 @@ from .._checks import (
     optional_real,
     require_ranges,
 )
-from .._types import Number, Scalar
-from ..machine import LinearMachine, RigidStop, StructureState
+from .._types import Scalar
+from ..machine import LinearMachine, RigidStop
 from ._base import number_field, stops_at
 
 
@@ -143,7 +143,3 @@ class Beam(LinearMachine):
         beta, (sigma, growth) = _roots(self.modes), _shape_factors(self.modes)
         exponentials = jnp.exp(beta * (x - 1)) * growth + (1 + sigma) * jnp.exp(-beta * x)
         return 0.5 * exponentials - jnp.cos(beta * x) + sigma * jnp.sin(beta * x)
-
-    def deflection(self, state: StructureState, place: Number = 1.0) -> Float[Array, "..."]:
-        """Return w at places along the beam, in [0, 1] of its length: by default at its tip."""
-        return self.shape(place) @ state.displacement

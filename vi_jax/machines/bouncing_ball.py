@@ -1,6 +1,6 @@
 """A ball that bounces on a shaken table."""
 
-from math import cos
+from math import cos, pi
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, SHARE, number
 from .._types import Number, Scalar
 from ..machine import RigidStop, State
-from ._base import PhaseMachine, number_field
+from ._base import ReadyMachine, number_field
 
 
-class BouncingBall(PhaseMachine):
+class BouncingBall(ReadyMachine):
     """A ball under gravity on a table that moves as -(Γ g/ω²) cos ωt.
 
     The independent variable is ωt, a cycle 2π. The state is `height` and upward `speed`, relative
@@ -25,6 +25,7 @@ class BouncingBall(PhaseMachine):
 
     acceleration: Any = number_field("acceleration", 1.2, NOT_NEGATIVE, "g")
     restitution: Any = number_field("restitution", 0.5, SHARE)
+    cycle: ClassVar = 2 * pi
     quantity_units: ClassVar = {
         "height": "g/ω²", "speed": "g/ω", "rate": "ω", "time": "1/ω", "energy": "m g²/ω²",
         "power": "m g²/ω",

@@ -1,7 +1,7 @@
 """A ball in a vibrating box: impact pair, impact damper, vibro-impact harvester."""
 
 from collections.abc import Mapping
-from math import sin
+from math import pi, sin
 from typing import Any, ClassVar
 
 import jax
@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE
 from .._types import Scalar, State
 from ..machine import Mechanical, RigidStop
-from ._base import PhaseMachine, number_field, stops_at
+from ._base import ReadyMachine, number_field, stops_at
 
 
-class ImpactPair(PhaseMachine, Mechanical):
+class ImpactPair(ReadyMachine, Mechanical):
     """A ball between the walls of a box.
 
     The box moves as a sin ωt. If `mass_ratio` is given, it is a body on a spring and a damper,
@@ -43,6 +43,7 @@ class ImpactPair(PhaseMachine, Mechanical):
     damping_ratio: Any = number_field("damping_ratio", 0.05, NOT_NEGATIVE)
     frequency: Any = number_field("frequency", 1.0, NOT_NEGATIVE, "ω")
     amplitude: Any = number_field("amplitude", 0.5, REAL, "M a ω²")
+    cycle: ClassVar = 2 * pi
     labels: ClassVar = ("place in the box (a)", "speed in the box (a ω)")  # pyright: ignore
 
     @property

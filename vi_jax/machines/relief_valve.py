@@ -5,23 +5,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, number
-from .._types import Number, Scalar
-from ..machine import RigidStop, Shown, falling
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE
+from .._types import Scalar, State
+from ..machine import RigidStop, falling
+from ..machine import State as NamedState
 from ._base import ReadyMachine, number_field
-
-
-class ValveState(Shown):
-    """The valve's body and the vessel under it; dimensionless, as the numbers of `ReliefValve`."""
-
-    ranges: ClassVar = {"pressure": POSITIVE}
-
-    lift: Scalar
-    """Distance of the body from its seat (dimensionless)."""
-    speed: Scalar
-    """Speed of the body, positive when the valve opens."""
-    pressure: Scalar
-    """Pressure in the vessel above the ambient one; positive."""
 
 
 class ReliefValve(ReadyMachine):
@@ -52,21 +40,18 @@ class ReliefValve(ReadyMachine):
     def contacts(self) -> tuple[RigidStop, ...]:
         return (RigidStop(0.0, self.restitution, "left", on=("lift", "speed")),)
 
-    def field(self, s: Scalar, state: ValveState) -> ValveState:
+    def field(self, s: Scalar, state: State) -> dict[str, Scalar]:
         spring = state.lift + self.precompression
         force = state.pressure - self.damping * state.speed - spring
         outflow = state.lift * jnp.sqrt(state.pressure)
-        return ValveState(state.speed, force, self.compressibility * (self.flow_rate - outflow))
+        rate = self.compressibility * (self.flow_rate - outflow)
+        return dict(lift=state.speed, speed=force, pressure=rate)
 
-    def relaxation(self, s: Scalar, state: ValveState) -> Scalar:
+    def relaxation(self, s: Scalar, state: State) -> Scalar:
         """Return the shorter time constant, of the motion or of the pressure."""
         outflow_rate = self.compressibility * jnp.abs(state.lift) / (2 * jnp.sqrt(state.pressure))
         return 1 / jnp.maximum(jnp.maximum(self.damping, outflow_rate), 1e-6)
 
-    def start(
-        self, *, lift: Number = 1.0, speed: Number = 0.0, pressure: Number = 12.0
-    ) -> ValveState:
+    def start(self, *, lift: Any = 1.0, speed: Any = 0.0, pressure: Any = 12.0) -> Any:
         """Return a state; by default an open valve whose lift begins to decrease."""
-        return ValveState(
-            number("lift", lift), number("speed", speed), number("pressure", pressure)
-        )
+        return NamedState(lift=lift, speed=speed, pressure=pressure)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range, number, require
+from .._checks import NOT_NEGATIVE, POSITIVE, SHARE, Range
 from .._types import Number, Scalar, State
 from ..machine import Mechanical, RigidStop, turn_of
 from ._base import ReadyMachine, draw_supported_body, number_field, stops_at
@@ -83,10 +83,7 @@ class UnbalancedRotor(ReadyMachine, Mechanical):
         """Return a state with φ = 0. The rotor's speed `W` (unit: ω) defaults to the no-load speed
         κ w0; `W=0` is a start from rest."""
         speed = self.control * self.no_load_speed if W is None else W
-        given = {"Y": number("Y", Y), "V": number("V", V), "W": number("W", speed)}
-        for name, value in given.items():
-            require(name, value)
-        return self.at(Y=given["Y"], v={"Y": given["V"], "phi": given["W"]})
+        return self.at(Y=Y, v={"Y": V, "phi": speed})
 
     def mirrored(self, state: Any) -> Any:
         if self.gap is not None and not self.two_sided:

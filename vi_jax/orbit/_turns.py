@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Flag, Scalar, State, Vector
 from ..flow import Rates, SmoothMachine, guard_rates
-from ..machine import events_of, guard_of, happens_at, has_velocity, section_number, stops_of
+from ..machine import event_of, events_of, guard_of, has_velocity, section_number, stops_of
 from ._flight import Flight, force_on
 
 # Newton's method has converged if it ends this close to a turn (as a share of the step): a choice.
@@ -102,7 +102,8 @@ class _Guard(_Quantity):
         if not events_of(flight.machine)[self.number].from_below:
             return super().happens(flight, s, u, length)
         state = flight.unravel(_state_after_step(flight, (s, length, u)))
-        condition = happens_at(flight.machine, self.number, s + length, state, flight.modes)
+        event, part, _ = event_of(flight.machine, self.number, flight.modes, ())
+        condition = event.happens(flight.machine, s + length, state, *flight.modes[part])
         return jnp.ones((), bool) if condition is None else condition
 
 

@@ -11,9 +11,9 @@ from ...machine import (
     AbstractEvent,
     AbstractMachine,
     after_event,
+    event_of,
     events_of,
     guard_of,
-    happens_at,
     has_velocity,
     holds_anywhere,
     mode_number,
@@ -23,7 +23,6 @@ from ...machine import (
     stops_of,
     struck_modes,
     switches_of,
-    value_of,
 )
 from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
@@ -124,11 +123,12 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     new, modes, any_chosen, happens, jumps = old, modes_before, none, none, none
     kind, logged_number, value, chosen = EventKind.mode, 0.0, jnp.nan, {}
     for number, due in zip(numbers, x.due, strict=True):
-        event, arguments = events_of(machine)[number], (machine, number, lane.s, old, modes_before)
+        event, part, _ = event_of(machine, number, modes_before, ())
+        before = machine, lane.s, old, *modes_before[part]
         chosen[number], any_chosen = (due > 0) & ~any_chosen, any_chosen | (due > 0)
-        when = happens_at(*arguments)
+        when = event.happens(*before)
         here = chosen[number] if when is None else chosen[number] & when
-        its_state, its_modes = after_event(*arguments, contact)
+        its_state, its_modes = after_event(machine, number, lane.s, old, modes_before, contact)
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
@@ -137,7 +137,7 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
             its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
         else:
             jumps = jumps | here
-            its_kind, its_value = EventKind.reset, value_of(*arguments)
+            its_kind, its_value = EventKind.reset, event.value(*before)
             its_number = its_number - len(switches_of(machine))
         if event.ends_cycle:
             lane = lane.complete_interval(here)

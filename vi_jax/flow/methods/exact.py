@@ -25,6 +25,7 @@ from ...machine import (
     Scene,
     forces,
     horner,
+    modal,
     overridden,
     phase_at,
     sincos,
@@ -344,10 +345,7 @@ def _linear_flight(
 ) -> tuple[State, Integrals, Scalar]:
     """Return the flight of a linear machine, as `ExactFlight.step`, in natural modes."""
     machine, h = smooth.machine, s1 - s0
-    if isinstance(machine, LinearMachine):
-        form = machine.prepared_modes()
-    else:
-        form = Prepared(machine, lambda x: x, lambda x: x)
+    form = modal(machine) if isinstance(machine, LinearMachine) else Prepared(machine)
     begin = form.inward(state)
 
     def along(share: float) -> State:

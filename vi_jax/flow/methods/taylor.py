@@ -22,7 +22,7 @@ from jax.lax import stop_gradient
 from ..._checks import count, require
 from ..._types import Scalar, Scalars, State
 from ...lanes import called
-from ...machine import switches_of
+from ...machine import SoftStop, switches_of
 from ..events import Rates
 from ..smooth import Integrals, SmoothMachine, rate_of_integrals
 from .base import AbstractMethod, has_relaxation
@@ -598,7 +598,7 @@ class Taylor(AbstractMethod):
     def check(self, machine):
         """**Raises:** `ValueError` for a soft stop whose force has no series at first touch."""
         for i, switch in enumerate(switches_of(machine)):
-            if not switch.analytic:
+            if isinstance(switch, SoftStop) and switch.law.exponent != 1:
                 raise ValueError(
                     f"Method `Taylor` cannot carry switch {i}, {type(switch).__name__}: at first "
                     "touch its force has no power series (a soft stop's has one with exponent 1). "
