@@ -569,10 +569,6 @@ class Run(Summarized):
         """
         return run_dataset(self, dims, in_names(self.result), along)
 
-    def drawn(self) -> Any:
-        """Return the numbers of the picture: the smallest position in each cycle."""
-        return None if self.steps.ndim else self.y_min
-
     def _outcome_in_words(self) -> str | None:
         if self.outcome is None or self.outcome_cycle is None or self.outcome < 0:
             return None

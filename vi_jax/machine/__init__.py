@@ -128,7 +128,6 @@ from .numbers import quantity_of as quantity_of
 from .numbers import size_of as size_of
 from .numbers import state_in_words as state_in_words
 from .numbers import stated as stated
-from .numbers import summary_table as summary_table
 from .numbers import unit_of as unit_of
 from .numbers import units_of as units_of
 from .numbers import with_leaf as with_leaf

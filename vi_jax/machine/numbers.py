@@ -3,9 +3,8 @@ their representation as text and as tables."""
 
 import dataclasses
 import difflib
-import html
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -279,15 +278,6 @@ class Shown(eqx.Module):
     def __repr__(self) -> str:
         return in_words(self, getattr(self, "units", NONE)) if known(self) else super().__repr__()
 
-    def _repr_html_(self) -> str:
-        if not known(self):
-            return f"<pre>{html.escape(repr(self))}</pre>"
-        units = getattr(self, "units", NONE)
-        rows = [
-            (name, number_in_words(x), unit_of(units, name)) for name, x in by_name(self).items()
-        ]
-        return table(type(self).__name__, rows)
-
 
 class Summarized(eqx.Module):
     """A result whose representation is a summary."""
@@ -296,15 +286,8 @@ class Summarized(eqx.Module):
         """Return a summary: a line of text, then indented lines "name: value"."""
         raise NotImplementedError
 
-    def drawn(self) -> Any:
-        """Return a row of numbers to draw with the summary, or `None`."""
-        return None
-
     def __repr__(self) -> str:
         return self.summary() if known(self) else super().__repr__()
-
-    def _repr_html_(self) -> str:
-        return summary_table(repr(self), self.drawn() if known(self) else None)
 
 
 def known(tree: object) -> bool:
@@ -367,36 +350,3 @@ def number_in_words(x: object, unit: str = "") -> str:
         return f"{x.dtype} ({shape})"
     low, high = (number_in_words(f(x)) for f in (np.nanmin, np.nanmax))
     return f"{with_unit(f'{low} … {high}', unit)} ({shape})"
-
-
-def table(title: str, rows: Iterable[tuple[str, ...]], after: str = "") -> str:
-    """Return an HTML table with these rows and a title."""
-    cells = "".join(
-        f"<tr>{''.join(f'<td style=text-align:left>{html.escape(x)}</td>' for x in row)}</tr>"
-        for row in rows
-    )
-    caption = f"<caption style=text-align:left>{html.escape(title)}</caption>"
-    return f"<table>{caption}{cells}</table>{after}"
-
-
-def summary_table(text: str, row: object = None) -> str:
-    """Return a summary as an HTML table: the first line as title, then lines "name: value"."""
-    first, *lines = text.splitlines()
-    after = "" if row is None else sparkline(row)
-    rows = (line.strip().rpartition(": ") if ": " not in line else line.strip().partition(": ")
-            for line in lines)  # fmt: skip
-    return table(first, (row[::2] for row in rows), after)
-
-
-def sparkline(row: object, width: int = 240, height: int = 40) -> str:
-    """Return a row of numbers as a small SVG curve; "" with fewer than two finite numbers."""
-    y = np.asarray(row, float).ravel()
-    good = np.isfinite(y)
-    if good.sum() < 2:
-        return ""
-    low, span = y[good].min(), np.ptp(y[good]) or 1.0
-    across = 2 + (width - 4) * np.arange(y.size) / (y.size - 1)
-    up = height - 2 - (height - 4) * (y - low) / span
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across[good], up[good], strict=True))
-    line = f'<polyline points="{points}" fill="none" stroke="currentColor"/>'
-    return f'<svg width="{width}" height="{height}">{line}</svg>'

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .numbers import by_name, in_words, known, number_in_words, split_index, table
+from .numbers import in_words, known, split_index
 
 
 class State:
@@ -46,10 +46,6 @@ class State:
 
     def __repr__(self) -> str:
         return in_words(self) if known(self) else f"State({', '.join(vars(self))})"
-
-    def _repr_html_(self) -> str:
-        rows = [(name, number_in_words(x)) for name, x in by_name(self).items() if known(x)]
-        return table("State", rows)
 
 
 def _state(components: Mapping[str, Any]) -> State:

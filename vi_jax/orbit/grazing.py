@@ -534,10 +534,6 @@ class Grazing(Summarized):
                 lines.append(f"  one impact in {each}: stable at {place} from there")
         return lines
 
-    def drawn(self):
-        """Return the period at each value, by the local map."""
-        return self.forecast.period
-
 
 def grazing(
     point: Point, *, check: bool = True, periods: int = 12, progress: bool = True

@@ -43,7 +43,6 @@ from ..machine import (
     plain,
     state_in_words,
     stops_of,
-    summary_table,
     units_of,
     with_units,
     without_modes,
@@ -373,13 +372,10 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
 
 
 class InWords:
-    """A mixin for display: `__str__` as text; in notebooks a table, with a curve of `y_min`."""
+    """A mixin for display: `__str__` as text."""
 
     def __repr__(self) -> str:
         return str(self)
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self), getattr(self, "y_min", None))
 
 
 def _advice(orbit: Orbit) -> str:

@@ -38,7 +38,6 @@ from ..machine import (
     is_angle,
     nearest_images,
     state_in_words,
-    summary_table,
     unit_of,
     units_of,
     with_leaf,
@@ -232,9 +231,6 @@ class Basins(NamedTuple):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self))
 
 
 def in_one_array(rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -594,9 +590,6 @@ class IntegrityProfile(NamedTuple):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return summary_table(str(self))
 
 
 @warning_once

@@ -126,10 +126,6 @@ class Sweep(Summarized):
         by_name = {name: name for name in (*self.averages, self.parameter)}
         return tidy(with_units(data, dict(self.units), by_name), along)
 
-    def drawn(self) -> Any:
-        """Return the smallest position at each value."""
-        return self.y_min if self.values.ndim == 1 else None
-
     def summary(self) -> str:
         """Return the motions in the order of the values as text, with the changes between them."""
         if self.values.ndim != 1:
