@@ -1,13 +1,13 @@
 """Simulation: methods of integration, the hybrid step, closed forms, `simulate` and its results."""
 
 from ._lane import has_fixed_cycle as has_fixed_cycle
-from ._own import average_names as average_names
-from ._own import check_parts as check_parts
-from ._own import depends_on_time as depends_on_time
-from ._own import has_averages as has_averages
-from ._own import has_quantities as has_quantities
-from ._own import quantities_on as quantities_on
-from ._own import quantity_names as quantity_names
+from ._machine_checks import check_parts as check_parts
+from ._machine_checks import depends_on_time as depends_on_time
+from ._quantities import average_names as average_names
+from ._quantities import has_averages as has_averages
+from ._quantities import has_quantities as has_quantities
+from ._quantities import quantities_on as quantities_on
+from ._quantities import quantity_names as quantity_names
 from ._simulate import compiling as compiling
 from ._simulate import jit as jit
 from ._simulate import simulate as simulate

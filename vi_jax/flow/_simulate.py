@@ -29,7 +29,7 @@ from ..machine import (
     without_modes,
 )
 from ._lane import Plan, Record
-from ._own import has_quantities
+from ._quantities import has_quantities
 from .arguments import RunOptions, make_plan
 from .loop import Ends, run_lane
 from .methods import MethodLike

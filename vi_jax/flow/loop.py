@@ -42,7 +42,7 @@ from ..machine import (
     without_modes,
 )
 from ._lane import Lane, Plan, Record, to_event, total
-from ._own import check_events, check_field, check_laws
+from ._machine_checks import check_events, check_field, check_laws
 from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of

@@ -25,7 +25,7 @@ from ..machine import (
     prepared,
 )
 from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
-from ._own import explain_errors
+from ._machine_checks import explain_errors
 from .smooth import limited_of
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).

@@ -24,11 +24,7 @@ from .._checks import fields_with, number, require
 from .._types import Machine, Scalar, State
 from .coordinates import Coordinate, coordinate_by_name
 from .cycles import Turn, at_intervals, counter_of, counts_turns
-from .event import AbstractEvent, AbstractSwitch, Section
-from .events import Reset
-from .friction import ContactFriction
-from .numbers import PLAIN, Shown, unit_in
-from .own import (
+from .declared import (
     defines,
     derived,
     overridden,
@@ -37,6 +33,10 @@ from .own import (
     with_own_defaults,
     with_static,
 )
+from .event import AbstractEvent, AbstractSwitch, Section
+from .events import Reset
+from .friction import ContactFriction
+from .numbers import PLAIN, Shown, unit_in
 from .stop import RigidStop, SoftStop, Wall
 
 # Required members, each with advice for an error message.

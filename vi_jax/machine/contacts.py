@@ -18,7 +18,7 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .own import stops_of, switches_of
+from .declared import stops_of, switches_of
 from .state import like
 
 # A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other

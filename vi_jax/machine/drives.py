@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, number, real, require, require_ranges
 from .._types import Scalar, State
 from ..lanes import sincos
+from .declared import overridden
 from .numbers import Shown
-from .own import overridden
 
 # The units of the paper's scene, by the names of quantities, components and parameters.
 UNITS: Mapping[str, str] = MappingProxyType({

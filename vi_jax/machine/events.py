@@ -19,10 +19,10 @@ from jax.lax import stop_gradient
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
+from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import choose_modes, frictions_in
 from .numbers import Shown, size_of
-from .own import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .state import changed
 
 

@@ -35,8 +35,8 @@ from .contacts import (
     rate_of,
     velocity_change,
 )
+from .declared import stops_of, switches_of
 from .event import AbstractSwitch, EventContext
-from .own import stops_of, switches_of
 from .state import with_components
 
 # In a tried set of modes, a force may have the wrong sign up to this share of the largest friction

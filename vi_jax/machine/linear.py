@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from .._checks import concrete, number
 from .._types import Flag, Number, Scalar, Scalars, State
 from .base import AbstractMachine, Coordinate
+from .declared import overridden
 from .numbers import Shown
-from .own import overridden
 from .stop import RigidStop
 
 Numbers = Float[Array, " n"]

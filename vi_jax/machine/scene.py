@@ -35,6 +35,7 @@ from .._checks import (
 from .._messages import warn
 from .._types import Number, Scalar, State
 from .base import AbstractMachine
+from .declared import overridden
 from .drives import (
     UNITS,
     AbstractCrank,
@@ -46,7 +47,6 @@ from .drives import (
     SliderCrank,
 )
 from .numbers import Shown
-from .own import overridden
 from .stop import RigidStop, SoftStop
 
 # The largest error of a state on the section. In single precision, that of a turn is 5e-7.
