@@ -186,7 +186,7 @@ for cubic in (0.0, 0.3):
 # %%
 heads = ["springs", "masses", "code", "µs a lane-cycle", "error", "compile s", "time over best"]
 model = platform.processor() or platform.machine()
-page = f"""# Long chains beside heyoka
+page = f"""# Long chains compared with heyoka
 
 {LANES} lanes of different driving frequencies (0.2 to 0.9), {CYCLES} cycles each, from rest; the \
 last mass strikes a stop. heyoka {hy.__version__} in batches of {BATCH} with a tolerance of 1e-9, \

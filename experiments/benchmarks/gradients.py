@@ -129,7 +129,7 @@ for task in tasks():
 heads = [
     "machine", "code", "numbers", "value, ms", "gradient, ms", "gradient / value", "compile, s",
 ]  # fmt: skip
-page = f"""# Gradients by many numbers
+page = f"""# Gradients with respect to many parameters
 
 {LANES} lanes of {CYCLES} cycles, {STEPS} steps of Dopri8 each, from different starts; the sum of \
 the squares of their last places and its gradient. JAX {jax.__version__}, diffrax \

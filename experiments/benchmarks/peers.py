@@ -163,6 +163,6 @@ def headline(sections: dict[str, dict]) -> dict[str, float]:
 # %%
 if __name__ == "__main__":
     measured = contest()
-    page = f"# vi_jax beside its peers\n\n{report(measured)}"
+    page = f"# vi_jax compared with other codes\n\n{report(measured)}"
     print(page)
     write("peers", page, headline(measured), picture(measured))

@@ -146,10 +146,10 @@ starts for each period:
 - `vi.basins` finds the four stable motions of that list with their multipliers, and one more, of 15
   cycles with 6 impacts, which a search for periods up to 6 cannot find. One in a hundred starts
   settles on it.
-- The basins of the 4π motion and of the free one have whole parts; elsewhere the basins are mixed
-  down to single cells, and the label of a start depends on the last digits.
-- The multiplier of the free motion is e^(-2πξ/ζ): it is the slowest to be reached, and its late
-  arrivals are what is called unsettled after {SETTLE:,} cycles.
+- The basins of the 4π motion and of the free motion have solid parts. Elsewhere the basins are
+  mixed down to single cells, and the motion of a start depends on its last digits.
+- The multiplier of the free motion is e^(-2πξ/ζ), so motions settle on it most slowly. Starts that
+  have not reached it count as unsettled after {SETTLE:,} cycles.
 - Random starts agree with the grid within their error. A grid's own error is smaller than that of
   as many random starts, where the basins have whole parts.
 """

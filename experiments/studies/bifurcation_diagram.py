@@ -190,9 +190,9 @@ chaotic (no period up to 8, exponent above 0.003). Their exponent per cycle is
 
 - There is no cascade. The 4π motion doubles once, and the 8π motion that comes of it is stable for
   {born - first:.1e} in ζ only. Then a turn of it touches the stop, and chaos is there at once. The
-  motion with that impact more exists on the whole stretch, but its largest multiplier is never
+  motion with one more impact exists on the whole interval, but its largest multiplier is never
   below {np.abs(three.multipliers).max(axis=1).min():.0f} in 8π and has no bound at either end.
-- Coming from the other side it is the same, but there the 8π motion lives for
+- From the other side the same happens, but there the 8π motion is stable for
   {second - dies:.0e} in ζ: no simulation shows it, and on a diagram chaos seems to begin at the
   doubling.
 - The chaos keeps the 4π motion's order: one hard impact in two cycles, and a soft one now and then.

@@ -242,8 +242,8 @@ orbit after 500 cycles of plain simulation; the others never strike, or end in c
   ends, the impacts weaken faster than they become more frequent.
 - Stability costs next to nothing: the condition of 0.8 does not bind at the optimum of A, and even
   0.5 (B) costs {100 * float(1 - end_b.power / end_a.power):.1g} % of the power.
-- The price is paid elsewhere. A and B stand beside a motion that never touches the stop; from rest
-  they go there, and the multipliers say nothing of it. Asked to start by itself (C) the machine
+- The price is a second stable motion of A and B, which never touches the stop. From rest they
+  settle on it, and the multipliers give no hint of it. A machine that starts by itself (C)
   gives {100 * float(end_c.power / end_a.power):.0f} % of the power of A.
 """
 

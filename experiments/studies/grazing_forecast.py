@@ -383,18 +383,18 @@ At {LANES} random values of the parameter on each side of the grazing, in the ra
 forecast names, the machine is simulated from the motion that grazes, {SETTLE} cycles and {WATCHED}
 more. The verdict:
 
-- Nothing near attracts if the distance from the motion that grazes does not rise with that of the
-  parameter: `nonsmooth_fold` if the motion with a touch more is on the side without impacts, where
-  one is shown that repeats when it is simulated; else `jump`.
+- No attractor is near if the distance from the grazing motion does not grow with the parameter. It
+  is a `nonsmooth_fold` if a motion with one more touch exists on the side without impacts, and
+  simulation confirms it; else a `jump`.
 - `persistence` if more than 96 % of the lanes have period 1; `chaos` if more than 96 % have none
   up to {LONGEST}.
 - Period adding if most periodic lanes have one touch in n > 1 cycles, n rising towards the grazing
   and some n next to n + 1; else `periodic` or `windows_and_chaos`. The share of lanes without a
   period, 2 %, tells windows next to each other from windows with chaos between.
 
-The machines are from a second draw. Of 50 machines of a first draw, of five kinds, 47 forecasts
-were right. Two were called period adding where simulation had windows of some n without n + 1;
-since then `vi.grazing` asks for both. The third has a largest multiplier next to 2/3, where windows
+These machines are a second random sample. In the first sample, of 50 machines of five kinds, 47
+forecasts were right. Two were called period adding where simulation had windows of some n without n + 1;
+since then `vi.grazing` requires both. The third has a largest multiplier next to 2/3, where windows
 begin to touch.
 """
 print(page)

@@ -200,8 +200,8 @@ def page() -> str:
         for i, name in enumerate(LABELS)
     ]
     heads = [
-        "number", "90 % intervals that hold the true one",
-        "uniform ranks, p (Kolmogorov–Smirnov)", "width of the interval beside the prior's",
+        "number", "90 % intervals that contain the true value",
+        "uniform ranks, p (Kolmogorov–Smirnov)", "width of the interval over that of the prior",
     ]  # fmt: skip
     of_one = [
         (
@@ -228,10 +228,10 @@ One record with {int(impacts[FIRST])} impacts, four walks, by ArviZ:
 
 {table(one, of_one)}
 
-Where a number decides whether an impact happens at all, the positions change without a jump, but \
-their derivative by that number grows without bound as the impact becomes a graze, and is another \
-beyond it. The sampler meets a kink in the density there: its steps diverge or are refused, and a \
-walk may stay on one side. Records of velocities would be worse: they jump at every impact, and \
+If a parameter decides whether an impact happens, the positions are continuous in it, but their \
+derivative is not. It grows without bound as the impact becomes a graze, and has another value \
+beyond it. So the density has a kink: steps of the sampler diverge or are rejected, and a chain \
+may stay on one side. Records of velocities would be worse: they jump at every impact, and \
 the density jumps as an impact moves past a sample. With this prior and these records it does no \
 harm that {RECORDS} records would show."""
 

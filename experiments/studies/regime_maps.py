@@ -266,20 +266,20 @@ then. {SIDE} × {SIDE} lanes a map by `ExactFlight`.
 
 {table(["", *(seen.plane.title for seen in maps)], rows)}
 
-- The curves and the maps know nothing of each other. The 2π motion gives way to the 4π motion on
-  the doubling curve, grey where it is crossed so slowly that {SETTLE} cycles do not suffice; the
+- Curves and maps are computed independently. The 2π motion gives way to the 4π motion on the
+  doubling curve, grey where it is crossed so slowly that {SETTLE} cycles do not suffice; the
   4π motion with one impact lies inside the dashed curve; no lane is free between the births; and
   of {sum(x[0] for x in limits):,} lanes on a motion with one impact that were looked at,
   {sum(x[1] for x in limits)} have no such stable motion in the closed form.
 - The maps end before the fold: between the second birth and the fold the 2π impact motion and the
   free one are both stable, and the start at rest goes to the free one from some ζ on.
 - Without damping the free vibration left by the start never dies out: right of ζ = √2, where it
-  does not reach the stop, the motion is rightly called not periodic. With c = 0.1 and more all that
-  is gone; the chaos that remains lies at the first birth and, up to c = 0.2, in a tongue about
-  ζ = 0.55.
+  does not reach the stop, the motion is rightly called not periodic. From c = 0.1 on these
+  lanes are periodic. The remaining chaos lies at the first birth and, up to c = 0.2, in a tongue
+  about ζ = 0.55.
 - Transient chaos: without damping the body hits the stop irregularly for hundreds to tens of
-  thousands of cycles. While it lasts nothing distinguishes it from chaos: "chaotic" means still so
-  after some {lasting:,} cycles.
+  thousands of cycles. Meanwhile it looks like chaos: "chaotic" means that it is still chaotic
+  after {lasting:,} cycles.
 """
 print(page)
 # With Table 1's damping nearly all lanes settle: a test finds these shares with fewer lanes.

@@ -112,10 +112,10 @@ broken where they are unstable.
 ![Lift and impacts over the flow rate](../figures/relief_valve.png)
 
 - **Rest is lost** in a Hopf bifurcation at q = {hopf.parameter:.9f}, where the branch shrinks to
-  nothing; the eigenvalues of the linearised valve say {rest_lost:.9f}.
-- **The seat is touched** at q = {graze.parameter:.9f}. The motion without impact, stable up to
-  there, ends; that with one impact begins in the other direction and is unstable at once, one of
-  its multipliers growing beyond all bounds like 1/V⁻: what is left is chaos.
+  nothing; the eigenvalues of the linearised valve give {rest_lost:.9f}.
+- **The seat is touched** at q = {graze.parameter:.9f}. The stable motion without impact
+  ends. The motion with one impact begins in the other direction and is unstable: one of its
+  multipliers grows as 1/V⁻ without bound. Only chaos is left.
 - **Below, one impact a cycle** is stable between the period doublings at
   q = {min(p.parameter for p in doublings):.9f} and {max(p.parameter for p in doublings):.9f}.
 

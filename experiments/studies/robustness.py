@@ -163,25 +163,25 @@ last, first = paper_kicks[round(HIGH[-1], 6)], paper_kicks[round(HIGH[0], 6)]
 text = f"""# How hard may the paper's 4π motion be kicked?
 
 Ideal drive, k = 0.8, gap 2a, damping ξ = {DAMPING:.6f} of Table 1. A kick changes the state on the
-section; its size is √(ΔY² + ΔV²) in units of a and aω. It is fatal if the machine does not come
-back. Each is a point on the boundary of the basin, found with the edge state and Newton's method,
-and confirmed by simulations of 1 ± 1e-6 of it.
+section; its size is √(ΔY² + ΔV²) in units of a and aω. It is fatal if the motion does not
+return. The smallest fatal kick ends on the boundary of the basin. The edge state and Newton's
+method determine it, and simulations of 1 ± 1e-6 of it confirm it.
 
 ![Kicks over ζ, and basins](../figures/robustness.png)
 
 - **From ζ = {BETWEEN[0]:g} to {BETWEEN[-1]:g} no kick is fatal.** The 4π motion with one impact
   is the only one there: it came back from kicks in 64 directions with 32 sizes on each, which were
-  doubled up to a thousand a and aω. The most robust choice is any ζ of that stretch.
+  doubled up to a thousand a and aω. Any ζ in this interval is a robust choice.
 - **At the upper end it may become the 2π motion**, which is stable from the period doubling CC' at
   ζ = 0.96554 on. The fatal kick is {float(first.norm):.4f} at ζ = {HIGH[0]:.4f} and
   {float(last.norm):.5f} at {HIGH[-1]:.4f}: it ends at the grazing at 0.96912, where the motion
   meets the saddle, the 4π motion with two impacts that springs at CC'.
-- **Multipliers tell the opposite.** At ζ = {AT:g} the 4π motion forgets a third of a small
+- **Multipliers suggest the opposite.** At ζ = {AT:g} the 4π motion forgets a third of a small
   disturbance in each period (its largest multiplier is {slowest_of(paper):.3f}), the 2π motion a
-  fiftieth ({slowest_of(one_impact(AT, 1)):.3f}). Yet the one is lost after a kick of
-  {float(ours.norm):.4f}, the other bears {float(theirs.norm):.3f}.
+  fiftieth ({slowest_of(one_impact(AT, 1)):.3f}). Yet a kick ends the 4π motion if it exceeds
+  {float(ours.norm):.4f}; the 2π motion survives {float(theirs.norm):.3f}.
 - **At the lower end it may become the 4π motion with two impacts**, up to that one's fold at
-  0.84372, and again the kick is nothing where the motion ends by grazing, at 0.83340.
+  0.84372, and the kick is zero again where the motion ends by grazing, at 0.83340.
 
 {runs}
 """

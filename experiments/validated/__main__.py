@@ -29,9 +29,9 @@ This page compares vi_jax with published examples of other codes. Each section i
 most sixty lines in [`experiments/validated`](../experiments/validated); the tests run all of them
 and compare every number below.
 
-*Theirs* is written with the digits that were published. *How* is their origin: printed in a
-documentation, a program or the reference file of a test, known in closed form, or computed from
-their equations by an independent integrator. Times include compilation.
+*Theirs* has the published digits, or those of a reference solution of the published equations.
+*How* gives the origin: a documentation, a program, the reference file of a test, a closed form, or
+an independent integrator. Times include compilation.
 """
 
 
