@@ -393,9 +393,9 @@ more. The verdict:
   period, 2 %, tells windows next to each other from windows with chaos between.
 
 These machines are a second random sample. In the first sample, of 50 machines of five kinds, 47
-forecasts were right. Two were called period adding where simulation had windows of some n without n + 1;
-since then `vi.grazing` requires both. The third has a largest multiplier next to 2/3, where windows
-begin to touch.
+forecasts were right. Two forecasts were period adding, but simulation had windows of n without
+windows of n + 1. Since then `vi.grazing` requires both. The third machine has a largest multiplier
+close to 2/3, where windows begin to touch.
 """
 print(page)
 numbers: dict[str, float] = {"machines": len(everything), "forecasts that are right": right}
