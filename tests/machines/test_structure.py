@@ -245,7 +245,7 @@ class Hardening(vi.machines.Structure):
         return vi.machines.StructureState(rate.displacement, rate.velocity - more)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("error")
 def test_own_field_is_vector_code():
     """The mass matrix and the shortest period are computed once, not in each step."""

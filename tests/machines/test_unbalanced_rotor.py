@@ -136,7 +136,7 @@ def test_branches_pass_the_begin_of_a_cycle():
     np.testing.assert_allclose(np.abs(a.multipliers)[:3], np.abs(b.multipliers), atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_body_pressed_on_comes_to_rest_and_leaves():
     """The unbalance presses the body on while W² cos φ exceeds the gap, also as a cycle begins."""
     rotor = ROTOR(control=1.2, strength=2.0, gap=0.4, restitution=0.1, coupling=0.1,

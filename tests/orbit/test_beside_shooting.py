@@ -66,7 +66,7 @@ def follow_capsule(orbit):
     return vi.continue_orbit(orbit, parameter="amplitude", bounds=(1.2, 4.0))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_capsule_that_sticks_once_a_cycle():
     """One branch ends where the capsule is at rest at the impact, and where the impact is on the
     section. The other one goes on from there, until the mass touches the stop a second time."""

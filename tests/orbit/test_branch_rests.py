@@ -129,7 +129,7 @@ def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping,
     assert not rests_again(point.parameter + 1e-9, k, gap, damping)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
     """Before the graze the left stop has no effect, so that the least position gives its gap."""
     scene = scene_at(0.7)
@@ -149,7 +149,7 @@ def test_a_stop_on_the_other_side_is_grazed_where_the_body_turns():
         vi.grazing(point)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rest_leaves_one_multiplier_of_a_motor():
     """A rest makes two of three multipliers zero. Compare with differences of the map."""
     motor = vi.Parameters(torque=10.0, control=0.55, restitution=0.3, gap=0.006)
@@ -366,7 +366,7 @@ class Busy(vi.AbstractMachine):
         return Two(q.u, push - pull, q.v, 2.0 * (q.x - q.z) - 0.1 * q.v - 0.5 * q.z)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rest_with_friction_a_switch_and_a_reset():
     """All of them act in every cycle, and the friction sticks. Compare with settled simulations and
     differences of their map."""

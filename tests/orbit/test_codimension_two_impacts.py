@@ -36,7 +36,10 @@ def coefficient_at(omega, curve, reach):
 
 @pytest.mark.parametrize(
     ("kind", "frequency", "coefficient"),
-    [("fold", 1.95, FOLD), ("period-doubling", 2.04, DOUBLING)],
+    [
+        pytest.param("fold", 1.95, FOLD, marks=pytest.mark.exhaustive),
+        ("period-doubling", 2.04, DOUBLING),
+    ],
 )
 def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency, coefficient):
     """For x'' + 0.1x' + x = F cos ωt with k = 0.8, the motion with one impact per cycle folds on
@@ -67,7 +70,7 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
 @pytest.mark.parametrize(
     ("to", "frequency", "force", "speed"),
     [
-        ("fold", 0.799, 0.362836201981, 0.124087344853),
+        pytest.param("fold", 0.799, 0.362836201981, 0.124087344853, marks=pytest.mark.exhaustive),
         ("period-doubling", 0.81, 0.347533397412, 0.065303943337),
     ],
 )
@@ -115,6 +118,7 @@ class Two(vi.Mechanical):
         return {"x": pull - q.x - 0.1 * v.x + drive, "y": -pull}
 
 
+@pytest.mark.exhaustive
 def test_folds_and_doublings_of_a_larger_machine_begin_at_different_points():
     """With four state components, they leave the curve of grazings at different points. A curve
     that starts with a slow impact ends at the same point."""

@@ -43,7 +43,7 @@ def sledge_speeds(damping):
     return (both + apart).real / 2, (both - apart).real / 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_motion_of_arbitrary_position_is_found_near_the_guess():
     """A multiplier is 1 to rounding, so that the equations of the orbit are singular."""
     guess = Sledges(*map(jnp.asarray, (0.35, 0.1, 0.35, -0.2)))  # equal positions

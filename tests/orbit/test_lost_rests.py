@@ -50,7 +50,7 @@ def rests_around(machine_at, value, by=1e-6):
     return [rests(machine_at(value + x)) for x in (-by, by)]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rest_that_is_divided():
     """Compare point, curve and multipliers of two bodies with a shooting code with exact hops, and
     the rests on both sides of the curve with simulations."""
@@ -114,7 +114,7 @@ class Switched(vi.AbstractMachine):
         return vi.OscillatorState(jnp.asarray(-0.5), jnp.asarray(0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_event_reaches_the_end_of_a_chatter():
     """The rest begins 1.1788045220098 before the drive changes its sign, by hops in 60 digits. The
     branch ends where the switch reaches the beginning of the rest."""

@@ -57,7 +57,7 @@ def after_a_cycle(x, shift):
         x[2 * body : 2 * body + 2] = 0.3, -0.6 * x[2 * body + 1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_switch_leads_to_the_other_order():
     machine = TwoBodies()
     orbit = vi.find_orbit(machine, vi.simulate(machine, machine.start(), 6, settle=300).last)

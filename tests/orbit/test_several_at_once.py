@@ -129,7 +129,7 @@ def test_a_curve_of_folds_of_both_oscillators():
         assert np.sum(np.abs(values - 1) < 1e-5) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_curves_of_branch_points():
     """Both curves end at folds of the uncoupled oscillators. One touches the curve of folds, which
     is no resonance, since the double multiplier 1 has two eigenvectors."""

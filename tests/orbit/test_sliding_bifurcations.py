@@ -16,7 +16,7 @@ def excess_force(omega, numbers, near):
     return abs(force) - numbers["level"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_slip_between_two_segments_of_sticking():
     """At phase 2π, where the drive is strongest, the force just reaches the friction level."""
     numbers = {"level": 0.5, "second": 0.0, "damping": 0.04}

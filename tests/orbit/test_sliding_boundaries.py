@@ -78,6 +78,7 @@ class Damped(Belt):
         return vi.OscillatorState(x.V, -x.Y - self.damping * x.V)
 
 
+@pytest.mark.exhaustive
 def test_grazing_sliding_of_a_motion_that_sticks():
     """The segment of sticking vanishes where the greatest velocity after a release equals the belt
     speed. Compare with shooting by SciPy."""

@@ -62,7 +62,7 @@ def test_a_boundary_takes_more_steps_for_a_slow_drive():
     np.testing.assert_allclose(gap, amplitude(omega), atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_flights_of_a_long_period_have_the_steps_of_the_longest():
     """Compare the multipliers of a motion with twelve impacts in sixteen cycles with the cycle map,
     and its origin with the doubling of the motion of eight cycles."""

@@ -100,7 +100,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(x, marks=[pytest.mark.exhaustive] * (x == "rubs")) for x in CASES]
+)
 def test_a_branch_is_the_same_in_all_units(case):
     """Friction gives the same branch as a contact and as a switch that slides. A branch, computed
     from event to event, contains the orbit found by the cycle map."""

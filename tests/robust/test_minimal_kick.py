@@ -137,7 +137,7 @@ def test_invalid_arguments_raise(motions, result):
         vi.edge_state(SCENE, motions[0], motions[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_minimal_kick_of_steady_sliding():
     """The kick leads to stick-slip, across the unstable cycle of sliding."""
     rest = 0.5 + 0.5 * np.exp(-3.0)

@@ -64,7 +64,7 @@ def test_a_killed_scan_resumes_on_two_devices(tmp_path, whole):
     _same(_finished(path, "--devices", "2"), whole)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_cluster_may_lose_a_worker(tmp_path, whole):
     _same(_finished(tmp_path / "cluster", "--cluster"), whole)
 

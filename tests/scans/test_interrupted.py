@@ -126,7 +126,7 @@ def test_interrupted_exponents_use_completed_cycles(monkeypatch):
     assert float(error.partial.exponents[0]) == pytest.approx(-0.2, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_interrupted_searches_for_kicks_and_edges(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
     places = ((1.283, 1.007), (1.528, 1.314), (1.26, 1.086))
