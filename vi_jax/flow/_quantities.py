@@ -11,14 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._types import State
-from ..machine import (
-    AbstractMachine,
-    begin_modes,
-    components,
-    leaf_names,
-    overridden,
-    shown_modes,
-)
+from ..machine import AbstractMachine, begin_modes, components, leaf_names, overridden, shown_modes
 from ._machine_checks import explain_errors
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.

@@ -56,7 +56,7 @@ class Beam(LinearMachine):
 
     with cos β cosh β = -1 and φ = cosh βξ - cos βξ - σ (sinh βξ - sin βξ). The mean of φ² is 1 (R.
     D. Blevins, Formulas for Natural Frequency and Mode Shape, 1979). The state is a
-    `StructureState` of the modes' coordinates q; `deflection` returns w.
+    `StructureState` of the modes' coordinates q, and w at a place is `shape(place) @ q`.
 
     The clamp moves as a cos ωs, and w is relative to it, or a force F cos ωs acts on the tip. An
     impact acts on all modes at once (F. C. Moon and S. W. Shaw, International Journal of Non-Linear

@@ -45,10 +45,7 @@ class Capsule(ForcedMachine, Mechanical):
         **dict.fromkeys(("v.place", "v.travel", "progress"), "F/√(k m)"),
         "rate": "√(k/m)", "time": "√(m/k)", "energy": "F²/k", "power": "F²/√(k m)",
     }  # fmt: skip
-    labels: ClassVar = (  # pyright: ignore
-        "place in the capsule (F/k)",
-        "speed in the capsule (F/√(k m))",
-    )
+    labels: ClassVar = ("place in the capsule (F/k)", "its speed (F/√(k m))")  # pyright: ignore
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore

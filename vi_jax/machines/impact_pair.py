@@ -84,8 +84,7 @@ class ImpactPair(ReadyMachine, Mechanical):
         box = float(state.box) if free else sin(phase)
         radius, wall, half = 0.4 * pen.size, 0.25 * pen.size, float(self.half_gap)
         edge, top = half + radius + wall, 1.6 * radius
-        for side in (-1, 1):
-            face = box + side * (edge - wall / 2)
+        for face in (box - edge + wall / 2, box + edge - wall / 2):
             pen.body(face, width=wall, height=2 * top, color=pen.green)
         pen.body(box, -top - wall / 2, width=2 * edge, height=wall, color=pen.green)
         pen.ball(box + float(state.place), radius - top, radius)

@@ -97,9 +97,10 @@ def _converted(parameter: inspect.Parameter, value: Any) -> Any:
 def _line(error: BaseException) -> str:
     """Return the last line of user code in the traceback of an error, as text."""
     libraries = (str(Path(__file__).parents[1]), "site-packages", "<frozen")
-    lines = traceback.extract_tb(error.__traceback__)
-    user_lines = [x for x in lines if not any(other in x.filename for other in libraries)]
-    return f" ({user_lines[-1].filename}, line {user_lines[-1].lineno})" if user_lines else ""
+    for line in reversed(traceback.extract_tb(error.__traceback__)):
+        if not any(library in line.filename for library in libraries):
+            return f" ({line.filename}, line {line.lineno})"
+    return ""
 
 
 def value_of(value: Any, place: str) -> Any:

@@ -96,7 +96,8 @@ class Structure(LinearMachine):
         loss = jnp.zeros(self.mass.shape[-1:]) if self.damping is None else self.damping
         n = _check_matrices(self.mass, loss, self.stiffness)
         for name in ("force", "sine_force", "static_force"):
-            _check_vector(name, getattr(self, name), n)
+            if getattr(self, name) is not None:
+                _check_vector(name, getattr(self, name), n)
         _check_contacts(self.contacts, n)
         require_ranges(self)
 
@@ -168,11 +169,7 @@ def _in_modes(name: str, f: Any, shapes: Float[Array, "points n"]) -> Any:
     if f is None:
         return None
     f = number(name, f)
-    if f.shape != shapes.shape[:1]:
-        raise ValueError(
-            f"Argument `{name}` must have the shape ({shapes.shape[0]},), one number for each "
-            f"point of `shapes`, but has {f.shape}."
-        )
+    _check_vector(name, f, shapes.shape[0], "point of `shapes`")
     return f @ shapes
 
 
@@ -193,7 +190,14 @@ def _check_matrices(mass: Any, damping: Any, stiffness: Any) -> int:
                 f"matrix, like `mass`, but has {value.shape}."
             )
         _check_numbers(name, value)
-    _check_positive(mass)
+    known = concrete(mass)
+    if known is not None:
+        values = known if known.ndim == 1 else np.linalg.eigvalsh(known)
+        if not values.min() > n * np.finfo(values.dtype).eps * np.abs(values).max():
+            raise ValueError(
+                "Argument `mass` must be positive definite, but its smallest eigenvalue is "
+                f"{values.min():.3g}, its largest {values.max():.3g}."
+            )
     return n
 
 
@@ -217,25 +221,11 @@ def _check_numbers(name: str, value: object) -> None:
         )
 
 
-def _check_positive(mass: object) -> None:
-    known = concrete(mass)
-    if known is None:
-        return
-    values = known if known.ndim == 1 else np.linalg.eigvalsh(known)
-    if not values.min() > known.shape[0] * np.finfo(values.dtype).eps * np.abs(values).max():
-        raise ValueError(
-            "Argument `mass` must be positive definite, but its smallest eigenvalue is "
-            f"{values.min():.3g}, its largest {values.max():.3g}."
-        )
-
-
-def _check_vector(name: str, value: Any, n: int) -> None:
-    if value is None:
-        return
+def _check_vector(name: str, value: Any, n: int, each: str = "degree of freedom") -> None:
     if value.shape != (n,):
         raise ValueError(
-            f"Argument `{name}` must have the shape ({n},), one number for each degree of freedom, "
-            f"but has {value.shape}."
+            f"Argument `{name}` must have the shape ({n},), one number for each {each}, but has "
+            f"{value.shape}."
         )
     _check_numbers(name, value)
 

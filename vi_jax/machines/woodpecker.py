@@ -9,13 +9,7 @@ import numpy as np
 
 from .._checks import NOT_NEGATIVE, POSITIVE, REAL, SHARE, concrete
 from .._types import Scalar, State
-from ..machine import (
-    Mechanical,
-    RigidStop,
-    counter_of,
-    rising,
-    solved,
-)
+from ..machine import Mechanical, RigidStop, counter_of, rising, solved
 from ._base import ReadyMachine, number_field
 
 WOOD, SLEEVE, BIRD, BEAK = "#c9a36b", "#6f6f6f", "#4c5b66", "#e0b83f"
@@ -105,8 +99,7 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def contacts(self) -> tuple[RigidStop, ...]:
-        """The pole at the beak and at the upper and the lower edge of the sleeve, with friction.
-        All gaps and slips are in metres, so that forces are in N."""
+        """The pole at the beak and at both edges of the sleeve. Gaps and slips are in metres."""
         arm = self.bird_arm - self.beak_arm
         beak = lambda q: self.beak_height * q.bird_angle
         edge = lambda q: self.sleeve_height * q.sleeve_angle
@@ -122,12 +115,9 @@ class Woodpecker(ReadyMachine, Mechanical):
 
     @property
     def mass(self) -> list[list[Any]]:  # pyright: ignore
-        sleeve, bird = self.sleeve_arm, self.bird_arm
-        J = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
-        coupled = [
-            [self.bird_mass * a * b for b in (1.0, sleeve, bird)] for a in (1.0, sleeve, bird)
-        ]
-        return [[x + (i == j) * J[i] for j, x in enumerate(row)] for i, row in enumerate(coupled)]
+        own = self.sleeve_mass, self.sleeve_inertia, self.bird_inertia
+        arms = list(enumerate((1.0, self.sleeve_arm, self.bird_arm)))
+        return [[self.bird_mass * a * b + (i == j) * own[i] for j, b in arms] for i, a in arms]
 
     def force(self, t: Scalar, q: Any, v: Any) -> dict[str, Any]:
         moment = self.stiffness * (q.sleeve_angle - q.bird_angle)
@@ -154,11 +144,9 @@ class Woodpecker(ReadyMachine, Mechanical):
         return {"descent": -state.v.height}
 
     def renewed(self, state: State) -> State:
-        """Return the state with the height set to zero; unchanged if observed at equal
-        intervals."""
-        if counter_of(self) is None:
-            return state
-        return state.replace(height=jnp.zeros_like(state.height))
+        """Return the state with height zero; unchanged if it is observed at equal intervals."""
+        is_observed = counter_of(self) is None
+        return state if is_observed else state.replace(height=jnp.zeros_like(state.height))
 
     def start(self) -> Any:
         """Return a state near the cycle of the default numbers: on the section, the sleeve on its

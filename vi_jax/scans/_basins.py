@@ -227,13 +227,17 @@ class Basins(NamedTuple):
                 f"{count_of(round(a.impacts), 'impact')}, {where}: "
                 f"{100 * a.fraction:.2f} ± {100 * a.error:.2f} %"
             )
+        for name, share in self.irregular.items():
+            if share:
+                why = f" ({self._reasons()})" if name == "failed" else ""
+                lines.append(f"  {name}: {100 * share:.2f} %{why}")
+        return "\n".join(lines)
+
+    def _reasons(self) -> str:
+        """Return the names of the reasons of failed starts."""
         failed = np.asarray(self.data["label"]) == int(REGIMES.failed)
         numbers = np.unique(np.asarray(self.data["result"])[failed]).astype(int)
-        names = ", ".join(REASON_NAMES[i] for i in numbers)
-        reason = {"failed": f" ({names})"} if names else {}
-        lines += [f"  {name}: {100 * x:.2f} %{reason.get(name, '')}"
-                  for name, x in self.irregular.items() if x]  # fmt: skip
-        return "\n".join(lines)
+        return ", ".join(REASON_NAMES[i] for i in numbers)
 
     __repr__ = __str__
 

@@ -8,15 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .entries import (
-    CYCLES,
-    KAPPA,
-    LANES,
-    ROUNDS,
-    Entry,
-    derivative_entries,
-    entries,
-)
+from .entries import CYCLES, KAPPA, LANES, ROUNDS, Entry, derivative_entries, entries
 from .pool import Worker, cores, together
 from .task import PARAMETERS, Task
 

@@ -14,15 +14,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars
 from ...lanes import pin
-from ...machine import (
-    RigidStop,
-    clock_of,
-    events_of,
-    horner,
-    section_number,
-    stops_of,
-    switches_of,
-)
+from ...machine import RigidStop, clock_of, events_of, horner, section_number, stops_of, switches_of
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
 from ..events import Rates, highest, offset_to_turn, quintic, rising_root, slope
 from ..methods import Foreseen
