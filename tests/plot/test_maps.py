@@ -122,7 +122,8 @@ def _basins(label, dims, **coords):
             1, 2, 3.0, {"Y": np.array([0.0, 9.0]), "V": np.array([0.0, 9.0])}, 2, 0.2, 0.1
         ),
     ]
-    data = xr.Dataset({"label": (dims, np.asarray(label, np.int8))}, coords=coords)
+    label = np.asarray(label, np.int8)
+    data = xr.Dataset({"label": (dims, label), "result": (dims, 0 * label)}, coords=coords)
     return vi.Basins(data, motions, {**IRREGULAR}, vi.Scene.ideal(frequency_ratio=0.9))
 
 
