@@ -1,71 +1,27 @@
 """Simulation: methods of integration, the hybrid step, closed forms, `simulate` and its results."""
 
-from ._lane import has_fixed_cycle as has_fixed_cycle
-from ._machine_checks import check_parts as check_parts
-from ._machine_checks import depends_on_time as depends_on_time
-from ._quantities import average_names as average_names
-from ._quantities import has_averages as has_averages
-from ._quantities import has_quantities as has_quantities
-from ._quantities import quantities_on as quantities_on
-from ._quantities import quantity_names as quantity_names
-from ._simulate import compiling as compiling
-from ._simulate import jit as jit
-from ._simulate import simulate as simulate
-from ._simulate import simulate_pool as simulate_pool
-from .arguments import RunOptions as RunOptions
-from .arguments import as_floats as as_floats
-from .arguments import check_leaves as check_leaves
-from .arguments import check_prescribed as check_prescribed
-from .arguments import check_reals as check_reals
-from .arguments import check_start as check_start
-from .arguments import check_values as check_values
-from .arguments import machine_of as machine_of
-from .arguments import make_plan as make_plan
-from .arguments import shape_of as shape_of
-from .events import Rates as Rates
-from .events import force_rate as force_rate
-from .events import guard_rates as guard_rates
-from .loop import row_sizes as row_sizes
-from .loop import sizes_on_host as sizes_on_host
-from .methods import AbstractMethod as AbstractMethod
-from .methods import Adaptive as Adaptive
-from .methods import ExactFlight as ExactFlight
-from .methods import FixedStep as FixedStep
-from .methods import ImplicitSteps as ImplicitSteps
-from .methods import MethodLike as MethodLike
-from .methods import Taylor as Taylor
-from .methods import Unrolled as Unrolled
-from .methods import Verner9 as Verner9
-from .methods import chosen as chosen
-from .methods import preset as preset
-from .methods.exact import lack_of_closed_form as lack_of_closed_form
-from .noise import WhiteNoise as WhiteNoise
-from .noise import check_noise as check_noise
-from .noise import lane_key as lane_key
-from .noise import words_of as words_of
-from .results import EVENTS as EVENTS
-from .results import REASON_NAMES as REASON_NAMES
-from .results import RESULTS as RESULTS
-from .results import Errors as Errors
-from .results import EventKind as EventKind
-from .results import EventLog as EventLog
-from .results import ImpactLog as ImpactLog
-from .results import NamedEnumeration as NamedEnumeration
-from .results import Run as Run
-from .results import Samples as Samples
-from .results import batch_names as batch_names
-from .results import in_names as in_names
-from .results import number_of as number_of
-from .results import present as present
-from .results import raised as raised
-from .results import states as states
-from .results import tidy as tidy
-from .smooth import TIME as TIME
-from .smooth import Integrals as Integrals
-from .smooth import SmoothMachine as SmoothMachine
-from .smooth import carried as carried
-from .smooth import elapsed as elapsed
-from .smooth import in_modes as in_modes
-from .smooth import means as means
-from .suggest import Suggestion as Suggestion
-from .suggest import suggest_method as suggest_method
+# The names that other packages import.
+# ruff: noqa: F401, I001
+# fmt: off
+from ._lane import has_fixed_cycle
+from ._machine_checks import check_parts, depends_on_time
+from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
+from ._simulate import compiling, jit, simulate, simulate_pool
+from .arguments import (
+    RunOptions, as_floats, check_leaves, check_reals, check_start,
+    check_values, machine_of, make_plan, shape_of,
+)
+from .events import Rates, force_rate, guard_rates
+from .loop import row_sizes, sizes_on_host
+from .methods import (
+    AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,
+    Unrolled, Verner9, chosen, preset,
+)
+from .methods.exact import lack_of_closed_form
+from .noise import WhiteNoise, check_noise, lane_key, words_of
+from .results import (
+    EVENTS, REASON_NAMES, RESULTS, Errors, EventKind, EventLog, ImpactLog, NamedEnumeration,
+    Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
+)
+from .smooth import TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means
+from .suggest import Suggestion, suggest_method

@@ -1,154 +1,51 @@
 """Machines: states, coordinates, contacts, events, drives, and the paper's scene."""
 
-from ..lanes import horner as horner
-from ..lanes import sincos as sincos
-from .base import AbstractMachine as AbstractMachine
-from .base import contacts_in as contacts_in
-from .base import has_velocity as has_velocity
-from .base import jumps_on_section as jumps_on_section
-from .base import listed as listed
-from .base import longest_step as longest_step
-from .base import names_on as names_on
-from .base import number_on as number_on
-from .base import renews as renews
-from .clocks import as_logged as as_logged
-from .clocks import at_section as at_section
-from .clocks import clock_in_words as clock_in_words
-from .clocks import convert_start as convert_start
-from .clocks import cycle_time as cycle_time
-from .clocks import cycles_in_words as cycles_in_words
-from .clocks import frequency_ratio as frequency_ratio
-from .clocks import in_clock as in_clock
-from .clocks import in_cycle_clock as in_cycle_clock
-from .clocks import in_cycle_state as in_cycle_state
-from .clocks import is_alive as is_alive
-from .clocks import is_in_range as is_in_range
-from .clocks import logged_turn as logged_turn
-from .clocks import may_rest as may_rest
-from .clocks import phase_at as phase_at
-from .clocks import prepared as prepared
-from .clocks import scales_known as scales_known
-from .contacts import added as added
-from .contacts import check_takes as check_takes
-from .contacts import constrained_rate as constrained_rate
-from .contacts import contact_constraints as contact_constraints
-from .contacts import field_in as field_in
-from .contacts import forces as forces
-from .contacts import push_gains as push_gains
-from .contacts import push_of as push_of
-from .contacts import shown_modes as shown_modes
-from .contacts import velocity_change as velocity_change
-from .contacts import with_friction_impulse as with_friction_impulse
-from .coordinates import Coordinate as Coordinate
-from .coordinates import angles_in as angles_in
-from .coordinates import component as component
-from .coordinates import has_component as has_component
-from .coordinates import is_angle as is_angle
-from .coordinates import nearest_images as nearest_images
-from .coordinates import with_component as with_component
-from .coordinates import without_turns as without_turns
-from .coordinates import wrap_angles as wrap_angles
-from .cycles import Turn as Turn
-from .cycles import counter_of as counter_of
-from .cycles import counts_turns as counts_turns
-from .cycles import falling as falling
-from .cycles import rising as rising
-from .cycles import turn_of as turn_of
-from .declared import clock_of as clock_of
-from .declared import others_of as others_of
-from .declared import outcomes_of as outcomes_of
-from .declared import overridden as overridden
-from .declared import section_in as section_in
-from .declared import stops_of as stops_of
-from .declared import switches_of as switches_of
-from .declared import with_earlier_clock as with_earlier_clock
-from .drives import UNITS as UNITS
-from .drives import AbstractCrank as AbstractCrank
-from .drives import AbstractDrive as AbstractDrive
-from .drives import CosineCrank as CosineCrank
-from .drives import DCMotor as DCMotor
-from .drives import DCMotorState as DCMotorState
-from .drives import IdealDrive as IdealDrive
-from .drives import Motor as Motor
-from .drives import MotorState as MotorState
-from .drives import OscillatorState as OscillatorState
-from .drives import SliderCrank as SliderCrank
-from .drives import TimedDCMotorState as TimedDCMotorState
-from .drives import TimedMotorState as TimedMotorState
-from .event import AbstractEvent as AbstractEvent
-from .event import AbstractSwitch as AbstractSwitch
-from .events import HybridState as HybridState
-from .events import Reset as Reset
-from .events import Switch as Switch
-from .events import after_event as after_event
-from .events import begin_modes as begin_modes
-from .events import begun as begun
-from .events import event_of as event_of
-from .events import events_of as events_of
-from .events import friction_on as friction_on
-from .events import guard_of as guard_of
-from .events import has_contact_friction as has_contact_friction
-from .events import holds_anywhere as holds_anywhere
-from .events import is_autonomous as is_autonomous
-from .events import jump_of as jump_of
-from .events import mode_number as mode_number
-from .events import modes_at_start as modes_at_start
-from .events import modes_of as modes_of
-from .events import own_modes as own_modes
-from .events import raveled as raveled
-from .events import replaced as replaced
-from .events import section_number as section_number
-from .events import sides_of as sides_of
-from .events import struck_modes as struck_modes
-from .events import with_modes as with_modes
-from .events import without_modes as without_modes
-from .friction import ContactFriction as ContactFriction
-from .friction import DryFriction as DryFriction
-from .friction import Friction as Friction
-from .linear import LinearMachine as LinearMachine
-from .linear import ModalMachine as ModalMachine
-from .linear import Prepared as Prepared
-from .linear import StructureState as StructureState
-from .linear import modal as modal
-from .mechanical import Mechanical as Mechanical
-from .mechanical import solved as solved
-from .numbers import PLAIN as PLAIN
-from .numbers import Shown as Shown
-from .numbers import Stated as Stated
-from .numbers import Summarized as Summarized
-from .numbers import attributes as attributes
-from .numbers import by_name as by_name
-from .numbers import check_again as check_again
-from .numbers import check_leaf as check_leaf
-from .numbers import check_name as check_name
-from .numbers import components as components
-from .numbers import drive_speed as drive_speed
-from .numbers import first_few as first_few
-from .numbers import in_brackets as in_brackets
-from .numbers import in_rows as in_rows
-from .numbers import in_unit as in_unit
-from .numbers import leaf as leaf
-from .numbers import leaf_names as leaf_names
-from .numbers import name_in as name_in
-from .numbers import number_in_words as number_in_words
-from .numbers import plain as plain
-from .numbers import quantity_of as quantity_of
-from .numbers import size_of as size_of
-from .numbers import state_in_words as state_in_words
-from .numbers import stated as stated
-from .numbers import unit_of as unit_of
-from .numbers import units_of as units_of
-from .numbers import with_leaf as with_leaf
-from .numbers import with_leaves as with_leaves
-from .numbers import with_unit as with_unit
-from .numbers import with_units as with_units
-from .scene import Oscillator as Oscillator
-from .scene import Parameters as Parameters
-from .scene import Scene as Scene
-from .state import State as State
-from .state import like as like
-from .stop import AbstractContactLaw as AbstractContactLaw
-from .stop import HuntCrossley as HuntCrossley
-from .stop import PowerLaw as PowerLaw
-from .stop import RigidStop as RigidStop
-from .stop import SoftStop as SoftStop
+# The names that other packages import.
+# ruff: noqa: F401, I001
+# fmt: off
+from ..lanes import horner, sincos
+from .base import (
+    AbstractMachine, contacts_in, has_velocity, jumps_on_section, listed, longest_step,
+    names_on, number_on, renews,
+)
+from .clocks import (
+    as_logged, at_section, clock_in_words, convert_start, cycle_time, cycles_in_words,
+    frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive, is_in_range,
+    logged_turn, may_rest, phase_at, prepared, scales_known,
+)
+from .contacts import (
+    added, check_takes, constrained_rate, contact_constraints, field_in, forces, push_gains,
+    push_of, shown_modes, velocity_change, with_friction_impulse,
+)
+from .coordinates import (
+    Coordinate, angles_in, component, has_component, is_angle, nearest_images, with_component,
+    without_turns, wrap_angles,
+)
+from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
+from .declared import (
+    clock_of, others_of, outcomes_of, overridden, section_in, stops_of, switches_of,
+    with_earlier_clock,
+)
+from .drives import (
+    AbstractCrank, AbstractDrive, CosineCrank, DCMotor, DCMotorState, IdealDrive, Motor,
+    MotorState, OscillatorState, SliderCrank, TimedDCMotorState, TimedMotorState,
+)
+from .event import AbstractEvent, AbstractSwitch
+from .events import (
+    HybridState, Reset, Switch, after_event, begin_modes, begun, event_of, events_of,
+    friction_on, guard_of, has_contact_friction, holds_anywhere, is_autonomous, jump_of,
+    mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
+    sides_of, struck_modes, with_modes, without_modes,
+)
+from .friction import ContactFriction, DryFriction
+from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
+from .mechanical import Mechanical, solved
+from .numbers import (
+    PLAIN, Shown, Stated, Summarized, attributes, by_name, check_again, check_leaf, check_name,
+    components, drive_speed, first_few, in_brackets, in_rows, in_unit, leaf, leaf_names,
+    name_in, number_in_words, plain, quantity_of, size_of, state_in_words, stated, unit_of,
+    units_of, with_leaf, with_leaves, with_unit, with_units,
+)
+from .scene import Oscillator, Parameters, Scene
+from .state import State, like
+from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop

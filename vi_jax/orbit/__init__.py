@@ -1,36 +1,17 @@
 """Periodic motion: the cycle map, closed-form solutions, finding orbits and judging them."""
 
-from ._continuation import boundary as boundary
-from ._continuation import continue_orbit as continue_orbit
-from ._cycle_map import CycleMap as CycleMap
-from ._cycle_map import cycle_map as cycle_map
-from ._cycle_map import map_state as map_state
-from .closed_form import ClosedFormOrbits as ClosedFormOrbits
-from .closed_form import closed_form_orbits as closed_form_orbits
-from .curve import Boundary as Boundary
-from .curve import Branch as Branch
-from .curve import branch_hits_in_words as branch_hits_in_words
-from .curve import column_names as column_names
-from .find import find_orbit as find_orbit
-from .find import is_equilibrium as is_equilibrium
-from .grazing import SCENARIOS as SCENARIOS
-from .grazing import Grazing as Grazing
-from .grazing import Motions as Motions
-from .grazing import grazing as grazing
-from .results import ORBIT_RESULTS as ORBIT_RESULTS
-from .results import STABILITY as STABILITY
-from .results import InWords as InWords
-from .results import Orbit as Orbit
-from .results import Orbits as Orbits
-from .results import check_multipliers as check_multipliers
-from .results import complex_in_words as complex_in_words
-from .results import distance as distance
-from .results import distinct_among as distinct_among
-from .results import distinct_orbits as distinct_orbits
-from .results import in_one_line as in_one_line
-from .results import multipliers_of as multipliers_of
-from .results import stability_of as stability_of
-from .root_finders import AbstractRootFinder as AbstractRootFinder
-from .root_finders import Gradient as Gradient
-from .root_finders import Newton as Newton
-from .special import Point as Point
+# The names that other packages import.
+# ruff: noqa: F401, I001
+# fmt: off
+from ._continuation import boundary, continue_orbit
+from ._cycle_map import CycleMap, cycle_map, map_state
+from .closed_form import ClosedFormOrbits, closed_form_orbits
+from .curve import Boundary, Branch, branch_hits_in_words, column_names
+from .find import find_orbit, is_equilibrium
+from .grazing import SCENARIOS, Grazing, Motions, grazing
+from .results import (
+    ORBIT_RESULTS, STABILITY, InWords, Orbit, Orbits, check_multipliers, complex_in_words,
+    distance, distinct_among, distinct_orbits, in_one_line, multipliers_of, stability_of,
+)
+from .root_finders import AbstractRootFinder, Gradient, Newton
+from .special import Point

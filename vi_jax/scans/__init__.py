@@ -1,31 +1,17 @@
 """Batches of motions: grids, sweeps, basins, Lyapunov exponents, regimes."""
 
-from ._all_orbits import AllOrbits as AllOrbits
-from ._all_orbits import Searched as Searched
-from ._all_orbits import all_orbits as all_orbits
-from ._basins import Attractor as Attractor
-from ._basins import Basins as Basins
-from ._basins import Integrity as Integrity
-from ._basins import IntegrityProfile as IntegrityProfile
-from ._basins import basins as basins
-from ._basins import integrity_profile as integrity_profile
-from ._geometry import BasinEntropy as BasinEntropy
-from ._geometry import Uncertainty as Uncertainty
-from ._lyapunov import Lyapunov as Lyapunov
-from ._lyapunov import lyapunov as lyapunov
-from ._scan import LanesFailed as LanesFailed
-from ._scan import scan as scan
-from ._sweep import Sweep as Sweep
-from ._sweep import moved_by_stops as moved_by_stops
-from ._sweep import sweep as sweep
-from .measures import REGIMES as REGIMES
-from .measures import AbstractMeasure as AbstractMeasure
-from .measures import Density as Density
-from .measures import Escape as Escape
-from .measures import Exponent as Exponent
-from .measures import Regime as Regime
-from .measures import Sections as Sections
-from .measures import Statistics as Statistics
-from .measures import escape_rate as escape_rate
-from .program import make_program as make_program
-from .store import NOT_COMPUTED as NOT_COMPUTED
+# The names that other packages import.
+# ruff: noqa: F401, I001
+# fmt: off
+from ._all_orbits import AllOrbits, all_orbits
+from ._basins import Attractor, Basins, Integrity, IntegrityProfile, basins, integrity_profile
+from ._geometry import BasinEntropy, Uncertainty
+from ._lyapunov import Lyapunov, lyapunov
+from ._scan import scan
+from ._sweep import Sweep, moved_by_stops, sweep
+from .measures import (
+    REGIMES, AbstractMeasure, Density, Escape, Exponent, Regime, Sections, Statistics,
+    escape_rate,
+)
+from .program import make_program
+from .store import NOT_COMPUTED
