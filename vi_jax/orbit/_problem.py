@@ -145,7 +145,8 @@ _SETTLED, _MOST = 1e-11, 4096
 COARSE = 1e-10
 
 
-# Events this close (by the clock) are simultaneous; a guard must be this close to zero: choices.
+# Events this close are simultaneous, relative to the last one's clock. A guard must be this close
+# to zero, relative to its change over the sizes of the state. Choices.
 _SAME_INSTANT, _OFF_ZERO = 1e-9, 1e-6
 
 
@@ -271,12 +272,15 @@ def _check_instants(
     """Raise `ValueError` for an event that another event or the restart of the clock triggers. Its
     guard is not zero there, so the equations cannot contain it."""
     machine, previous = blank.machine, 0.0
+    span = max((abs(place) for place, _ in found), default=0.0)
+    sizes = blank.unravel(jnp.abs(jnp.asarray(states)).max(axis=0))
     for i, (place, event) in enumerate(found):
-        if abs(place - previous) <= _SAME_INSTANT and event.cycle is None:
+        if abs(place - previous) <= _SAME_INSTANT * span and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
-            if abs(float(guard_at(before, event, jnp.asarray(place), state))) > _OFF_ZERO:
+            guard = partial(guard_at, before, event, jnp.asarray(place))
+            if abs(float(guard(state))) > _OFF_ZERO * (float(size_of(guard, state, sizes)) or 1.0):
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
                     f"{event.name_on(machine)} does, with another event or as a cycle begins. "

@@ -29,7 +29,7 @@ from ._shooting import Observed, Shooting
 from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
-from .results import InWords, Orbit, stability_of
+from .results import NEUTRAL, InWords, Orbit, stability_of
 from .special import Point
 
 # Names of the numbers at each point of every curve.
@@ -182,8 +182,8 @@ class Curve(InWords, abc.ABC):
 
     @property
     def stable(self) -> np.ndarray:
-        """True at each point if all multipliers lie inside the unit circle."""
-        return self.multiplier < 1
+        """True at each point if all multipliers lie inside the unit circle, by more than 1e-9."""
+        return self.multiplier < 1 - NEUTRAL
 
     @property
     def admissible(self) -> np.ndarray:
@@ -420,7 +420,7 @@ class Boundary(Curve):
     @property
     def kind(self) -> str:
         """The kind of its points: "fold", "period-doubling", "neimark-sacker", "symmetry-breaking",
-        "branch-point", "grazing" or that of a sliding bifurcation."""
+        "branch-point", "grazing", "rest" or that of a sliding bifurcation."""
         return self.condition.kind
 
     @cached_property

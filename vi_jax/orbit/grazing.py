@@ -80,7 +80,7 @@ class Attractors(NamedTuple):
     impacts: np.ndarray
     """Impacts at the touches in a period; the mean over one without a period."""
     places: np.ndarray
-    """States after the first touch, less the smooth motion there; (lanes, LOOKED, states)."""
+    """States after the first touch, less the smooth motion there; (lanes, SOUGHT, states)."""
     depth: np.ndarray
     """The deepest penetration √(-h), without an impact."""
 
@@ -276,7 +276,7 @@ class SimulatedAttractors(NamedTuple):
     impacts: np.ndarray
     """As `Attractors.impacts`; NaN if a touch is not one of a rigid stop."""
     places: np.ndarray
-    """States on the section, less the smooth motion; (lanes, LOOKED, states)."""
+    """States on the section, less the smooth motion; (lanes, SOUGHT, states)."""
     far: np.ndarray
     """As `period`, for lanes that left; 0 for others."""
     hits: np.ndarray
@@ -355,7 +355,7 @@ class Motions(NamedTuple):
     """In periods of the motion that grazes; 0 without a period, -1 if the attractor is far away."""
     impacts: Float[np.ndarray, " values"]
     """Impacts at the touch in a period; the mean over one without a period."""
-    position: Float[np.ndarray, "values looked"]
+    position: Float[np.ndarray, "values sought"]
     """The first coordinate on the section, less that of the smooth motion."""
 
 
@@ -510,7 +510,7 @@ class Grazing(Summarized):
                 f"{100 * self.agreement:.3g} % of the values alike"
             )
         elif self.machine is not None:
-            lines.append("  checked by the machine: it does not agree at the values looked at")
+            lines.append("  checked by the machine: it does not agree at these values")
         return "\n".join(lines)
 
     @property

@@ -94,8 +94,7 @@ def edge_state(
     - `settle`: number of cycles after which a start that has not returned to the motion of `inside`
       counts as settling elsewhere.
     - `tolerance`: a start has returned once a section state is this close to one of the motion.
-      It is relative to u + |state|, with u the largest component of the motion, at most 1, and must
-      be smaller than the basin.
+      It is relative to the sizes of the state's components, and must be smaller than the basin.
     - `longest`: longest period of the edge state, in cycles.
     - `rounds`: number of bisections after which the edge is called irregular.
     - `method`: as for `cycle_map`.

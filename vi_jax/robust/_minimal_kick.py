@@ -161,9 +161,9 @@ def first_exits(
     while np.isfinite(found.outside).any():
         least = found.outside.min()
         closer = exits(settling, kick, rays, 0.0, least, points)
-        refine_direction = closer.outside < found.outside
-        inside = np.where(refine_direction, closer.inside, found.inside)
-        found = Exits(rays, inside, np.where(refine_direction, closer.outside, found.outside))
+        is_closer = closer.outside < found.outside
+        inside = np.where(is_closer, closer.inside, found.inside)
+        found = Exits(rays, inside, np.where(is_closer, closer.outside, found.outside))
         if found.outside.min() > 0.5 * least:
             break
     return narrowed(settling, kick, found, _COARSE)

@@ -172,7 +172,8 @@ def lyapunov(
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
-    start = machine_of(machine).start() if start is None else start
+    machine = machine_of(machine)
+    start = machine.start() if start is None else start
     if is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(

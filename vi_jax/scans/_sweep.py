@@ -220,7 +220,7 @@ def sweep(
     - `machine`, `parameter`: the machine and the name of the number that varies, such as
       `"drive.frequency_ratio"`.
     - `values`: its values in the order of the sweep.
-    - `start`: state at the first value; by default at rest (a motor at its no-load speed).
+    - `start`: state at the first value; by default the machine's `start()`.
     - `settle`, `cycles`: drive cycles at each value before observation, and observed; static.
     - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
     - `tolerance`: the largest difference of sections that repeat, as in `Regime`.
