@@ -29,7 +29,7 @@ from ._shooting import Observed, Shooting
 from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_of
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
-from .results import NEUTRAL, InWords, Orbit, stability_of
+from .results import NEUTRAL, Orbit, stability_of
 from .special import Point
 
 # Names of the numbers at each point of every curve.
@@ -79,7 +79,7 @@ _ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
-class Curve(InWords, abc.ABC):
+class Curve(abc.ABC):
     """A curve of periodic motions: host arrays with one row for each point, in order, in the
     machine's units (see `AbstractMachine.units`)."""
 
@@ -385,7 +385,7 @@ class Branch(Curve):
         )
         return [f"  held: {held_in_words(self.problem)}; by {', '.join(ranges)}"]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
         machine = self.problem.machine
         period = cycles_in_words(machine, self.cycles)
@@ -441,7 +441,7 @@ class Boundary(Curve):
         """The columns of any curve; for Neimark–Sacker points also the `angle`."""
         return (*super().column_names, *(("angle",) if self.kind == TORUS else ()))
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         low, high = self.parameters.min(axis=0), self.parameters.max(axis=0)
         lines = [
             f"Curve of {count_of(len(self.parameters), 'point')} of {self.kind}: {self.names[0]} "

@@ -371,13 +371,6 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
         )
 
 
-class InWords:
-    """A mixin for display: `__str__` as text."""
-
-    def __repr__(self) -> str:
-        return str(self)
-
-
 def _advice(orbit: Orbit) -> str:
     """Return advice for a search that ended close to an orbit, at the errors of the steps."""
     # A choice: searches from bad starts end with residuals of some 1e-3 and more.
@@ -437,10 +430,10 @@ def distance(here: Any, there: Any, unit: Any = 1) -> Any:
     return (abs(here - there) / (unit + abs(there))).max(axis=-1)
 
 
-class Orbits(InWords, list[Orbit]):
+class Orbits(list[Orbit]):
     """Several periodic motions: a list that prints as a table, one motion a line."""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return "\n".join([count_of(len(self), "orbit"), *map(in_one_line, self)])
 
 

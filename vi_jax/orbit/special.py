@@ -13,14 +13,14 @@ from ._shooting import ROUNDING, Shooting
 from ._sliding import SLIDING
 from ._solution import Step, orbit_of
 from ._words import DETAILS, GRAZING, REST, grazing_in_words, with_article
-from .results import InWords, Orbit
+from .results import Orbit
 
 # A grazing is a touch within this share of the motion: a choice.
 _TOUCHES = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
-class Point(InWords):
+class Point:
     """A special point: of a branch, or of codimension two on a `Boundary`."""
 
     kind: str
@@ -143,7 +143,7 @@ class Point(InWords):
         start = starts[next(iter(starts)) if to is None else one_of("to", to, tuple(starts))]
         return start(self, distance)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         values = self.parameters[: 1 if self.curve is None else None]
         place = ", ".join(f"{x:.10g}" for x in values)
         return f"{self.kind} at {f'({place})' if self.curve else place}: {self.detail}"

@@ -16,7 +16,6 @@ from ..machine import AbstractMachine, components, cycles_in_words, units_of, wi
 from ..orbit import (
     ORBIT_RESULTS,
     AbstractRootFinder,
-    InWords,
     Orbit,
     Orbits,
     distinct_among,
@@ -61,7 +60,7 @@ class Searched:
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class AllOrbits(InWords):
+class AllOrbits:
     """Periodic motions from a region of starts, stable and unstable, and search statistics."""
 
     orbits: Orbits
@@ -116,7 +115,7 @@ class AllOrbits(InWords):
             data[f"search_{name}"] = "search", np.array(values)
         return tidy(with_units(xr.Dataset(data), units_of(self.machine), {}), along)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         count, stable = len(self.orbits), int(self.stable.sum())
         longest = max(searched.cycles for searched in self.searched)
         lines = [

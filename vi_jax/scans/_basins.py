@@ -217,7 +217,7 @@ class Basins(NamedTuple):
             variables[f"motion_{name}"] = ("motion", "cycle"), rows, about
         return tidy(self.data.assign(variables), along)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [f"Basins of {count_of(len(self.attractors), 'periodic motion')}"]
         for a in self.attractors:
             first = {name: x[0] for name, x in a.sections.items()}
@@ -238,8 +238,6 @@ class Basins(NamedTuple):
         failed = np.asarray(self.data["label"]) == int(REGIMES.failed)
         numbers = np.unique(np.asarray(self.data["result"])[failed]).astype(int)
         return ", ".join(REASON_NAMES[i] for i in numbers)
-
-    __repr__ = __str__
 
 
 def in_one_array(rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -577,7 +575,7 @@ class IntegrityProfile(NamedTuple):
         coords = {self.parameter: (self.parameter, self.values, attributes(unit))}
         return tidy(xr.Dataset(variables, coords), along)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         low, high = self.values[[0, -1]]
         lines = [
             f"Integrity over {self.parameter}, {self.values.size} values from {low:.6g} to "
@@ -597,8 +595,6 @@ class IntegrityProfile(NamedTuple):
         if len(self.period) > 8:
             lines.append(f"  {len(self.period) - 8} further motions")
         return "\n".join(lines)
-
-    __repr__ = __str__
 
 
 @warning_once
