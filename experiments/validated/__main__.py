@@ -23,9 +23,9 @@ ORDER = (
     "bstab_belt", "duffing_basins", "woodpecker", "walker", "siconos_chain", "siconos_bar",
 )  # fmt: skip
 
-BEGIN = """# Validated against other codes
+BEGIN = """# Examples of other codes
 
-This page compares vi_jax with published examples of other codes. Each section is a script of at
+This page computes published examples of other codes again. References are their numbers or reference solutions. Each section is a script of at
 most sixty lines in [`experiments/validated`](../experiments/validated); the tests run all of them
 and compare every number below.
 
