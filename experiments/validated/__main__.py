@@ -25,9 +25,10 @@ ORDER = (
 
 BEGIN = """# Examples of other codes
 
-This page computes published examples of other codes again. References are their numbers or reference solutions. Each section is a script of at
-most sixty lines in [`experiments/validated`](../experiments/validated); the tests run all of them
-and compare every number below.
+This page computes published examples of other codes again and compares the numbers with theirs, or
+with a reference solution. Each section is a script of at most sixty lines in
+[`experiments/validated`](../experiments/validated); the tests run all of them and compare every
+number below.
 
 *Theirs* has the published digits, or those of a reference solution of the published equations.
 *How* gives the origin: a documentation, a program, the reference file of a test, a closed form, or
