@@ -86,10 +86,7 @@ class _AxisMap(NamedTuple):
 
 
 def _viewed(t: Text, x: Array, shape: Sequence[int], maps: Sequence[_AxisMap]) -> Array:
-    """Return a view of an array's numbers in another shape.
-
-    **Arguments:** the text; the array; the new shape; the indices along each axis of the array.
-    """
+    """Return a view of an array's numbers in another shape."""
     cuts: dict[int, set[int]] = {}
     if any(maps[a].step != 1 for a in x.cuts):
         x = stored(t, x)
@@ -116,7 +113,6 @@ def _(t, p, avals, x):
 
 
 def reshaped(t: Text, x: Array, shape: tuple[int, ...]) -> Array:
-    """Return an array in another shape, with its numbers in the same order."""
     if isinstance(x, Registers):
         return Registers(x.values.reshape(shape), x.kind)
     old, new = ([i for i, n in enumerate(s) if n != 1] for s in (x.shape, shape))
@@ -157,7 +153,6 @@ def _(t, p, avals, x):
 
 
 def part_along(t: Text, x: Array, axis: int, begin: int, end: int) -> Array:
-    """Return the part of an array between two indices of an axis."""
     shape = [end - begin if a == axis else n for a, n in enumerate(x.shape)]
     return _viewed(t, x, shape, [_AxisMap(a, 1, begin if a == axis else 0) for a in range(x.ndim)])
 
@@ -255,7 +250,6 @@ def _(t, p, avals, x, value):
 
 
 def _spread(t: Text, config: Sequence[tuple[int, int, int]], x: Array, number: Value) -> Array:
-    """Return an array with copies of `number` between its own numbers, as `config` states."""
     between = [int(inside) for _, _, inside in config]
     shape = [max(0, (n - 1) * (i + 1) + 1) for n, i in zip(x.shape, between, strict=True)]
     whole = uniform(shape, number)
@@ -317,12 +311,9 @@ def _(t, p, avals, d, x, update, *starts):
 
 
 def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
-    """Return a large array with other numbers in a window, without a copy; `None` unless the window
-    covers all axes but one completely.
-
-    **Arguments:** the text; the array; the first index and the size of the window along each axis;
-    a function from an index in the window to the new number.
-    """
+    """Return a large array with other numbers in a window, without a copy. The window is the first
+    index and the size along each axis; `new` maps an index in it to a number. `None` unless it
+    covers all axes but one completely."""
     axes = [a for a, (_, n) in enumerate(window) if n != x.shape[a]]
     if len(axes) != 1 or isinstance(x, Registers):
         return None
@@ -336,7 +327,6 @@ def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable
 
 
 def _copy(t: Text, x: Array, in_memory: bool) -> Registers | Strided:
-    """Return a copy that may be changed, in memory if `in_memory` or if the array is large."""
     if in_memory or not isinstance(x, Registers):
         return stored(t, x)
     return Registers(x.values.copy(), x.kind)
@@ -430,13 +420,10 @@ def _with_blocks(
     t: Text, x: Array, update: Array, inner: Sequence[int], axes: Sequence[int],
     corner: Callable, combined: Callable[[Value, Value], Value] | None = None,
 ) -> Array:  # fmt: skip
-    """Return an array with blocks of other numbers.
-
-    **Arguments:** the text; the array; the blocks; the axes of the array along which they extend,
-    and the corresponding axes of `update`; `corner`, which maps indices along the other axes of
-    `update` to the first indices of a block and whether it is valid; `combined`, the new number
-    from the old one and that of `update`, which by default replaces it.
-    """
+    """Return an array with blocks of other numbers. They extend along its axes `inner`, which
+    correspond to `axes` of `update`. `corner` maps indices along the other axes of `update` to the
+    first indices of a block and whether it is valid. `combined` gets the old number and that of
+    `update`, which by default replaces it."""
     sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
     others = [n for o, n in enumerate(update.shape) if o not in axes]
     if int(np.prod(others, dtype=int)) == 1:
@@ -471,10 +458,7 @@ def _with_blocks(
 
 
 def put_at(t: Text, x: Registers | Strided, place: Sequence[Index], new: Callable) -> None:
-    """Change the number of an array at an index; in registers, by `select` at all possible ones.
-
-    **Arguments:** the text; the array; the index; the new number as a function of the old one.
-    """
+    """Change the number of an array at an index; in registers, by `select` at all possible ones."""
     if isinstance(x, Strided):
         return x.put(t, place, new(x.at(t, place)))
     for candidate in np.ndindex(x.shape):
@@ -511,11 +495,8 @@ def reduced(
     t: Text, number: int, term: Callable[[Index], Value], combine: Callable, empty: Value,
     *, in_order: bool = False,
 ) -> Value:  # fmt: skip
-    """Return a reduction of all terms, in several partial results.
-
-    **Arguments:** the text; the number of terms; a function from an index to a term; the operation
-    on two values; the result for no terms; `in_order`, True to write all terms in sequence instead.
-    """
+    """Return a reduction of all terms, in several partial results unless `in_order`; `empty` is the
+    result for no terms."""
     if number == 0:
         return empty
     if in_order:
@@ -565,7 +546,6 @@ def _grouped(t: Text, x: Array, groups: Sequence[Sequence[int]]) -> Array:
 
 
 def _cumulate(name: str, t: Text, p: dict, avals, x: Array) -> Array:
-    """Return the cumulative results of a rule along an axis."""
     combine = partial(ELEMENTWISE[name], t, {}, [avals[0].dtype])
     if isinstance(x, Registers):
         out = np.moveaxis(x.values, p["axis"], 0).copy()
@@ -604,7 +584,6 @@ STRUCTURAL["reduce_or"] = partial(_reduce, "or", 0)
 
 
 def any_in(t: Text, x: Array) -> Value:
-    """Return whether any flag of an array holds."""
     if not x.ndim:
         return x.at(t, ())
     axes, flag = {"axes": tuple(range(x.ndim))}, jax.ShapeDtypeStruct((), bool)

@@ -24,7 +24,6 @@ Index = int | str | Value
 
 
 def splat(t: Text, scalar: str, kind: str) -> Value:
-    """Return a scalar of the kernel as a vector over the lanes."""
     v = t.vector(kind)
     one = t.raw(f"insertelement {v} poison, {kind} {scalar}, i32 0")
     mask = f"<{t.width} x i32> zeroinitializer"
@@ -64,7 +63,6 @@ def times(t: Text, a: Index, number: int) -> Index:
 
 
 def place_of(t: Text, index: Sequence[Index], strides: Sequence[int], offset: Index = 0) -> Index:
-    """Return the place of an element among an array's numbers."""
     total = offset
     for i, stride in zip(index, strides, strict=True):
         total = plus(t, total, times(t, i, stride))
@@ -82,13 +80,8 @@ def write_loop(
     body: Callable[[Index, list[Value]], list[Value]],
     first: list[Value],
 ) -> list[Value]:
-    """Write a loop with a known number of iterations and a scalar counter.
-
-    **Arguments:** the text; the number of iterations; the body, which maps the iteration's number
-    and the carry to the next carry; the initial carry.
-
-    **Returns:** the final carry.
-    """
+    """Write a loop with a known number of iterations and a scalar counter. Return the final carry.
+    `body` maps the iteration's number and the carry to the next carry."""
     if number < 2:
         return body(0, first) if number else first
     inside, after = t.label(), t.label()
@@ -162,12 +155,10 @@ class Array:
 
     @property
     def size(self) -> int:
-        """The number of its elements."""
         return int(np.prod(self.shape, dtype=int))
 
     @property
     def ndim(self) -> int:
-        """The number of its axes."""
         return len(self.shape)
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
@@ -176,10 +167,7 @@ class Array:
 
 
 class Registers(Array):
-    """An array in registers, with at most `MOST_IN_REGISTERS` numbers.
-
-    **Arguments:** an object array of `Value`s; their type, by default that of the first.
-    """
+    """An array in registers: at most `MOST_IN_REGISTERS` `Value`s."""
 
     def __init__(self, values: np.ndarray, kind: str | None = None):
         self.values: Any = values
@@ -188,7 +176,6 @@ class Registers(Array):
 
     @classmethod
     def of(cls, shape: Sequence[int], kind: str, number: Callable[[tuple[int, ...]], Value]):
-        """Return an array of this shape with a number for each index."""
         values = np.empty(tuple(shape), object)
         for i in np.ndindex(values.shape):
             values[i] = number(i)
@@ -196,13 +183,11 @@ class Registers(Array):
 
     @classmethod
     def one(cls, value: Value) -> "Registers":
-        """Return an array without axes that holds one value."""
         values = np.empty((), object)
         values[()] = value
         return cls(values, value.kind)
 
     def item(self) -> Value:
-        """Return the value of an array without axes."""
         return self.values.item()
 
     def at(self, t: Text, index: Sequence[Index]) -> Value:
@@ -235,7 +220,6 @@ class Formula(Array):
 
 
 def uniform(shape: Sequence[int], value: Value) -> Formula:
-    """Return an array whose numbers are all equal."""
     return Formula(tuple(shape), value.kind, lambda index: value, True, value)
 
 
@@ -290,7 +274,6 @@ def _clamped(t: Text, place: Index, last: int) -> Value:
 
 
 def joined_cuts(*cuts: Cuts) -> Cuts:
-    """Return the union of the cuts of several arrays of one shape."""
     axes = {axis for c in cuts for axis in c}
     return {a: frozenset().union(*(c.get(a, frozenset()) for c in cuts)) for a in axes}
 
@@ -302,7 +285,6 @@ class Table:
     pointer: str
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
-        """Return the number at a place, in every lane."""
         stored = stored_kind(kind)
         if isinstance(place, Value):
             return gathered(t, self.pointer, place, kind)
@@ -319,7 +301,6 @@ class Memory:
     """The block, or the name of a pointer and an offset in bytes."""
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
-        """Return each lane's number at a place."""
         if isinstance(place, Value):
             return gathered(t, self._base(t), self._of_slots(t, place), kind)
         stored = stored_kind(kind)
@@ -329,7 +310,6 @@ class Memory:
         return _flag_if(t, value, kind)
 
     def store(self, t: Text, place: Index, value: Value) -> None:
-        """Store each lane's number at a place."""
         if isinstance(place, Value):
             return scattered(t, self._base(t), self._of_slots(t, place), value)
         value = _as_stored(t, value)
@@ -374,14 +354,12 @@ class Strided(Array):
         return self.source.load(t, place_of(t, index, self.strides, self.offset), self.kind)
 
     def put(self, t: Text, index: Sequence[Index], value: Value) -> None:
-        """Store the number at an index."""
         assert isinstance(self.source, Memory)
         self.source.store(t, place_of(t, index, self.strides, self.offset), value)
 
     def viewed(
         self, t: Text, shape: Sequence[int], strides: Sequence[int], more: Index = 0
     ) -> "Strided":
-        """Return a view of the same memory or table."""
         offset = plus(t, self.offset, more)
         return Strided(tuple(shape), self.kind, self.source, tuple(strides), offset)
 
@@ -456,10 +434,7 @@ def to_registers(t: Text, x: Array) -> Any:
 
 
 def mapped(t: Text, function: Callable[..., Value], *arrays: Array, kind: str | None = None) -> Any:
-    """Apply a function of numbers elementwise to arrays of one shape.
-
-    **Arguments:** `kind`, the type of its result, by default that of the first array.
-    """
+    """Apply a function elementwise; `kind` is the result's type, by default the first array's."""
     first, kind = arrays[0], kind or arrays[0].kind
     if not first.shape:
         return Registers.one(function(*(x.at(t, ()) for x in arrays)))
@@ -489,12 +464,10 @@ def reserve(t: Text, shape: Sequence[int], kind: str) -> Strided:
 
 
 def fill(t: Text, out: Strided, x: Array) -> None:
-    """Store the numbers of an array in allocated memory."""
     write_for_each(t, x, lambda i: out.put(t, i, x.at(t, i)))
 
 
 def stored(t: Text, x: Array) -> Strided:
-    """Return a copy of an array in memory."""
     out = reserve(t, x.shape, x.kind)
     fill(t, out, x)
     return out
@@ -518,7 +491,6 @@ def is_cheap(x: Array) -> bool:
 
 
 def selected(t: Text, mask: Value, a: Array, b: Array) -> Any:
-    """Return the first array where `mask` holds, else the second."""
     return mapped(t, lambda x, y: t.select(mask, x, y), a, b)
 
 

@@ -36,15 +36,10 @@ def by_columns(
     weights: Mapping[int, Any],
     batch: tuple[int, ...],
 ) -> dict[int, Any]:
-    """Run the program forward along each number, and weight the derivatives with the cotangents.
-
-    Up to `DIRECTIONS` numbers share one motion.
-
-    **Arguments:** a program that is linear in some inputs; its backend; its arguments, with `None`
-    for these inputs; a dictionary from places of results to their cotangents; the batch axes.
-
-    **Returns:** a dictionary from places of these inputs to their cotangents, with the batch axes.
-    """
+    """Run the program forward along each number, and weight the derivatives with the cotangents. Up
+    to `DIRECTIONS` numbers share one motion. Inputs in which the program is linear are `None` in
+    `args`; the result has their cotangents by place, with the batch axes. `weights` has the
+    cotangents of the results by place."""
     places: dict[int, slice] = {}  # the range of each such input among the numbers of all
     number = 0
     for i, (x, aval) in enumerate(zip(args, program.in_avals, strict=True)):
@@ -130,8 +125,7 @@ def _length(program: LaneProgram) -> int:
 
 
 def _for_argument(x, lane_aval, aval):
-    """Return the cotangent of an argument: the sum over lanes, if all share it. Arguments: the
-    cotangents with batch axes; the aval of one lane; the aval of the argument."""
+    """Return the cotangent of an argument: the sum over lanes, if all share it."""
     if aval.ndim == lane_aval.ndim:
         x = jnp.sum(x, axis=tuple(range(x.ndim - lane_aval.ndim)))
     return x.reshape(aval.shape).astype(aval.dtype)
@@ -173,7 +167,6 @@ ad.primitive_transposes[lanes_p] = _transposed
 
 
 def _columns(*args, program: ReverseProgram) -> list[Any]:
-    """Return the results of `lanes_backward`, computed by columns."""
     base, varied = program.program, program.varied
     n, batch = len(base.in_avals), batch_of(program, [x.shape for x in args])
     inputs, weights_given = list(args[:n]), args[n:]
@@ -292,7 +285,6 @@ _columns_lowered = mlir.lower_fun(_columns, multiple_results=True)
 
 
 def _lowered(ctx, *args, program: ReverseProgram):
-    """Lower to a call of the reverse kernel on a CPU, or to columns if there can be no kernel."""
     otherwise = functools.partial(_columns_lowered, ctx, *args, program=program)
     return lower_to_kernel(ctx, args, program, otherwise)
 

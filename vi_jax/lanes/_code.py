@@ -38,14 +38,8 @@ def engine_of(text: str) -> Any:
 
 
 def compile_in_background(text: str, cpu: str | None) -> Future:
-    """Compile a kernel's text on another thread.
-
-    **Arguments:** the text, which defines `kernel`; the processor's name in LLVM, `None` for this
-    one.
-
-    **Returns:** a future of the engine, which holds the code in memory, and the address of
-    `kernel`. Its result **raises** `RuntimeError` if LLVM could not compile the text.
-    """
+    """Compile a kernel's text on another thread. The future's result is the engine, which holds the
+    code in memory, and the address of `kernel`."""
     return _worker().submit(_load_or_compile, llvm(), text, cpu, _level(), _cache_folder())
 
 
@@ -72,7 +66,6 @@ def _load_or_compile(
 
 
 def _level() -> int:
-    """Return LLVM's optimization level: lower if JAX is set to skip most optimizations."""
     return 0 if jax.config.read("jax_disable_most_optimizations") else 1
 
 
@@ -81,12 +74,8 @@ def _host(binding: Any) -> tuple[str, str]:
 
 
 def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> bytes:
-    """Return the object code of a text for a processor (LLVM's name, or `None` for this one).
-
-    LLVM does not vectorize, since the text is vector code already, and does not unroll loops.
-
-    **Raises:** `RuntimeError` if the text is not valid, or LLVM cannot compile it.
-    """
+    """Return the object code of a text for a processor (LLVM's name, or `None` for this one). LLVM
+    does not vectorize, since the text is vector code already, and does not unroll loops."""
     name, features = _host(binding) if cpu is None else (cpu, "")
     target = binding.Target.from_default_triple()
     machine = target.create_target_machine(cpu=name, features=features, opt=level)
@@ -134,7 +123,6 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, code: bytes) -> None:
-    """Store code for other processes, if the folder is writable."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent)

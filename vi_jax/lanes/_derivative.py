@@ -22,7 +22,6 @@ from .elementary import elementwise_primitive
 
 
 def _divided(eqn: Any) -> Any:
-    """Return the equation, with this derivative if it is a division of floating-point numbers."""
     if eqn.primitive.name == "div" and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return eqn.replace(primitive=quotient_p, params={})
     return eqn
@@ -76,10 +75,7 @@ class Derived(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
     """Return the program of values and forward derivatives. Parts that cannot depend on a varied
-    input are not differentiated.
-
-    **Arguments:** the program; flags of the inputs with a tangent.
-    """
+    input are not differentiated."""
     if program.widening is not None:
         return _widened_forward(program, program.widening, varied)
     n = len(program.carry_avals)
@@ -130,12 +126,10 @@ def _with_derivatives(
     groups: tuple[int, ...],
     split: int | None = None,
 ) -> ClosedJaxpr:
-    """Return a jaxpr of values and derivatives.
-
-    **Arguments:** the jaxpr; flags of the arguments with a tangent; flags of the results whose
-    derivatives are wanted; the sizes of the groups of results, each followed by its derivatives;
-    the number of arguments whose tangents precede the other arguments (`None`: all).
-    """
+    """Return a jaxpr of values and derivatives. Flags mark the arguments with a tangent and the
+    results whose derivatives are `wanted`. Each of the `groups` of results is followed by its
+    derivatives. The tangents of the first `split` arguments precede the other arguments (`None`:
+    all)."""
     function = jaxpr_as_fun(with_quotients(closed))
     ends = [0, len(varied) if split is None else split, len(varied)]
 
@@ -168,11 +162,7 @@ def values_and_slopes(
     primals: Sequence[Any],
     tangents: Sequence[Any],
 ) -> tuple[Sequence[Any], Sequence[Any]]:
-    """Return the results of a function, and the derivatives of the `wanted` ones.
-
-    **Arguments:** the function; flags of its arguments with a tangent; flags of the wanted
-    derivatives; the arguments; the tangents.
-    """
+    """Return the results of a function, and the derivatives of the `wanted` ones."""
 
     def of_varied(*changing):
         inputs = iter(changing)
@@ -188,14 +178,9 @@ def values_and_slopes(
 def widened(
     program: LaneProgram, batched: tuple[bool, ...], number: int
 ) -> tuple[LaneProgram, DependentParts]:
-    """Return the program with `number` values of some of its inputs in one lane.
-
-    Other parts are computed once, so that several directions of a derivative share one motion.
-
-    **Arguments:** the program; flags of the inputs with a leading axis of that length.
-
-    **Returns:** the widened program, and flags of its parts with such an axis.
-    """
+    """Return the program with `number` values of its `batched` inputs in one lane, and flags of its
+    parts with such a leading axis. Other parts are computed once, so that several directions of a
+    derivative share one motion."""
     depend = dependent_parts(program, batched, smooth=False)
     return _widened(Widening(program, batched, number, depend)), depend
 

@@ -114,12 +114,10 @@ def _native() -> _Native:
 
 
 def guard(handler: object) -> int:
-    """Return the address of a handler for XLA that calls a function until it has an answer.
-
-    **Arguments:** `handler(frame, out)`, made by `ctypes`. It stores into `out`, a `HandlerResult`,
-    its answer and a signal that it caught, which is then raised again. An exception that leaves it,
-    such as one raised by a signal, leaves no answer. Then it is called again, with `out.lost` set.
-    """
+    """Return the address of a handler for XLA that calls `handler(frame, out)`, made by `ctypes`,
+    until it has an answer. The handler stores into `out`, a `HandlerResult`, its answer and a
+    signal that it caught, which is then raised again. An exception that leaves it, such as one
+    raised by a signal, leaves no answer. Then it is called again, with `out.lost` set."""
     engine = _native().engine
     for name, function in {
         "handler": handler, "interrupt_again": ctypes.pythonapi.PyErr_SetInterruptEx,
@@ -154,7 +152,6 @@ def _remove_counter() -> None:
 
 
 def interrupt_count() -> int:
-    """Return the number of interrupts since `install_counter`."""
     return _native().count.value
 
 
@@ -181,11 +178,8 @@ class Watch:
 
     @contextmanager
     def stopping(self, run: int, stop: Any) -> Iterator[None]:
-        """Set `stop` to 1 on an interrupt within this context; at once if there was one since the
-        first lanes of this run of XLA.
-
-        **Arguments:** XLA's number of the run; the `ctypes` number that the kernel reads.
-        """
+        """Set `stop`, which the kernel reads, to 1 on an interrupt within this context; at once if
+        there was one since the first lanes of this run of XLA."""
         install_counter()
         count_at_start = _counts_at_start.get(run)
         if count_at_start is None:
@@ -264,7 +258,6 @@ def raise_interrupts_within() -> Iterator[None]:
 
 
 def raise_dropped() -> None:
-    """Raise `KeyboardInterrupt` if Python dropped one."""
     if interrupt_dropped():
         _dropped.clear()
         raise KeyboardInterrupt

@@ -60,10 +60,7 @@ entry:"""
 def kernel_text(
     program: LaneProgram, width: int, bits: int, one_for_all: tuple[bool, ...] = ()
 ) -> str:
-    """Return LLVM's text of a program, for groups of `width` lanes in registers of `bits` bits.
-
-    **Arguments:** `one_for_all`, flags of inputs that all lanes share. Large ones are not copied.
-    """
+    """Return LLVM's text of a program. Large inputs that lanes share are not copied."""
     return _Writer(program, width, one_for_all).text(bits)
 
 
@@ -133,7 +130,6 @@ class _Writer:
         t.line("br label %refill")
 
     def _names(self) -> _Group:
-        """Return new names for all values of a group, to be defined by phi instructions."""
         t, arrays = self.t, []
         avals = (*self.program.in_avals, *self.program.carry_avals)
         for aval, in_memory in zip(avals, self.large, strict=True):
@@ -152,9 +148,7 @@ class _Writer:
     def _head(self) -> tuple[_Group, int]:
         """Write `head` and `look`, which run in every iteration. They exit on `stop`, flush if a
         lane has ended, or step. Both blocks stay open, since `step` and `flush` use their values.
-
-        **Returns:** the names of the group's values, and the line at which to insert their phis.
-        """
+        Return the group, and the line at which to insert its phis."""
         t = self.t
         t.open("head")
         group, place = self._names(), len(t.lines)
@@ -198,12 +192,7 @@ class _Writer:
         return block
 
     def _refill(self, head: _Group, flush_end: str) -> tuple[_Group, Value]:
-        """Assign the next lanes to slots without an active lane.
-
-        **Arguments:** the group at the head; the last block of `flush`.
-
-        **Returns:** the group with the numbers of its new lanes; the mask of slots with new lanes.
-        """
+        """Assign lanes to free slots. Return the group, and the mask of slots with new lanes."""
         t = self.t
         t.open("refill")
         old = self._names()
@@ -296,10 +285,7 @@ class _Writer:
     # Rows
 
     def _store_row(self, lane: Value, mask: Value, place: Value, row: list[Any]) -> None:
-        """Store a row where `mask` holds and the lane has room for it.
-
-        **Arguments:** each slot's lane; the mask of lanes with a row; the row's number; the row.
-        """
+        """Store row number `place` where `mask` holds and the lane has room for it."""
         t, rows = self.t, self.program.rows
         if not row:
             return
@@ -332,7 +318,6 @@ class _Writer:
 
 
 def load_pointer(t: Text, table: str, i: int) -> str:
-    """Load entry `i` of one of the kernel's tables of pointers, as a scalar."""
     place = t.raw(f"getelementptr ptr, ptr %{table}, i64 {i}")
     return t.raw(f"load ptr, ptr {place}")
 
@@ -344,11 +329,8 @@ def load_stride(t: Text, i: int) -> Value:
 
 
 def gathered_array(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -> Formula:
-    """Return an array of each slot, read at each use where `mask` holds, else zero.
-
-    **Arguments:** the address of all lanes' arrays; for each slot the index of its first number;
-    the array's shape and type; the mask of slots that read.
-    """
+    """Return an array of each slot, read at each use where `mask` holds, else zero. `base` is the
+    index of its first number in the arrays of all lanes."""
     steps, kind = contiguous(aval.shape), kind_of(aval.dtype)
 
     def number(index) -> Value:
@@ -359,16 +341,11 @@ def gathered_array(t: Text, pointer: str, base: Value, aval: Any, mask: Value) -
 
 
 def shared_input(pointer: str, aval: Any) -> Strided:
-    """Return an input that all lanes share, at its place in XLA's memory."""
     return Strided(aval.shape, kind_of(aval.dtype), Table(pointer), contiguous(aval.shape))
 
 
 def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
-    """Store `x` of the lanes in `mask`.
-
-    **Arguments:** the address of the output's array; for each lane, the index of its first number
-    there; the values; the mask of slots that store.
-    """
+    """Store `x` of the lanes in `mask`; `base` is the index of each lane's first number."""
 
     steps = contiguous(x.shape)
 
@@ -383,11 +360,8 @@ def scatter(t: Text, pointer: str, base: Value, x: Array, mask: Value) -> None:
 def over_rows(
     t: Text, first: Value, number: int, mask: Value, body: Callable[[Value, Value], None]
 ) -> None:
-    """Write a loop over the rows of each lane, beginning at that lane's first row.
-
-    **Arguments:** each slot's first row; the number of rows of a lane; the mask of slots; a
-    function that writes the body, from each slot's row and the mask of slots that have it.
-    """
+    """Write a loop over the rows of each lane, beginning at that lane's first row. `body` gets each
+    slot's row and the mask of slots that have it."""
     head, inside, after, before = t.label(), t.label(), t.label(), t.block
     t.line(f"br label %{head}")
     t.open(head)

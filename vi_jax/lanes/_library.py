@@ -78,7 +78,6 @@ class Real:
         return self._two("fcmp uno", self, "i1").value
 
     def choose(self, flag: Value, other) -> "Real":
-        """Return this number where the flag holds, else the other."""
         return Real(self.t, self.t.select(flag, self.value, self.of(other).value))
 
     def at_most(self, most: float) -> "Real":
@@ -89,7 +88,6 @@ class Real:
         return self.of(least).choose(self < least, self)
 
     def call(self, name: str, *others) -> "Real":
-        """Call an intrinsic of LLVM on this number and the others."""
         return Real(self.t, self.t.intrinsic(name, self.value, *(self.of(o).value for o in others)))
 
     def size(self) -> "Real":

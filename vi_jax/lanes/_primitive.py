@@ -35,7 +35,6 @@ def vector_only() -> AbstractContextManager:
 
 
 def primitive_of_programs(name: str) -> Primitive:
-    """Return a primitive that runs a batch of lanes of its parameter `program`."""
     primitive = Primitive(name)
     primitive.multiple_results = True
 
@@ -79,10 +78,7 @@ def _batched(args, dims, *, program: LaneProgram, backend: str):
 
 
 def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
-    """Return the length of an axis of `jax.vmap`, and the other batch axes of the lanes.
-
-    **Arguments:** the program; the arrays; the place of that axis in each, or `None`.
-    """
+    """Return the length of `jax.vmap`'s axis (at `dims`), and the lanes' other batch axes."""
     pairs = [(x.shape, d) for x, d in zip(args, dims, strict=True)]
     size = next(shape[d] for shape, d in pairs if d is not None)
     shapes = [shape if d is None else shape[:d] + shape[d + 1 :] for shape, d in pairs]
@@ -90,11 +86,8 @@ def axes_of(program: AnyProgram, args, dims) -> tuple[int, tuple[int, ...]]:
 
 
 def with_lane_axis(args, dims, avals, inner: tuple, size: int) -> list[Any]:
-    """Return arguments of a batch of lanes, with an axis of `jax.vmap` before the other batch axes.
-
-    **Arguments:** the arrays; the place of the new axis in each, or `None`; the shapes of one lane;
-    the other batch axes; the length of the new one.
-    """
+    """Return arguments of a batch of lanes, with an axis of `jax.vmap`, at `dims`, before the other
+    batch axes `inner`; `avals` are of one lane."""
     moved = []
     for x, d, aval in zip(args, dims, avals, strict=True):
         is_single = x.ndim - (d is not None) == aval.ndim
@@ -128,7 +121,6 @@ batching.primitive_batchers[lanes_p] = _batched
 
 
 def _jvp(primals, tangents, *, program: LaneProgram, backend: str):
-    """Compute values and derivatives with one program (`forward`)."""
     varied = tuple(type(t) is not ad.Zero for t in tangents)
     derived = forward(program, varied)
     changes = [t for t in tangents if type(t) is not ad.Zero]
@@ -162,12 +154,9 @@ def _partially_known(trace, *tracers, program: LaneProgram, backend: str):
 
 
 def _partially_known_equation(saveable, unknown, instantiated, equation):
-    """Do the same for an equation within `jax.checkpoint`. The values are computed again along with
-    their derivatives, unless the policy saves them.
-
-    **Returns:** for JAX's `partial_eval_jaxpr_custom_rules`: the equation to compute now; that to
-    compute later; flags of the unknown results of both; the values to keep.
-    """
+    """Do the same within `jax.checkpoint`: values are computed again along with their derivatives,
+    unless the policy saves them. A rule of `partial_eval_jaxpr_custom_rules` returns the equations
+    to compute now and later, flags of the unknown results of both, and the values to keep."""
     program, outs = equation.params["program"], len(equation.outvars)
     shapes = [x.aval.shape for x in equation.invars]
     of_values = program, [True] * outs
@@ -211,11 +200,8 @@ _STEPS_PER_CHECK = 8
 
 
 def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
-    """Return the results and rows of a batch of lanes, as the primitive does.
-
-    **Arguments:** the program; its inputs, each with the batch axes first, or without them if all
-    lanes share it.
-    """
+    """Return the results and rows of a batch of lanes, as the primitive does. Inputs have the batch
+    axes first, or none if all lanes share them."""
     batch = batch_of(program, [x.shape for x in args])
     lanes = math.prod(batch)
     if lanes == 0:
@@ -235,10 +221,8 @@ def run_on_xla(program: LaneProgram, *args: Any) -> list[Any]:
 def _run_together(
     program: LaneProgram, inputs: list, axes: list[int | None], lanes: int
 ) -> list[Any]:
-    """Return results and rows of lanes with one leading axis.
-
-    **Arguments:** `axes`, 0 for an input with a value for each lane, else `None`.
-    """
+    """Return results and rows of lanes with one leading axis; `axes` is 0 for an input with a value
+    for each lane, else `None`."""
     n, index = len(program.carry_avals), jnp.arange(lanes)
     carried = [0] * n
     begin = jax.vmap(jaxpr_as_fun(program.begin), in_axes=axes, axis_size=lanes)
@@ -299,10 +283,8 @@ def _lowered(ctx, *args, program: LaneProgram, backend: str):
 
 
 def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]):
-    """Lower to a call of a program's kernel. Without a kernel, warn and return `otherwise()`.
-
-    **Raises:** `Unsupported` within `vector_only`, instead of the warning.
-    """
+    """Lower to a call of a program's kernel. Without a kernel, warn and return `otherwise()`;
+    within `vector_only` raise `Unsupported` instead."""
     try:
         avals = list(zip(ctx.avals_in, program.in_avals, strict=True))
         one_for_all = tuple(a.size > MOST_IN_REGISTERS and x.ndim == a.ndim for x, a in avals)
@@ -319,7 +301,6 @@ def lower_to_kernel(ctx, args, program: AnyProgram, otherwise: Callable[[], Any]
 
 
 def kernel_call(target: str, kernel, program: AnyProgram, avals, *args):
-    """Call the kernel as an XLA foreign function. Return results of the shapes `avals`."""
     strides = [
         aval.size if x.ndim > aval.ndim else 0
         for x, aval in zip(args, program.in_avals, strict=True)

@@ -73,13 +73,9 @@ class LaneProgram(eqx.Module):
     def values_without(
         self, missing: Sequence[bool], shapes: Sequence[tuple[int, ...]]
     ) -> "tuple[LaneProgram, list[bool]] | None":
-        """Return the program of the values that can be computed without some of the tangents.
-
-        **Arguments:** flags of the missing inputs; the shapes of all inputs, including batch axes.
-
-        **Returns:** that program, and flags of the results and rows of this program that it
-        returns; `None` if no such program exists.
-        """
+        """Return the program of the values that can be computed without the `missing` tangents, and
+        flags of the results and rows that it returns; `None` if no such program exists. `shapes` of
+        the inputs include batch axes."""
         found, base = [True] * len(self.result_avals), self.base
         program, batch = self, batch_of(self, shapes)
         while base is not None and any(missing[: len(program.in_avals)]):
@@ -99,7 +95,6 @@ def shape_of(x: Any) -> jax.ShapeDtypeStruct:
 
 
 def batch_of(program: Any, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the batch axes of inputs of these shapes."""
     for aval, shape in zip(program.in_avals, shapes, strict=True):
         if len(shape) > aval.ndim:
             return shape[: len(shape) - aval.ndim]
@@ -270,7 +265,6 @@ def _parameter(value: object, rule: Callable[[Any], Any]) -> Any:
 
 
 def bodies(eqn: Any) -> list[Jaxpr]:
-    """Return the jaxprs in the parameters of an equation."""
     values = [x for v in eqn.params.values() for x in (v if isinstance(v, tuple) else (v,))]
     return [inner(x) for x in values if isinstance(x, Jaxpr | ClosedJaxpr)]
 
@@ -291,11 +285,9 @@ def propagate_marks(
     visit: Callable[[Any, list[bool], list[bool]], None] = lambda *_: None,
 ) -> list[bool]:
     """Propagate marks from the arguments of a jaxpr through its equations to its results.
-
-    **Arguments:** `marks`, flags of the marked arguments; `rule(equation, marks)`, which returns
-    the marks of an equation's results if any of its arguments is marked; `visit`, called with each
-    equation, the marks of its arguments and those of its results.
-    """
+    `rule(equation, marks)` returns the marks of an equation's results if any of its arguments is
+    marked. `visit` is called with each equation, the marks of its arguments and those of its
+    results."""
     found = {v for v, mark in zip(jaxpr.invars, marks, strict=True) if mark}
     marked = lambda atoms: [not isinstance(a, Literal) and a in found for a in atoms]
     for eqn in jaxpr.eqns:
@@ -319,7 +311,6 @@ def _dependent_results(jaxpr: Jaxpr, sources: tuple[bool, ...], smooth: bool) ->
 
 
 def dependent_of_equation(eqn: Any, args: list[bool], *, smooth: bool) -> list[bool]:
-    """Return flags of the results of an equation that depend on the arguments flagged in `args`."""
     if smooth and eqn.primitive.name in _ZERO_DERIVATIVE:
         return [False] * len(eqn.outvars)
     found = zip(_dependent(eqn, args, smooth=smooth), eqn.outvars, strict=True)
@@ -383,11 +374,8 @@ def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def fixed_point(body: Callable[[list[bool]], list[bool]], carry: list[bool]) -> list[bool]:
-    """Return the flags of a loop body's results at their fixed point, carry first.
-
-    **Arguments:** `body`, which maps flags of the carry to flags of a body's results; the flags of
-    the carry before the first iteration.
-    """
+    """Return the flags of a loop body's results at their fixed point, carry first. `body` maps
+    flags of the carry to flags of its results."""
     while True:
         outs = body(carry)
         grown = [a or b for a, b in zip(carry, outs, strict=False)]

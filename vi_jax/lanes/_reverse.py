@@ -170,10 +170,8 @@ def reverse(
     program: LaneProgram, varied: tuple[bool, ...], given: tuple[bool, ...]
 ) -> ReverseProgram | None:
     """Return the program backward; `None` if a part of it has no transpose or no vector form.
-
-    **Arguments:** the program; flags of the inputs whose cotangents are wanted; flags of the
-    results, then of the parts of a row, with a cotangent (each must depend on a wanted input).
-    """
+    `given` flags the results, then the parts of a row, with a cotangent; each depends on a `varied`
+    input."""
     carried = _carried(program, varied, given)
     parts = (program.begin, varied), (program.step, (*varied, *carried))
     if any(loop_depends(jaxpr.jaxpr, flags_of_part) for jaxpr, flags_of_part in parts):
@@ -222,13 +220,9 @@ def _split_passes(
     weighted: Sequence[bool],
     kept: int,
 ) -> ForwardBackward:
-    """Return the forward and the backward jaxpr of a function.
-
-    **Arguments:** the program; the name of its function; flags of the arguments to differentiate;
-    flags of the results with a cotangent; the number of results that the forward pass needs.
-
-    **Raises:** `NotImplementedError` or `ValueError` if an operation has no transpose.
-    """
+    """Return the forward and the backward jaxpr of the function `name`, for flags of its `varied`
+    arguments and `weighted` results. The forward pass needs `kept` results. An operation without a
+    transpose raises `NotImplementedError` or `ValueError`."""
     closed, number = getattr(program, name), len(varied)
     along = _along(program, name, varied, weighted)
 

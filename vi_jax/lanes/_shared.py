@@ -28,7 +28,6 @@ class Recent(Generic[K, V]):
             self._values.clear()
 
     def get(self, key: K) -> V | None:
-        """Return the value of a key, or `None`."""
         with self._lock:
             value = self._values.get(key)
             if value is not None:
@@ -36,7 +35,6 @@ class Recent(Generic[K, V]):
         return value
 
     def put(self, key: K, value: V) -> None:
-        """Store a value. If there are more than `most`, drop the least recently used one."""
         with self._lock:
             self._values[key] = value
             self._values.move_to_end(key)

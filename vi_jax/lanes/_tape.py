@@ -186,11 +186,7 @@ def reverse_text(
     entries: int = _FIRST_ENTRIES,
     most: int = MOST_BYTES,
 ) -> str:
-    """Return LLVM's text of a program forward and backward.
-
-    **Arguments:** the program; the lanes of a group; the width of the registers that LLVM may use;
-    `one_for_all` as for `_kernel.kernel_text`; the initial entries of a tape; its greatest size.
-    """
+    """Return LLVM's text of a program forward and backward; a tape begins with `entries`."""
     return _Writer(program, width, one_for_all).text(bits, entries, most)
 
 
@@ -233,7 +229,6 @@ class _Writer:
         self.frame = Frame(parts, width)
 
     def text(self, bits: int, entries: int, most: int) -> str:
-        """Return LLVM's text of the module: forward pass, reverse pass, and the driver of both."""
         functions = [
             self._begin(), self._step(), self._end_back(), self._step_back(), self._begin_back(),
         ]  # fmt: skip
@@ -269,11 +264,8 @@ class _Writer:
     def _weights(
         self, t: Text, first: int, avals: list[Any], lane: Value, place: Value | None, mask: Value
     ) -> list[Array]:
-        """Return given cotangents, zero where `mask` does not hold.
-
-        **Arguments:** the number of the first of them; their shapes and types; each slot's lane;
-        the number of the row, for cotangents of rows; the lanes that have any.
-        """
+        """Return given cotangents from number `first` on, zero where `mask` does not hold; `place`
+        is the number of the row, for cotangents of rows."""
         arrays = []
         for i, aval in enumerate(avals, len(self.inputs) + first):
             start = t.binary("mul", lane, load_stride(t, i))
@@ -451,26 +443,20 @@ def masked_to(t: Text, flag: Value, arrays: list[Array], avals: list[Any]) -> li
 
 
 def select_all(t: Text, flag: Value, a: list[Array], b: list[Array]) -> list[Array]:
-    """Return the arrays `a` in the lanes where the flag holds, else `b`."""
     return [selected(t, flag, x, y) for x, y in zip(a, b, strict=True)]
 
 
 def add_all(t: Text, a: list[Array], b: list[Array]) -> list[Array]:
-    """Return the sums of two lists of arrays."""
     return [mapped(t, lambda x, y: add(t, x, y), x, y) for x, y in zip(a, b, strict=True)]
 
 
 def zeros(t: Text, avals: list[Any]) -> list[Array]:
-    """Return zeros of the given shapes and types."""
     return [to_registers(t, uniform(aval.shape, t.zero(kind_of(aval.dtype)))) for aval in avals]
 
 
 class Frame:
-    """Memory of a group of lanes at `%frame`, kept between the functions of a kernel.
-
-    **Arguments:** the parts by name, each with shapes and types of its arrays; the lanes of a
-    group.
-    """
+    """Memory of a group of lanes at `%frame`, kept between the functions of a kernel: parts by
+    name, each with shapes and types of its arrays."""
 
     def __init__(self, parts: dict[str, list[Any]], width: int):
         self._parts, self.places, size = parts, {}, 0
@@ -497,7 +483,6 @@ class Frame:
         return [to_registers(t, x) for x in self._arrays(t, part, pointer)]
 
     def store(self, t: Text, part: str, arrays: list[Array]) -> None:
-        """Store the arrays of a part."""
         # Large arrays may depend on those that are overwritten, so they are computed first.
         arrays = [x if isinstance(x, Registers) else stored(t, x) for x in arrays]
         for place, x in zip(self._arrays(t, part), arrays, strict=True):
@@ -520,9 +505,7 @@ class Frame:
                     fill(t, place, new)
 
     def number(self, t: Text, part: str, pointer: str = "%frame") -> Value:
-        """Return the single number of a part."""
         return self.load(t, part, pointer)[0].item()
 
     def store_number(self, t: Text, part: str, value: Value) -> None:
-        """Store the single number of a part."""
         self.store(t, part, [Registers.one(value)])

@@ -35,7 +35,6 @@ class Arena:
         return Block(self, begin, numbers)
 
     def free(self, begin: int, end: int) -> None:
-        """Free a range of places."""
         kept = []
         for a, b in self._free:
             if b == begin:
@@ -93,7 +92,6 @@ def is_float(kind: str) -> bool:
 
 
 def literal(number: Any, kind: str) -> str:
-    """Return a number as LLVM's text."""
     if is_float(kind):
         return "0x" + struct.pack(">d", float(number)).hex().upper()
     return str(bool(number)).lower() if kind == "i1" else str(int(number))
@@ -120,16 +118,13 @@ class Text:
         self._operations: list[dict[tuple, Value]] = [{}]
 
     def vector(self, kind: str) -> str:
-        """Return LLVM's type of a vector with one number of each lane."""
         return f"<{self.width} x {kind}>"
 
     def fresh(self) -> str:
-        """Return a new name of a value."""
         self._names += 1
         return f"%v{self._names}"
 
     def constant(self, number: Any, kind: str) -> Value:
-        """Return a value that is the same number in each lane."""
         if is_float(kind):
             number = float(np.float32(number)) if kind == "float" else float(number)
         else:
@@ -140,7 +135,6 @@ class Text:
         return self.constant(0, kind)
 
     def line(self, text: str) -> None:
-        """Append an instruction without a result."""
         self.lines.append("  " + text)
 
     def raw(self, operation: str) -> str:
@@ -155,10 +149,7 @@ class Text:
         return self.value(operation, "scalar").text
 
     def load(self, operation: str, kind: str) -> Value:
-        """Append a load from memory, merged with an equal one in this block since the last store.
-
-        **Arguments:** as for `value`.
-        """
+        """Append a load, merged with an equal one in this block since the last store."""
         key = (f"{operation}, {self._stores}", kind)
         found = self._operations[-1].get(key)
         if found is None:
@@ -166,15 +157,11 @@ class Text:
         return found
 
     def store(self, operation: str) -> None:
-        """Append a store to memory."""
         self._stores += 1
         self.line(operation)
 
     def value(self, operation: str, kind: str, *, merge: bool = True) -> Value:
-        """Append an operation on vectors, or reuse an equal one from a dominating block.
-
-        **Arguments:** the operation in LLVM's syntax; the type of the result's numbers.
-        """
+        """Append an operation on vectors, or reuse an equal one from a dominating block."""
         key = (operation, kind)
         if merge:
             for operations in self._operations:
@@ -199,7 +186,6 @@ class Text:
         return self.value(f"{operation} {self.vector(a.kind)} {a.text}, {b.text}", kind or a.kind)
 
     def negative(self, a: Value) -> Value:
-        """Append the negation of a floating-point number."""
         return self.value(f"fneg {self.vector(a.kind)} {a.text}", a.kind)
 
     def cast(self, operation: str, a: Value, kind: str) -> Value:
@@ -208,7 +194,6 @@ class Text:
         return self.value(f"{operation} {old} {a.text} to {new}", kind)
 
     def select(self, condition: Value, a: Value, b: Value) -> Value:
-        """Return a in lanes where the condition holds, else b."""
         if a == b:
             return a
         if condition.number is not None:
@@ -301,7 +286,6 @@ class Text:
         self._stores += 1  # other blocks that lead here may have stored
 
     def label(self) -> str:
-        """Return a new name of a block."""
         self._names += 1
         return f"b{self._names}"
 
@@ -312,12 +296,9 @@ class Text:
     def join(
         self, names: list[Value], *sources: tuple[list[Value], str], at: int | None = None
     ) -> None:
-        """Define names by phi instructions.
-
-        **Arguments:** the names; for each predecessor of this block, the incoming values and its
-        label; the line at which to insert the phis, by default the current one. The phis of a
-        loop's head are inserted later, since the head is written before the loop's body.
-        """
+        """Define names by phi instructions, from the values and the label of each predecessor of
+        this block. They are inserted at line `at`, by default the current one. The phis of a loop's
+        head are inserted later, since the head is written before the loop's body."""
         lines = []
         for name, *values in zip(names, *(values for values, _ in sources), strict=True):
             pairs = [(v.text, block) for v, (_, block) in zip(values, sources, strict=True)]

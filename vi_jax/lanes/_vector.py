@@ -85,7 +85,6 @@ def _bodies(eqn: Any) -> list[Jaxpr]:
 
 
 def constants(t: Text, array: object) -> Array:
-    """Return a constant array, the same in every lane."""
     array = np.asarray(array)
     kind = kind_of(array.dtype)
     if array.size > MOST_IN_REGISTERS:
@@ -94,14 +93,9 @@ def constants(t: Text, array: object) -> Array:
 
 
 def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
-    """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes.
-
-    **Arguments:** the text; the jaxpr; its arguments, as `Array`s of their shapes; the mask of the
-    lanes that need the results. Code that none of them needs may be skipped. Results of other lanes
-    are arbitrary.
-
-    **Returns:** the jaxpr's results, as `Array`s.
-    """
+    """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes; return its
+    results as `Array`s. `mask` holds in the lanes that need them. Code that none of them needs may
+    be skipped. Results of other lanes are arbitrary."""
     jaxpr, env = inner(closed), {}
     needed = _needed_equations(jaxpr)
     uses, last = _uses(jaxpr, needed)
@@ -243,10 +237,7 @@ _CHEAP = 4
 
 
 def _cond(t: Text, params: dict, args: list[Any], mask: Value) -> list[Any]:
-    """Write the branches. All but a cheap first one are skipped if no lane takes them.
-
-    **Arguments:** as for `CONTROL`.
-    """
+    """Write the branches. All but a cheap first one are skipped if no lane takes them."""
     branches, choice, args = params["branches"], args[0].item(), args[1:]
     last = len(branches) - 1
     flags = []
@@ -327,12 +318,9 @@ def _branch_if_any(t: Text, jaxpr, args, mask: Value, otherwise) -> list[Any]:
 def _branch_result(
     t: Text, x: Array, y: Array | None, r: Strided, args: list[Any], mask: Value
 ) -> Array:
-    """Return a large result: `x` in the lanes of `mask`, `y` in the others. Copies are avoided,
-    since branches of a derivative often return an argument unchanged, or zeros.
-
-    **Arguments:** the text; the branch's result `x`; the other lanes' `y`, or `None` if they are
-    arbitrary; memory for a stored result; the branch's arguments; its lanes.
-    """
+    """Return a large result: `x` in the lanes of `mask`, `y` in the others (`None`: arbitrary), in
+    the memory `r` if it is stored. Copies are avoided, since branches of a derivative often return
+    an argument unchanged, or zeros."""
     value_x, value_y = (a.value if isinstance(a, Formula) else None for a in (x, y))
     if value_x is not None and value_x.number is not None and (y is None or value_x == value_y):
         return x

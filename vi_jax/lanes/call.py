@@ -135,7 +135,6 @@ def _handler(frame, out):
 
 
 def _answer_without_exceptions(frame: _Frame, out: HandlerResult) -> int | None:
-    """Return the result of `_answer`, or its exception as an error of XLA."""
     try:
         if out.lost or interrupt_dropped():
             raise KeyboardInterrupt

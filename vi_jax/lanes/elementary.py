@@ -29,11 +29,8 @@ def horner(coefficients: tuple, x):
 def elementwise_primitive(
     name: str, function: Callable[..., Any], jvp: Callable[..., Any] | None = None, results: int = 1
 ) -> Primitive:
-    """Return an elementwise primitive of arrays of one shape, which also runs outside `jit`.
-
-    **Arguments:** its name; the function that it computes; its JVP rule; the number of its results,
-    which have the type of the last argument.
-    """
+    """Return an elementwise primitive of arrays of one shape, which also runs outside `jit`. Its
+    results have the type of the last argument."""
     primitive = Primitive(name)
     primitive.multiple_results = several = results > 1
 

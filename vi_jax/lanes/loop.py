@@ -50,7 +50,6 @@ def backend(name: str) -> AbstractContextManager:
 
 
 def current_backend() -> str:
-    """Return the backend that this context sets."""
     return _backend.get()
 
 
@@ -94,10 +93,8 @@ def run(
 
 
 def once(function: Callable[[Any], Any], inputs: object) -> Any:
-    """Run `function(inputs)` as vector code without a loop. `vmap` batches it like `run`.
-
-    **Arguments:** a function of a pytree of scalars and small arrays; the pytree.
-    """
+    """Run `function(inputs)` as vector code without a loop, on a pytree of scalars and small
+    arrays. `vmap` batches it like `run`."""
     return run(_begin_ended, _no_step, functools.partial(_end_with, function), inputs, rows=0)[0]
 
 
@@ -117,16 +114,12 @@ def _end_with(function: Callable[[Any], Any], inputs: object, carry: object) -> 
 
 
 class Functions(NamedTuple):
-    """The functions of a lane, as `run` takes them."""
-
     begin: Callable[..., Any]
     step: Callable[..., Any]
     end: Callable[..., Any]
 
 
 class Traced(NamedTuple):
-    """The program of a lane, and the structure of its results."""
-
     program: LaneProgram
     consts: list[Any]
     """Arrays over which the functions close; they are further inputs."""
@@ -140,11 +133,7 @@ _recent: "Recent[Any, Traced]" = Recent(64)
 
 
 def traced(functions: Functions, treedef: object, leaves: Sequence[Any], rows: int) -> Traced:
-    """Return the program for inputs of this structure, and of these shapes and types.
-
-    **Arguments:** the functions; the structure and the leaves of one lane's inputs; `rows` of the
-    `LaneProgram`.
-    """
+    """Return the program for inputs of this structure, and of these shapes and types."""
     shapes = [shape_of(x) for x in leaves]
     try:
         jax.eval_shape(_clear_with_jax, jax.ShapeDtypeStruct((), jnp.int32))
@@ -173,10 +162,8 @@ def _clear_with_jax(x: object) -> Any:
 
 
 def _function_key(function: Callable[..., Any]) -> tuple:
-    """Return a key that is equal only for functions that compute the same if they are pure.
-
-    **Raises:** `TypeError` if this cannot be decided.
-    """
+    """Return a key that is equal only for functions that compute the same if they are pure; raise
+    `TypeError` if this cannot be decided."""
     if isinstance(function, functools.partial):
         if function.keywords:
             raise TypeError("no place in an order")
@@ -200,9 +187,7 @@ def _argument_key(x: object) -> tuple:
 
 def _constant_key(x: object) -> Any:
     """Return a key that is equal only for equal constants: 1, 1.0, True differ, 0.0 and -0.0 too.
-
-    **Raises:** `TypeError` for values that may change.
-    """
+    Raise `TypeError` for values that may change."""
     if isinstance(x, jax.Array):
         raise TypeError("no constant")
     if isinstance(x, np.ndarray | np.generic):
@@ -215,7 +200,6 @@ def _constant_key(x: object) -> Any:
 
 
 def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) -> Traced:
-    """Return the result of `traced` without its cache."""
     n = len(leaves)
     structures: dict[str, Any] = {}
 
@@ -255,10 +239,8 @@ def _flag(x: object) -> Any:
 
 
 def _checked(what: str, treedef: object, tree: object, avals: list) -> list:
-    """Return the leaves that `step` returned, converted to the types from `begin`.
-
-    **Raises:** `TypeError` if the structure or a shape differs.
-    """
+    """Return the leaves that `step` returned, converted to the types from `begin`; raise
+    `TypeError` if the structure or a shape differs."""
     leaves, other = jtu.tree_flatten(tree)
     if other != treedef:
         raise TypeError(f"`step` must give a {what} of the structure {treedef}, but gave {other}.")

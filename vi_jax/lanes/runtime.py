@@ -82,7 +82,6 @@ def processor(name: str) -> AbstractContextManager:
 
 
 def thread_count() -> int:
-    """Return the number of threads that run lanes."""
     number = _threads.get()
     if number is None:
         number = next(reversed(_entered), None)
@@ -109,12 +108,8 @@ def _register_bits(cpu: str | None) -> int:
 
 
 class Kernel:
-    """The machine code of a program. It is compiled on another thread and lives as long as this
-    object.
-
-    **Arguments:** LLVM's text; the processor's name in LLVM, or `None` for this one; the lanes of a
-    group.
-    """
+    """The machine code of a program for groups of `width` lanes. It is compiled on another thread
+    and lives as long as this object."""
 
     def __init__(self, text: str, cpu: str | None, width: int):
         self.key, self.width = key_of(text, cpu), width
@@ -122,10 +117,8 @@ class Kernel:
 
     @functools.cached_property
     def function(self) -> Any:
-        """The kernel as a `ctypes` function with the arguments of `_kernel.py`.
-
-        **Raises:** `RuntimeError` if LLVM could not compile it.
-        """
+        """The kernel as a `ctypes` function with the arguments of `_kernel.py`; raises
+        `RuntimeError` if LLVM could not compile it."""
         try:
             self._engine, address = self._code.result()
         except RuntimeError as error:
@@ -136,11 +129,8 @@ class Kernel:
 
 
 class KernelCall:
-    """One call of a kernel. It holds the memory that its threads use until they end.
-
-    **Arguments:** the kernel; the addresses of the input arrays; the numbers per lane of each, or 0
-    for one that all lanes share; the addresses of the output arrays; the number of lanes.
-    """
+    """One call of a kernel. It holds the memory that its threads use until they end. An input's
+    stride is the numbers per lane, or 0 if all lanes share it."""
 
     def __init__(
         self, kernel: Kernel, inputs: list[int], strides: list[int], outputs: list[int], lanes: int
@@ -159,12 +149,9 @@ class KernelCall:
         self._lock, self._running = threading.Lock(), 0
 
     def run(self) -> bool:
-        """Run all lanes, on as many threads as have work.
-
-        **Returns:** True if all lanes have ended and the call was not stopped.
-
-        **Raises:** in the main thread the exceptions of signals. Then call `stop_and_wait`.
-        """
+        """Run all lanes, on as many threads as have work. Return True if all have ended and the
+        call was not stopped. Signals raise their exceptions in the main thread; then call
+        `stop_and_wait`."""
         if self._threads == 1 and threading.current_thread() is not threading.main_thread():
             self._run_here()
         else:
@@ -216,12 +203,8 @@ _keys: "weakref.WeakKeyDictionary[AnyProgram, dict[tuple, int]]" = weakref.WeakK
 
 
 def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = ()) -> Kernel:
-    """Return the kernel of a program for a number of lanes. Equal texts share a kernel.
-
-    **Arguments:** the program; the number of lanes; flags of the inputs that all lanes share.
-
-    **Raises:** `Unsupported` if the program has no vector form, or LLVM is missing.
-    """
+    """Return the kernel of a program for a number of lanes. Equal texts share a kernel. Raise
+    `Unsupported` if the program has no vector form, or LLVM is missing."""
     cpu = _cpu.get()
     bits = _register_bits(cpu)
     width = _width(program, lanes, bits)
@@ -236,10 +219,7 @@ def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = (
 
 
 def _width(program: AnyProgram, lanes: int, bits: int) -> int:
-    """Return the lanes of a group: a power of two of at least 4. It does not change results.
-
-    **Arguments:** the program; the lanes of the batch; the bits of a vector register.
-    """
+    """Return the lanes of a group: a power of two of at least 4. It does not change results."""
     avals = [*program.in_avals, *program.carry_avals]
     wide = any(np.dtype(a.dtype).itemsize == 8 for a in avals)
     # At least 4: two registers of 128 bits hide the latency of arithmetic.
@@ -271,5 +251,4 @@ def _new_kernel(
 
 
 def kernel_by_key(key: int) -> Kernel | None:
-    """Return the kernel of this key (see `key_of`) if it is in use, else `None`."""
     return _in_use.get(key)
