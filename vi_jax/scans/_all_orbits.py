@@ -86,13 +86,8 @@ class AllOrbits:
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
         """Return the motions as an `xarray.Dataset`: for each its period, extremes, impacts,
         stability, multipliers, section states (NaN beyond its period), and the number of searches
-        that `found` it; for each period the statistics of its search.
-
-        **Arguments:** `along`, to keep only variables with one dimension: `"motion"`, `"search"`
-        (the periods), `"cycle"` or `"multiplier"`, as a table without repetitions.
-
-        **Raises:** `ValueError` if there is no such dimension.
-        """
+        that `found` it; for each period the statistics of its search. `along`, as in
+        `Run.to_xarray`, is `"motion"`, `"search"` (the periods), `"cycle"` or `"multiplier"`."""
         data: dict[str, Any] = {"period": ("motion", self.periods)}
         for name in ("impacts", "duration", "y_min", "y_max", "clearance", "slowest_impact"):
             values = [np.asarray(getattr(orbit, name)) for orbit in self.orbits]

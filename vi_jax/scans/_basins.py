@@ -201,12 +201,8 @@ class Basins(NamedTuple):
         """Return the basins as an `xarray.Dataset`: `data`, and for each motion `motion_period`,
         `motion_impacts`, `motion_starts`, `motion_fraction`, `motion_error` and its section states
         (`motion_Y`, NaN beyond its period). A nonnegative `label` is an index along `motion`.
-
-        **Arguments:** `along`, to keep only variables with one dimension: `"motion"`, `"cycle"`
-        (section states), or the last axis of the starts for `data`.
-
-        **Raises:** `ValueError` if there is no such dimension.
-        """
+        `along`, as in `Run.to_xarray`, is `"motion"`, `"cycle"` (section states), or the last axis
+        of the starts."""
         variables = {}
         for name in ("period", "impacts", "starts", "fraction", "error"):
             values = [getattr(a, name) for a in self.attractors]
@@ -391,8 +387,7 @@ def _may_start(machine: AbstractMachine, begin: object, values: Mapping[str, flo
 def _check_options(
     verb: Callable[..., Any], options: Mapping[str, Any], refused: Iterable[str]
 ) -> None:
-    """Raise `TypeError` for an option that `scan` does not have, that no function here takes, or
-    that is `refused` by this one."""
+    """Raise `TypeError` for an option that `scan` does not have, or that is `refused`."""
     function = verb.__name__
     parameters, of_scan = ({*inspect.signature(x).parameters} - {"options"} for x in (verb, scan))
     for name in options:
@@ -411,7 +406,6 @@ def _scan_starts(
     tolerance: float | None,
     **options: Any,
 ) -> "xr.Dataset":
-    """Return the data of a scan of starts, without a warning of failed lanes."""
     measures = Regime(longest=longest, tolerance=tolerance), _Mark(longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LanesFailed)
@@ -426,8 +420,7 @@ def starts_in(
     samples: int | None,
     seed: int | tuple[int, ...],
 ) -> dict[str, np.ndarray]:
-    """Return the starts in a region as axes of a scan: those of a grid, or random ones in pairs.
-    **Raises:** `ValueError` or `TypeError` that names the argument."""
+    """Return the starts in a region as axes of a scan: those of a grid, or random ones in pairs."""
     ranges = axes_of(region, "region")
     for name, row in ranges.items():
         if not name.startswith(START):
@@ -462,8 +455,7 @@ def _label_lanes(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
     method: AbstractMethod,
 ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
-    """Return a label for each lane, and the section states (period, components) of each motion,
-    most lanes first; arguments as for `_find_basins`."""
+    """Return labels, and each motion's section states (period, components), most lanes first."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
@@ -559,12 +551,8 @@ class IntegrityProfile(NamedTuple):
         return f"{period}, {count_of(round(float(self.impacts[motion])), 'impact')}"
 
     def to_xarray(self, *, along: str | None = None) -> "xr.Dataset":
-        """Return the profile as an `xarray.Dataset` over `motion` and the parameter.
-
-        **Arguments:** `along`, to keep only variables over one of these.
-
-        **Raises:** `ValueError` if there is no such dimension.
-        """
+        """Return the profile as an `xarray.Dataset` over `motion` and the parameter; `along` is one
+        of these, as in `Run.to_xarray`."""
         both = "motion", self.parameter
         unit = unit_of(units_of(self.basins[0].machine), self.parameter)
         variables: dict[str, Any] = {
@@ -664,7 +652,6 @@ def _profile(
     found: list[Basins],
     integrity: list[list[Integrity]],
 ) -> IntegrityProfile:
-    """Return the basins at each value sorted by motion."""
     label = _matched(found, axes)
     shape = label.shape
     numbers = {name: np.full(shape, absent) for name, absent in _NUMBERS.items()}

@@ -155,7 +155,6 @@ def _power(
 
 
 def _labels_differ(label: np.ndarray, is_start: np.ndarray, axis: int, distance: int) -> np.ndarray:
-    """Return which cells have another outcome at this distance along an axis, up or down."""
     found = np.zeros(label.shape, bool)
     low = (slice(None),) * axis + (slice(None, -distance),)
     high = (slice(None),) * axis + (slice(distance, None),)

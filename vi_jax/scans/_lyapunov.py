@@ -88,11 +88,8 @@ class Lyapunov(Summarized):
         self, dims: Sequence[str] | None = None, *, along: str | None = None
     ) -> "xr.Dataset":
         """Return the exponents, or a batch, as an `xarray.Dataset`. The final state has a variable
-        for each component (`state_Y`), and `result` is the reason's name. Not to be traced.
-
-        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only variables
-        with one dimension: `"exponent"`, or a batch axis.
-        """
+        for each component (`state_Y`), and `result` is the reason's name. `dims` and `along` are as
+        in `Run.to_xarray`; `along` is `"exponent"`, or a batch axis."""
         batch = batch_names(dims, self.exponents.ndim - 1)
         each = *batch, "exponent"
         variables = present({"exponents": self.exponents, "per_cycle": self.per_cycle}, each)
@@ -217,7 +214,6 @@ def lyapunov(
 
 @compiled
 def _lyapunov(the_map: CycleMap, start, cycles: int, settle, number: int) -> Lyapunov:
-    """Return the exponents of one motion that begins on the section."""
     carry = _initial_carry(the_map, start, settle, number)
     window = _window(cycles) if number == 1 else 1
     carry, found = jax.lax.scan(_observer(the_map, start, window), carry, length=cycles // window)

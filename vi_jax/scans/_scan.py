@@ -49,7 +49,6 @@ _LONG = 6
 
 
 def interrupted(data: "xr.Dataset", store: str | Path | None) -> Interrupted:
-    """Return the exception of an interrupted scan, whose `partial` is the finished part."""
     if store is None:
         return Interrupted("scan", data)
     where = f"what was computed is in {store}, and the same call continues from there"
@@ -65,8 +64,7 @@ class Workplace(NamedTuple):
 
 
 def workplace(workers: int | None, devices: int | None, cluster: object) -> Workplace:
-    """Return the given numbers of threads and devices, or those available. **Raises:** `TypeError`
-    or `ValueError` for other values, too many devices, or another object than a cluster."""
+    """Return the given numbers of threads and devices, or those available."""
     if not (
         cluster is None or isinstance(cluster, futures.Executor) or hasattr(cluster, "get_executor")
     ):
@@ -87,8 +85,7 @@ def workplace(workers: int | None, devices: int | None, cluster: object) -> Work
 def computed(
     program: ScanProgram, blocks: Blocks, place: Workplace, store: Any = None, progress=False
 ) -> "xr.Dataset":
-    """Return the data of a program on a grid (`blocks`), checked before any work; `store` is the
-    path of a store, `None` for memory. **Raises:** as `scan`."""
+    """Return the data of a program on a grid, checked before any work."""
     program = check_corners(program, blocks)
     with contextlib.closing(opened(program, blocks, store)) as storage:
         todo = storage.open_blocks()
@@ -123,9 +120,8 @@ def in_blocks(
     lanes: int | None = None,
     numbers: np.ndarray | None = None,
 ) -> Blocks:
-    """Return the grid in blocks of `lanes`: by default those of the store if there is one, or
-    suitable for the workplace. The lanes' `numbers`, by default their indices, determine their
-    noise. **Raises:** `ValueError` if a block would not fit into memory."""
+    """Return the grid in blocks of `lanes`, by default those of the store or suitable for the
+    workplace. The lanes' `numbers`, by default their indices, determine their noise."""
     total = Blocks(grid, 1, paired=paired).total
     if store is not None and lanes is None:
         lanes = _lanes_in(Path(store))
@@ -185,8 +181,6 @@ def run_blocks(
     there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
     cluster seems to have lost are submitted once more (a killed worker can leave Dask waiting for
     ever: https://github.com/dask/distributed/issues/3196).
-
-    **Raises:** `ClusterLost`; errors of a block.
     """
     # As NumPy arrays it is sent with every task: shared data would be lost with their worker.
     packed = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
@@ -264,7 +258,6 @@ def _executor_of(cluster: Any) -> futures.Executor:
 
 
 def _has_workers(cluster: Any) -> bool:
-    """Return whether a cluster has workers; warn if it has none."""
     if hasattr(cluster, "scheduler_info") and not cluster.scheduler_info()["workers"]:
         warn("The Dask cluster has no workers. The scan waits for new ones, until Ctrl-C.")
         return False
@@ -286,7 +279,6 @@ def _task(
 
 
 def _advice_after_loss(storage: MemoryStore) -> str:
-    """Return a message about the finished part of a scan after the loss of its cluster."""
     advice = "Nothing was stored. Pass a `store`, from which the same call can continue."
     if isinstance(storage, ZarrStore):
         number = len(storage.blocks)
@@ -324,7 +316,7 @@ def compute(
 ) -> dict[str, np.ndarray]:
     """Return the numbers of a block of lanes, by name. A block is padded to `lanes`, so that all
     blocks are one program. Lanes are given to several devices in turn, since neighbours take
-    similar times. With `dry`, the program is only compiled: no lane is run."""
+    similar times. With `dry`, the program is only compiled."""
     size = next(iter(values.values())).size
     order = np.arange(lanes).reshape(-1, devices).T.ravel()
     lanes_here = np.minimum(order, size - 1)

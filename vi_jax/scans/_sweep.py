@@ -112,11 +112,8 @@ class Sweep(Summarized):
     ) -> "xr.Dataset":
         """Return the sweep, or a batch of them, as an `xarray.Dataset` over its values, a
         coordinate with the parameter's name. Section states are a variable for each component
-        (`section_Y`), and `result` is the reason's name. Not to be traced.
-
-        **Arguments:** `dims` and **Raises** as `Run.to_xarray`; `along`, to keep only variables
-        with one dimension: `"value"`, or `"cycle"` (the sections).
-        """
+        (`section_Y`), and `result` is the reason's name. `dims` and `along` are as in
+        `Run.to_xarray`; `along` is `"value"`, or `"cycle"` (the sections)."""
         each = (*batch_names(dims, self.values.ndim - 1), "value")
         variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
         variables |= states("section", self.sections, (*each, "cycle"))

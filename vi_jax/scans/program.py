@@ -99,14 +99,12 @@ class Blocks:
         return math.prod(self.shape)
 
     def dims_of(self, name: str) -> tuple[str]:
-        """Return the dimension of an axis' values."""
         return ("sample",) if self.paired else (name,)
 
     def __len__(self) -> int:
         return math.prod(map(len, self._edges()))
 
     def __iter__(self) -> Iterator[tuple[slice, ...]]:
-        """Iterate over the blocks as slices of the grid."""
         pairs = zip(self._edges(), self.block, self.shape, strict=True)
         rows = ([slice(i, min(i + n, size)) for i in edges] for edges, n, size in pairs)
         return itertools.product(*rows)
@@ -125,8 +123,6 @@ class Blocks:
 
 
 class LaneNoise(eqx.Module):
-    """The noise of a scan."""
-
     noise: WhiteNoise
     key: UInt32[Array, "2"]
     """The words of the key from which each lane's key is derived."""
@@ -191,8 +187,7 @@ class ScanProgram(eqx.Module):
         self, values: Mapping[str, Any], perturbation: Array | None = None
     ) -> tuple[AbstractMachine, State]:
         """Return machine and start of the lane with these values on the axes, in the scan's clock;
-        `perturbation` is added to the numbers of `derivatives`. **Raises:** `TypeError` if the
-        function in argument `machine` returns another object."""
+        `perturbation` is added to the numbers of `derivatives`."""
         of_machine = {name: x for name, x in values.items() if part_of(name) == MACHINE}
         if self.build is not None:
             machine = self.build(**of_machine)
@@ -215,7 +210,6 @@ class ScanProgram(eqx.Module):
         return machine, self._perturbed(start, START, perturbation)
 
     def at(self, blocks: Blocks, place: int) -> tuple[AbstractMachine, State]:
-        """Return machine and start of the lane at this index of all axes."""
         return self.lane({name: jnp.asarray(x[place]) for name, x in blocks.axes.items()})
 
     def noise_of(
@@ -327,8 +321,7 @@ def make_program(
     noise: Any = None,
     key: Any = None,
 ) -> ScanProgram:
-    """Return the program of a scan, with its arguments checked as far as possible without the axes'
-    values; `names` are those of the axes. **Raises:** `TypeError` or `ValueError`, as `scan`."""
+    """Return the program of a scan, checked as far as possible without the values of its axes."""
     build, machine_names = None, [name for name in names if part_of(name) == MACHINE]
     template = machine_of(machine) if isinstance(machine, AbstractMachine) else None
     if template is not None:
@@ -419,7 +412,6 @@ def _properties_of_made(
 
 
 def _check_variables(measure: AbstractMeasure, new: Iterable[str], taken: list[str]) -> None:
-    """Raise `ValueError` for a name that a variable cannot have, or that is in use."""
     owner = getattr(measure, "function", measure)
     owner = getattr(owner, "__name__", type(owner).__name__)
     for name in new:
@@ -450,7 +442,6 @@ def check_leaf_name(
 
 
 def start_with(start: State, values: Mapping[str, Any]) -> State:
-    """Return a start with other numbers, by the names of their axes."""
     return with_leaves(start, {name.removeprefix(START): x for name, x in values.items()})
 
 
@@ -465,13 +456,10 @@ def _corners(blocks: Blocks) -> np.ndarray:
 
 
 def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
-    """Return the program after checks of machine, start and method at the corners of the grid.
-    **Raises:** `ValueError` or `TypeError` for what cannot be run.
-
-    The gaps at the corners decide whether a body may come to rest anywhere on the grid; if not, the
-    program omits rests. (If a function makes the machines, this is known already.) Paired axes have
-    no corners: machines are checked at all their lanes.
-    """
+    """Return the program after checks of machine, start and method at the corners of the grid;
+    paired axes have none, so all their lanes are checked. The gaps at the corners decide whether a
+    body may come to rest anywhere on the grid; if not, the program omits rests. (If a function
+    makes the machines, this is known already.)"""
     rests = False
     if blocks.paired and program.machine is not None:
         rows = {name: x for name, x in blocks.axes.items() if part_of(name) == MACHINE}
@@ -495,8 +483,6 @@ def check_corners(program: ScanProgram, blocks: Blocks) -> ScanProgram:
 
 
 class Custom(AbstractMeasure):
-    """A user's own function of a lane's machine and run."""
-
     function: Callable[..., Any] = eqx.field(static=True)
 
     def __call__(self, machine, run):
@@ -519,9 +505,7 @@ class Custom(AbstractMeasure):
 
 
 def measures_of(measure: object, averages: Sequence[str] = ()) -> tuple[AbstractMeasure, ...]:
-    """Return measures by name, as objects, or functions of a machine and a run; any number.
-    Names of the machine's own `averages` come first. **Raises:** `ValueError` for an unknown name,
-    `TypeError` for anything else."""
+    """Return measures by name, as objects, or functions; `averages` come first."""
     if isinstance(measure, str) or callable(measure) or not isinstance(measure, Iterable):
         measure = (measure,)
     return tuple(_measure(one, averages) for one in measure)
@@ -545,8 +529,7 @@ def _measure(one: object, averages: Sequence[str]) -> AbstractMeasure:
 
 
 def cycles_for(measures: Iterable[AbstractMeasure], cycles: int | None) -> int:
-    """Return the number of cycles to observe: the given one, or what these measures need.
-    **Raises:** `ValueError` if it is too small for one of them."""
+    """Return the number of cycles to observe: the given one, or what these measures need."""
     needed = max((m.cycles for m in measures), default=1)
     cycles = max(32, needed) if cycles is None else count("cycles", cycles, least=1)
     if cycles < needed:

@@ -63,8 +63,6 @@ class Variable(NamedTuple):
 
 
 class MemoryStore:
-    """Arrays in memory, for a scan without a store."""
-
     def __init__(self, program: ScanProgram, blocks: Blocks, variables: Mapping[str, Variable]):
         self.program, self.blocks, self.variables = program, blocks, variables
         # In the form read from a file.
@@ -76,7 +74,6 @@ class MemoryStore:
         return {name: np.full(shape + v.sizes, v.empty, v.dtype) for name, v in variables}
 
     def open_blocks(self) -> list[Where]:
-        """Return the blocks still to be computed."""
         return list(self.blocks)
 
     def write(self, where: Where, numbers: Mapping[str, np.ndarray]) -> None:
@@ -90,7 +87,6 @@ class MemoryStore:
         """Do nothing: no resource is open."""
 
     def data(self) -> "xr.Dataset":
-        """Return the results, with units and a description of the scan."""
         data, (machine, _) = self._labelled(), self.program.at(self.blocks, 0)
         for name in self.blocks.axes:
             # Machines from a function have no numbers with these names, and noise has no units.
@@ -115,12 +111,8 @@ class MemoryStore:
 
 class ZarrStore(MemoryStore):
     """A Zarr group on disk with a chunk for each block, with Zarr's checksum of each (CRC-32C).
-
     Chunks of NaN are written too, so that a missing chunk of a computed block is a lost one. No
-    other process, and no other scan of this one, may write to the store until it is closed.
-
-    **Raises:** `ValueError` for a folder that is not the store of this scan, or is in use.
-    """
+    other process, and no other scan of this one, may write to the store until it is closed."""
 
     def __init__(self, path: str | Path, *scan: Any):
         self.path, self.lost = Path(path), list[str]()
@@ -272,8 +264,7 @@ def _create_store(
 
 
 def opened(program: ScanProgram, blocks: Blocks, path: str | Path | None) -> MemoryStore:
-    """Return the storage of a scan: a Zarr store, or memory without a path. **Raises:**
-    `ValueError` for data that do not fit into memory, or a path that is not a store's."""
+    """Return the storage of a scan: a Zarr store, or memory without a path."""
     variables = _variables_of(program, blocks)
     per_lane = sum(math.prod(v.sizes) * v.dtype.itemsize for v in variables.values())
     in_memory = blocks.total * per_lane if path is None else blocks.total + 500 * len(blocks)
@@ -397,13 +388,10 @@ _GENERATED = (types.GetSetDescriptorType, types.MemberDescriptorType, types.Wrap
 
 
 def identity(thing: object) -> str:
-    """Return a digest of a function or an object, from its source code and its content.
-
-    A function refers to its defaults, to the variables that it closes over and to the globals that
-    it names. Functions and classes among them are part of the digest, unless they are a library's.
-    An object contributes its class and its attributes. If something has neither source nor content,
-    the result begins with `UNVERIFIABLE` and names it.
-    """
+    """Return a digest of a function or an object, from its source code and its content: defaults,
+    variables that it closes over, globals that it names, class and attributes. Functions and
+    classes among them count too, unless they are a library's. If something has neither source nor
+    content, the result begins with `UNVERIFIABLE` and names it."""
     digest = hashlib.sha256()
     try:
         for word in _words(thing, {}):
@@ -478,7 +466,6 @@ def _numbers(tree: Any) -> dict[str, Any]:
 
 
 def _variables_of(program: ScanProgram, blocks: Blocks) -> dict[str, Variable]:
-    """Return the variables of a program by name, without computing them."""
     values = {name: jnp.zeros(4) + x[0] for name, x in blocks.axes.items()}
     if blocks.numbers is not None:
         values[LANE] = jnp.zeros(4, jnp.uint32)
