@@ -158,7 +158,6 @@ class _Saddle:
         self.period, self.growth = turns * period, float(np.abs(growth[0]) ** turns)
 
     def states_after(self, rows: Rows, periods: int) -> Rows:
-        """Return states after some periods."""
         return self.map.states_after(rows * self.map.unit, periods * self.period) / self.map.unit
 
     def states(self, parts: list[Rows]) -> Rows:

@@ -80,8 +80,6 @@ class Kick(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Exits:
-    """The exits of rays from the basin."""
-
     directions: Kicks
     """Unit vectors, (rays, components)."""
     inside: Float[np.ndarray, " rays"]
@@ -235,11 +233,9 @@ _FARTHEST = 0.5
 
 def shortest(settling: Settling, kick: Kick, saddle: Orbit, z: Row) -> tuple[Row, float] | None:
     """Return the kick of least norm onto the stable manifold of a saddle, near a kick onto it that
-    is known to rounding; `None` if Newton's method fails, as near a grazing.
-
-    **Returns:** the kick and its residual, relative to its norm: the larger of its distance from
-    the manifold to first order and its deviation from a right angle to it.
-    """
+    is known to rounding, and its residual relative to its norm: the larger of its distance from the
+    manifold to first order and its deviation from a right angle to it. `None` if Newton's method
+    fails, as near a grazing."""
     rows, normals = _frame(settling, saddle)
     if not np.isfinite(normals).all():
         return None

@@ -66,10 +66,8 @@ class Settling:
     A start has returned once a section state of its motion lies within `tolerance` (relative to the
     motion's size) of one of the motion's. This is tested after 1, 2, 3, 4, 5, 6, … cycles, each
     time a quarter more: a motion that decays towards an equilibrium returns long before it has
-    shrunk to rounding, where its sections would be noise.
-
-    **Arguments:** the map of one cycle; a state, for its structure; the motion's section states;
-    cycles after which a start that has not returned is elsewhere; the tolerance.
+    shrunk to rounding, where its sections would be noise. After `settle` cycles a start is
+    elsewhere.
     """
 
     def __init__(self, the_map: CycleMap, like: State, motion: Rows, settle: int, tolerance: float):
@@ -114,7 +112,6 @@ class Settling:
         return np.concatenate([self._judged(*part) for part in _padded_parts(rows)])
 
     def _judged(self, rows: Rows, is_running: Bool[np.ndarray, " lanes"]) -> Int[np.ndarray, " _"]:
-        """Judge one filled program of starts; return the verdicts on those that count."""
         count = int(is_running.sum())
         self._judged_so_far.append(count)
         self.report(count)
@@ -267,8 +264,7 @@ def settling_on(
     cycle: int = 0,
 ) -> tuple[Settling, Row]:
     """Return a classifier of starts by their return to a motion, and a state of the motion (for an
-    orbit that on section `cycle`). `name` is the argument's name, others are as in
-    `edge_state`."""
+    orbit that on section `cycle`)."""
     settle = count("settle", settle, least=1)
     tolerance = given_number("tolerance", tolerance, low=0.0, open_low=True)
     the_map = cycle_map(machine, method=method)
@@ -358,7 +354,6 @@ def _sections_of(the_map: CycleMap, like: State, rows: Array, begin: Array) -> A
 
 @compiled
 def _state_at_clock(the_map: CycleMap, like: State, row: Array, clock: Array) -> Array:
-    """Return the state of a driven machine at a clock within the cycle that begins in a state."""
     return in_rows(_runs(the_map, like, row[None], 1, 0, None, until=clock).sections, 2)[0, -1]
 
 
