@@ -89,8 +89,6 @@ _DOUBLE = 1e-4
 
 
 class AbstractCondition(eqx.Module):
-    """An additional equation for a motion."""
-
     @property
     def observes(self) -> bool:
         """True if it is an equation of the quantities observed of the motion."""
@@ -106,8 +104,6 @@ class AbstractCondition(eqx.Module):
 
 
 class HeldQuantity(AbstractCondition):
-    """The condition that a quantity of the motion, one of `known_names`, has a given value."""
-
     name: str = eqx.field(static=True)
     value: Scalar
 
@@ -162,7 +158,6 @@ def in_one_parameter(problem: Shooting, step: Step) -> tuple[Shooting, Step]:
 
 
 def hold_values(values: dict[str, float], multipliers: np.ndarray) -> tuple[AbstractCondition, ...]:
-    """Return the conditions that these numbers of a motion have these values."""
     greatest = complex(multipliers[0])
     is_pair = abs(greatest.imag) > 1e-9
     sign = 1 if is_pair or greatest.real > 0 else -1

@@ -140,7 +140,6 @@ def _check_orbit(orbit: Orbit) -> None:
 
 
 def _check_held(orbit: Orbit, free: object, fixed: object) -> None:
-    """Check that these arguments free and hold equally many quantities of the orbit."""
     for argument, mapping in (("free", free), ("fixed", fixed)):
         if not isinstance(mapping, Mapping):
             example = '{"stops.0.gap": (1.0, 3.0)}' if argument == "free" else '{"y_min": None}'
@@ -196,7 +195,6 @@ def _with_parameters(
 
 
 def _check_names(argument: str, names: str | Sequence[str], problem: Shooting) -> tuple[str, ...]:
-    """Check names of quantities of a motion; an error lists the known names."""
     known = known_names(problem)
     return tuple(one_of(argument, name, known) for name in tuple_of_names(argument, names))
 
@@ -204,7 +202,6 @@ def _check_names(argument: str, names: str | Sequence[str], problem: Shooting) -
 def _check_watched(
     watch: Mapping[str, Callable[[Orbit], float]], orbit: Orbit
 ) -> Mapping[str, Callable[[Orbit], float]]:
-    """Check that each function returns a number of the orbit, else raise `TypeError`."""
     if not isinstance(watch, Mapping) or not all(callable(f) for f in watch.values()):
         raise TypeError(
             "Argument `watch` must map names to functions of an `Orbit`, as "
@@ -366,7 +363,6 @@ def _checked_bounds(point: Point, parameter: str, bounds: Any) -> Intervals:
 
 
 def _special_motion(point: Point, parameter: str, bounds: Intervals) -> tuple[Shooting, np.ndarray]:
-    """Return the equations of the curve with its condition, and its first unknowns."""
     old, start, impact = point.problem, np.asarray(point.step.x), point.impact
     change = change_at(old, point.step) if point.kind in SLIDING else None
     if change is not None:  # with the vanishing part it could not be solved beyond the point

@@ -32,8 +32,6 @@ Rows = tuple[Float[Array, " rows"], Float[Array, "rows states"]]
 
 
 class Event(NamedTuple):
-    """An event of the machine as it occurs in a periodic motion."""
-
     number: int
     """Its index among the machine's events, in the order of `events_of(machine)`."""
     cycle: int | None = None
@@ -42,7 +40,6 @@ class Event(NamedTuple):
     """For a stop: `LANDS` at the first impact of a chatter into rest, `LEAVES` at a rest's end."""
 
     def name_on(self, machine: AbstractMachine) -> str:
-        """Return its name for messages: its own, its side, or its kind and its index there."""
         event, events = self.of(machine), events_of(machine)
         if isinstance(event, RigidStop | SoftStop):
             soft = "soft " if isinstance(event, SoftStop) else ""
@@ -114,7 +111,6 @@ class Flight(eqx.Module):
     def step(
         self, s0: Scalar, s1: Scalar, u: Vector, integrals: Integrals
     ) -> tuple[Vector, Integrals]:
-        """Return the state, and the time and integrals passed, after one step of the method."""
         smooth, state = self.smooth, self.unravel(u)
         before = carried(smooth, s0, state, integrals)
         new, after = _take_step(self.method, smooth, s0, s1, state, before)

@@ -115,7 +115,6 @@ class Table(abc.ABC):
         """Return the rows for a step between two points."""
 
     def advance(self, x: Any, tangent: Any, length: Any) -> Step:
-        """Return the point at this length along the tangent."""
         new = advance(self.problem, x, tangent, length)
         distance = float(np.linalg.norm((new.x - np.asarray(x)) / self.scale))
         deviates = distance > _TINY and not abs(length) >= _LEAST_COSINE * distance
@@ -147,12 +146,10 @@ class Table(abc.ABC):
         return []
 
     def stall_end(self, steps: list[Step]) -> Ending:
-        """Return how a curve ends if the corrector cannot follow it further."""
         return Ending(steps[-1], STALLED)
 
 
 def check_walk(*, step: object, max_step: object, max_points: object) -> dict[str, Any]:
-    """Return the settings of a walk; raise `ValueError` or `TypeError` for wrong ones."""
     return {
         "step": given_number("step", step, low=0.0, open_low=True),
         "max_step": given_number("max_step", max_step, low=0.0, open_low=True),
@@ -169,13 +166,9 @@ def follow_both_ways(
     progress: bool,
     settings: dict[str, Any],
 ) -> Any:
-    """Follow the curve through a point ahead and back, with a new table for each way.
-
-    **Arguments:** `result` makes the result from the fields of a `Curve` and its `special` points;
-    `what` is its name in messages.
-
-    **Raises:** on Ctrl-C `Interrupted`, with the result so far.
-    """
+    """Follow the curve through a point ahead and back, with a new table for each way. `result`
+    makes the result from the fields of a `Curve` and its `special` points; `what` is its name in
+    messages. On Ctrl-C `Interrupted` is raised with the result so far."""
     tables = table(), table()
     start = tables[0].snap_to_bounds(start)
     ahead = _Walk(tables[0], start)
@@ -250,7 +243,6 @@ class _Walk:
         return end
 
     def _append(self, step: Step | None, point: Point | None = None) -> None:
-        """Add a point of the curve, and its special point if there is one."""
         self.steps += [] if step is None else [step]
         if point is not None:
             self.special.append(dataclasses.replace(point, index=len(self.steps) - 1))
@@ -339,7 +331,6 @@ class _Walk:
 
 
 def _falls_from_zero(row: Event, begin: float, new: Step) -> bool:
-    """Return whether a test is zero at a point, to rounding, and falls from there."""
     if begin > row.noise:
         return False
     end = row.test(new)
@@ -357,8 +348,6 @@ def rescaled(steps: list[Step], before: np.ndarray, after: np.ndarray) -> list[S
 
 
 def bound_rows(table: Table) -> list[Event]:
-    """Return the rows of a table that end a curve at the bounds of its parameters."""
-
     def row(i: int, bound: float, sense: float) -> Event:
         def distance(step: Step) -> float:
             return sense * (float(step.x[i]) - bound) / float(table.scale[i])
@@ -394,7 +383,6 @@ class Closing:
         self.restart([])
 
     def restart(self, points: list[Step]) -> None:
-        """Set these points as those that the curve has passed."""
         self.points: list[Step] = list(points)
         self.starts, self.cycle = [], 0.0
         if points:

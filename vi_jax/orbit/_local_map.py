@@ -371,8 +371,6 @@ class Section(NamedTuple):
 
 
 class LocalGrazing(NamedTuple):
-    """A grazing with its local map."""
-
     problem: Shooting
     """The equations of the motion without the touch."""
     x: np.ndarray
@@ -382,7 +380,6 @@ class LocalGrazing(NamedTuple):
 
 
 def graze_at(point: Point) -> LocalGrazing:
-    """Return the local map of a special point that is a grazing of a stop or a switch."""
     problem, x, number, clock = _without_touch(point)
     problem, x = with_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
@@ -478,7 +475,6 @@ def transport(problem: Shooting, x: np.ndarray, leg: int, s0: float, s1: float) 
 
 
 def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) -> Section:
-    """Return the smooth motion on its first section."""
     period = float(problem.period(x))
     place = period * (np.floor(touch.clock / period) + 1)
     leg, leg_clock = problem.leg_at(x, place if problem.events else 0.0)

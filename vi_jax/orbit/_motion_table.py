@@ -211,7 +211,6 @@ class MotionTable(Table):
         self, here: Step, at: Step, *, impact: int | None = None,
         text: Callable[[Step], str] | None = None,
     ) -> Ending:  # fmt: skip
-        """Return the end at a lost event, a touch, or a change in the order of events."""
         flight = _brief_flight(self.problem, at)
         if flight is not None:
             return Ending(at, REST, self._merged_rests(at, flight))
@@ -384,7 +383,6 @@ class MotionTable(Table):
         return []
 
     def _bifurcation(self, kind: str, here: Step, last: Step) -> Located:
-        """Return the bifurcation between two points at which a test changes its sign, if any."""
         at = self.locate_zero(here, last, lambda step: bifurcation_tests(step)[kind])
         if at is None:
             return []
@@ -468,7 +466,6 @@ _CROSSING_MULTIPLIERS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
 
 
 def bifurcation_tests(step: Step) -> dict[str, float]:
-    """Functions that change sign at the bifurcations."""
     M, identity = step.observed.monodromy, np.eye(step.observed.monodromy.shape[0])
     values = step.observed.multipliers
     with np.errstate(invalid="ignore"):  # without an answer of the corrector these are NaN
@@ -523,7 +520,6 @@ def _outside_count(step: Step) -> int | None:
 
 
 def _turns_back(here: Step, at: Step, last: Step, scale: np.ndarray) -> bool:
-    """Return whether the parameter turns back at a point between two, by more than rounding."""
     sides = [(float(at.x[-1]) - float(step.x[-1])) / scale[-1] for step in (here, last)]
     return bool(sides[0] * sides[1] > 0 and min(map(abs, sides)) > 1e-12)
 

@@ -76,15 +76,10 @@ def has_fixed_steps(method: AbstractMethod) -> bool:
 def fixed_step_method(
     given: MethodLike, orbit_method: AbstractMethod, machine: AbstractMachine
 ) -> AbstractMethod:
-    """Choose a method of fixed steps for the branch of an orbit.
-
-    **Returns:** the argument, if given; else the method of the orbit, if its steps are fixed; else
-    `ExactFlight` where it applies; else 20 steps of `Verner9` a cycle, with error 1e-13. For an
-    implicit solver, equal steps. With such a solver, or if the motion paces its own clock, the
-    number of steps is found by refinement (see `problem_of`).
-
-    **Raises:** `ValueError` if the argument is explicit and sizes its steps by a tolerance.
-    """
+    """Choose a method of fixed steps for the branch of an orbit: the given one; else that of the
+    orbit, if its steps are fixed; else `ExactFlight` where it applies; else 20 steps of `Verner9` a
+    cycle, with error 1e-13. For an implicit solver, equal steps. With such a solver, or if the
+    motion paces its own clock, the number of steps is found by refinement (see `problem_of`)."""
     method = orbit_method if given is None else given
     if isinstance(method, Adaptive) and method.solver.implicit:
         return ImplicitSteps(method.solver, 20)
@@ -167,8 +162,7 @@ def check_parameter(
     machine: AbstractMachine, name: str, value: float, interval: tuple[float, float], owner: str,
     argument: str = "bounds",
 ) -> None:  # fmt: skip
-    """Check that an interval of a parameter contains its value and that the machine is valid at
-    both ends, else raise `ValueError`; `owner` names the owner of the value in the message."""
+    """Check that an interval contains `value`, and that the machine is valid at both ends."""
     low, high = interval
     if not low <= value <= high:
         raise ValueError(
@@ -297,8 +291,8 @@ def steps_depend_on_motion(problem: Shooting) -> bool:
 
 
 def with_finer_steps(problem: Shooting, x: Unknowns, error: float) -> Shooting | None:
-    """Return the equations with the steps and the tolerance that a solution needs; `error` is its
-    present `step_error`. `None` if more steps change nothing or are not allowed."""
+    """Return the equations with the steps and the tolerance that a solution with this `step_error`
+    needs; `None` if more steps change nothing or are not allowed."""
     refined = None
     while 2 * problem.steps <= _MOST:
         method, steps = problem.method.tighter(), 2 * problem.steps
@@ -524,7 +518,6 @@ def _states_at(
 
 @compiled
 def _state_at(machine, method, like, row, modes, clock):
-    """Return the state at a clock in the cycle that begins with these components and modes."""
     unravel = ravel_pytree(like)[1]
     options = RunOptions(method=method, record="sections", rests=True)
     if counts_turns(machine):

@@ -222,7 +222,6 @@ class Shooting(eqx.Module):
 
     @property
     def rests(self) -> bool:
-        """True if a body rests during a part of the motion or all of it."""
         return bool(self.landings or self.held)
 
     @property
@@ -244,7 +243,6 @@ class Shooting(eqx.Module):
         return tuple(found[self.legs :])
 
     def at(self, x: Unknowns) -> AbstractMachine:
-        """Return the machine with the parameters in `x`."""
         x = jnp.asarray(x)
         n = x.shape[0]
         return self._with_parameters([x[i] for i in range(n - len(self.parameters), n)])
@@ -265,7 +263,6 @@ class Shooting(eqx.Module):
         return dataclasses.replace(self, machine=machine, **cleared), x[:end]
 
     def corners(self, intervals: Iterable[tuple[float, float]]) -> list[AbstractMachine]:
-        """Return the machines at the ends of these intervals of the parameters."""
         return [self.at(jnp.asarray(ends)) for ends in itertools.product(*intervals)]
 
     def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
@@ -424,7 +421,6 @@ class Shooting(eqx.Module):
         return flight.with_contact(self._contact(self.contacts, leg)) if self.rests else flight
 
     def flight_after_event(self, machine: AbstractMachine, leg: Leg) -> Flight:
-        """Return the flight of a leg just after the event that begins it."""
         if not self.landings:
             return self.flight(machine, leg)
         first = [self.contacts[i - (i in self.landings)] for i in range(self.legs)]
@@ -707,7 +703,6 @@ class Shooting(eqx.Module):
         return self._for_event(leg, agrees, s, u)
 
     def state_at(self, x: Vector, leg: Leg, s: Scalar) -> State:
-        """Return the state at clock `s`, which lies in leg number `leg`."""
         machine = self.at(x)
         clock, states = self.parts(x)
         s0, s1 = clock[leg], self.ends(clock, self.period(x))[leg]

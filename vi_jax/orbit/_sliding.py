@@ -74,7 +74,6 @@ class Change(NamedTuple):
 
     @property
     def kind(self) -> str | None:
-        """The kind of sliding bifurcation, or `None`."""
         before, brief, after = self.modes
         if brief == 0 and before and after:
             return GRAZING_SLIDING if before == after else CROSSING_SLIDING
@@ -197,7 +196,6 @@ _CLOSE = 1e-8
 
 
 def locate_change(problem: Shooting, at: Step, change: Change) -> Step:
-    """Locate the special point at which a part of the motion vanishes, from one close to it."""
     clock = problem.values(at.x)[0]
     is_close = abs(float(at.observed.order_margin)) < _CLOSE * problem.radian
     if not change.exists or problem.conditions or is_close:

@@ -164,7 +164,6 @@ def tangent_at(problem: Shooting, x: np.ndarray) -> np.ndarray:
 
 @on_host
 def state_at(problem: Shooting, x, leg, s):
-    """Return the components of the state at clock `s` within the leg of this number."""
     return ravel_pytree(problem.state_at(x, leg, s))[0]
 
 
@@ -290,7 +289,6 @@ def locate_zero(
 def _known_bracket(
     places: list[float], length: float, value: Callable[[float], float]
 ) -> tuple[float, float]:
-    """Return two neighbours among known places between which a test changes its sign."""
     places = sorted({0.0, *places, length}, key=abs)
     low, high, begin = 0, len(places) - 1, value(0.0)
     while high - low > 1:

@@ -85,8 +85,6 @@ Intervals = tuple[tuple[float, float], tuple[float, float]]
 
 
 class SpecialTable(Table):
-    """Possible events of a curve of special motions in two parameters, in each of its steps."""
-
     def __init__(self, problem: Shooting, bounds: Intervals):
         super().__init__(problem, bounds)
         self.condition: Special = problem.conditions[0]
@@ -184,7 +182,6 @@ class SpecialTable(Table):
 
 
 def lost_at(step: Step) -> np.ndarray:
-    """Return which events of a motion are lost, to rounding."""
     return np.abs(np.asarray(step.observed.approach / step.observed.units)) < _SLOW
 
 
@@ -293,8 +290,6 @@ def _place(problem: Shooting, i: int, steps: list[Step], at: Step) -> float:
 
 
 def _tests_of(problem: Shooting, condition: Special) -> dict[str, Test]:
-    """Return functions that change sign at the points of each kind, by the curve's kind."""
-
     def scalar(function: Callable[[Step], float]) -> Test:
         return lambda step, like: (function(step), None)
 

@@ -91,7 +91,6 @@ def half_difference(problem: Shooting, step: Step, *, mirrored: bool = False) ->
 
 
 def over_periods(old: Shooting, n: int) -> Shooting:
-    """Return the equations of a motion that is gone through n times."""
     events = tuple(event.shifted(i * old.cycles) for i in range(n) for event in old.events)
     # With events, `steps` counts those of one leg, which stays as long. Each hop of a chatter takes
     # a part of `steps / cycles`, so that with chatters the steps grow with the cycles.
@@ -103,7 +102,6 @@ def over_periods(old: Shooting, n: int) -> Shooting:
 
 
 def repeated(problem: Shooting, x: np.ndarray | Array, new: Shooting) -> np.ndarray:
-    """Return the unknowns of a motion that is gone through several times, as those of `new`."""
     (clock, states, period), n = problem.values(x), new.cycles // problem.cycles
     if problem.events:
         clock = (clock + period * np.arange(n)[:, None]).ravel()
@@ -197,7 +195,6 @@ def without_events(
 
 
 def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    """Return the equations of the same motion over its least period, and their unknowns."""
     leaves = jax.tree.leaves(sections_of(old, x)[0])
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):

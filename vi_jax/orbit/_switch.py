@@ -59,7 +59,6 @@ _SETTLES, _LISTED = 100, 32
 
 
 def _orbit_at(problem: Shooting, step: Step, what: str, distance: float) -> Orbit:
-    """Return the motion at a step; raise `ValueError` if the corrector found none there."""
     if not bool(step.good):
         raise ValueError(f"No motion of {what} was found at distance {distance:g}; try another.")
     return orbit_of(problem, step)
@@ -155,13 +154,8 @@ def _search(
     """Return a motion near a point that does not belong to the branch.
 
     The section map has no jump there unless an impact falls on the section, so its fixed points are
-    sought. The search begins at the guesses, at points close by on the branch, and at a settled
-    simulation. The far side of the point is tried first.
-
-    **Arguments:** `what`, the motion in words; `accepts`, whether a motion is of that kind;
-    `guesses`, states on the section.
-
-    **Raises:** `ValueError` if none is found.
+    sought. The search begins at the `guesses` on the section, at points close by on the branch, and
+    at a settled simulation. The far side of the point is tried first.
     """
     problem, step, guesses = point.problem, point.step, list(guesses)
     for near_step in (advance(problem, step.x, step.tangent, distance), step):
@@ -226,7 +220,6 @@ def _check_plain(problem: Shooting) -> None:
 def _with_touch(
     old: Shooting, x: np.ndarray, number: int, touch: float
 ) -> tuple[Shooting, np.ndarray]:
-    """Return the equations of a motion with a touch as one of its events, and their unknowns."""
     (clock, states, period), events = old.values(x), list(old.events)
     u, hit = state_at(old, x, *old.leg_at(x, touch))[None], Event(number)
     if not events:
@@ -241,7 +234,6 @@ def _with_touch(
 
 
 def _as_kind(kind: str, point: Point, distance: float) -> Point:
-    """Return the motion at a point of a boundary as a special point of another kind."""
     impact = point.impact if kind == GRAZING else None
     found = point_at(point.problem, point.step, kind, impact=impact)
     return dataclasses.replace(found, further=point.further)
@@ -250,7 +242,6 @@ def _as_kind(kind: str, point: Point, distance: float) -> Point:
 def _in_two_parameters(
     point: Point, problem: Shooting, x: np.ndarray, condition: AbstractCondition
 ) -> tuple[Shooting, np.ndarray]:
-    """Return equations and unknowns near a point of a two-parameter boundary, with a condition."""
     ((name, (value, size)),) = point.further.items()
     problem_two = dataclasses.replace(
         problem, parameters=(name, *problem.parameters), conditions=(condition,),

@@ -61,13 +61,11 @@ def with_article(kind: str) -> str:
 
 
 def place_in_words(problem: Shooting, at: Step, clock: float) -> str:
-    """Return the place in its period of a motion, in words."""
     place = float(since_section(problem, at.x, clock))
     return f"at {clock_in_words(problem.machine, place, problem.cycles)}"
 
 
 def coincidence_in_words(problem: Shooting, at: Step) -> str:
-    """Describe two consecutive events of a motion that come together, and their place."""
     lengths, place_of_both = problem.lengths(at.x), ""
     i = int(np.argmin(lengths))
     if lengths[i] < TOGETHER * problem.radian:
@@ -78,7 +76,6 @@ def coincidence_in_words(problem: Shooting, at: Step) -> str:
 
 
 def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
-    """Describe what a motion touches, or the impact that it loses, and the place in its period."""
     machine = problem.machine
     if impact is None:
         touched, clock = int(at.observed.nearest.event), float(at.observed.nearest.clock)

@@ -111,11 +111,8 @@ def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> Clo
 def one_impact_orbits(
     zeta: Number, xi: Number, k: Number, d: Number, n: int, section: Number = 0.0
 ) -> ClosedFormOrbits:
-    """Compute `closed_form_orbits` from dimensionless scalars.
-
-    **Arguments:** `zeta` > 0, `xi` ≥ 0, the restitution `k` in [0, 1], the gap `d`, the period `n`
-    ≥ 1 in drive cycles, and `section`, its crank angle (radians).
-    """
+    """Compute `closed_form_orbits` from dimensionless scalars; the period `n` is in drive cycles,
+    `section` is a crank angle (radians)."""
     dtype = jnp.result_type(float, zeta, xi, k, d)
     zeta, xi, k, d, section = (jnp.asarray(x, dtype) for x in (zeta, xi, k, d, section))
     period = 2 * pi * n / zeta

@@ -40,7 +40,6 @@ COLUMNS = (
 
 
 def column_names(machine: AbstractMachine, like: State) -> tuple[str, ...]:
-    """Return the names of the numbers at each point of a branch with this machine and state."""
     inner = (*components(like), *quantity_names(machine, like))
     return (*COLUMNS, *average_names(machine, like), *(f"section_{name}" for name in inner))
 
@@ -80,8 +79,7 @@ _ROUNDING = 1e-12
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class Curve(abc.ABC):
-    """A curve of periodic motions: host arrays with one row for each point, in order, in the
-    machine's units (see `AbstractMachine.units`)."""
+    """A curve of periodic motions; its columns have one row for each point, in order."""
 
     problem: Shooting
     """The equations of the motions."""
@@ -322,13 +320,8 @@ class Curve(abc.ABC):
         index `special_point` of the curve's point (-1 if none), and more. The parameters are also
         variables by their own names, unless another column has that name. The ends are in `attrs`.
 
-        `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too.
-
-        **Arguments:** `along`, to keep only variables of one dimension: `"point"`, `"special"`,
-        `"impact"` or `"state"` (the multipliers). This makes a table without repetitions:
-        `branch.to_xarray(along="point").to_dataframe().to_csv(path)`.
-
-        **Raises:** `ValueError` if there is no such dimension.
+        `.to_netcdf(path, engine="h5netcdf")` writes all of it, complex multipliers too. `along`, as
+        in `Run.to_xarray`, is `"point"`, `"special"`, `"impact"` or `"state"` (the multipliers).
         """
         data: dict[str, Any] = {self.names[0]: ("point", self.parameter)}
         data |= {name: ("point", self.column(name)) for name in self.column_names}
@@ -453,7 +446,6 @@ class Boundary(Curve):
 
 
 def branch_hits_in_words(branch: Branch) -> str:
-    """Describe the impacts of a branch's motions, or that they rest: then the number varies."""
     if branch.problem.rests:
         return "rest on a stop"
     return count_of(branch.impact_speed.shape[1], "impact")

@@ -121,7 +121,6 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 
 def _samples_per_cycle(the_map: CycleMap, state: State) -> int:
-    """Return the number of samples of the state in a cycle; 1 for an autonomous machine."""
     return 1 if is_autonomous(the_map.machine, without_modes(state)) else _SAMPLES
 
 
@@ -305,12 +304,9 @@ def order_impacts(
     observed: ObservedArc, hit: Bool[Array, "cycles log"], least: Int[Array, ""],
     machine: AbstractMachine, place: Int[Array, ""] | None,
 ) -> Impacts:  # fmt: skip
-    """Return the impacts of a period in one row, in order from the given section.
-
-    **Arguments:** `hit`, which of those listed belong to it; `place`, the eighths of a cycle from
-    the given section to that of the search, or `None` if the machine is autonomous (cycles of any
-    length).
-    """
+    """Return the impacts of a period in one row, in order from the given section. `hit` flags those
+    of the log that belong to it; `place` is the eighths of a cycle from the given section to that
+    of the search, `None` for cycles of any length."""
     phase, cycles = observed.listed.phase, observed.duration.shape[0]
     if place is not None:
         turn = jnp.asarray(machine.cycle, phase.dtype)
@@ -538,7 +534,6 @@ def _with_later_modes(the_map: CycleMap, guess: State) -> State:
 
 
 def _modes_recur(start: State, observed: ObservedArc) -> Flag:
-    """Return whether a motion ends in its first modes, after all cycles of the search."""
     modes = modes_of(start)
     if modes is None or observed.modes is None:
         return jnp.ones((), bool)
@@ -573,7 +568,6 @@ def is_equilibrium(machine: AbstractMachine, state: State, duration: Any, unit: 
 
 
 def _state_tolerance(dtype: object) -> float:
-    """Return the tolerance for equal states, see `distance`."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 

@@ -117,7 +117,6 @@ def find_attractors(local: LocalMap, offsets: np.ndarray) -> Attractors:
 
 
 def _iterate(local: LocalMap, offsets: np.ndarray) -> Attractors:
-    """Iterate the local map from the smooth motion, at each offset of the parameter."""
     z = np.zeros((len(offsets), local.matrices.shape[1]))
     settle = transient_length(local)
     places = np.zeros((len(offsets), SOUGHT, z.shape[1]))
@@ -269,8 +268,6 @@ _KICKS_SUMMED = 64
 
 
 class SimulatedAttractors(NamedTuple):
-    """Attractors of the machine, lane by lane."""
-
     period: np.ndarray
     """As `Attractors.period`; -1 also for a lane that left the neighbourhood or failed."""
     impacts: np.ndarray
@@ -299,7 +296,6 @@ def _simulate_lanes(problem: Shooting, values, states, cycles: int, settle: int)
 
 
 def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAttractors:
-    """Simulate the machine at each offset of the parameter, from the smooth motion."""
     problem, section, local = graze.problem, graze.section, graze.map
     value = float(graze.x[-1])
     smooth = section.state + np.outer(offsets, section.slope)
@@ -596,7 +592,6 @@ def _limit_to_checked(
 
 
 def _forecast(graze: LocalGrazing, periods: int) -> tuple[Grazing, Attractors]:
-    """Return the forecast of the local map, and its attractor at each value of the parameter."""
     local, machine = graze.map, graze.problem.machine
     first = graze.touches[0]
     half = 0.5 * _BRIEF * float(graze.problem.period(graze.x)) / graze.problem.cycles

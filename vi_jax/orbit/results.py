@@ -90,7 +90,6 @@ def eigenvalues(
 
 
 def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
-    """Return the stability that the largest multiplier determines."""
     largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
     size = jnp.abs(largest)
     real = jnp.abs(largest.imag) <= NEUTRAL * size
@@ -291,14 +290,9 @@ class Orbit(Summarized):
         """Return this orbit, or a batch of them, as an `xarray.Dataset`.
 
         Each component of the section states is a variable (`section_Y`), multipliers are complex;
-        `result` and `stability` are words. Host-side: not to be traced.
-
-        **Arguments:** names of the batch axes, by default `lane`; `along`, to keep only variables
-        of one dimension (`"section"`, `"impact"`, `"multiplier"`, `"column"` of the monodromy
-        matrix, or a batch axis). This makes a table without repetitions.
-
-        **Raises:** `ValueError` if the number of names is not that of the batch axes, or there is
-        no such dimension.
+        `result` and `stability` are words. `dims` and `along` are as in `Run.to_xarray`; `along` is
+        `"section"`, `"impact"`, `"multiplier"`, `"column"` of the monodromy matrix, or a batch
+        axis.
         """
         batch = batch_names(dims, self.residual.ndim)
         scalars = ("cycles", "duration", "frequency_ratio", "impacts", "rests", "y_min", "y_max",
@@ -372,7 +366,6 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
 
 
 def _advice(orbit: Orbit) -> str:
-    """Return advice for a search that ended close to an orbit, at the errors of the steps."""
     # A choice: searches from bad starts end with residuals of some 1e-3 and more.
     if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
         return ""
@@ -383,7 +376,6 @@ def _advice(orbit: Orbit) -> str:
 
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
-    """Return whether a body rests on a stop on the section."""
     x, machine = without_modes(orbit.state), orbit.machine
     bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
