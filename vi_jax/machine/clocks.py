@@ -16,8 +16,7 @@ from .scene import Scene
 
 
 def in_clock(machine: Machine, clock: str) -> Machine:
-    """Return the same machine with another independent variable. **Raises:** `ValueError` for a
-    machine with one clock."""
+    """Return the same machine with another independent variable."""
     if isinstance(machine, Scene):
         return machine.in_clock(clock)
     raise ValueError(
@@ -33,8 +32,7 @@ def in_cycle_clock(machine: Machine) -> Machine:
 
 
 def at_section(machine: Machine, phase: Number) -> Machine:
-    """Return the same machine with its section elsewhere in the cycle. **Raises:** `ValueError` for
-    a machine whose section cannot be moved."""
+    """Return the same machine with its section elsewhere in the cycle."""
     if isinstance(machine, Scene):
         return machine.at_section(phase)
     raise ValueError(
@@ -54,8 +52,7 @@ def convert_start(machine: Machine, start: State) -> State:
 
 
 def in_cycle_state(machine: Machine, name: str, state: State) -> State:
-    """Return a section state of any clock in the form for `in_cycle_clock`; `name` is the
-    argument's name in error messages."""
+    """Return a section state of any clock in the form for `in_cycle_clock`."""
     if isinstance(machine, Scene | LinearMachine):
         return machine.in_cycle_state(name, state)
     return state
@@ -115,8 +112,7 @@ def may_rest(machine: Machine) -> bool:
 
 
 def is_in_range(machine: Machine, start: State) -> Flag:
-    """Return whether the numbers of a machine and of its start, also traced ones, are in their
-    ranges, and the start is not beyond its section."""
+    """Return whether all numbers are in their ranges, and the start not beyond its section."""
     good = in_range((machine, stops_of(machine), switches_of(machine), start))
     clock = clock_of(machine, start)
     return good if clock is None else good & (clock < machine.cycle)

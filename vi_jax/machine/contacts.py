@@ -50,8 +50,7 @@ def forces(
     gains: Sequence[Sequence[Scalar]], acting: Sequence[Flag], wanted: Sequence[Scalar]
 ) -> list[Scalar]:
     """Return the amount of each push that changes the velocities of the `acting` contacts as
-    `wanted`; 0 for the others. **Arguments:** `gains`, from `push_gains`; `acting` and `wanted`,
-    with an entry for each contact."""
+    `wanted`, with `gains` from `push_gains`; 0 for the others."""
     rows = []
     for j, row in enumerate(gains):
         both = zip(row, acting, strict=True)
@@ -104,14 +103,11 @@ class FrictionImpulse(NamedTuple):
 def with_friction_impulse(
     machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
 ) -> FrictionImpulse:
-    """Return the result of an impact on stop `number` with Coulomb friction. The body sticks if the
+    """Return the result of an impact on stop `number` with Coulomb friction, from the states before
+    it and after one without friction, whose normal velocity is kept. The body sticks if the
     required impulse is at most `level` times that of the stop: its velocity along the stop is
     reversed and scaled by the tangential restitution. Otherwise it slips against `level` times the
-    stop's impulse.
-
-    **Arguments:** `friction`, the one on this stop; `before` and `after`, the states before the
-    impact and after one without friction, whose velocity normal to the stop is kept.
-    """
+    stop's impulse."""
     stop = stops_of(machine)[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
     push, drag = push_of(body, before), push_of(along, before)
@@ -196,14 +192,10 @@ def constrained_rate(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
 ) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:  # fmt: skip
-    """Return the rate of the state along `flow`, corrected so that resting coordinates keep their
-    velocities. Forces on shared bodies depend on each other and are solved for together.
-
-    **Arguments:** `modes`, those of the switches first; `contact`, as in `EventContext`.
-
-    **Returns:** the rate; and for each friction, by its index among the switches, the force along
-    the surface, the normal force (`None` without a stop), and the effective mass.
-    """
+    """Return the rate along `flow`, corrected so that resting coordinates keep their velocities.
+    Forces on shared bodies are solved for together. Also return for each friction, by its index
+    among the switches, the force along the surface, the normal force (`None` without a stop), and
+    the effective mass."""
     bodies, pushes, acts, stop_frictions, masses = contact_constraints(
         machine, s, state, modes, contact
     )
@@ -238,9 +230,7 @@ def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
 def check_takes(
     function: Callable[..., Any], whose: str, first: str, arguments: tuple[Any, ...], modes: int
 ) -> None:
-    """Raise `TypeError` if a user's function does not accept these arguments. **Arguments:**
-    `whose`, the function in words; `first`, the arguments before the modes in words; `modes`, how
-    many arguments are modes."""
+    """Raise `TypeError` if a user's function does not accept these arguments, modes last."""
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError as error:

@@ -173,9 +173,8 @@ def _values(modes: Any) -> tuple[Any, ...]:
 
 
 def modes_after(machine: Machine, found: Any, modes: Modes, whose: str) -> tuple[Any, ...]:
-    """Return the machine's own modes after an event, for which a user's function `whose` returned
-    `found`: all, or a dictionary of those that change. **Raises:** `TypeError` for a name that the
-    machine does not declare."""
+    """Return the machine's own modes after an event, for which a function returned `found`: all, or
+    a dictionary of those that change."""
     names = tuple(declared_modes(machine))
     if not isinstance(found, Mapping) or not names:
         return _values(found)
@@ -240,8 +239,7 @@ def replaced(state: State, new: State) -> State:
 
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:
-    """Return the state with the initial modes of a motion that begins in it; unchanged if it has
-    modes, or the machine has none. **Arguments:** `axes`, the number of batch axes."""
+    """Return the state with a motion's initial modes, unless it has some or the machine none."""
     if isinstance(state, HybridState) or not has_own_modes(machine):
         return state
 

@@ -115,8 +115,7 @@ class Friction(AbstractSwitch):
     def _balanced_force(
         self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
     ) -> tuple[Any, Any]:
-        """Return the force that friction balances on a body that sticks, and the largest one.
-        **Arguments:** `around`, the other modes and the resting contacts; `mode`, its own."""
+        """Return the force that friction balances on a body that sticks, and the largest one."""
         solve: Any = _solve_forces
         _, found = solve(machine, s, state, around.with_mode(mode), around.contact)
         force, largest, _ = self.held(machine, s, state, around.contact, found[around.mode_index])
@@ -125,8 +124,8 @@ class Friction(AbstractSwitch):
     def _mode_at_rest(
         self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
     ) -> Scalar:
-        """Return the mode of a body without slip: sticking if the force is not too large, else the
-        direction of the force. **Arguments:** `sticks`, whether the body may stick at all."""
+        """Return the mode of a body without slip: sticking if it may and the force is not too
+        large, else the direction of the force."""
         if not self.is_known(around):
             return jnp.zeros_like(s)
         pull, largest = self._balanced_force(machine, s, state, around, jnp.zeros_like(s))
@@ -323,13 +322,9 @@ def choose_modes(
     released: tuple[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
     """Return the modes of several frictions after one has changed: the first set that is consistent
-    with all forces, in the order of decreasing numbers of sticking bodies.
-
-    A friction with slip keeps its direction. Each of the others sticks or slips either way.
-
-    **Arguments:** `modes`, all of the machine; `contact`, as in `EventContext`; `released`, the
-    index of a friction that does not stick again, and whether this holds.
-    """
+    with all forces, in the order of decreasing numbers of sticking bodies. A friction with slip
+    keeps its direction, and that in `released` (index and flag) does not stick. Each of the others
+    sticks or slips either way."""
     indices = frictions_in(machine)
     switches = switches_of(machine)
     signs = [switches[i].slip_sign(machine, s, state) for i in indices]

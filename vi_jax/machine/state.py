@@ -72,13 +72,8 @@ jtu.register_pytree_with_keys(
 
 
 def like(state: Any, found: Any, whose: str) -> Any:
-    """Return the result of a user's function in the form of a state. The result may be a dictionary
-    or a state with the same names; plain numbers become arrays.
-
-    **Arguments:** `state`, of the required form; `whose`, the function's name in messages.
-
-    **Raises:** `TypeError` that names a missing or an unknown component.
-    """
+    """Return the result of a user's function, also a dictionary, in the form of a state; raise
+    `TypeError` that names a missing or an unknown component."""
     if isinstance(found, State):
         return with_components(state, vars(found), whose, all_of_them=True)
     if isinstance(found, Mapping) and type(found) is not type(state):
@@ -89,20 +84,14 @@ def like(state: Any, found: Any, whose: str) -> Any:
 
 
 def changed(state: Any, found: Any, whose: str) -> Any:
-    """Return the state after a jump, for which a user's function returned the changed components.
-    **Arguments and raises:** as `like`."""
+    """Return the state after a jump, for which a function returned the changed components."""
     if isinstance(found, Mapping):
         return with_components(state, found, whose, all_of_them=False)
     return like(state, found, whose)
 
 
 def with_components(state: Any, given: Mapping[str, Any], whose: str, *, all_of_them: bool) -> Any:
-    """Return a state with these components, each with the type of the old one.
-
-    **Arguments:** `all_of_them`, whether each component must be given.
-
-    **Raises:** as `like`.
-    """
+    """Return a state with these components, each with the type of the old one."""
     if isinstance(state, Mapping):
         parts = state
     elif hasattr(state, "__dict__"):
