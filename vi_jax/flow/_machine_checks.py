@@ -174,10 +174,7 @@ _SAMPLES, _MODES, _DISTANCES = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 def check_values(machine: AbstractMachine, start: State) -> None:
     """Check numbers of a machine around its start. Warn once if the field is not periodic, or if an
     event's guard is not negative in any of many states. Machines of this package and machines with
-    traced numbers are not checked.
-
-    **Raises:** `ValueError` for invalid masses.
-    """
+    traced numbers are not checked."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     is_builtin = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
     if is_builtin or any(isinstance(x, Tracer) for x in leaves):

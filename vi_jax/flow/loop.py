@@ -73,11 +73,9 @@ def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) 
 
 def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
     """Return the size of each number of a state, in the order of `in_rows`: its expected magnitude
-    along a motion. It is 1 for an angle, for a number that is zero to rounding, and for a machine
-    whose numbers are about 1 by definition. States are compared relative to these sizes.
-
-    **Arguments:** `start`, the initial state; `rows`, other states of the motion, (..., states).
-    """
+    along a motion, from `start` and `rows` (..., states). It is 1 for an angle, for a number that
+    is zero to rounding, and for a machine whose numbers are about 1 by definition. States are
+    compared relative to these sizes."""
     state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(start))  # integers too
     row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
@@ -304,11 +302,8 @@ class Ends(NamedTuple):
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
     """Run a lane to its end in one flat loop; in a batch no lane waits for another at a section.
-
-    **Returns:** its `Ends`; states and records of the recorded intervals, with leading axis
-    `plan.recorded_intervals + 1`. The first are the state in which recording begins, and an empty
-    record. The states are `HybridState`s if the machine has its own modes.
-    """
+    Return states and records with leading axis `plan.recorded_intervals + 1`: first the state in
+    which recording begins, and an empty record. With own modes the states are `HybridState`s."""
     form = prepared(plan.machine)
     is_unchanged = form.machine is plan.machine
     if not is_unchanged:

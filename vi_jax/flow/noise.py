@@ -278,12 +278,9 @@ def with_impulse(
     noise: Impulses, when: Flag, cycle: Scalar, instant: Scalar, state: State,
     elapsed: Scalar | None,
 ) -> State:  # fmt: skip
-    """Return the state after the impulse of an instant, if `when` is true.
-
-    **Arguments:** `cycle`, counted from the start of the run, `settle` included; `instant`, its
-    number in the cycle; `elapsed`, the time since the last impulse, `None` if it is known in
-    advance.
-    """
+    """Return the state after impulse number `instant` of `cycle` if `when` is true. Cycles are
+    counted from the start of the run, `settle` included. `elapsed` is the time since the last
+    impulse, `None` if it is known in advance."""
     leaves, tree = jtu.tree_flatten(state)
     sizes = [0 if x is None else leaf.size for x, leaf in zip(noise.scales, leaves, strict=True)]
     words = cycle.astype(jnp.uint32), instant.astype(jnp.uint32)

@@ -246,12 +246,10 @@ class FirstEvent(NamedTuple):
 def first_event(
     plan: Plan, lane: Lane, guards: list[Passed], turns: list[Course], met: Flag, corrections: int
 ) -> FirstEvent:
-    """Return the first event of a step.
-
-    **Arguments:** `guards` and `turns`, of the events and of each coordinate, not both empty;
-    `met`, whether the step landed on its target; `corrections`, how often a root is corrected.
-    A quintic through a step's ends needs none, since its root is only the next target.
-    """
+    """Return the first event of a step, by the `guards` of events and the `turns` of coordinates
+    (not both empty). `met` is whether the step landed on its target. A root is corrected
+    `corrections` times; a quintic through a step's ends needs none: its root is only the next
+    target."""
     found, crossed, any_turn = [], jnp.zeros_like(met), jnp.zeros_like(met)
     for guard, over, curve in guards:
         # The chord is accurate enough to find the first event: a landing that lies beyond another
@@ -295,11 +293,8 @@ def first_event(
 
 def _earliest(lane: Lane, found: list[tuple]) -> tuple[Scalar, Curve, Flag | None]:
     """Return the earliest event of a step: its target, the curve that rises through zero there, and
-    whether it lies at the start of the step (`None` if it cannot).
-
-    **Arguments:** `found`, for each event its place, then these three. The place is infinite if the
-    event was not met, and negative if it comes before any other.
-    """
+    whether it lies at the start of the step (`None` if it cannot). In `found` the place comes
+    before these: infinite if the event was not met, negative if it comes before any other."""
     (soonest, target, curve, at_once), *others = found
     target = jnp.full_like(lane.s, target)
     for place, its_target, its_curve, its_at_once in others:

@@ -53,12 +53,9 @@ def apply_events(
 ) -> Lane:
     """Return the lane after the events that are no impacts, and after all that they trigger.
 
-    Simultaneous events happen in the order of the machine's list. The jumps of guards trigger
-    others: an event happens next if its guard jumps from below zero to above, or was near zero and
-    jumps away from it. No event triggers itself.
-
-    **Arguments:** `due` and `near`, flags by the numbers of events: those that are due, and those
-    whose guards are at zero to rounding.
+    Simultaneous events (`due`) happen in the order of the machine's list. The jumps of guards
+    trigger others: an event happens next if its guard jumps from below zero to above, or was zero
+    to rounding (`near`) and jumps away from it. No event triggers itself.
     """
     zero = jnp.zeros_like(lane.s)
     due_, near_ = (tuple(jnp.where(x, 1.0, zero) for x in y.values()) for y in (due, near))
@@ -85,11 +82,7 @@ def trigger_events(
     causes: dict[int, Flag], near: Scalars,
 ) -> tuple[Lane, dict[int, Flag], Scalars]:  # fmt: skip
     """Return the lane after a jump, the events that the jump triggers, and the remaining `near`. In
-    `Lane.below` of the lane, guards that happened, or that the jump moved to or above zero, are 0.
-
-    **Arguments:** `when`, whether state or modes jumped; `before`, both before the jump; `causes`,
-    for each event whether it caused the jump; `near`, as in `_DueEvents`.
-    """
+    the new `Lane.below`, guards that happened, or that the jump moved to or above zero, are 0."""
     (old, modes), contact, machine = before, lane.contact or (), plan.machine
     below, nearby, triggered = [], [], {}
     held = hold_contacts(machine, lane.modes, lane.contact)
@@ -208,11 +201,8 @@ def release_pulled(
     before: tuple[State, Scalars], contact_before: Scalars | None = None,
 ) -> Lane:  # fmt: skip
     """Return the lane with those bodies free that were pressed on their stops before an event, and
-    are pulled away after it: a force that jumps does not pass through zero.
-
-    **Arguments:** `when`, whether the event happens; `before`, state and modes before it;
-    `contact_before`, the contacts before it, if they may differ from the present ones.
-    """
+    are pulled away after it: a force that jumps does not pass through zero. `contact_before` is
+    given if contacts may have changed."""
     machine, contact, modes, s = plan.machine, lane.contact, lane.modes, lane.s
     if contact is None:
         return lane

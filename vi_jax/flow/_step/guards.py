@@ -108,11 +108,8 @@ def inner_guards(
     ends: list[tuple[Rates, Rates]], stages: list[Stage], at: Callable[[Scalar], State],
     h: Scalar, longest: Scalar,
 ) -> InnerGuards:  # fmt: skip
-    """Return the guards at the stages of a step.
-
-    **Arguments:** `free_machines`, as in `Trial`; `ends`, the rates of each coordinate at both
-    ends; `at(share)`, returns the state there, for stages without one; `longest`, a step's limit.
-    """
+    """Return the guards at the stages of a step; `ends` are each coordinate's rates at both ends,
+    and `at(share)` is the state at stages without one."""
     if not stages:
         return InnerGuards({}, {}, {}, {})
     machine, arguments = plan.machine, (lane.modes, lane.contact or ())
@@ -295,12 +292,8 @@ def crossings(
     plan: Plan, lane: Lane, smooth: SmoothMachine, paths: list[Any], end: tuple,
     ends: tuple[Flag, Flag], inner: InnerGuards,
 ) -> tuple[tuple[Crossing, ...], Scalars]:  # fmt: skip
-    """Return the events in a step, and `Lane.below` at its end.
-
-    **Arguments:** `smooth`, the machine during the step; `paths`, the path of each coordinate;
-    `end`, s at the step's end, its length and the state; `ends`, whether the step was good, and
-    ends an interval; `inner`, guards at the stages.
-    """
+    """Return the events in a step, and `Lane.below` at its end. `end` is s there, the step's length
+    and the state; `ends` is whether the step was good, and ends an interval."""
     machine, (s1, h, new), (good, last) = plan.machine, end, ends
     others, below = _other_events(plan, lane, smooth, (s1, new), inner)
     stops = at_stops(plan, [(path.begin, path.end) for path in paths])

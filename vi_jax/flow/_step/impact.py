@@ -346,11 +346,8 @@ def _pushed_state(
     instant: _Instant, state: State, velocities: dict[int, Scalar], slow: dict[int, Flag],
     hits: dict[int, Flag], rebounds: dict[int, Scalar],
 ) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
-    """Return the state after the next impacts, and the push of each coordinate's velocity.
-
-    **Arguments:** `slow`, which coordinates come to rest; for each stop, by its number, `hits`,
-    whether it is hit, and `rebounds`, the velocity after that.
-    """
+    """Return the state after the next impacts, and the push of each coordinate's velocity. `hits`
+    and `rebounds` (velocities) are by the numbers of stops."""
     machine, stops = instant.plan.machine, stops_of(instant.plan.machine)
     on, wanted, places = dict(slow), {k: -V for k, V in velocities.items()}, {}
     for k, body in instant.bodies.items():
@@ -553,10 +550,7 @@ def _remaining_chatter(
     growth: Scalar | None = None,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
-
-    **Arguments:** `free`, the machine with this body free; `speed` of its rebound with respect to
-    s; `lane` at the impact; `growth`, the rate of the force on the body, if known.
-    """
+    `speed` is that of the rebound with respect to s; `growth` is the rate of the force."""
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.

@@ -49,13 +49,10 @@ class Release(NamedTuple):
 def locate_release(
     plan: Plan, lane: Lane, k: int, begin: Rates, end: Rates, good: Flag, h: Scalar
 ) -> Release:
-    """Return the release of coordinate number k from its stop, if it is released, by the rates of
-    the free coordinate at both ends of the step.
-
-    The body is held while it is pressed on. It leaves when the force changes sign: the acceleration
-    that a free body would have there. The drive goes on turning, with the reaction of a spring
-    whose end is held.
-    """
+    """Return the release of coordinate number k, by its rates when free at both ends of the step. A
+    body is held while it is pressed on. It leaves when the acceleration that a free body would have
+    there changes sign. The drive goes on turning, with the reaction of a spring whose end is
+    held."""
     assert lane.contact is not None
     # Steps approach the release from the pressed side. Each ends a share short of the last
     # estimate, until one is so short that the force is linear over it: choices.
@@ -155,11 +152,8 @@ class AppliedStep(NamedTuple):
 def try_step(
     plan: Plan, lane: Lane, active: Flag, smooth: SmoothMachine, motion: Foreseen | None
 ) -> Trial:
-    """Try the next step and find its events. For a lane that has ended, the step has length zero.
-
-    **Arguments:** `active`, whether the lane goes on; `smooth`, the machine in its modes with
-    resting bodies held; `motion`, the motion ahead, for a method that computes it in advance.
-    """
+    """Try the next step and find its events; a step of a lane that has ended has length zero.
+    `motion` is the motion ahead, for a method that computes it in advance."""
     machine, method = plan.machine, plan.method
     free = lane.target == FREE
     bound = plan.end(lane.part)
@@ -254,13 +248,8 @@ def _path(
     good: Flag,
     inner: InnerGuards,
 ) -> Path:
-    """Return the path of coordinate number k during a step.
-
-    **Arguments:** `free`, the machine with this body free and other resting bodies held; `smooth`,
-    the machine during the step; `ends`, the rates in `free` at both ends; `at_end`, s and state at
-    the end, the step's length and the longest length; `good`, whether the step was good; `inner`,
-    guards at the stages.
-    """
+    """Return the path of coordinate number k during a step. Its body is free in `free`, with rates
+    `ends` there; `at_end` is s, state, the step's length and the longest length."""
     (begin, end), (s1, new, h, limit) = ends, at_end
     position = plan.machine.coordinates[k].position
     if lane.contact is not None and not stops_are_exact(plan.machine, lane.state):

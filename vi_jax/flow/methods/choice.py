@@ -59,11 +59,8 @@ def chosen(
     argument: str = "method",
 ) -> AbstractMethod:
     """Return the given method, or the preset of the given name. For `None`, return `ExactFlight` if
-    it applies, else `otherwise`, by default the `"standard"` preset.
-
-    **Raises:** `TypeError` for an invalid method, `ValueError` for a name that is no preset's. It
-    does not check whether the method can integrate the machine; `AbstractMethod.check` does.
-    """
+    it applies, else `otherwise`, by default the `"standard"` preset. `AbstractMethod.check` decides
+    whether it can integrate the machine."""
     if method is None:
         if otherwise is None or (machine is not None and lack_of_closed_form(machine) is None):
             return preset(machine)
