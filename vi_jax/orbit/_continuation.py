@@ -26,7 +26,7 @@ from ._problem import (
 from ._shooting import Shooting
 from ._sliding import SLIDING, change_at, without_part
 from ._solution import Step, advance, tangent_at
-from ._special_table import Intervals, SpecialTable, lost_at
+from ._special_table import Intervals, SpecialTable
 from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, with_article
 from .curve import Boundary, Branch
 from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
@@ -307,7 +307,7 @@ def boundary(
         start = advance(problem, x, tangent * np.copysign(1.0, tangent[-2]), 0.0)
     if not bool(start.good):
         several = ""
-        if point.kind in TOUCHING and sum(lost_at(point.step)) > 1:
+        if point.kind in TOUCHING and sum(point.step.observed.lost) > 1:
             several = (
                 " Several of its events vanish at once, as in a motion that repeats within its "
                 "period. Begin with the motion of fewer cycles."

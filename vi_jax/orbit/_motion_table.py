@@ -197,11 +197,11 @@ class MotionTable(Table):
             rest_ending = partial(self._end_with, REST, detail=detail, impact=event)
             yield Event(lambda step, i=i: -float(step.observed.escape_margin[i]), rest_ending)
         if self.problem.rests:
-            yield Event(least_hold_force, self._divided_rest)
+            yield Event(lambda step: step.observed.least_hold_force, self._divided_rest)
         new_mode = lambda _: "a switch goes into another mode: the motion sticks or slips anew"
         coincidence = partial(coincidence_in_words, self.problem)
         ended = partial(self._ending, here)
-        yield Event(relative_clearance, ended)
+        yield Event(lambda step: step.observed.relative_clearance, ended)
         yield Event(lambda step: float(step.observed.modes_agree), partial(ended, text=new_mode))
         yield Event(
             lambda step: float(step.observed.order_margin) + slack, partial(ended, text=coincidence)
@@ -448,17 +448,6 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
     leaving, after = (problem.events[i % problem.legs] for i in (first, first + 1))
     lands = leaving.use == LEAVES and after == leaving._replace(use=LANDS)
     return first if lands and lengths[first] < _BRIEF * problem.radian else None
-
-
-def relative_clearance(step: Step) -> float:
-    """Return the clearance as a share of its size; 1 for motions without a turn."""
-    return float(np.clip(step.observed.nearest.margin / step.observed.nearest.unit, -1.0, 1.0))
-
-
-def least_hold_force(step: Step) -> float:
-    """Return the least force on a body within its rest, relative to the motion's; at most 1."""
-    unit = step.observed.length * (2 * np.pi / float(step.observed.duration)) ** 2
-    return float(np.clip(step.observed.pull.margin / unit, -1.0, 1.0))
 
 
 # The number of multipliers that cross the unit circle at a change of sign of each test.

@@ -52,6 +52,10 @@ from .results import multipliers_of
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
 
+# An event with a lower speed of approach (in its unit) is lost, and a stop with a smaller distance
+# is touched: a choice. The corrector leaves up to 5e-8 at the release from a soft stop that grazes.
+_GRAZES = 1e-6
+
 # Newton steps from the begin of a step to the passage of an angle within it. Four reach rounding if
 # the speed changes by less than half in a step.
 _PASSING = 5
@@ -103,6 +107,27 @@ class Observed(NamedTuple):
         inside = self.nearest.margin >= -ROUNDING * self.nearest.unit
         slowest = np.asarray(self.approach / self.units)[list(events)].min(initial=0.0)
         return bool(inside and slowest >= -ROUNDING)
+
+    @property
+    def lost(self) -> np.ndarray:
+        """True for each event that grazes; host-side."""
+        return np.abs(np.asarray(self.approach / self.units)) < _GRAZES
+
+    @property
+    def touches(self) -> bool:
+        """True if the motion turns on a stop that it does not hit; host-side."""
+        return abs(self.relative_clearance) <= _GRAZES
+
+    @property
+    def relative_clearance(self) -> float:
+        """The clearance as a share of its size, within ±1; 1 for motions without a turn."""
+        return float(np.clip(self.nearest.margin / self.nearest.unit, -1.0, 1.0))
+
+    @property
+    def least_hold_force(self) -> float:
+        """The least force on a body within its rest, relative to the motion's; within ±1."""
+        unit = self.length * (2 * np.pi / float(self.duration)) ** 2
+        return float(np.clip(self.pull.margin / unit, -1.0, 1.0))
 
     @property
     def fastest(self) -> float:

@@ -27,7 +27,7 @@ from .._messages import count_of
 from ._conditions import Special, is_defective, sum_of_minors
 from ._follow import SAME_CURVE, Ending, Event, Table, bound_rows
 from ._local_map import LocalMap, graze_at
-from ._motion_table import bifurcation_tests, least_hold_force, relative_clearance
+from ._motion_table import bifurcation_tests
 from ._shooting import ROUNDING, Shooting
 from ._solution import (
     MOST_SAMPLES,
@@ -73,10 +73,6 @@ _ZERO, _ENTRY = 1e-6, 1e-4
 # An impact slower than so many roots of a clearance is its turn, for accelerations of up to 50.
 _SAME_TURN = 10.0
 
-# Events with a lower speed of approach (in their units) are lost: a choice. The corrector leaves up
-# to 5e-8 at the release from a soft stop that grazes.
-_SLOW = 1e-6
-
 # Local maps of grazing motions are examined over so many periods.
 PERIODS = 3
 
@@ -114,12 +110,13 @@ class SpecialTable(Table):
         """Yield the rows of lost impacts other than the grazing one, and of touched stops."""
         kind, grazes = self.condition.kind, self.condition.impact
         if self.problem.rests and (kind != REST or grazes is not None):
-            yield Event(least_hold_force, lambda at: Ending(at, REST), noise=ROUNDING)
+            hold_force = lambda step: step.observed.least_hold_force
+            yield Event(hold_force, lambda at: Ending(at, REST), noise=ROUNDING)
         for i, event in enumerate(self.problem.landings):
             if kind != REST or event != grazes:
                 ending = lambda step, i=i: -float(step.observed.escape_margin[i])
                 yield Event(ending, lambda at: Ending(at, REST), noise=ROUNDING)
-        for i, is_lost in enumerate(lost_at(here)):
+        for i, is_lost in enumerate(here.observed.lost):
             # In a symmetric motion another impact grazes as well, on a soft stop the release.
             if kind == GRAZING and (is_lost or i == grazes):
                 continue
@@ -131,7 +128,7 @@ class SpecialTable(Table):
         if kind not in TOUCHING or kind == REST or grazes is not None:
             # The turn of a grazing impact itself is at a distance of rounding.
             slack = 2 * ROUNDING if kind == GRAZING else 0.0
-            clearance = lambda step: relative_clearance(step) + slack
+            clearance = lambda step: step.observed.relative_clearance + slack
             yield Event(clearance, lambda at: Ending(at, GRAZING), noise=ROUNDING)
 
     def _grazing_ending(self, here: Step, test: Callable[[Step], float], at: Step) -> Ending:
@@ -179,10 +176,6 @@ class SpecialTable(Table):
 
         overlap = lambda step: float(np.dot(begin, self.image_difference(step)))
         return crossing(self.problem, self.advance, here, root, overlap, admits)
-
-
-def lost_at(step: Step) -> np.ndarray:
-    return np.abs(np.asarray(step.observed.approach / step.observed.units)) < _SLOW
 
 
 def cosine_of(step: Step) -> float:
@@ -247,7 +240,7 @@ def _grazing_impact(step: Step) -> int | None:
     approach = np.asarray(step.observed.approach / step.observed.units)
     # A lost impact comes with a turn near the stop: at a distance of about v² for a speed v. At a
     # touched stop the impacts keep their speed.
-    touches = max(_SAME_TURN * np.sqrt(abs(relative_clearance(step))), _ZERO)
+    touches = max(_SAME_TURN * np.sqrt(abs(step.observed.relative_clearance)), _ZERO)
     if approach.size and approach.min() < touches:
         return int(np.argmin(approach))
     return None
@@ -263,8 +256,8 @@ def _resonant_grazings(
         return graze_at(point_at(problem, step, GRAZING, "", impact)).map
 
     # If another impact is lost as well, at an end, the map has a pole: its sign is rounding.
-    usually_lost = lost_at(steps[len(steps) // 2])
-    maps = [None if (lost_at(step) & ~usually_lost).any() else local(step) for step in steps]
+    usually_lost = steps[len(steps) // 2].observed.lost
+    maps = [None if (step.observed.lost & ~usually_lost).any() else local(step) for step in steps]
     is_planar = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if is_planar else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"

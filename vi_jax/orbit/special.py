@@ -9,14 +9,11 @@ import numpy as np
 
 from .._checks import given_number, one_of
 from ._conditions import in_one_parameter
-from ._shooting import ROUNDING, Shooting
+from ._shooting import Shooting
 from ._sliding import SLIDING
 from ._solution import Step, orbit_of
 from ._words import DETAILS, GRAZING, REST, grazing_in_words, with_article
 from .results import Orbit
-
-# A grazing is a touch within this share of the motion: a choice.
-_TOUCHES = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -87,8 +84,7 @@ class Point:
         """True if at a grazing an impact is lost or a stop is touched, to rounding; at a sliding
         bifurcation, if the motion without the vanishing part touches a surface."""
         lost = self.kind == REST or (self.impact is not None and self.kind not in SLIDING)
-        observed = self.step.observed
-        return lost or bool(abs(observed.nearest.margin) <= _TOUCHES * observed.nearest.unit)
+        return lost or self.step.observed.touches
 
     @property
     def lost(self) -> list[int]:
@@ -96,9 +92,8 @@ class Point:
         stop is touched that the motion did not hit before."""
         if self.impact is None:
             return []
-        speed = np.abs(np.asarray(self.step.observed.approach / self.step.observed.units))
-        others = (i for i in self.problem.impacts if speed[i] < ROUNDING)
-        return sorted({self.impact, *others})
+        lost = self.step.observed.lost
+        return sorted({self.impact, *(i for i in self.problem.impacts if lost[i])})
 
     def switch(self, to: str | None = None, *, distance: float = 0.01) -> Any:
         """Return the start of another curve that begins here: an `Orbit` to be continued, or on a
