@@ -178,7 +178,7 @@ def test_maps_of_a_machine_use_its_units_and_names():
     ax = vi.plot_basins(found, ax=_axes())
     assert next(iter(_legend(ax))).startswith("1 cycle, 1 impact")
     assert "period 1 cycle" in str(found) and "π" not in str(found)
-    assert ax.get_xlabel() == "height (g/ω²) at the start"
+    assert ax.get_xlabel() == "height at the start (g/ω²)"
     named = _legend(vi.plot_regimes(_data(), machine=ball, ax=_axes()))
     assert "1 cycle" in named and "> 8 cycles" in named
     data = vi.scan(

@@ -404,12 +404,6 @@ def sections_at(problem: Shooting, x: Unknowns) -> tuple[State, tuple[Array, Arr
     return _sections(motion, jnp.asarray(x))
 
 
-def sections_of(problem: Shooting, x: Unknowns) -> tuple[State, Scalar]:
-    """Return the states on the sections, leaves (cycles,), and the largest residual component."""
-    states, _, residual = sections_at(problem, x)
-    return states, residual
-
-
 def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     """Return clocks counted from the first section, within the period."""
     begin = float(sections_at(problem, x)[1][1][0]) if problem.omits_sections else 0.0
@@ -418,7 +412,7 @@ def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
 
 def _first_state(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
-    sections = sections_of(problem, x)[0] if sections is None else sections
+    sections = sections_at(problem, x)[0] if sections is None else sections
     modes = problem.modes_in(int(sections_at(problem, x)[1][0][0])) if problem.modes[0] else ()
     state = jax.tree.map(lambda x: x[0], sections)
     return with_modes(state, own_modes(problem.machine, modes))
@@ -472,7 +466,7 @@ def _impact_energies(problem: Shooting, xs: Array, states: State) -> Array:
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     observed, machine = step.observed, problem.at(step.x)
-    sections, residual = sections_of(problem, step.x)
+    sections, _, residual = sections_at(problem, step.x)
     state = _first_state(problem, step.x, sections)
     admissible = observed.admissible(range(len(problem.events)))
     hits = hits_of(problem, step, state)

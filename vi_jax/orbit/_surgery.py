@@ -23,7 +23,6 @@ from ._solution import (
     observe,
     on_host,
     sections_at,
-    sections_of,
     state_at,
     tangent_at,
 )
@@ -195,7 +194,7 @@ def without_events(
 
 
 def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarray]:
-    leaves = jax.tree.leaves(sections_of(old, x)[0])
+    leaves = jax.tree.leaves(sections_at(old, x)[0])
     rows = np.stack([np.asarray(leaf) for leaf in leaves], axis=-1)
     for cycles in range(1, old.cycles):
         repetitions, remainder = divmod(old.cycles, cycles)

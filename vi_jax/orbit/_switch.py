@@ -26,7 +26,7 @@ from ._solution import (
     jacobian_at,
     locate_zero,
     orbit_of,
-    sections_of,
+    sections_at,
     state_at,
     tangent_at,
 )
@@ -160,7 +160,7 @@ def _search(
     problem, step, guesses = point.problem, point.step, list(guesses)
     for near_step in (advance(problem, step.x, step.tangent, distance), step):
         if np.all(np.isfinite(near_step.x)):
-            guesses.append(jax.tree.map(lambda x: x[0], sections_of(problem, near_step.x)[0]))
+            guesses.append(jax.tree.map(lambda x: x[0], sections_at(problem, near_step.x)[0]))
     sense = np.copysign(1.0, float(step.tangent[-1]))
     n = problem.cycles
     options: Any = {"method": problem.method}

@@ -26,7 +26,7 @@ from ..machine import (
 )
 from ._conditions import Special, held_in_words
 from ._shooting import Observed, Shooting
-from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_of
+from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_at
 from ._special_table import cosine_of, points_of
 from ._words import TORUS
 from .results import NEUTRAL, Orbit, stability_of
@@ -230,7 +230,7 @@ class Curve(abc.ABC):
         access."""
         rows = []
         for step in self.steps:
-            first = jax.tree.map(lambda x: x[:1], sections_of(self.problem, step.x)[0])
+            first = jax.tree.map(lambda x: x[:1], sections_at(self.problem, step.x)[0])
             quantities = quantities_on(self.problem.at(step.x), first)
             rows.append(components(first, 1) | quantities)
         return {name: np.concatenate([np.asarray(row[name]) for row in rows]) for name in rows[0]}

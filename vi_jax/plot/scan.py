@@ -4,8 +4,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -15,7 +13,7 @@ from matplotlib.patches import Patch
 
 from .._checks import flag, instance_of, one_of
 from .._messages import count_of
-from ..machine import AbstractMachine, cycles_in_words, in_brackets, leaf_names, unit_of, units_of
+from ..machine import AbstractMachine, cycles_in_words, in_brackets, unit_of, units_of
 from ..scans import NOT_COMPUTED, REGIMES, Basins, IntegrityProfile
 from . import colors as look
 from .colors import IRREGULAR, OUTCOMES, PERIODS, color_of, distinct_colors, thick
@@ -180,22 +178,9 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
 
 
 def _start_name(machine: AbstractMachine, name: str) -> str:
-    """Return the label of an axis of starts: the machine's label, with units, for a position or a
-    velocity; else the name, with the unit that the machine states."""
+    """Return the label of an axis of starts: the component's name and unit."""
     name = name.removeprefix("start.")
-    by_its_name = in_brackets(f"{name} at the start", unit_of(units_of(machine), name))
-    try:
-        start = machine.start()
-    except ValueError:  # a machine without a start
-        start = None
-    names = [] if start is None else leaf_names(start)
-    if name in names:  # not a number within an array
-        probe = jtu.tree_unflatten(jtu.tree_structure(start), jnp.arange(len(names)) + 2.5)
-        value = names.index(name) + 2.5
-        for get, words in zip((machine.position, machine.velocity), machine.labels, strict=True):
-            if float(get(probe)) == value and not words.startswith(f"{name} = "):
-                return f"{words} at the start"
-    return by_its_name
+    return in_brackets(f"{name} at the start", unit_of(units_of(machine), name))
 
 
 def _two_axes(names: list[str], x: str | None, y: str | None) -> tuple[str, str]:
