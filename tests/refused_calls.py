@@ -63,23 +63,14 @@ def orbit(guess=START, **options):
 COUNT, REAL = "must be an integer", "must be a real number"
 ROW = "must be one row of finite real numbers"
 CALLS = {
-    **{f"settle={x!r}": (simulate(settle=x), f"`settle` {COUNT}") for x in ("3", None, 2.5, True)},
     "cycles=0": (simulate(cycles=0), "`cycles` must be at least 1, but got 0"),
     "cycles=2.5": (simulate(cycles=2.5), "`cycles` must be an integer, but got 2.5"),
     "record='all'": (simulate(record="all"), "`record` must be one of 'motion', 'sections'"),
     "NaN in a start": (simulate(vi.OscillatorState(np.nan, 0.0)), "must be finite"),
-    "settle=[1]": (simulate(settle=[1]), f"`settle` {COUNT}"),
-    "settle=10**20": (simulate(settle=10**20), "`settle` must be at most"),
-    "settle of lyapunov": (lambda: vi.lyapunov(SCENE, START, 10, settle="3"), f"`settle` {COUNT}"),
     "machine and start swapped": (lambda: vi.simulate(START, SCENE, 2), "`machine` must be a"),
     "a list as start": (simulate([0.0, 0.0]), "`start` must be a `OscillatorState`"),
-    "a text as start": (simulate("ab"), "`start` must be a `OscillatorState`"),
-    "lists in a start": (simulate(vi.OscillatorState([0.0], [0.0])), "its Y is [0.0]"),
-    "a text in a start": (simulate(vi.OscillatorState(0.0, "a")), "its V is 'a'"),
-    "None in a start": (simulate(vi.OscillatorState(None, 0.0)), "its Y is None"),
-    "texts in a guess": (orbit(vi.OscillatorState("a", "b")), "its Y is 'a'"),
     **{f"{x!r} in {who}": (call(vi.OscillatorState(x, 0.0)), "must hold real numbers, but its Y")
-       for x in (1j, np.complex128(1j), jnp.array(1j), jnp.array(True), "a")
+       for x in (1j, jnp.array(True), "a")
        for who, call in {
            "a start": simulate, "a guess": orbit,
            "a sweep's start": lambda start: sweep(start=start),
@@ -89,64 +80,38 @@ CALLS = {
     "a text for an own scene": (lambda: vi.simulate(Own(), "ab", 2), "`start` must hold real"),
     "a list as a scan's start": (scan(start=[0.0]), "`start` must be a `OscillatorState`"),
     "a text as a sweep's start": (sweep(start="ab"), "`start` must be a `OscillatorState`"),
-    "cycles=10**12": (simulate(cycles=10**12), "`cycles` must be at most"),
     "cycles=2*10**9": (simulate(cycles=2 * 10**9), "results that fit into the memory"),
-    "cycles=10**20": (simulate(cycles=10**20), "`cycles` must be at most"),
     "samples=10**12": (simulate(samples=10**12), "`samples` must be at most"),
-    "impact_log=10**12": (simulate(impact_log=10**12), "`impact_log` must be at most"),
-    "cycles of a sweep": (sweep(cycles=10**12), "`cycles` must be at most"),
-    "cycles of a scan": (scan(cycles=10**12), "`cycles` must be at most"),
     "a grid": (scan({ZETA: np.linspace(0.5, 1, 10**6), "start.Y": np.linspace(0, 1, 10**6)}),
                "`axes` must ask for results that fit into the memory"),
     "flags": (simulate(estimate="no"), "`estimate` must be True or False"),
-    "rests='no'": (simulate(rests="no"), "`rests` must be True or False"),
-    "paired='no'": (scan(paired="no"), "`paired` must be True or False"),
-    "throw='no'": (orbit(throw="no"), "`throw` must be True or False"),
     **{f"axis of {x!r}": (scan({ZETA: x}), ROW) for x in (
         ["0.8"], [True], np.array([True]), [True, 0.5], [1 + 0j], [None], [datetime.date.max],
         np.array(["2020-01-01"], "M8[D]"), [[0.8]], [np.nan], "0.8", 0.8, [])},
     **{f"values of {x!r}": (sweep(values=x), "Argument `values` must be") for x in (
         ["0.8"], [True], [1j], np.array(["2020-01-01"], "M8[D]"), [np.nan], 0.8)},
-    "sweep of None": (sweep(None), "`machine` must be a `Scene`"),
-    "sweep of no name": (sweep(parameter=None), "`parameter` must be"),
     **{f"tolerance={x!r}": (sweep(tolerance=x), "Argument `tolerance` must be") for x in (
         np.nan, np.float32("nan"), "1", True, 1j, 0.0)},
-    "max_steps=-1": (sweep(max_steps=-1), "`max_steps` must be at least 1"),
     **{f"rtol={x!r}": (lambda x=x: vi.Adaptive(rtol=x), f"`rtol` {REAL}") for x in (
         1e-3 + 0j, True, "a", None)},
-    "atol='a'": (lambda: vi.Adaptive(atol="a"), f"`atol` {REAL}"),
     **{f"apart={x!r}": (basins(apart=x), "Argument `apart` must be") for x in (
         0, -1, np.nan, "a", None, True)},
-    "seed=-1": (basins(samples=3, seed=-1), "`seed` must be at least 0"),
-    "seed='a'": (basins(samples=3, seed="a"), f"`seed` {COUNT}"),
-    "tolerance of basins": (basins(tolerance="1"), f"`tolerance` {REAL}"),
-    "a region of three": (basins({"start.Y": (0.0, 1.0, 2.0)}), "`region` must give ranges"),
     "a region of no part": (basins({"start.Z": (0.0, 1.0)}), "got 'start.Z'; near names: start.Y"),
     "a region of texts": (basins({"start.Y": ("0", "1")}), ROW),
     "crank='cosine'": (lambda: vi.Scene.ideal(frequency_ratio=0.9, crank="cosine"),
                        "`crank` must be a `CosineCrank()`"),
     "oscillator=0.1": (built(oscillator=0.1), "`oscillator` must be an `Oscillator`"),
     "one stop": (built(stops=vi.RigidStop(1.0, 0.5)), "`stops` must be a tuple"),
-    "stops=3": (built(stops=3), "`stops` must be a tuple"),
-    "stops=None": (built(stops=None), "`stops` must be a tuple"),
-    "stops='ab'": (built(stops="ab"), "`stops` must be a tuple"),
     **{f"frequency_ratio={x!r}": (
         lambda x=x: vi.Scene.ideal(frequency_ratio=x), "Argument `frequency_ratio` must be") for x
        in (1j, True, jnp.array(True), np.str_("0.9"), ["0.9"], np.datetime64("2020"), 10**400)},
     "Y='1'": (lambda: SCENE.start(Y="1"), f"`Y` {REAL}"),
-    "clock=['phase']": (simulate(clock=["phase"]), "`clock` must be one of"),
-    "Gradient('adam')": (lambda: vi.Gradient("adam"), "`optimiser` must be an `optax"),
     **{f"Newton(tolerance={x!r})": (
         lambda x=x: vi.Newton(tolerance=x), "Argument `tolerance` must be") for x in (
         np.nan, True, 1j, "a", 0.0)},
     "root_finder=Newton": (orbit(root_finder=vi.Newton), "`root_finder` must be `Newton(...)`"),
     "boundary('x')": (lambda: vi.boundary("x", parameter="stops.0.gap", bounds=((0, 1), (0, 1))),
                       "`point` must be a `Point`"),
-    "grazing('x')": (lambda: vi.grazing("x"), "`point` must be a `Point`"),
-    "plot_grazing('x')": (lambda: vi.plot_grazing("x"), "`found` must be a `Grazing`"),
-    "continue_orbit('x')": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1)),
-                            "`orbit` must be one `Orbit`"),
-    "a list as a guess": (orbit([0.9, 0.6]), "`guess` must be a `OscillatorState`"),
     "a list as a guess of an own scene": (lambda: vi.find_orbit(Own(), [0.9]),
                                           "`guess` must be a state"),
     "a list as a guess of a structure": (lambda: vi.find_orbit(vi.machines.Beam(), [0.9]),
@@ -154,12 +119,6 @@ CALLS = {
     "a table of guesses": (orbit(vi.OscillatorState(np.zeros((2, 3)), np.zeros((2, 3)))),
                            "`guess` must be one state, or several along one axis"),
     "section='pi'": (orbit(section="pi"), f"`section` {REAL}"),
-    "plot_sketch(ax)": (lambda: vi.plot_sketch(SCENE, ax=np.empty(2)), "`ax` must be one `Axes`"),
-    "plot_history('x')": (lambda: vi.plot_history("x"), "`motion` must be a `Run`"),
-    "plot_multipliers(5)": (lambda: vi.plot_multipliers(5), "`orbits` must be a tuple of `Orbit`"),
-    "step='a'": (lambda: vi.continue_orbit("x", parameter=ZETA, bounds=(0, 1), step="a"),
-                 f"`step` {REAL}"),
-    "distinct_orbits('x')": (lambda: vi.distinct_orbits("x"), "`orbits` must be from"),
     "cluster='tcp://x'": (scan(cluster="tcp://x"), "`cluster` must be a `dask"),
     "a scene of 5": (scan({"zeta": [1.0]}, lambda zeta: 5), "but it returned 5"),
     "a scene of another name": (scan({"zeta": [1.0]}, lambda xi: SCENE), "missing a required"),
@@ -176,9 +135,6 @@ CALLS = {
     "a measure with a path": (measured(**{"a/b": 1.0}), "must name its numbers by words"),
     "derivatives=5": (scan(derivatives=5), "`derivatives` must be a tuple"),
     "store=5": (scan(store=5), "`store` must be a path"),
-    "store=''": (scan(store=""), "`store` must be a path"),
-    "store of a null": (scan(store="a\0b"), "`store` must be a path"),
-    "FixedStep": (lambda: vi.FixedStep(steps_per_cycle=10**12), "`steps_per_cycle` must be at"),
 }  # fmt: skip
 
 

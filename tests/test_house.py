@@ -90,14 +90,3 @@ def test_simulate_loads_no_other_package():
     command = [sys.executable, "-c", run]
     out = subprocess.run(command, capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
-
-
-def test_dir_lists_public_names_only():
-    listed = dir(vi_jax)
-    inner = {"TYPE_CHECKING", "importlib", "lanes", "flow", "orbit", "machine", "sys"}
-    assert not inner & {*listed}
-    assert {"scan", "sweep", "machines", "plot", "__version__"} <= {*listed}
-    for name in listed:
-        value = getattr(vi_jax, name)
-        home = getattr(value, "__module__", None) or getattr(value, "__name__", "vi_jax")
-        assert home.startswith("vi_jax"), name

@@ -1,105 +1,11 @@
 """Compiled programs are dropped before the process reaches Linux's limit of memory maps."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax import _programs
-from vi_jax.lanes import _primitive
-
-SCENE = vi.Scene.ideal(frequency_ratio=0.9, gap=None)
-
-
-def section(cycles):
-    with vi.backend("xla"):  # its programs take hundreds of maps
-        return vi.simulate(SCENE, SCENE.start(Y=0.1), cycles, record="sections").sections.Y
-
-
-@pytest.fixture
-def watch(monkeypatch):
-    """Return a watch that checks at every call."""
-    watch = _programs._Watch()
-    monkeypatch.setattr(_programs, "_watch", watch)
-    monkeypatch.setattr(_programs, "_SELDOM", 0)
-    monkeypatch.setattr(_programs, "_PAUSE", 0)
-    # Collection takes seconds after other tests; `maps_used` is replaced anyway.
-    monkeypatch.setattr(_programs.gc, "collect", lambda: 0)
-    return watch
-
-
-@pytest.mark.slow
-def test_the_program_called_last_is_dropped_last(watch, monkeypatch):
-    dropped = []
-
-    def program(name):
-        made = _programs.CompiledFunction(lambda x: x + 1)
-        monkeypatch.setattr(made, "drop", lambda: dropped.append(name))
-        return made
-
-    a, b, c = (program(name) for name in "abc")
-    for each in (a, b, c, a):
-        each(jnp.zeros(3))
-    used = iter([900, 800, 300, 300])
-    monkeypatch.setattr(_programs, "maps_granted", lambda: 1000)
-    monkeypatch.setattr(_programs, "maps_used", lambda: next(used))
-    with pytest.warns(RuntimeWarning, match=r"used 900 of the 1,000 .* which leaves 300[.]$"):
-        a(jnp.zeros(3))
-    assert dropped == ["b", "c"]
-    used = iter([900, 900, 900, 900])
-    with pytest.warns(RuntimeWarning, match=r"call `jax.clear_caches\(\)` now and then"):
-        a(jnp.zeros(3))
-
-
-def test_systems_without_memory_maps_give_no_warning(watch, monkeypatch, tmp_path):
-    monkeypatch.setattr(_programs, "_MAPS", tmp_path / "maps")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        section(1)
-
-
-class Table(vi.AbstractMachine):
-    """An oscillator driven by a cosine, or by a table plus a small term without a vector form."""
-
-    looked_up: bool
-    contacts: tuple = (vi.RigidStop(1.5, 0.7),)
-    cycle = 2 * np.pi
-
-    def field(self, s, state):
-        push = jnp.cos(s)
-        if self.looked_up:
-            push = jnp.interp(s, jnp.linspace(0, 7, 99), jnp.cos(jnp.linspace(0, 7, 99)))
-            push = push + 1e-6 * jax.scipy.special.erfinv(0.5 * jnp.sin(s))
-        return vi.OscillatorState(state.V, push - 0.1 * state.V - 0.5 * state.Y)
-
-
-@pytest.mark.slow
-def test_fields_without_a_vector_form_are_compiled_in_full(monkeypatch):
-    """A program is compiled quickly only if XLA does not compile its loops."""
-    _primitive._warn.cache_clear()  # the warning may have been given in this process
-    made = []
-    original = _programs.CompiledFunction._quick.func
-    monkeypatch.setattr(
-        _programs.CompiledFunction,
-        "_quick",
-        property(lambda self: made.append(self) or original(self)),
-    )
-    zero = jnp.zeros(())
-    function = _programs.CompiledFunction(
-        lambda scene: vi.simulate(scene, vi.OscillatorState(zero, zero), 3, method="draft").last
-    )
-    last = function(Table(False))
-    assert made == [function] and not function._never_quick
-    with pytest.warns(UserWarning, match="slower backend"):
-        there = function(Table(True))
-    assert made == 2 * [function] and len(function._never_quick) == 1
-    function(Table(False))  # this one stays quick
-    assert made == 3 * [function]
-    function(Table(True))
-    assert made == 3 * [function]
-    np.testing.assert_allclose(there.Y, last.Y, atol=1e-3)
 
 
 def test_a_compiled_function_works_within_other_programs():

@@ -4,10 +4,8 @@ import inspect
 from pathlib import Path
 
 import pytest
-from PIL import Image
 from reproduction.report import KEPT, read
 from reproduction.report import headline_numbers as of_report
-from tools.pictures import save_picture
 from tools.study import headlines
 
 from headline_numbers import benchmarks, machines, orbits, paper
@@ -47,24 +45,3 @@ def test_headline_numbers(name):
     kept, function = kept_of(name), COMPUTED[name]
     computed = function(kept) if inspect.signature(function).parameters else function()
     assert computed and not stale(kept, computed)
-
-
-def test_stale_numbers_are_found():
-    page = '# A study\n\n## Headline numbers\n\n```json\n{"doubling": 0.824557221002}\n```\n'
-    kept = headlines(page)
-    assert kept == {"doubling": 0.824557221002}
-    assert not stale(kept, {"doubling": (0.8245572, 1e-7)})
-    assert stale(kept, {"doubling": (0.82470, 1e-7)})
-    assert stale(kept, {"another": (0.8, 1.0)})
-
-
-def test_the_same_figure_gives_the_same_small_picture(tmp_path):
-    from matplotlib.figure import Figure
-
-    for name in ("a.png", "b.png"):
-        figure = Figure(figsize=(2, 2))
-        figure.subplots().plot([0, 1])
-        save_picture(figure, tmp_path / name)
-    with Image.open(tmp_path / "a.png") as image:
-        assert image.size == (220, 220) and image.mode == "P"
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

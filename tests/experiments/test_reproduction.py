@@ -7,13 +7,9 @@ import copy
 
 import numpy as np
 import pytest
-from PIL import Image
-from reproduction.assumptions import check_assumptions, check_motor
 from reproduction.claims import check_claims
 from reproduction.faults import check_faults, period_doubling_damping
-from reproduction.figures import draw_figure
 from reproduction.motions import closed_form, sampled, simulate_cases
-from reproduction.motors import TORQUES, draw_motors, simulate_motors
 from reproduction.printed import energy_drift, eq21_misses
 from reproduction.report import KEPT, differences, read
 
@@ -54,58 +50,9 @@ def test_differences_from_the_stored_report_are_found():
     ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def assumptions(cases):
-    return {claim.name: claim for claim in check_assumptions(cases[0])}
-
-
-@pytest.mark.slow
-def test_crank_phase_of_the_start(assumptions):
-    claim = assumptions["the start's crank phase"]
-    apart = claim.numbers["max_difference_cycles_3_4_by_phase_over_pi"]
-    assert claim.verdict == "confirmed in part"
-    assert apart["0"] == pytest.approx([0.197, 0.170], abs=2e-3)
-    assert apart["1"] == pytest.approx([1.708, 1.708], abs=2e-3)
-    # Starts at all phases end in the same 4π motion.
-    assert claim.numbers["last_minima"] == pytest.approx([-3.2543] * len(apart), abs=1e-2)
-
-
-@pytest.mark.slow
-def test_exact_crank(assumptions):
-    claim = assumptions["the cosine in the crank's place (Eq. 4)"]
-    assert claim.verdict == "confirmed"
-    assert claim.numbers["minima_exact"] == pytest.approx([-3.2985, -1.7043], abs=1e-4)
-    assert claim.numbers["minima_cosine"] == pytest.approx([-3.2543, -1.5442], abs=1e-4)
-
-
 def test_direct_short(claims):
     numbers = claims["direct 2π solutions by initial conditions"].numbers
     assert numbers["cycles_within_0.05"] == {"undamped": 60, "damped": 60}
-
-
-@pytest.mark.slow
-def test_motors_at_the_stated_speed(cases):
-    """κ and minima come from an independent code (SciPy), at a mean ζ of 0.90."""
-    motors = simulate_motors()
-    for row in motors.rows:
-        assert row.kappa is not None and bool(row.orbit.successful)
-        assert float(row.orbit.frequency_ratio) == pytest.approx(0.9, abs=1e-9)
-    assert [run.torque for run in motors.runs] == list(TORQUES)
-    kappa = [run.kappa for run in motors.runs]
-    assert kappa == pytest.approx([0.9277, 0.9055, 0.9005], abs=1e-4)
-    minima = [float(run.orbit.y_min) for run in motors.runs]
-    assert minima == pytest.approx([-3.291, -3.282, -3.257], abs=1e-3)
-    found = {claim.name: claim for claim in check_motor(motors)}
-    assert found["Figures 3 and 4 with the motor"].verdict == "confirmed"
-    speed = found["the speed hardly varies within a cycle (Eq. 10)"].numbers
-    assert len(draw_motors(motors.runs, cases[0].from_rest).axes) == 6
-    assert 0 < speed["variation_by_torque"]["100"] < speed["variation_by_torque"]["2"] < 0.1
-
-
-@pytest.mark.slow
-def test_disc_and_lever(faults):
-    assert faults[8].numbers["mass_of_the_disc"] == pytest.approx(75.0)
-    assert faults[7].numbers["mass_of_such_a_lever"] == pytest.approx(12.5)
 
 
 def test_transient_from_rest(claims):
@@ -175,13 +122,3 @@ def test_damping_at_the_period_doubling(faults):
     assert period_doubling_damping() == pytest.approx(0.27, abs=0.005)
     assert faults[6].numbers["largest_multiplier_by_c"]["0.5"] < 1
     assert faults[6].numbers["largest_multiplier_by_c"]["0"] > 1
-
-
-def test_figures(cases, tmp_path):
-    path = tmp_path / "fig.png"
-    with pytest.raises(ValueError, match="3 or 4"):
-        draw_figure(2, cases, path)
-    draw_figure(3, cases, path)
-    picture = Image.open(path)
-    assert picture.size == (1540, 924) and path.stat().st_size < 200_000
-    assert len(np.unique(np.asarray(picture))) > 16

@@ -6,10 +6,8 @@ import time
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.explore.pictures import MAPS, MotionPicture, draw_diagram, gif_of
-from vi_jax.explore.subject import CYCLES, SETTLE, SHOWN, WINDOW, Subject, look, ready
-
-from differences import some
+from vi_jax.explore.pictures import MAPS, MotionPicture, draw_diagram
+from vi_jax.explore.subject import CYCLES, SETTLE, SHOWN, WINDOW, look, ready
 
 ZETA, GAP, K = "drive.frequency_ratio", "stops.0.gap", "stops.0.restitution"
 
@@ -88,20 +86,6 @@ def test_other_regimes(ideal):
     assert not free.impact_speed.size and "neither" in free.stability
 
 
-@pytest.mark.slow
-def test_a_motor_lags_behind_and_may_stop(ideal):
-    motors = [vi.Parameters(torque=T).scene() for T in (15.0, 7.5)]
-    strong, weaker = (look(motor, motor.start(W=0.9), 300) for motor in motors)
-    lag = [0.9 - found.frequency_ratio.mean() for found in (strong, weaker)]
-    assert 0 < lag[0] < 5e-3 and lag[1] == pytest.approx(2 * lag[0], rel=0.02)
-    assert strong.multipliers.size == 3 and "stable" in strong.stability
-    scene = vi.Parameters(control=-1.0).scene()
-    found = look(scene, scene.start(W=0.1), 300)
-    assert found.regime == "failed" and "turning forward" in found.fault and not found.stability
-    for which in MAPS:
-        assert MotionPicture(scene.labels).draw(found, which)
-
-
 def test_sliders_do_not_compile_and_redraw_quickly(ideal, compilations):
     begin, picture, took = ideal.first_values(), MotionPicture(ideal.machine.labels), []
     picture.draw(ideal.motion_at(begin))
@@ -165,20 +149,3 @@ def test_slider_ranges_are_valid_for_the_machine():
     duffing = made["Duffing"].controls
     assert (duffing["restitution"].low, duffing["restitution"].high) == (0.0, 1.0)
     assert (duffing["amplitude"].low, duffing["amplitude"].high) == pytest.approx((0.0, 0.6))
-
-
-@pytest.mark.parametrize("name", some(["Beam", "ReliefValve"], "ReliefValve"))
-def test_machines_of_other_kinds(name):
-    """A beam with several coordinates, and a valve without a drive."""
-    subject: Subject = ready()[name]()
-    subject.compile(lambda step: None)
-    values = subject.first_values()
-    found = subject.motion_at(values)
-    assert not found.fault and found.regime and subject.words(found)["position"]
-    assert np.isfinite(found.path.Y).all()
-    check_picture(MotionPicture(subject.machine.labels).draw(found), found)
-    assert gif_of(found).startswith(b"GIF")
-    diagram = subject.diagram(values, subject.names[0])
-    assert np.isfinite(diagram.position).any()
-    run = vi.simulate(*subject.at(values), 256, settle=int(values[SETTLE]))
-    np.testing.assert_allclose(found.extremes, (run.y_min.min(), run.y_max.max()), rtol=1e-7)

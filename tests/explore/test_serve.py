@@ -5,7 +5,6 @@ import http.client
 import importlib.util
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -103,16 +102,11 @@ PAGE = "127.0.0.1:8417"
     [
         ("127.0.0.1", PAGE, None, True),
         ("127.0.0.1", "localhost:8417", "http://localhost:8417", True),
-        ("::1", "[::1]:8417", "http://[::1]:8417", True),
-        ("127.0.0.5", "127.0.0.5:8417", None, True),
         ("0.0.0.0", "machine.lab:8417", "http://machine.lab:8417", True),
         ("127.0.0.1", PAGE, "http://evil.example", False),
-        ("127.0.0.1", PAGE, "http://127.0.0.1:8888", False),  # another port
-        ("127.0.0.1", PAGE, "null", False),
         ("0.0.0.0", "machine.lab:8417", "http://evil.example", False),
         ("127.0.0.1", "evil.example:8417", "http://evil.example:8417", False),
         ("localhost", "127.0.0.1.evil.example", None, False),
-        ("127.0.0.1", "", None, False),
     ],
 )
 def test_only_requests_from_the_page_are_answered(kind, listening, host, origin, good):
@@ -163,57 +157,3 @@ def test_requests_without_the_token_are_rejected(address):
     own = {"additional_headers": {"Cookie": cookie}, "origin": f"http://{place.netloc}"}
     with client.connect(socket_at, **own) as opened:
         assert "kernel-ready" in opened.recv(timeout=60)
-
-
-@pytest.fixture
-def page(address):
-    """Open the page in a headless browser."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    own = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
-    with playwright.sync_playwright() as tools:
-        try:
-            browser = tools.chromium.launch(executable_path=own, args=["--no-sandbox"])
-        except playwright.Error as error:
-            pytest.skip(f"no Chromium can be started: {str(error).splitlines()[0]}")
-        page = browser.new_page(viewport={"width": 1400, "height": 1000})
-        page.set_default_timeout(60_000)
-        faults = []
-        page.on("pageerror", lambda error: faults.append(error))
-        page.goto(address)
-        page.wait_for_selector("#motion")
-        yield page
-        browser.close()
-        assert not faults
-
-
-def after(page, act) -> str:
-    """Call `act`, wait for a new picture, and return the regime."""
-    before = page.get_attribute("#motion", "src")
-    act()
-    page.wait_for_function(
-        "old => document.querySelector('#motion') && document.querySelector('#motion').src != old",
-        arg=before,
-    )
-    return page.inner_text("#regime")
-
-
-@pytest.mark.slow
-def test_sliders_a_click_in_the_diagram_and_another_machine(page):
-    assert page.inner_text("#regime").startswith("period 4π with 1 impact")
-    slider = page.get_by_role("slider").nth(1)
-    assert slider.get_attribute("aria-valuenow") == "0.9"
-    after(page, lambda: slider.press("ArrowRight"))
-    assert slider.get_attribute("aria-valuenow") == "0.905"
-    page.get_by_role("tab", name="Diagram").click()
-    page.wait_for_selector("#diagram")
-    canvas = page.locator("marimo-matplotlib canvas").last
-    box = canvas.bounding_box()
-    middle = {"x": 0.525 * box["width"], "y": 0.5 * box["height"]}  # of the axes, 6.5 % to 98.5 %
-    assert "period 2π" in after(page, lambda: canvas.click(position=middle))
-    # Sliders may lag behind the picture; their step is 0.0005.
-    values = ("^='0.099'", "='0.1'", "^='0.100'")
-    page.locator(",".join(f"[role=slider][aria-valuenow{x}]" for x in values)).first.wait_for()
-    page.get_by_role("tab", name="Motion").click()
-    menu = page.get_by_label("machine")
-    assert "multipliers" in after(page, lambda: menu.select_option("Duffing"))
-    assert "period 1 cycle" in page.inner_text("#regime")

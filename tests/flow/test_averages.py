@@ -139,16 +139,6 @@ def test_averages_with_modes_and_resets():
     np.testing.assert_allclose(run.averages["height"], [height, height], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_averages_in_repr_and_xarray():
-    run = vi.simulate(Shaken(), begin(), 2, samples=2)
-    assert "mean taken: " in repr(run) and f"{run.averages['taken'][-1]:.6g} W" in repr(run)
-    data = run.to_xarray()
-    assert data.taken.dims == ("cycle",) and data.taken.attrs["units"] == "W"
-    assert data.section_energy.dims == ("section",) and data.sample_energy.attrs["units"] == "J"
-    assert vi.simulate(Shaken(), begin(), 2, record="sections").averages == {}
-
-
 @pytest.mark.parametrize(
     ("said", "kind", "match"),
     [

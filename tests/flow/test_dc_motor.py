@@ -122,45 +122,6 @@ def test_derivatives_match_differences():
     check_derivatives(last, [0.4, 0.9, 0.1], tolerance=1e-7, impacts=2)
 
 
-@pytest.mark.slow
-def test_fixed_steps_are_stable_for_fast_and_slow_currents():
-    def last(te, method):
-        scene = machine(electrical_time=te, strength=5.0)
-        return vi.simulate(scene, scene.start(W=0.9), 4, method=method).last
-
-    times = jnp.array([0.004, 0.3, 30.0])
-    run, exact = (
-        jax.vmap(lambda te, m=m: last(te, m))(times)
-        for m in (vi.FixedStep(), vi.Adaptive(rtol=1e-12))
-    )
-    np.testing.assert_allclose(run.M, exact.M, atol=1e-6)
-    np.testing.assert_allclose(run.Y, exact.Y, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_orbit_has_exponents_mean_torque_and_a_branch():
-    scene = machine()
-    settled = vi.simulate(scene, scene.start(Y=1.5, V=1.0), 1, settle=300).last
-    orbit = vi.find_orbit(scene, settled, throw=True)
-    assert bool(orbit.stable) and orbit.multipliers.shape == (4,)
-    # On a periodic orbit, Lyapunov exponents are logarithms of the multipliers per time.
-    spectrum = vi.lyapunov(scene, orbit.state, cycles=96)
-    growth = np.sort(np.log(np.abs(orbit.multipliers)))[::-1] / float(orbit.duration)
-    np.testing.assert_allclose(spectrum.exponents, growth, atol=2e-3)
-    timed = vi.lyapunov(scene, scene.in_clock("time").convert_start(orbit.state), cycles=96)
-    np.testing.assert_array_equal(timed.exponents, spectrum.exponents)
-    # The armature stores nothing over a period: the mean torque is the steady one at mean speed.
-    run = orbit.trajectory(samples=256)
-    drive, state = scene.drive, run.samples.state
-    mean = float(np.trapezoid(np.asarray(state.M), np.asarray(run.samples.time)))
-    steady = float(drive.strength) * (
-        float(drive.control) - float(orbit.frequency_ratio) / float(drive.no_load_speed)
-    )
-    assert mean / float(orbit.duration) == pytest.approx(steady, rel=1e-4)
-    branch = vi.continue_orbit(orbit, parameter="drive.electrical_time", bounds=(0.2, 1.0))
-    assert branch.parameter.min() == pytest.approx(0.2) and branch.parameter.max() > 0.99
-
-
 def test_scene_from_parameters_in_si_units():
     table = vi.Parameters(torque=10.0, control=0.9, electrical_time=0.01)
     scene = table.scene()

@@ -1,7 +1,5 @@
 """Simultaneous events, chains of events, guards that jump, and events that change a mode."""
 
-import inspect
-import itertools
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow._step.impact import _coupled
 
 CLOSE = vi.Adaptive(rtol=1e-11)
 
@@ -279,33 +276,3 @@ def test_start_on_a_guard_does_not_trigger_it():
     assert run.event_log.number[:, 0, 0].tolist() == [-1, -1, -1, -1, 0]
     phase = 2 * np.arctan(0.1)  # y - 2 = -cos s - sin(s)/10
     np.testing.assert_allclose(run.event_log.phase[-1, 0, 0], phase, rtol=1e-8)
-
-
-class ByNumber(WithReset):
-    events: tuple = (
-        vi.Reset(lambda m, s, x: x.Y - 1, lambda m, s, x: x, when=lambda m, s, x: x.V),
-    )
-
-
-def test_condition_of_the_wrong_kind_raises():
-    start = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(0.0))
-    with pytest.raises(TypeError, match=r"`when` of event 0 .* must return a flag"):
-        vi.simulate(ByNumber(), start, 1)
-
-
-def test_impact_reaches_bodies_along_any_path_of_contacts():
-    """Six bodies in a row, numbered in every order."""
-
-    def reached(order):
-        ones = jnp.zeros((6, 6)).at[order[:-1], order[1:]].set(1.0)
-        acts = [list(row) for row in ones + ones.T > 0]
-        plan = type("Plan", (), {"machine": Row()})
-        struck = {i: jnp.equal(order[0], i) for i in range(6)}
-        closed = dict.fromkeys(range(6), jnp.ones((), bool))
-        return jnp.stack([*inspect.unwrap(_coupled)(plan, acts, closed, struck).values()]).all()
-
-    class Row:
-        _stops = tuple(vi.RigidStop(0.0, 0.5, coordinate=i) for i in range(6))
-
-    orders = jnp.array(list(itertools.permutations(range(6))))
-    assert bool(jax.jit(jax.vmap(reached))(orders).all())

@@ -11,7 +11,6 @@ import pytest
 import vi_jax as vi
 
 from linear_truth import Contact, LinearTruth
-from truth import integrated
 
 # ζ, ξ, gap, restitution, Y and V at the start, cycles in double and in single precision.
 CORNERS = {
@@ -123,22 +122,6 @@ def test_strong_motor_approaches_the_ideal_drive():
     off, result = last(jnp.array([1e3, 1e4, 1e6]))
     assert float(off[0] / off[1]) == pytest.approx(10, rel=0.02)
     assert (result == vi.RESULTS.max_steps).tolist() == [False, False, True]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "close"), [(vi.FixedStep(), 1e-5), (vi.Adaptive(rtol=1e-11), 1e-8)]
-)
-def test_strong_coupling_matches_scipy(method, close):
-    for eps, tau0, kappa, W in ((1.0, 3.0, 2.0, 2.0), (10.0, 30.0, 8.0, 8.0)):
-        scene = vi.Scene(
-            vi.Oscillator(0.05), vi.Motor(tau0, kappa, eps, 0.005), (vi.RigidStop(2.0, 0.5),)
-        )
-        found = vi.simulate(scene, scene.start(W=W), 5, method=method).sections
-        motor = {"tau0": tau0, "kappa": kappa, "eps": eps, "mu": 0.005}
-        wanted = integrated(motor, 0.05, ((1, 2.0, 0.5),), (0.0, 0.0, W), 5).sections
-        off = abs(np.stack([found.Y, found.V, found.W], axis=-1) - wanted) / (1 + abs(wanted))
-        assert off.max() < close
 
 
 @pytest.mark.slow

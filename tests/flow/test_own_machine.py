@@ -40,34 +40,6 @@ def test_own_machines_have_one_clock_and_no_closed_form():
         vi.simulate(ball(), start, 1, method=vi.ExactFlight())
 
 
-class Wrong(BouncingBall):
-    """A machine with one wrong part, chosen by `kind`."""
-
-    kind: str = eqx.field(static=True, default="")
-
-    @property
-    def cycle(self):
-        return (lambda: 1.0) if self.kind == "cycle" else 1.0
-
-    def field(self, s, state):
-        return Ball(state.V, jnp.ones(2) if self.kind == "shape" else -self.gravity)
-
-
-@pytest.mark.parametrize(
-    ("kind", "stops", "told"),
-    [
-        ("cycle", (), "`cycle` of a Wrong must be a number"),
-        ("shape", (), "`field` of a Wrong must return"),
-        ("", (0.5,), "`contacts` of a Wrong must be a tuple of contacts"),
-        ("", (vi.RigidStop(0.5, 0.5, coordinate=1),), "limits coordinate 1, but there are 1"),
-    ],
-)
-def test_wrong_parts_raise(kind, stops, told):
-    machine = Wrong(jnp.asarray(1.0), stops, kind)
-    with pytest.raises((TypeError, ValueError), match=told):
-        vi.simulate(machine, Ball(*map(jnp.asarray, (0.1, 0.0))), 2)
-
-
 class Swapped(BouncingBall):
     """A field that takes the state first, as in other libraries."""
 
@@ -105,68 +77,6 @@ class Shaken(BouncingBall):
     def field(self, s, state):
         shaken = self.gravity * jnp.sin(self.frequency * s) * jnp.clip(state.Y, 1.0, 2.0)
         return Ball(state.V, shaken - state.Y - jax.nn.relu(state.V) ** 2)
-
-
-@pytest.mark.slow
-def test_field_of_another_period_than_its_cycle_warns_once():
-    start, floor = Ball(*map(jnp.asarray, (1.0, 0.3))), ()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for frequency, length in ((1.0, 6.28318), (2.0, np.pi), (3.0, 2 * np.pi)):
-            vi.simulate(Shaken(jnp.asarray(1.0), floor, frequency, length), start, 2)
-        # Traced values cannot be compared, so there is no warning.
-        machine = Shaken(jnp.asarray(1.0), floor, 1.1)
-        jax.jit(lambda x: vi.simulate(machine, x, 2).last.Y)(start)
-    verbs = (
-        lambda m: vi.simulate(m, start, 2),
-        lambda m: vi.find_orbit(m, start),
-        lambda m: vi.sweep(m, "gravity", [0.9, 1.0], start=start, settle=2, cycles=8),
-        lambda m: vi.scan(m, {"gravity": [0.9, 1.0]}, start=start, settle=2, cycles=8,
-                          measure="extremes"),
-        lambda m: vi.lyapunov(m, start, 8),
-    )  # fmt: skip
-    for verb in verbs:
-        own = type("Own", (Shaken,), {})
-        machine = own(jnp.asarray(1.0), floor, 1.1)
-        words = "`field` of a Own is not the same .* the rate of its V differs"
-        with pytest.warns(UserWarning, match=words) as told:
-            verb(machine)
-            verb(machine)
-        told = [w for w in told if "is not the same" in str(w.message)]
-        assert len(told) == 1 and told[0].filename == __file__
-
-
-class Carried(BouncingBall):
-    """A ball in a lift at height 1. The floor limits the height above the lift."""
-
-    @property
-    def coordinates(self):
-        def place(state):
-            return state.Y - 1.0
-
-        return (vi.Coordinate(place, lambda x: x.V, lambda x, Y, V: Ball(Y + 1.0, V)),)
-
-
-def test_extremes_are_those_of_the_first_coordinate():
-    lifted = Carried(jnp.asarray(2.0), (vi.RigidStop(0.0, 0.8, "left"),))
-    start = Ball(*map(jnp.asarray, (1.5, 0.0)))
-    run, plain = vi.simulate(lifted, start, 3), vi.simulate(ball(), Ball(start.Y - 1, start.V), 3)
-    np.testing.assert_allclose(run.y_min, plain.y_min, atol=1e-12)
-    np.testing.assert_allclose(run.y_max, plain.y_max, atol=1e-12)
-    assert float(lifted.position(start)) == 0.5 and lifted.placed(start, start.V, start.V).Y == 1
-
-
-class CallsSuper(BouncingBall):
-    @property
-    def coordinates(self):
-        return super().coordinates
-
-
-def test_coordinates_can_call_super():
-    start, stop = Ball(*map(jnp.asarray, (1.5, 0.0))), vi.RigidStop(0.0, 0.8, "left")
-    run, plain = (vi.simulate(kind(2.0, (stop,)), start, 3) for kind in (CallsSuper, BouncingBall))
-    jax.tree.map(np.testing.assert_array_equal, run.sections, plain.sections)
-    assert int(run.impacts.sum()) > 0
 
 
 def test_samples_cost_nothing_while_settling():

@@ -73,18 +73,6 @@ def test_release_when_the_crank_no_longer_presses(method):
 
 
 @pytest.mark.slow
-def test_derivatives_pass_through_rest():
-    def lowest(zeta):
-        body = scene(zeta)
-        return vi.simulate(body, body.start(Y=0.1), 2, method=vi.ExactFlight()).y_min[1]
-
-    h = 1e-6
-    difference = (lowest(ZETA + h) - lowest(ZETA - h)) / (2 * h)
-    for derivative in (jax.jacfwd, jax.grad):
-        assert float(derivative(lowest)(ZETA)) == pytest.approx(float(difference), rel=1e-6)
-
-
-@pytest.mark.slow
 def test_rest_is_the_same_in_single_precision():
     """Random machines chatter, rest and leave. The lowest hops are smaller than rounding."""
     rng = np.random.default_rng(0)
@@ -108,24 +96,6 @@ def test_rest_is_the_same_in_single_precision():
     assert found[True][0].all() and found[False][0].all()
     assert np.abs(found[True][1] - found[False][1]).max() < 1e-5
     np.testing.assert_array_equal(found[True][2].sum(1), found[False][2].sum(1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("machine", "start"),
-    [
-        (vi.machines.BouncingBall(acceleration=0.9), {}),
-        (scene(zeta=0.3, gap=-1.5), {"Y": -1.5, "V": 0.0}),
-    ],
-    ids=["ball", "pressed"],
-)
-def test_permanent_rest_is_a_periodic_orbit(machine, start):
-    """A small perturbation comes to rest on the stop, so the multipliers are zero."""
-    settled = vi.simulate(machine, machine.start(**start), 1, settle=200).last
-    orbit = vi.find_orbit(machine, settled, throw=True)
-    assert int(orbit.impacts) == 0 and int(orbit.cycles) == 1 and bool(orbit.stable)
-    np.testing.assert_array_equal(orbit.multipliers, 0)
-    assert float(orbit.y_max) == float(orbit.y_min) == float(machine.position(settled))
 
 
 def test_resting_body_moves_with_its_stop():

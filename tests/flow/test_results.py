@@ -35,15 +35,6 @@ def test_sections_only():
     assert int(lean.steps) < int(full.steps)
 
 
-def test_exact_flight_raises_with_its_requirements():
-    motor = vi.Parameters().scene()
-    with pytest.raises(ValueError, match=r"`ExactFlight` needs.*`IdealDrive`.*`Motor`"):
-        vi.simulate(motor, motor.start(), 3, method=vi.ExactFlight())
-    slider = vi.Parameters().scene(drive="ideal", crank="slider")
-    with pytest.raises(ValueError, match=r"`ExactFlight` needs a `CosineCrank`.*`SliderCrank`"):
-        vi.simulate(slider, slider.start(), 3, method=vi.ExactFlight())
-
-
 def test_impact_log_has_crank_angles_in_both_clocks():
     scene = vi.Scene.ideal(frequency_ratio=0.4, restitution=0.5, gap=0.8, damping_ratio=0.05)
     logs = [

@@ -71,27 +71,6 @@ def test_higher_derivatives_pass_through_impacts():
         np.testing.assert_allclose(higher(0.0), (4 * near - far) / 3, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_gradients_match_forward_derivatives():
-    """Gradients and Hessians of a function of two parameters, also under `vmap`."""
-
-    def lowest(numbers):
-        scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=numbers[0], gap=numbers[1])
-        run = vi.simulate(scene, scene.start(), 6, method=vi.ExactFlight(), record="sections")
-        return run.last.Y * run.last.V
-
-    at = jnp.asarray([[0.5, 1.0], [0.7, 1.3]])
-    gradient = jax.jit(jax.vmap(jax.grad(lowest)))(at)
-    forward = jax.jit(jax.vmap(jax.jacfwd(lowest)))(at)
-    np.testing.assert_allclose(gradient, forward, rtol=1e-12)
-    shared = jax.grad(lambda k: jnp.sum(jax.vmap(lambda x: lowest(jnp.stack([k, x[1]])))(at)))(0.6)
-    apart = [jax.jacfwd(lambda k, x=x: lowest(jnp.stack([k, x[1]])))(0.6) for x in at]
-    np.testing.assert_allclose(shared, sum(apart), rtol=1e-12)
-    curved = jax.hessian(lowest)(at[0])  # forward over reverse
-    np.testing.assert_allclose(curved, jax.jacfwd(jax.jacfwd(lowest))(at[0]), rtol=1e-9)
-    np.testing.assert_allclose(curved, jax.jacrev(jax.grad(lowest))(at[0]), rtol=1e-9)
-
-
 RECORDED = [
     ("ideal", "phase", vi.ExactFlight()),
     ("motor", "time", vi.FixedStep(steps_per_cycle=40)),

@@ -186,15 +186,3 @@ def test_matches_scipy_over_gaps_restitutions_stops_and_clocks(drive, clock, sid
         np.testing.assert_allclose(low, expected.y_min, atol=1e-7, err_msg=where)
         np.testing.assert_allclose(high, expected.y_max, atol=1e-7, err_msg=where)
         assert rests.tolist() == expected.rests.tolist(), where
-
-
-def test_both_references_agree():
-    for stops, start in (
-        (((1, -0.9, 0.5),), (-0.9, 0.0)),
-        (((1, 0.2, 0.0), (-1, 0.3, 0.5)), (0.0, 0.0)),
-        (((1, 1.5, 1.0),), (0.0, 1.0)),
-    ):
-        one = truth.integrated(0.9, 0.05, stops, start, 3)
-        many = truth.flown(0.9, 0.05, stops, *start, 3)
-        for a, b in zip(one, many, strict=True):
-            np.testing.assert_allclose(a, b[..., 0], atol=1e-11)

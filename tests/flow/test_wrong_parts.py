@@ -1,6 +1,5 @@
 """Wrong parts of user-defined machines: each error names the part and what it must be."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -82,51 +81,6 @@ def test_parts_are_tuples_of_their_kind():
             vi.find_orbit(Swing(parts=(contacts,)), START)
 
 
-class Floor(vi.AbstractMachine):
-    """A block on a floor, with a coordinate that returns a tuple for its state."""
-
-    cycle = 6.0
-
-    @property
-    def coordinates(self):
-        return (vi.Coordinate(lambda x: x.Y, lambda x: x.V, lambda state, Y, V: (Y, V)),)
-
-    contacts = vi.RigidStop(0.0, 0.5, "left")
-
-    def field(self, s, state):
-        return vi.OscillatorState(state.V, -1.0 + 0 * state.V)
-
-
-def test_placed_returns_a_state():
-    with pytest.raises(TypeError, match="`placed` of coordinate 0 of a Floor must be like its s"):
-        vi.simulate(Floor(), START, 1)
-
-
-class Flywheel(vi.AbstractDrive):
-    """A drive without a `state` class."""
-
-    def field(self, scene, s, state, pushes):
-        return state
-
-
-def test_drives():
-    ideal = vi.Scene.ideal(frequency_ratio=0.9)
-    with pytest.raises(TypeError, match="`Flywheel` must define `state`"):
-        dataclasses.replace(ideal, drive=Flywheel())
-
-    class Timeless(Flywheel):
-        state = vi.MotorState
-
-    with pytest.raises(TypeError, match=r"`Timeless` has no .* must define `timed_state`"):
-        dataclasses.replace(ideal, drive=Timeless())
-
-    class Bare(Timeless):
-        timed_state = vi.TimedMotorState
-
-    with pytest.raises(ValueError, match="`W` of `start` must be given for a `Bare`"):
-        dataclasses.replace(ideal, drive=Bare()).start()
-
-
 class Springs(vi.AbstractMachine):
     k: Any = eqx.field(default_factory=lambda: jnp.array([1.0, 2.0]))
     gap: Any = 9.0
@@ -165,8 +119,3 @@ ROWS = vi.State(x=jnp.zeros(2), v=jnp.ones(2))
 def test_arrays_in_place_of_numbers_raise(machine, words):
     with pytest.raises((TypeError, ValueError), match=words):
         vi.simulate(machine, ROWS, 2)
-
-
-def test_array_as_scan_axis_raises():
-    with pytest.raises(ValueError, match=r"name one of its numbers, as 'k\[0\]'"):
-        vi.scan(Springs(), {"k": [1.0, 2.0]}, start=ROWS, measure="extremes", cycles=2)

@@ -1,7 +1,5 @@
 """Caches: machine code in files, kernels, and programs of equal functions."""
 
-import gc
-import weakref
 from functools import partial, wraps
 
 import jax
@@ -9,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
-from vi_jax._programs import maps_used
-from vi_jax.lanes import _code, _text, runtime
+from vi_jax.lanes import _code, runtime
 
 from lanes.toys import failing
 
@@ -50,38 +47,6 @@ def test_the_cache_folder_is_within_that_of_jax(tmp_path):
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_old_programs_are_dropped():
-    """Memory maps and kernels stay few after many programs in one process."""
-
-    def one(number):
-        begin = lambda x: (x, lanes.Emitted(True, False, None))
-        step = lambda x, carry: (carry + number, lanes.Emitted(False, False, None))
-        return lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)[0]
-
-    def kernels(numbers):
-        for number in numbers:
-            runtime.kernel_of(program_of(partial(one, float(number))), 1)
-
-    kernels(range(80))
-    before = maps_used() or 0
-    kernels(range(80, 240))
-    assert (maps_used() or 0) - before < 160
-    assert len(runtime._recent) <= runtime._MOST_KERNELS
-
-
-def test_arrays_are_freed_without_the_garbage_collector(monkeypatch):
-    """Otherwise texts, and so the names of cached files, would depend on when it runs."""
-    function = lambda x: (jnp.outer(x, x) @ jnp.sin(x), jnp.sort(x), jnp.cumsum(x))
-    program = program_of(lambda x: lanes.once(function, x), jnp.ones(23))
-    blocks, take = [], _text.Arena.take
-    kept = lambda *args: (blocks.append(weakref.ref(block := take(*args))), block)[1]
-    monkeypatch.setattr(_text.Arena, "take", kept)
-    gc.disable()
-    runtime.kernel_text(program, 8, 512)
-    gc.enable()
-    assert blocks and not any(block() for block in blocks)
-
-
 def _sum(bound, x):
     return x + bound["offset"] if isinstance(bound["offset"], float) else x - bound["offset"]
 
@@ -115,15 +80,6 @@ FACTOR = 2.0
 
 def _scaled(x):
     return FACTOR * x
-
-
-@pytest.mark.slow
-def test_clearing_the_caches_of_jax_clears_those_of_lanes(monkeypatch):
-    x = jnp.asarray(3.0)
-    assert lanes.once(_scaled, x) == 6.0
-    monkeypatch.setitem(globals(), "FACTOR", 5.0)
-    jax.clear_caches()
-    assert lanes.once(_scaled, x) == 15.0
 
 
 def test_decorated_functions_are_distinguished_by_their_wrapper():

@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from vi_jax import lanes
-from vi_jax.lanes import runtime
-from vi_jax.lanes._kernel import kernel_text
 
 X = np.concatenate(
     [
@@ -242,32 +240,6 @@ def test_derivatives_of_quotients(backend):
         found, wanted = jax.jit(jax.vmap(lanes_))(x, y), jax.jit(jax.vmap(plain))(x, y)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-
-
-def test_directions_share_divisions(monkeypatch):
-    texts = []
-
-    def kept(*args):
-        texts.append(kernel_text(*args))
-        return texts[-1]
-
-    monkeypatch.setattr(runtime, "kernel_text", kept)
-
-    def divisions(directions):
-        def lane(x, y, slopes):
-            def along(slope):
-                return jax.jvp(
-                    lambda y: once(lambda x, y: (x / y,), x, y, backend=None), (y,), (slope,)
-                )
-
-            return jax.vmap(along)(slopes)[1]
-
-        texts.clear()
-        one = jnp.ones(8)
-        jax.jit(lane)(one, one, jnp.ones((directions, 8)))
-        return max(text.count("fdiv") for text in texts)
-
-    assert divisions(2) == divisions(6) == 2  # the quotient and the divisor's reciprocal
 
 
 @pytest.mark.parametrize("kind", [jnp.int32, jnp.int64, jnp.uint32])

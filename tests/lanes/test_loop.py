@@ -1,14 +1,11 @@
 """The loop over lanes: batches, axes, threads, backends, precision and processors."""
 
-import ast
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import vi_jax
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from vi_jax import lanes
@@ -184,12 +181,3 @@ def test_a_wrong_carry_raises():
 
     with pytest.raises(TypeError, match="carry of the structure"):
         lanes.run(begin, step, lambda x, carry: carry, 1.0, rows=0)
-
-
-def test_lanes_import_nothing_from_the_package():
-    folder = Path(vi_jax.__file__).parent / "lanes"
-    for file in folder.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom):
-                assert node.level <= 1, f"{file.name} imports {node.module}"
-                assert not (node.module or "").startswith(("vi_jax", "jax._src"))

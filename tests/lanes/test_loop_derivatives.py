@@ -44,15 +44,6 @@ def test_rules_that_fail_raise():
         jax.grad(lambda x: lanes.once(backward, x))(0.5)
 
 
-def test_directions_share_the_primal_computation():
-    """Three directions make one program with one primal computation."""
-    rows = jax.make_jaxpr(jax.jacfwd(lambda x: logistic(*x, backend="xla")[1]["x"]))(
-        jnp.asarray([0.3, 3.7, 6.0])
-    )
-    equations = [e for e in rows.jaxpr.eqns if e.primitive.name == "lanes"]
-    assert len(equations) == 1 and equations[0].outvars[0].aval.shape == ()
-
-
 def test_empty_arrays():
     """Gradients of empty arrays are empty; integers joined with them stay integers."""
     value = lambda x, y: lanes.once(lambda v: jnp.sum(v[0]) + jnp.sum(v[1] ** 2), (x, y))

@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.integrate import solve_ivp
 
-from belts import Belt
 from den_hartog import den_hartog
 from differences import check_derivatives
 from event_by_event import followed
@@ -217,42 +215,6 @@ def test_derivatives_through_sticking():
 def test_wrong_arguments_raise(arguments, told):
     with pytest.raises(ValueError, match=told):
         vi.DryFriction(**{"level": 1.0, **arguments}, on="V")
-
-
-def belt_friction(speed):
-    """Return the friction of `belts.Belt`, for SciPy."""
-    return 0.5 + 0.5 * np.exp(-2 * speed)
-
-
-def slip(speed, until):
-    """Return time and state at the event `until` of a slip, from SciPy."""
-
-    def field(t, x):
-        return [x[1], -x[0] - 0.1 * x[1] + belt_friction(speed - x[1])]
-
-    until.terminal, until.direction = True, 1
-    start = [1.0 - 0.1 * speed, speed - 1e-13]
-    found = solve_ivp(field, (0, 20), start, "DOP853", events=until, rtol=1e-12, atol=1e-13)
-    return found.t_events[0][0], found.y_events[0][0]
-
-
-def furthest_back(t, x):
-    return x[1]
-
-
-def test_sticking_and_slipping_where_friction_falls_with_the_speed():
-    """A cycle is one slip, from static friction to the belt's speed, and then sticking."""
-    speed = 1.5
-    start = vi.OscillatorState(jnp.asarray(0.5 - 0.1 * speed), jnp.asarray(speed))
-    run = vi.simulate(Belt(), start, 4, method=CLOSE)
-    slips, (Y, _) = slip(speed, lambda t, x: x[1] - speed + 1e-15 if t > 1 else -1.0)
-    _, (back, _) = slip(speed, furthest_back)
-    sticks = (1.0 - 0.1 * speed - Y) / speed
-    assert float(run.duration[-1]) == pytest.approx(slips + sticks, abs=1e-8)
-    assert float(run.y_min[-1]) == pytest.approx(back, abs=1e-8)
-    np.testing.assert_allclose(
-        run.duration[1:], run.duration[-1], atol=1e-9
-    )  # independent of the start
 
 
 class Shaken(vi.AbstractMachine):

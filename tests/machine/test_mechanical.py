@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -105,30 +104,6 @@ def test_two_bodies_and_a_wall():
     z = run.last
     wanted = [0.457113976, 0.698178941, 0.119586666, 1.344958219]
     np.testing.assert_allclose([z.left, z.right, z.v.left, z.v.right], wanted, atol=2e-9)
-
-
-def test_plots_show_a_coordinate_by_name():
-    """Plots show stops and impacts of the coordinate, if it has any."""
-
-    class Measured(Pair):
-        units = property(lambda self: {"left": "mm", "right": "mm"})
-        contacts = property(lambda self: Pair.contacts.fget(self)[::-1])  # the wall is the first
-
-    machine = Measured()
-    run = vi.simulate(machine, machine.at(left=-0.5, right=0.3), 4, samples=8, impact_log=8)
-    figure, axes = plt.subplots(1, 3)
-    swing = run.samples.state.left.max()
-    for name, lines, highest, ax in (("right", 2, 1.0, axes[0]), ("left", 1, swing, axes[1])):
-        vi.plot_history(run, machine=machine, coordinate=name, ax=ax)
-        assert len(ax.lines) == lines and ax.get_ylabel() == f"{name} (mm)"
-        assert ax.lines[0].get_ydata().max() == pytest.approx(float(highest))
-    vi.plot_phase_portrait(run, machine, coordinate="left", ax=axes[2])
-    assert axes[2].get_ylabel() == "v.left"  # not in a unit of length
-    assert "  last cycle: right in [" in str(run) and "] mm\n" in str(run)
-    assert run.to_xarray()["y_max"].attrs["units"] == "mm"
-    with pytest.raises(ValueError, match="`coordinate` must be a number or a component"):
-        vi.plot_history(run, machine=machine, coordinate="up")
-    plt.close(figure)
 
 
 def test_an_unbalanced_motor_on_a_structure():
@@ -241,18 +216,6 @@ def test_a_ball_on_a_table_whose_motion_is_prescribed():
         Table().at(table=1.0)
 
 
-@pytest.mark.slow
-def test_an_orbit_on_a_table_whose_motion_is_prescribed():
-    ours, theirs = Table(), vi.machines.BouncingBall()
-    orbit = vi.find_orbit(ours, ours.at(ball=6.15 - 1.2, v={"ball": -1.06}), throw=True)
-    wanted = vi.find_orbit(theirs, theirs.start(height=6.15, speed=-1.06), throw=True)
-    found, other = (np.sort(np.abs(x.multipliers))[::-1] for x in (orbit, wanted))
-    np.testing.assert_allclose(found[:2], other, atol=1e-7)
-    np.testing.assert_allclose(other.prod(), 0.5**2, rtol=1e-7)
-    # Errors in the position of the table decay at this rate by definition.
-    np.testing.assert_allclose(found[2:], np.exp(-2 * np.pi), rtol=1e-2)
-
-
 class Pendulums(vi.Mechanical):
     """A double pendulum whose lower bob strikes a wall."""
 
@@ -363,20 +326,6 @@ def test_masses_that_depend_on_coordinates_are_the_same_in_an_array():
     one = Names().field(0.0, Names().at(x=0.4, y=-0.7, v={"x": 1.3, "y": 0.6}))
     other = Array().field(0.0, Array().at(a=np.array([0.4, -0.7]), v={"a": np.array([1.3, 0.6])}))
     np.testing.assert_allclose(other.v.a, [one.v.x, one.v.y], rtol=1e-14)
-
-
-def test_equal_gap_functions_share_a_coordinate():
-    class Between(Pair):
-        share: float = 0.5
-
-        def wall(self, side, place):
-            return vi.RigidStop(1.0, 0.5, side, on=lambda q: q.left - self.share * q.right - place)
-
-        contacts = property(
-            lambda self: (self.wall("left", 0.0), self.wall("right", 0.0), self.wall("right", 1.0))
-        )
-
-    assert [x.coordinate for x in Between()._stops] == [0, 0, 1]
 
 
 WRONG = [

@@ -49,29 +49,9 @@ class Box(Masses):
         return z.ball - z.box, z.box, z.v.ball - z.v.box, z.v.box
 
 
-class ShakenBox(Box):
-    """A ball in a box that moves as sin t."""
-
-    mass: ClassVar = (1.0,)
-
-    def prescribed(self, t):
-        return dict(box=jnp.sin(t))
-
-    def force(self, t, q, v):
-        return dict(ball=0.0)
-
-    def from_ready(self, x):
-        return self.at(ball=x.place, v=dict(ball=1.0 + x.v.place))
-
-    def view(self, z):
-        return super().view(z)[::2]
-
-
 # Ready machine, class with masses, ranges of parameters and of starts.
 HITS = {"restitution": (0.3, 0.9)}
 CASES = {
-    "pair": (M.ImpactPair(), ShakenBox, {**HITS, "half_gap": (0.6, 2)},
-             {"place": (-0.5, 0.5), "v": {"place": (-1, 1)}}),
     "free pair": (
         M.ImpactPair(mass_ratio=0.2), Box,
         {**HITS, "half_gap": (0.6, 2), "mass_ratio": (0.1, 1), "damping_ratio": (0, 0.3),

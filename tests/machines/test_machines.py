@@ -47,15 +47,6 @@ def test_fold_and_period_doubling_of_a_bounce_match_closed_forms(bounces, restit
     assert doubles == pytest.approx(1.5268237005, abs=1e-10)
 
 
-@pytest.mark.slow
-def test_switch_to_a_bounce_of_twice_the_period(bounces):
-    doubling = next(p for p in bounces.special if p.kind == "period-doubling")
-    twice = doubling.switch()
-    assert int(twice.cycles) == 2 and int(twice.impacts) == 2 and "2 cycles" in str(twice)
-    run = vi.simulate(twice.machine, twice.state, 4, method="reference")
-    np.testing.assert_allclose(run.sections.height[2:], run.sections.height[:-2], atol=1e-9)
-
-
 @pytest.fixture(scope="module")
 def symmetric(restitution):
     """The branch of the symmetric motion, found from its closed form at λ = 2."""

@@ -2,7 +2,6 @@
 
 import warnings
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -130,23 +129,6 @@ def test_a_cycle_that_an_impact_ends():
         branch = vi.continue_orbit(orbit, parameter="restitution", bounds=(0.55, 0.65))
     assert branch.ends == ("bounds", "bounds")
     np.testing.assert_allclose(branch.at(0.6)[0].state.V, -speed, rtol=1e-9)
-
-
-def test_backends_agree():
-    @jax.vmap
-    def lanes(x):
-        machine, start = StickSlip(0.57), sliding(0.1 + 0.01 * x, 0.0)
-        return vi.simulate(machine, start, 3, method=vi.FixedStep(steps_per_cycle=20), event_log=4)
-
-    runs, at = [], jnp.linspace(-0.5, 0.5, 5)
-    for backend in ("auto", "xla"):
-        with vi.backend(backend):
-            runs.append(jax.jit(lanes)(at))
-    fast, slow = runs
-    assert bool(fast.successful.all()) and int((fast.event_log.number == 1).sum()) > 4
-    np.testing.assert_array_equal(fast.event_log.number, slow.event_log.number)
-    for a, b in zip(*map(jax.tree.leaves, (fast.sections, slow.sections)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 class Thrown(vi.AbstractMachine):

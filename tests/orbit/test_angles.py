@@ -113,20 +113,6 @@ def test_an_erosion_profile_passes_half_a_turn(orbit):
     assert profile.label.tolist() == [[0, 0]]
 
 
-@pytest.mark.slow
-def test_plots_of_an_angle_break_the_line_where_it_wraps(orbit):
-    """The angle is plotted modulo 2π, and a cycle ends in the middle of a turn."""
-    run = orbit.trajectory(cycles=3, samples=64)
-    phi = np.asarray(run.samples.state.phi)
-    figure, (left, right) = plt.subplots(1, 2)
-    vi.plot_history(run, machine=orbit.machine, ax=left)
-    vi.plot_phase_portrait(run, orbit.machine, coordinate="phi", ax=right)
-    for y in (left.lines[0].get_ydata(), right.lines[0].get_xdata()):
-        np.testing.assert_allclose(np.exp(1j * y[np.isfinite(y)]), np.exp(1j * phi), atol=1e-12)
-        assert np.isnan(y).sum() == 9 and np.nanmax(np.abs(np.diff(y))) < 1
-    plt.close(figure)
-
-
 REST = np.arcsin(0.3)
 
 

@@ -12,7 +12,6 @@ from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from in_decimals import rests_again
 from two_coupled import Two
 
 ZETA, GAP = "drive.frequency_ratio", 0.3
@@ -110,23 +109,6 @@ def test_a_branch_reports_rests(branch):
     (lost,) = branch.special
     beyond = lost.switch()
     assert beyond.rests == 0 and beyond.impacts == len(beyond.impact_speed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("k", "gap", "damping", "bounds"),
-    [(0.1, 0.6, 0.2, (0.89, 0.92)), (0.7, 0.3, 0.2, (0.46, 0.5))],
-)
-def test_the_rest_is_lost_where_its_chatter_takes_until_release(k, gap, damping, bounds):
-    """Compare with flights in 40 digits, since double precision displaces the loss by 3e-7."""
-    scene = scene_at(bounds[0] + 0.01, k, gap, damping)
-    orbit = vi.find_orbit(scene, settled(scene), impact_log=32, throw=True)
-    branch = vi.continue_orbit(orbit, parameter=ZETA, bounds=bounds)
-    (point,) = branch.special
-    assert branch.ends == ("bounds", "rest")
-    assert point.kind == "rest" and "lost" in point.detail
-    assert rests_again(point.parameter - 1e-9, k, gap, damping)
-    assert not rests_again(point.parameter + 1e-9, k, gap, damping)
 
 
 @pytest.mark.exhaustive

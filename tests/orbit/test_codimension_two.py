@@ -166,19 +166,6 @@ def test_motions_of_three_and_of_four_periods(torus, periods):
         np.testing.assert_allclose(values, np.sort_complex(np.linalg.eigvals(M)), atol=1e-9)
 
 
-def test_plot_boundary_marks_special_points(torus):
-    ax = vi.plot_boundary(torus)
-    np.testing.assert_array_equal(ax.lines[0].get_xydata(), torus.parameters)
-    marked = {line.get_label(): line.get_xydata()[0] for line in ax.lines[1:]}
-    assert sorted(marked) == sorted(kinds_of(torus))
-    for point in torus.special:
-        np.testing.assert_array_equal(marked[point.kind], point.parameters)
-    named = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert named == ["neimark-sacker", *kinds_of(torus)]
-    plain = vi.plot_boundary(torus, special=False, legend=False)
-    assert len(plain.lines) == 1 and plain.get_legend() is None
-
-
 @pytest.mark.parametrize(
     ("kind", "resonant", "cosine"),
     [("fold", "resonance-1:1", 1), ("period-doubling", "resonance-1:2", -1)],

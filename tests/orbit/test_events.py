@@ -1,28 +1,9 @@
-"""Orbits and branches of a motor and of a relief valve, and the methods that branches accept."""
+"""Exponents of a relief valve, and the methods that branches accept."""
 
 import equinox as eqx
 import numpy as np
 import pytest
 import vi_jax as vi
-
-MOTOR = vi.Parameters(torque=10.0, control=0.9, restitution=0.8, gap=0.08).scene(drive="motor")
-
-
-@pytest.mark.slow
-def test_a_branch_agrees_with_find_orbit():
-    """Compare orbit and multipliers by the cycle map, differentiated through its events, with those
-    from event to event, by saltation matrices. `test_units_of_branches` has other machines."""
-    settled = vi.simulate(MOTOR, MOTOR.start(), 1, settle=200).last
-    orbit = vi.find_orbit(MOTOR, settled, 2, throw=True)
-    bounds = (0.88, 0.95)
-    (there,) = vi.continue_orbit(orbit, parameter="drive.control", bounds=bounds).at(0.93)
-    found = vi.find_orbit(there.machine, there, 2, throw=True)
-    for a, b in zip(vars(there.state).values(), vars(found.state).values(), strict=True):
-        assert float(a) == pytest.approx(float(b), abs=2e-9)
-    assert float(there.duration) == pytest.approx(float(found.duration), abs=1e-8)
-    assert int(there.impacts) == int(found.impacts)
-    assert np.abs(there.multipliers) == pytest.approx(np.abs(found.multipliers), abs=1e-6)
-    assert float(there.y_max) == pytest.approx(float(found.y_max), abs=1e-8)
 
 
 @pytest.mark.slow

@@ -133,18 +133,6 @@ def test_optax_finds_the_start_without_transient():
 
 
 @pytest.mark.slow
-def test_adaptive_steps_find_the_same_orbit():
-    exact, stepped = (
-        vi.find_orbit(UNDAMPED, near(UNDAMPED, 2), cycles=2, method=method)
-        for method in (None, vi.Adaptive(rtol=1e-11))
-    )
-    assert float(exact.residual) < 1e-12 and bool(exact.stable) and int(exact.cycles) == 2
-    for a, b in zip(jax.tree.leaves(stepped.state), jax.tree.leaves(exact.state), strict=True):
-        assert float(a) == pytest.approx(float(b), abs=1e-8)
-    np.testing.assert_allclose(stepped.multipliers, exact.multipliers, atol=1e-8)
-
-
-@pytest.mark.slow
 def test_many_guesses_in_one_program(compilations):
     draw = np.random.default_rng(0).uniform
     Y, V = jnp.asarray(draw(-3, 2, 4096)), jnp.asarray(draw(-3, 3, 4096))

@@ -182,27 +182,6 @@ def test_unsupported_points_raise(half):
 
 
 @pytest.mark.slow
-def test_text_and_plot_of_a_grazing(half):
-    _, found, _, _ = half
-    low, high = found.checked  # over decades of the offset
-    assert high / low > 1e3 and found.agreement > 0.9
-    assert set(found.machine.offset) <= set(found.forecast.offset)
-    text = str(found)
-    assert text.startswith("Grazing at gap = 0.1092048354: touches the right stop\n")
-    assert "what follows: period adding with chaos between" in text
-    assert "one impact in 5 periods: stable at -4.29e-06 … -1.23e-05 from there" in text
-    assert "checked by the machine: from " in text
-    assert repr(found.outcome) == "SCENARIOS.period_adding_with_chaos"
-    ax = vi.plot_grazing(found)
-    named = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert named[0] == "the machine" and named[-1] == "grazing"
-    assert {"forecast: 5 periods", "forecast: no period"} <= set(named)
-    assert ax.get_xlabel() == "gap d, from 0.109205" and ax.get_xscale() == "function"
-    drawn = np.concatenate([line.get_xdata() for line in ax.lines if len(line.get_xdata())])
-    assert drawn.min() == found.forecast.offset.min() and drawn.max() == 0
-
-
-@pytest.mark.slow
 def test_resonant_grazings_of_a_linear_oscillator():
     """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, with the damped frequency ω_d. A motion of n
     cycles begins there if all earlier entries are positive."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from vi_jax.orbit._local_map import LocalMap
-from vi_jax.orbit.grazing import _are_adjacent, find_attractors, scenario_of, windows
+from vi_jax.orbit.grazing import find_attractors, scenario_of, windows
 
 
 def root_map(share):
@@ -51,10 +51,3 @@ def test_signs_of_the_entries_decide_the_outcome():
     assert (find_attractors(turned, offsets).period < 0).any()
     smooth = LocalMap(np.array([[[-0.5]]]), ones, ones, np.array([1.5]), np.ones(1))
     assert scenario_of(smooth, offsets, find_attractors(smooth, offsets))[0] == "persistence"
-
-
-def test_period_adding_needs_consecutive_periods():
-    """Neither 5 and 7 without 6, as between two stops, nor falling periods are period adding."""
-    offsets = np.geomspace(1e-3, 1e-7, 30)
-    for kinds, adding in (((5, 6, 7), True), ((5, 7, 9), False), ((7, 6, 5), False)):
-        assert _are_adjacent(offsets, np.repeat(kinds, 10)) == adding

@@ -78,20 +78,6 @@ def test_a_rest_that_is_divided():
     assert rests == [2, 1]
 
 
-@pytest.mark.exhaustive
-def test_a_lost_rest_of_a_ball_on_its_table():
-    """Compare with simulations on both sides of the curve."""
-    machine, bounds = vi.machines.BouncingBall(acceleration=1.3, restitution=0.4), (1.2, 2.0)
-    orbit = search(machine, machine.start(), 60)
-    point = vi.continue_orbit(orbit, parameter="acceleration", bounds=bounds).special[-1]
-    assert point.kind == "rest"
-    curve = vi.boundary(point, parameter="restitution", bounds=(bounds, (0.35, 0.55)))
-    for i in (2, -3):
-        value, k = curve.parameters[i]
-        rests = rests_around(lambda a, k=k: type(machine)(acceleration=a, restitution=k), value)
-        assert rests[0] == int(orbit.rests) and rests[1] < rests[0]
-
-
 class Switched(vi.AbstractMachine):
     """x'' + 0.1 x' + x = cos 0.6 t, x ≤ 0, with a switch at `phase` that changes nothing."""
 

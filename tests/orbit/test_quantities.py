@@ -1,7 +1,5 @@
 """Averages and quantities that a machine defines, along orbits and branches."""
 
-import itertools
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,25 +54,3 @@ def test_quantities_along_a_branch(branch, orbit):
     assert set(data) >= {"duration", "impacts", "lost", "section_V", "section_push"}
     frame = branch.table(lambda at: at.impact_speed)
     assert frame.value.shape == branch.impact_speed.shape
-
-
-@pytest.mark.slow
-def test_plots_of_quantities(branch):
-    ax = vi.plot_branch(branch, y="taken")
-    assert ax.get_ylabel() == "mean taken (W)"
-    drawn = ax.lines[0].get_ydata()  # of the first segment, stable or not
-    np.testing.assert_array_equal(drawn, branch.averages["taken"][: len(drawn)])
-    assert len(drawn) > 5
-    with pytest.raises(ValueError, match=r"lost.*section_push.*'power'"):
-        vi.plot_branch(branch, y="power")
-
-
-@pytest.mark.slow
-def test_invalid_tables_raise(branch):
-    with pytest.raises(TypeError, match="'word' is 'high'"):
-        branch.table(lambda at: {"word": "high"})
-    counts = itertools.count()
-    with pytest.raises(TypeError, match="same names and shapes"):
-        branch.table(lambda at: np.zeros(next(counts)))
-    with pytest.raises(TypeError, match="must not return `parameter`"):
-        branch.table(lambda at: {"parameter": 0.0})

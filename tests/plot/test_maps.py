@@ -102,19 +102,6 @@ def test_outcomes_have_colours():
             assert {tuple(c) for c in cells[ends == number]} == {legend[name]}
 
 
-def test_maps_need_two_axes():
-    with pytest.raises(ValueError, match="two axes"):
-        vi.plot_basins(_basins([0, 1], ("start.Y",), **{"start.Y": [0.0, 1.0]}))
-    with pytest.raises(ValueError, match="must hold `period` or `outcome`"):
-        vi.plot_regimes(_data().drop_vars("period"))
-    with pytest.raises(ValueError, match="two axes"):
-        vi.plot_regimes(_data().isel({"stops.0.restitution": 0}))
-    with pytest.raises(ValueError, match="`x` must be one of"):
-        vi.plot_regimes(_data(), x="gap")
-    with pytest.raises(ValueError, match="different axes"):
-        vi.plot_regimes(_data(), x="stops.0.restitution", y="stops.0.restitution")
-
-
 def _basins(label, dims, **coords):
     motions = [
         vi.Attractor(0, 1, 1.0, {"Y": np.array([0.2]), "V": np.array([1.0])}, 4, 0.5, 0.1),
@@ -206,10 +193,3 @@ def test_basins_of_random_starts():
     (dots,) = ax.collections
     assert dots.get_offsets().tolist() == [[0.0, 0.5], [1.0, 0.5], [2.0, 0.0]]
     assert len({tuple(color) for color in dots.get_facecolors()}) == 3
-
-
-def test_an_axis_of_an_array_component_has_its_name():
-    from vi_jax.plot.scan import _start_name
-
-    words = _start_name(vi.machines.Beam(), "start.displacement[0]")
-    assert words == "displacement[0] at the start"

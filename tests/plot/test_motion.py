@@ -1,18 +1,14 @@
 """Pictures of motions agree with the simulation: points, impacts, stops, units."""
 
-import dataclasses
-
 import matplotlib
 
 matplotlib.use("Agg")
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
-from vi_jax.plot import motion_path, plot_history, plot_phase_portrait
+from vi_jax.plot import motion_path, plot_history
 
 
 @pytest.fixture(scope="module")
@@ -83,55 +79,3 @@ def test_history_of_a_machine_counts_cycles():
     ax = plot_history(run, machine=ball, ax=_axes())
     assert ax.get_xlabel() == "cycles since the start" and ax.get_ylabel() == "height (g/ω²)"
     assert ax.lines[0].get_xdata().max() == pytest.approx(3.0)
-
-
-class Stated(vi.AbstractMachine):
-    """An oscillator between a rigid and a soft stop, in millimetres."""
-
-    contacts = (vi.RigidStop(1.5, 0.5), vi.SoftStop(1.2, 50.0, side="left"))
-    cycle: float = 6.0
-
-    @property
-    def units(self):
-        return {"position": "mm", "velocity": "mm/s"}
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, -x.Y)
-
-
-def test_pictures_show_a_machines_units_and_soft_stop():
-    machine, start = Stated(), vi.OscillatorState(jnp.array(1.0), jnp.array(0.0))
-    run = vi.simulate(machine, start, 1, samples=16)
-    assert plot_history(run, machine=machine, ax=_axes()).get_ylabel() == "position (mm)"
-    portrait = plot_phase_portrait(run, machine, ax=_axes())
-    assert portrait.get_xlabel() == "position (mm)" and portrait.get_ylabel() == "velocity (mm/s)"
-    drawn = [line.get_xdata() for line in vi.plot_sketch(machine, start, ax=_axes()).lines]
-    face = -1.2 - 0.35 * 1.5 / 2  # half a body beyond the stop
-    assert any(np.allclose(x, [face, face]) for x in drawn)
-
-
-def test_errors_name_the_argument(scene, run):
-    with pytest.raises(ValueError, match="`motion` must have samples"):
-        plot_history(dataclasses.replace(run, samples=None))
-    with pytest.raises(ValueError, match="`unit` must be"):
-        plot_history(run, unit="seconds")
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), run)
-    with pytest.raises(ValueError, match="one motion"):
-        motion_path(batch)
-    samples = vi.Samples(run.samples.cycles, run.samples.time, {"q": run.samples.state.Y})
-    with pytest.raises(ValueError, match="`machine` must be given"):
-        motion_path(samples)
-
-
-@pytest.mark.slow
-def test_impacts_of_a_machine_without_a_drive_are_drawn_in_place():
-    """The motion's period differs from the machine's nominal cycle."""
-    valve = vi.machines.ReliefValve()
-    start = valve.start(lift=2.4936, speed=0.0, pressure=1.5342)
-    run = vi.find_orbit(valve, start, throw=True).trajectory()
-    path = vi.plot.motion_path(run, machine=valve)
-    step = float(run.duration[0]) / 128
-    assert np.abs(np.diff(path.Y)).max() < 1.01 * step * np.abs(path.V).max()
-    ax = plot_history(run, machine=valve, ax=_axes())
-    assert ax.get_xlabel() == "time since the start"
-    assert ax.lines[0].get_xdata().max() == pytest.approx(float(run.duration[0]))

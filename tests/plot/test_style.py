@@ -1,7 +1,5 @@
 """The styles set the sizes of figures and the fonts of files."""
 
-import re
-
 import matplotlib
 
 matplotlib.use("Agg")
@@ -30,14 +28,4 @@ def test_sizes_of_figure_words_and_lines(run, name, width, points, line):
     ratio = ax.lines[0].get_linewidth() / plain.lines[0].get_linewidth()
     assert ratio == pytest.approx(line / 1.5)
     plt.close(plain.figure)
-    plt.close(ax.figure)
-
-
-def test_a_pdf_has_its_fonts_as_truetype(run, tmp_path):
-    with plt.style.context(["vi_jax.plot.journal", {"pdf.compression": 0}]):
-        ax = vi.plot_history(run)
-        ax.figure.savefig(tmp_path / "figure.pdf")
-    text = (tmp_path / "figure.pdf").read_bytes()
-    kinds = set(re.findall(rb"/Subtype /(Type3|CIDFontType2|Type42)", text))
-    assert kinds == {b"CIDFontType2"}  # an embedded TrueType font
     plt.close(ax.figure)

@@ -183,12 +183,3 @@ def test_a_chaotic_edge_state():
     edge = vi.edge_state(Between(push=7.5), HOME, third(1.0, 0.5, -0.5), rounds=24)
     assert edge.orbit is None and edge.kind == "chaotic"
     assert np.abs(np.asarray(edge.sections.x)).max() < 2e-5
-
-
-@pytest.mark.exhaustive
-def test_a_kick_in_three_components():
-    """The boundary is the plane x = 0, at distance 1 from rest."""
-    result = vi.minimal_kick(Between(), HOME, candidates=1, directions=64)
-    kick = [float(result.kick[name]) for name in ("Y", "V", "x")]
-    np.testing.assert_allclose(kick, [0.0, 0.0, -1.0], atol=1e-9)
-    assert result.exact and result.confirmed and result.edge.kind == "saddle"

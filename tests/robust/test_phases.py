@@ -1,11 +1,9 @@
 """Kicks at other moments than the section."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from scipy.optimize import minimize_scalar
 
 from belts import Belt
 
@@ -36,46 +34,6 @@ def test_a_kick_at_a_phase_equals_that_on_a_section_there(motion):
         assert (found.cycle, float(found.phase)) == (at["cycle"], at["phase"])
         for name in components:
             assert float(found.kick[name]) == pytest.approx(float(there.kick[name]), abs=1e-10)
-
-
-class Later(vi.machines.Duffing):
-    """The Duffing oscillator with the drive's phase shifted by `later`."""
-
-    later: jax.Array | float = 0.0
-
-    def field(self, s, state):
-        return super().field(s + self.later, state)
-
-
-@pytest.mark.exhaustive
-def test_a_driven_machine_is_kicked_at_a_phase():
-    """Compare with the same machine after a shift of the drive's phase."""
-    numbers = {"amplitude": 0.2, "damping": 0.15, "stiffness": -1.0, "cubic": 1.0, "gap": 100.0}
-    first, then = Later(**numbers), Later(later=jnp.asarray(2.0), **numbers)
-    motion = vi.find_orbit(first, first.start(Y=1.0, V=0.2), 1)
-    found = vi.minimal_kick(first, motion, phase=2.0, **BLOW)
-    state = vi.OscillatorState(found.start.Y, found.start.V - found.kick["V"])
-    there = vi.find_orbit(then, state, 1)
-    np.testing.assert_allclose([there.state.Y, there.state.V], [state.Y, state.V], atol=1e-9)
-    other = vi.minimal_kick(then, there, **BLOW)
-    assert float(found.norm) == pytest.approx(float(other.norm), abs=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_an_autonomous_machine_is_kicked_at_a_phase():
-    """A kick stops stick-slip. The minimum over phases is the distance between its cycle and the
-    unstable one of sliding, computed with SciPy."""
-    belt = Belt(jnp.asarray(1.5))
-    motion = vi.find_orbit(belt, belt.start(Y=-1.2), 1, throw=True)
-    options = {"candidates": 1, "directions": 32, "progress": False}
-
-    def norm(phase):
-        found = vi.minimal_kick(belt, motion, phase=phase, **options)
-        assert found.confirmed and found.phase == phase
-        return float(found.norm)
-
-    least = minimize_scalar(norm, bounds=(1.4, 1.9), method="bounded", options={"xatol": 1e-2})
-    assert least.fun == pytest.approx(0.250943, abs=1e-5)
 
 
 @pytest.mark.slow
