@@ -18,14 +18,7 @@ from jaxtyping import Array
 from .._checks import count, require
 from .._messages import warning_once
 from .._types import Scalar, State
-from ..machine import (
-    AbstractMachine,
-    convert_start,
-    in_rows,
-    longest_step,
-    size_of,
-    without_modes,
-)  # fmt: skip
+from ..machine import AbstractMachine, convert_start, in_rows, longest_step, size_of, without_modes
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .loop import row_sizes, sizes_on_host
