@@ -217,6 +217,7 @@ def test_user_defined_machines(run, here, monkeypatch, head):
     assert said.count("\n") == 1 and "State(Y=1)" in said
 
 
+@pytest.mark.slow
 def test_machines_with_other_arguments_and_without_a_drive(run):
     beam = """machine = "vi_jax.machines:Beam"
         method = { class = "vi_jax:ExactFlight" }

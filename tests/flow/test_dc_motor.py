@@ -133,6 +133,7 @@ def test_scene_from_parameters_in_si_units():
     assert isinstance(vi.Parameters(electrical_time=0.01).scene(drive="ideal").drive, vi.IdealDrive)
 
 
+@pytest.mark.slow
 def test_starts():
     scene = machine()
     assert isinstance(scene.start(), vi.DCMotorState)

@@ -172,6 +172,7 @@ def test_a_furnace_with_two_thresholds():
     np.testing.assert_allclose(runs[0].y_max[:, 2:], 296.0, rtol=1e-12)  # switched off there
 
 
+@pytest.mark.slow
 def test_last_state_keeps_its_modes():
     """Compare runs of one cycle with a long run. Between the thresholds both modes are possible."""
     furnace = Furnace(cycle=0.37)
@@ -243,6 +244,7 @@ class WithIdleReset(vi.AbstractMachine):
         return vi.OscillatorState(x.V, jnp.cos(0.9 * s) - x.Y - 0.1 * x.V)
 
 
+@pytest.mark.slow
 def test_derivatives_of_extremes_with_events():
     def extremes(gap):
         run = vi.simulate(WithIdleReset(gap), vi.OscillatorState(0 * gap, 0 * gap), 3, method=CLOSE)

@@ -46,6 +46,7 @@ def test_start_from_rest():
     assert float(run.frequency_ratio[-1]) == pytest.approx(0.9, abs=0.02)
 
 
+@pytest.mark.slow
 def test_fixed_steps_stay_stable_for_a_strong_motor():
     # The shaft returns to its speed within a small part of a cycle, above all at low speed.
     def last(torque, kappa, method):

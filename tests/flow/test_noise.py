@@ -158,6 +158,7 @@ def test_derivatives_follow_the_path():
         np.testing.assert_allclose(mode(last)(at), differences, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_energy_is_balanced_with_rests_between_impulses():
     """The spring presses the body on its stop, where it rests between impulses."""
     restitution, place = 0.5, 0.3

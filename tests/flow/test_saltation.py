@@ -44,6 +44,7 @@ def product(Y: float, V: float, cycles: int) -> tuple[np.ndarray, int]:
     return flight(2 * np.pi * cycles / ZETA - time) @ matrix, impacts
 
 
+@pytest.mark.slow
 def test_jacobian_is_the_product_of_saltation_matrices():
     """Compare derivatives with respect to parameters with differences."""
     truth, impacts = product(*START, CYCLES)

@@ -68,6 +68,7 @@ class Cart(vi.Mechanical):
         return dict(cart=1.0, load=0.2 * jnp.sin(t))
 
 
+@pytest.mark.slow
 def test_as_many_contacts_stick_as_possible():
     """A sliding cart would be consistent too, as kinetic friction does not hold it. The load slides
     from π/6 until its momentum is spent."""

@@ -234,6 +234,7 @@ class Shaken(vi.AbstractMachine):
         return z.replace(w=-z.w)
 
 
+@pytest.mark.slow
 def test_surfaces_whose_speed_jumps():
     """Friction is 0.1 and never holds the body, even where the speed of the surface jumps."""
     start = vi.State(x=0.0, v=0.0, w=1.0)

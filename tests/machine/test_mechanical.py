@@ -190,6 +190,7 @@ class Table(vi.Mechanical):
         return vi.RigidStop(0.0, self.restitution, "left", on=lambda q: q.ball - q.table)
 
 
+@pytest.mark.slow
 def test_a_ball_on_a_table_whose_motion_is_prescribed():
     """The ball bounces, rests on the table and leaves it again, as in `BouncingBall`."""
 
@@ -235,6 +236,7 @@ class Pendulums(vi.Mechanical):
         return vi.RigidStop(0.5, 1.0, on=lambda q: jnp.sin(q.a) + jnp.sin(q.b))
 
 
+@pytest.mark.slow
 def test_masses_that_depend_on_all_coordinates_and_a_curved_gap():
     """Flights and elastic impacts conserve energy; `impact_energy` is the loss in other impacts."""
     machine = Pendulums()
@@ -376,6 +378,7 @@ def test_invalid_starts_raise():
         vi.simulate(SliderCrank(), SliderCrank().at(phi=7.0, v=dict(phi=15.0)), 1)
 
 
+@pytest.mark.slow
 def test_given_motion_has_no_exponents():
     """The other body is an oscillator without damping."""
     machine = Driven(restitution=1.0)

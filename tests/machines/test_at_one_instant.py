@@ -220,6 +220,7 @@ def test_a_rod_lands_flat_on_its_feet():
             np.testing.assert_allclose((v, turn), wanted, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_impacts_coupled_by_friction():
     """The faster impact is first: b from 2 to -1 takes .9 off a; a from .1 to -.05 gives b .045."""
     rough = dict(restitution=0.5, friction=0.3)

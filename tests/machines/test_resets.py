@@ -60,6 +60,7 @@ class OwnWalker(Walker):
         return (Strike(ends_cycle=True, name="strike"),)
 
 
+@pytest.mark.slow
 def test_own_class_of_events(walk):
     own = vi.find_orbit(OwnWalker(0.009), legs(0.2003, -0.1998))
     np.testing.assert_allclose(own.state.stance, walk.state.stance, atol=1e-14)

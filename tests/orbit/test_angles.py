@@ -92,6 +92,7 @@ def test_branch_of_a_locked_motor_is_closed():
     np.testing.assert_allclose(branch.parameter, DAMPING - 0.2 * np.sin(phase), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_orbit_with_its_section_at_half_a_turn_is_counted_once(orbit):
     """Rounding puts the section angle near π or near -π."""
     machine = Pendulum(zero=float(orbit.state.phi) - np.pi)

@@ -39,6 +39,7 @@ def branch(orbit):
     return vi.continue_orbit(orbit, parameter=ZETA, bounds=(0.6, 0.8))
 
 
+@pytest.mark.slow
 def test_an_orbit_reports_rests(orbit):
     assert int(orbit.rests) == 1 and "impacts and 1 rest on a stop, stable" in str(orbit)
     pressed = scene_at(0.7, gap=-3.0)

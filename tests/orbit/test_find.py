@@ -17,6 +17,7 @@ def near(scene, cycles, by=0.01):
     return scene.start(Y=closed.Y[0] - by, V=closed.V[0] - by)
 
 
+@pytest.mark.slow
 def test_cycles_accepts_the_number_of_an_orbit():
     orbit = vi.find_orbit(UNDAMPED, near(UNDAMPED, 1))
     again = vi.find_orbit(UNDAMPED, orbit.state, cycles=orbit.cycles)

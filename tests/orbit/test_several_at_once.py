@@ -161,6 +161,7 @@ def test_a_branch_that_begins_at_a_grazing_goes_to_one_side():
     assert again.parameter.min() == pytest.approx(grazes, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_watch_locates_the_zero_of_a_function():
     """Locate the point at which the greatest position is 1.3."""
     scene = vi.Scene.ideal(frequency_ratio=0.31, restitution=0.76, gap=9.0, damping_ratio=0.25)
