@@ -289,7 +289,8 @@ class RESULTS(NamedEnumeration):
         "The end of a cycle (an event, or the clock) could not be located within the step."
     )
     turn_unresolved = (
-        "A turning point, or the release of a body from rest, could not be located within the step."
+        "A turning point, or the release of a body from rest, could not be located within the step. "
+        "The `on` of a stop must have the position first, then its velocity."
     )
     bad_impact = (
         "An impact left faster than it came, or further into its stop: a restitution law must have "
