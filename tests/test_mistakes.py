@@ -67,6 +67,35 @@ class FreeByNumpy(Free):
         return np.cos(z.x)
 
 
+class RubbedByNumpy(FreeByNumpy):
+    contacts = vi.DryFriction(0.1, on="u")
+
+
+class Harmonic(Free):
+    def force(self, t, z):
+        return 0.0
+
+
+class PushedPosition(Harmonic):
+    contacts = (vi.RigidStop(1.0, 0.5, on=("x", "u")), vi.DryFriction(0.1, on="x"))
+
+
+class CycleByNumpy(Harmonic):
+    length: float = 6.0
+
+    @property
+    def cycle(self):
+        return np.sqrt(self.length)
+
+
+class StopByNumpy(Harmonic):
+    gap: float = 2.0
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(np.sqrt(self.gap), 0.5, on=("x", "u"))
+
+
 class FreeWithIf(Free):
     def force(self, t, z):
         return 1.0 if z.x > 0 else 0.0
@@ -168,7 +197,7 @@ def test_6_a_start_beyond_the_stop():
 
 
 def test_7_numpy_in_a_field():
-    for kind in (ByNumpy, ByMath, FreeByNumpy):
+    for kind in (ByNumpy, ByMath, FreeByNumpy, RubbedByNumpy, CycleByNumpy, StopByNumpy):
         said = refused(lambda kind=kind: simulate(kind()))
         assert "with the functions of `jax.numpy`" in said
 
@@ -254,6 +283,7 @@ class Spare(Machine):
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),
         (continue_clocked, "must not have cycles that end at a given time"),
         (kick_another, "an orbit of this machine, but its stops.0.gap is 2, not 2.1"),
@@ -265,6 +295,19 @@ class Spare(Machine):
         (
             lambda: instance_of("machine", Machine, vi.AbstractMachine, "one"),
             "`Machine(…)`, for one",
+        ),
+        (
+            lambda: vi.simulate(
+                vi.machines.Structure(
+                    mass=[1.0],
+                    stiffness=[1.0],
+                    force=[1.0],
+                    contacts=(vi.RigidStop(1.0, 0.5, at=[1.0], friction=0.3, along="x"),),
+                ),
+                None,
+                1,
+            ),
+            "Stop 0 of a Structure must have no `friction`",
         ),
         (lambda: vi.find_orbit(SCENE, vi.simulate(SCENE, SCENE.start(), 1)), "take its `last`"),
         (lambda: vi.simulate(SCENE, vi.find_orbit(SCENE, SCENE.start()), 1), "take its `state`"),

@@ -246,3 +246,30 @@ def test_surfaces_whose_speed_jumps():
         vi.simulate(Shaken(lambda t, w: jnp.where(t < 0.5, 1.0, -1.0)), start, 1)
     with pytest.warns(UserWarning, match="within a thousandth of a cycle, at t = 0.5:"):
         vi.simulate(Shaken(lambda t, w: jnp.tanh(1e4 * (t - 0.5))), start, 1)
+
+
+def test_a_turn_where_friction_reverses_counts_for_the_stop_ahead_only():
+    """The far wall is not reached, so the clearance is its distance from the smallest position.
+    Without it there is no other turn before a stop. Regression: turns away from a stop counted."""
+
+    class Rubbed(vi.AbstractMachine):
+        cycle = 2 * np.pi
+        wall: float | None = None
+
+        @property
+        def contacts(self):
+            stops = [vi.RigidStop(0.1, 0.6, on=("x", "u")), vi.DryFriction(0.1, on="u")]
+            if self.wall is not None:
+                stops.append(vi.RigidStop(self.wall, 0.6, "left", on=("x", "u")))
+            return tuple(stops)
+
+        def field(self, t, z):
+            return dict(x=z.u, u=jnp.cos(t) - 0.5 * z.x)
+
+    start = vi.State(x=0.0, u=0.0)
+    alone, between = (
+        vi.simulate(Rubbed(wall), start, 4, settle=40, impact_log=8) for wall in (None, 9.0)
+    )
+    assert int(alone.impacts.min()) > 0 and float(alone.y_min.min()) < -0.2
+    np.testing.assert_allclose(between.clearance, 9.0 + between.y_min, atol=1e-9)
+    assert bool((alone.clearance == jnp.inf).all())

@@ -37,6 +37,7 @@ from ..machine import (
     events_of,
     field_in,
     guard_of,
+    has_own_modes,
     is_angle,
     is_autonomous,
     like,
@@ -94,6 +95,16 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     _output_shapes(
         f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state
     )
+
+
+def check_before_modes(machine: AbstractMachine, s: Scalar, state: State) -> None:
+    """Check the cycle, and the field if it needs no modes: those of friction depend on the forces.
+    **Raises:** as `check_field`."""
+    with explain_errors(f"`cycle` of a {type(machine).__name__}"):
+        jnp.asarray(machine.cycle)
+    switches = switches_of(machine)
+    if switches and all(x.acts for x in switches) and not has_own_modes(machine):
+        check_field(machine, s, state, ())
 
 
 def batch_hint(machine: AbstractMachine) -> str:
@@ -463,6 +474,7 @@ def _check_names(machine: AbstractMachine) -> None:
                 f"`q` of a {kind.__name__} must have different names, and none of them `v`, but is "
                 f"{machine.q}."
             )
+    pairs = [x.on for x in contacts_in(machine) if isinstance(getattr(x, "on", None), tuple)]
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
         if isinstance(stop, RigidStop) and stop.friction is not None and stop.along == on:
@@ -483,6 +495,12 @@ def _check_names(machine: AbstractMachine) -> None:
                     f"{type(machine).__name__}, whose own masses are used."
                 )
             continue
+        is_position = any(on == position for position, *_ in pairs)
+        if isinstance(stop, DryFriction) and (isinstance(on, tuple) or is_position):
+            raise ValueError(
+                f"Argument `on` of a DryFriction of a {type(machine).__name__} must be the name of "
+                f'a velocity, `on="u"`, but got {on!r}.'
+            )
         is_pair = isinstance(on, tuple) and len(on) == 2 and all(isinstance(x, str) for x in on)
         if isinstance(stop, RigidStop | SoftStop) and on is not None and not is_pair:
             raise ValueError(

@@ -55,7 +55,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._lane import Plan
-from ._machine_checks import INNER_INSTANT, check_parts, explain_errors
+from ._machine_checks import INNER_INSTANT, check_before_modes, check_parts, explain_errors
 from ._machine_checks import check_values as check_values
 from ._quantities import average_names, quantity_names
 from .methods import AbstractMethod, MethodLike, chosen
@@ -281,6 +281,7 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     """**Raises:** `TypeError` for an invalid state, which only the field can show."""
     whose = f"`field` of a {type(machine).__name__}"
     try:
+        check_before_modes(machine, jnp.zeros(()), state)
         modes = shown_modes(machine, begin_modes(machine, jnp.zeros(()), state))
         check_takes(machine.field, whose, "`s`, the state", (0.0, state, *modes), len(modes))
         rate = lambda s, x: field_in(machine, s, x, begin_modes(machine, s, x))

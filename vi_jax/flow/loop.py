@@ -42,7 +42,13 @@ from ..machine import (
     without_modes,
 )
 from ._lane import Lane, Plan, Record, to_event, total
-from ._machine_checks import check_events, check_field, check_laws
+from ._machine_checks import (
+    check_before_modes,
+    check_events,
+    check_field,
+    check_laws,
+    explain_errors,
+)
 from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
@@ -312,8 +318,10 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         # The condition that ends a lane early is a function of the machine's own state.
         plan = dataclasses.replace(plan, machine=form.machine, stop=None)
         start = form.inward(start)
-    zero = jnp.zeros_like(plan.machine.position(start))
+    with explain_errors(f"`contacts` of a {type(plan.machine).__name__}"):
+        zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
+    check_before_modes(plan.machine, s, start)
     modes = begin_modes(plan.machine, s, start, plan.start_modes)
     check_field(plan.machine, s, start, modes)
     check_laws(plan.machine, zero)

@@ -277,7 +277,10 @@ class RESULTS(NamedEnumeration):
         "The impacts within one cycle exceeded `max_impacts` (perhaps no event ends the cycle), "
         "or followed each other too fast to be told apart (chatter)."
     )
-    underflow = "The step size fell below what the precision resolves. Loosen the tolerance."
+    underflow = (
+        "The step size fell below what the precision resolves: the motion goes to infinity in "
+        "finite time, or the tolerance is too small."
+    )
     not_finite = "The state ceased to be finite."
     unresolved = "An impact could not be located within the step."
     max_steps = (
@@ -289,8 +292,8 @@ class RESULTS(NamedEnumeration):
         "The end of a cycle (an event, or the clock) could not be located within the step."
     )
     turn_unresolved = (
-        "A turning point, or the release of a body from rest, could not be located within the step. "
-        "The `on` of a stop must have the position first, then its velocity."
+        "A turning point, or the release of a body from rest, could not be located within the "
+        "step. The `on` of a stop must have the position first, then its velocity."
     )
     bad_impact = (
         "An impact left faster than it came, or further into its stop: a restitution law must have "

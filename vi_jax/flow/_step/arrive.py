@@ -536,7 +536,10 @@ def _extremes(step: AppliedStep, places: Scalars) -> dict[str, Scalar | None]:
     if clearance is not None:
         for stop in stops_of(plan.machine):
             k = stop.coordinate
-            turns_short = taken & trial.paths[k].at_turn & (lane.direction[k] == stop.sign)
+            path = trial.paths[k]
+            turns_short = taken & path.at_turn & (lane.direction[k] == stop.sign)
+            # Friction reverses the direction where a body turns, so that it may seem to turn twice.
+            turns_short = turns_short & (stop.sign * path.end.a <= 0)
             if lane.contact is not None:
                 turns_short = turns_short & (lane.contact[k] == 0)
             distance = jnp.where(turns_short, -stop.beyond(tops[k]), jnp.inf)
