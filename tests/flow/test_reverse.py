@@ -15,7 +15,7 @@ RESTING = vi.Scene.ideal(frequency_ratio=0.3, restitution=0.3, gap=-0.5, damping
 CASES = {
     "chatter and rest": (RESTING, RESTING.start(Y=-0.6), 6, {"method": vi.FixedStep()}),
     "friction": (vi.machines.Capsule(), vi.machines.Capsule().start(), 4, {}),
-    "a section of its own": (vi.machines.ReliefValve(), vi.machines.ReliefValve().start(), 3, {}),
+    "relief valve": (vi.machines.ReliefValve(), vi.machines.ReliefValve().start(), 3, {}),
 }
 
 
@@ -36,7 +36,7 @@ def weighted_sum(case):
     return function, [jnp.asarray(x, float) for x in leaves]
 
 
-@pytest.mark.parametrize("case", quick(CASES, "a section of its own"))
+@pytest.mark.parametrize("case", quick(CASES, "relief valve"))
 def test_tape_matches_forward_derivatives(case, monkeypatch):
     """The tolerance is 1e-10 of the largest derivative: rounding grows along a motion (measured: at
     most 4e-12). A step lands within 1e-9 of an event, at a place that depends on rounding. After a

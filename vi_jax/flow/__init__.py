@@ -4,12 +4,11 @@
 # ruff: noqa: F401, I001
 # fmt: off
 from ._lane import has_fixed_cycle
-from ._machine_checks import check_parts, depends_on_time
+from ._machine_checks import check_parts, check_values, depends_on_time
 from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
 from ._simulate import compiling, jit, simulate, simulate_pool
 from .arguments import (
-    RunOptions, as_floats, check_leaves, check_reals, check_start,
-    check_values, machine_of, make_plan, shape_of,
+    RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
 from .events import Rates, force_rate, guard_rates
 from .loop import row_sizes, sizes_on_host

@@ -55,8 +55,13 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._lane import Plan
-from ._machine_checks import INNER_INSTANT, check_before_modes, check_parts, explain_errors
-from ._machine_checks import check_values as check_values
+from ._machine_checks import (
+    INNER_INSTANT,
+    check_before_modes,
+    check_parts,
+    check_values,
+    explain_errors,
+)
 from ._quantities import average_names, quantity_names
 from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding_bounds

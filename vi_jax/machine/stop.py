@@ -192,11 +192,9 @@ class RigidStop(Wall, AbstractEvent):
         k = self.coefficient(approach)
         return -k * _unless_tiny(self.sign * approach), k
 
-    def loss(self, approach: Any, coefficient: Any = None) -> Any:
-        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²; `coefficient` is
-        k."""
-        k = self.coefficient(approach) if coefficient is None else coefficient
-        return 0.5 * (1 - k**2) * approach**2
+    def loss(self, approach: Any, coefficient: Any) -> Any:
+        """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²."""
+        return 0.5 * (1 - coefficient**2) * approach**2
 
 
 class AbstractContactLaw(Shown):
