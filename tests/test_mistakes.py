@@ -1,5 +1,6 @@
 """Error messages of ten common mistakes, in the order of the page `docs/faq.md`, and others."""
 
+import dataclasses
 import math
 import warnings
 
@@ -283,6 +284,12 @@ class Spare(Machine):
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (
+            lambda: vi.simulate(
+                dataclasses.replace(SCENE, soft_stops=(vi.SoftStop(1.0, 9.0, mass=2.0),)), None, 1
+            ),
+            "Soft stop 0 of a Scene must have no `mass`",
+        ),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),
         (continue_clocked, "must not have cycles that end at a given time"),

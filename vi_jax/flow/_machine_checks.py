@@ -429,14 +429,11 @@ def check_parts(machine: AbstractMachine) -> None:
     cycle = concrete(machine.cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
-    count, has_own_stops = len(machine.coordinates), isinstance(machine, LinearMachine | Scene)
+    if isinstance(machine, LinearMachine | Scene):
+        _check_ignored("Stop", stops_of(machine), name)
+        _check_ignored("Soft stop", switches_of(machine), name)
+    count = len(machine.coordinates)
     for i, stop in enumerate(stops_of(machine)):
-        ignored = [x for x in ("on", "mass", "friction") if getattr(stop, x) is not None]
-        if has_own_stops and ignored:
-            raise ValueError(
-                f"Stop {i} of a {name} must have no `{ignored[0]}`. Write a `vi.Mechanical` for a "
-                "machine whose stops have one."
-            )
         for part in ("gap", "restitution"):
             shape = () if callable(getattr(stop, part)) else jnp.shape(getattr(stop, part))
             if shape:
@@ -455,6 +452,16 @@ def check_parts(machine: AbstractMachine) -> None:
                 "(`vi.machines.Structure`) takes; other machines name what stops limit in "
                 "`coordinates`, and stops its number in `coordinate`."
             )
+
+
+def _check_ignored(what: str, parts: Sequence[Any], name: str) -> None:
+    for i, part in enumerate(parts):
+        for given in ("on", "mass", "friction"):
+            if getattr(part, given, None) is not None:
+                raise ValueError(
+                    f"{what} {i} of a {name} must have no `{given}`. Write a `vi.Mechanical` for a "
+                    "machine whose stops have one."
+                )
 
 
 def _check_names(machine: AbstractMachine) -> None:
