@@ -52,7 +52,7 @@ def basins(region=REGION, **options):
 
 
 def built(**parts):
-    usual = {"oscillator": vi.Oscillator(0.1), "drive": vi.IdealDrive(0.9)}
+    usual = {"damping_ratio": 0.1, "drive": vi.IdealDrive(0.9)}
     return lambda: vi.Scene(**{**usual, **parts})
 
 
@@ -100,7 +100,6 @@ CALLS = {
     "a region of texts": (basins({"start.Y": ("0", "1")}), ROW),
     "crank='cosine'": (lambda: vi.Scene.ideal(frequency_ratio=0.9, crank="cosine"),
                        "`crank` must be a `CosineCrank()`"),
-    "oscillator=0.1": (built(oscillator=0.1), "`oscillator` must be an `Oscillator`"),
     "one stop": (built(stops=vi.RigidStop(1.0, 0.5)), "`stops` must be a tuple"),
     **{f"frequency_ratio={x!r}": (
         lambda x=x: vi.Scene.ideal(frequency_ratio=x), "Argument `frequency_ratio` must be") for x

@@ -61,7 +61,7 @@ def test_a_law_may_close_over_a_differentiated_number():
 
     def speed(k):
         stop = vi.RigidStop(0.4, lambda approach: k + 0 * approach)
-        scene = vi.Scene(oscillator=vi.Oscillator(0.1), drive=vi.IdealDrive(0.9), stops=(stop,))
+        scene = vi.Scene(damping_ratio=0.1, drive=vi.IdealDrive(0.9), stops=(stop,))
         return vi.simulate(scene, scene.start(), 3, method=vi.ExactFlight()).last.V
 
     slope = (speed(0.6 + 1e-6) - speed(0.6 - 1e-6)) / 2e-6

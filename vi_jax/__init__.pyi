@@ -34,16 +34,12 @@ from .machine import AbstractMachine as AbstractMachine
 from .machine import AbstractSwitch as AbstractSwitch
 from .machine import Coordinate as Coordinate
 from .machine import CosineCrank as CosineCrank
-from .machine import DCMotor as DCMotor
-from .machine import DCMotorState as DCMotorState
 from .machine import DryFriction as DryFriction
 from .machine import HuntCrossley as HuntCrossley
 from .machine import HybridState as HybridState
 from .machine import IdealDrive as IdealDrive
 from .machine import Mechanical as Mechanical
 from .machine import Motor as Motor
-from .machine import MotorState as MotorState
-from .machine import Oscillator as Oscillator
 from .machine import OscillatorState as OscillatorState
 from .machine import Parameters as Parameters
 from .machine import PowerLaw as PowerLaw
@@ -54,8 +50,6 @@ from .machine import SliderCrank as SliderCrank
 from .machine import SoftStop as SoftStop
 from .machine import State as State
 from .machine import Switch as Switch
-from .machine import TimedDCMotorState as TimedDCMotorState
-from .machine import TimedMotorState as TimedMotorState
 from .machine import falling as falling
 from .machine import rising as rising
 from .machine import turn_of as turn_of

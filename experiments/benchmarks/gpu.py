@@ -67,7 +67,7 @@ def _machine(task: Task, kappa: jax.Array) -> tuple[vi.Scene, Any]:
     motor = vi.Motor(tau0, kappa, eps, mu, jnp.ones_like(kappa))
     drive = motor if task.motor else vi.IdealDrive(kappa)
     stops = (vi.RigidStop(gap, k),)
-    machine = vi.Scene(oscillator=vi.Oscillator(xi), drive=drive, stops=stops)
+    machine = vi.Scene(damping_ratio=xi, drive=drive, stops=stops)
     start = machine.start(W=kappa) if task.motor else machine.start()
     return machine, jax.tree.map(lambda x: jnp.asarray(x, kappa.dtype), start)
 

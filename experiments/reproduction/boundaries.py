@@ -26,7 +26,7 @@ from vi_jax.plot import DASHES, color_of, paler
 from .motions import FREQUENCY_RATIO, RESTITUTION, table_damping_ratio
 from .response import MAX_STEP, RANGE, RATIO
 
-K, XI = "stops.0.restitution", "oscillator.damping_ratio"
+K, XI = "stops.0.restitution", "damping_ratio"
 # At k = 1 without damping the motions are no longer isolated, and the curves end there.
 K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 

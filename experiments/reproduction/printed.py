@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from vi_jax.flow import Adaptive, simulate
-from vi_jax.machine import AbstractMachine, RigidStop, TimedMotorState
+from vi_jax.machine import AbstractMachine, RigidStop, State
 
 
 class CoastingMachine(AbstractMachine):
@@ -30,14 +30,14 @@ class CoastingMachine(AbstractMachine):
         """The body's natural period, 2π in time τ."""
         return 2 * pi
 
-    def field(self, s: Float[Array, ""], state: TimedMotorState) -> TimedMotorState:
+    def field(self, s: Float[Array, ""], state: State) -> dict[str, Any]:
         """Return d(state)/dτ of the state (Y, V, W, φ)."""
         sine, cosine = jnp.sin(state.phase), jnp.cos(state.phase)
         right = self.slider_inertia * sine * cosine
         factor = jnp.where(self.printed_inertia > 0, -self.printed_inertia * cosine, right)
         torque = -self.coupling * sine * (state.Y - cosine) - factor * state.W**2
         inertia = 1 + self.slider_inertia * sine**2
-        return TimedMotorState(state.V, cosine - state.Y, torque / inertia, state.W)
+        return {"Y": state.V, "V": cosine - state.Y, "W": torque / inertia, "phase": state.W}
 
 
 def energy(state: Any, *, coupling: float, slider_inertia: float) -> np.ndarray:
@@ -63,7 +63,7 @@ def energy_drift(
         slider_inertia=jnp.asarray(slider_inertia, float),
         printed_inertia=jnp.asarray(printed_inertia, float),
     )
-    start = TimedMotorState(*(jnp.asarray(x, float) for x in (0.0, 0.0, 0.9, 0.0)))
+    start = State(Y=0.0, V=0.0, W=0.9, phase=0.0)
     run = simulate(
         machine, start, 20, method=Adaptive(rtol=1e-12), samples=16, throw=True,
         record="sections",

@@ -19,7 +19,7 @@ RESTITUTIONS = (0.8, 0.5)
 RANGE = (0.5, 1.9)
 # The longest step along its branches, in the units of `continue_orbit`: a choice.
 MAX_STEP = 0.2
-RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.restitution"
+RATIO, DAMPING, BOUNCE = "drive.frequency_ratio", "damping_ratio", "stops.0.restitution"
 
 # The paper draws a second stop below without a number. At this value the 2π motion does not reach
 # it, and most of the motions that the sweeps reach do.

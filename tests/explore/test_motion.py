@@ -52,7 +52,7 @@ def check_picture(svg, motion):
 
 
 def seen(subject, settle=1000, **numbers):
-    names = {"zeta": ZETA, "gap": GAP, "xi": "oscillator.damping_ratio", "Y": "start.Y"}
+    names = {"zeta": ZETA, "gap": GAP, "xi": "damping_ratio", "Y": "start.Y"}
     values = subject.first_values() | {names.get(name, name): x for name, x in numbers.items()}
     return look(*subject.at(values), settle)
 

@@ -32,7 +32,7 @@ class Driven(vi.Scene):
 
 def averaged_scene(gap):
     stop = vi.RigidStop(gap, 0.5)
-    return AveragedScene(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.7), stops=(stop,))
+    return AveragedScene(damping_ratio=0.05, drive=vi.IdealDrive(0.7), stops=(stop,))
 
 
 def begin(gap=0.5):
@@ -71,7 +71,7 @@ def test_energy_is_balanced_with_exact_flight(gap):
 def test_mean_speed_of_a_motor_is_one_turn_in_a_cycle():
     ready = vi.Parameters(torque=10.0, restitution=0.5, gap=0.05, control=1.2).scene()
     scene = Driven(
-        oscillator=ready.oscillator, drive=ready.drive, stops=ready.stops, crank=ready.crank
+        damping_ratio=ready.damping_ratio, drive=ready.drive, stops=ready.stops, crank=ready.crank
     )
     run = vi.simulate(scene, scene.start(), 8)
     assert int(run.impacts.sum()) > 5

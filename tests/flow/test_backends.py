@@ -11,13 +11,12 @@ from vi_jax.machine.base import AbstractMachine
 
 from differences import quick
 
-IDEAL = vi.Oscillator(0.05)
 ONE = (vi.RigidStop(1.3, 0.6),)
 PRESSED = (vi.RigidStop(0.3, 0.4),)
 
 
 def ideal(ratio, stops=ONE):
-    return vi.Scene(oscillator=IDEAL, drive=vi.IdealDrive(ratio), stops=stops)
+    return vi.Scene(damping_ratio=0.05, drive=vi.IdealDrive(ratio), stops=stops)
 
 
 def motor(kappa):

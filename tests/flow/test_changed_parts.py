@@ -48,7 +48,7 @@ class Hooked(vi.SoftStop):
 
 def scene(kind=vi.Scene, drive=vi.IdealDrive, crank=vi.CosineCrank, gap=1.2, soft=()):
     stop = vi.RigidStop(gap, 0.5)
-    return kind(vi.Oscillator(0.1), drive(0.9), (stop,), crank(), soft_stops=soft)
+    return kind(0.1, drive(0.9), (stop,), crank(), soft_stops=soft)
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,7 @@ def test_presets_keep_their_promise_from_slow_to_fast_drives():
 
     def last(kappa, method):
         motor = vi.Motor(0.65, kappa, 0.0093, 0.0053)
-        scene = vi.Scene(
-            oscillator=vi.Oscillator(0.045), drive=motor, stops=[vi.RigidStop(2.0, 0.8)]
-        )
+        scene = vi.Scene(damping_ratio=0.045, drive=motor, stops=[vi.RigidStop(2.0, 0.8)])
         return jnp.stack(jax.tree_util.tree_leaves(vi.simulate(scene, scene.start(), 30,
                                                                method=method).last))  # fmt: skip
 
@@ -91,7 +89,7 @@ def test_invalid_calibrations_raise():
         )(0.9)  # fmt: skip
     # The crank stops in every lane.
     drive = vi.Motor(0.0, 0.0, 1.0, 0.005)
-    weak = vi.Scene(oscillator=vi.Oscillator(0.0), drive=drive, stops=[vi.RigidStop(2.0, 0.5)])
+    weak = vi.Scene(damping_ratio=0.0, drive=drive, stops=[vi.RigidStop(2.0, 0.5)])
     with pytest.raises(ValueError, match="4 of 4 lanes of the calibration failed"):
         vi.suggest_method(weak, start=weak.start(Y=-1.0, W=0.05), lanes=4, cycles=3)
 

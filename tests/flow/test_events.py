@@ -12,7 +12,7 @@ NAMES = ["ExactFlight", "Adaptive", "FixedStep"]
 
 
 def scene_with(*stops, zeta=0.8, xi=0.05):
-    return vi.Scene(oscillator=vi.Oscillator(xi), drive=vi.IdealDrive(zeta), stops=stops)
+    return vi.Scene(damping_ratio=xi, drive=vi.IdealDrive(zeta), stops=stops)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)

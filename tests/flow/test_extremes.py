@@ -108,7 +108,7 @@ def test_error_is_at_most_ten_tolerances():
 def test_strong_motor_approaches_the_ideal_drive():
     """The difference falls as 1/τ0. The strongest motor needs more steps than allowed."""
     method = vi.Adaptive(rtol=1e-11)
-    stops, oscillator = (vi.RigidStop(2.0, 0.5),), vi.Oscillator(0.05)
+    stops, oscillator = (vi.RigidStop(2.0, 0.5),), 0.05
     still = vi.Scene(oscillator, vi.IdealDrive(0.9), stops)
     limit = vi.simulate(still, still.start(), 3).last
 
@@ -129,7 +129,7 @@ def test_strong_motor_approaches_the_ideal_drive():
 def test_narrow_gap_between_stops(method):
     """Two stops are 1e-6 apart, and the body rests twice in each cycle."""
     stops = vi.RigidStop(0.3, 0.5), vi.RigidStop(-0.3 + 1e-6, 0.5, "left")
-    scene = vi.Scene(vi.Oscillator(0.05), vi.IdealDrive(0.5), stops=stops)
+    scene = vi.Scene(0.05, vi.IdealDrive(0.5), stops=stops)
     run = vi.simulate(scene, scene.start(Y=0.3 - 5e-7), 4, settle=4, method=method)
     assert bool(run.successful) and bool((run.rests == 2).all())
     assert float(jnp.maximum(run.y_max - 0.3, 0.3 - 1e-6 - run.y_min).max()) < 1e-12

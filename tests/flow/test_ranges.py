@@ -13,7 +13,7 @@ from vi_jax.flow.results import code as code_of
 
 CYCLES = 3
 BASE = vi.Scene(
-    oscillator=vi.Oscillator(0.05),
+    damping_ratio=0.05,
     drive=vi.Motor(0.6, 0.9, 0.01, 0.005),
     stops=[vi.RigidStop(2.0, 0.5), vi.RigidStop(2.5, 0.5, "left")],
     crank=vi.SliderCrank(1 / 3),
@@ -22,7 +22,7 @@ BASE = vi.Scene(
 PLACES = {
     "restitution": lambda s: s.stops[0].restitution,
     "left restitution": lambda s: s.stops[1].restitution,
-    "damping_ratio": lambda s: s.oscillator.damping_ratio,
+    "damping_ratio": lambda s: s.damping_ratio,
     "ratio": lambda s: s.crank.ratio,
     "strength": lambda s: s.drive.strength,
     "coupling": lambda s: s.drive.coupling,

@@ -118,7 +118,7 @@ def test_second_derivatives_pass_through_rest_and_release():
     def run(shift):
         k, gap, control, coupling, xi, Y, V = numbers + shift * direction
         drive = vi.Motor(0.6, control, coupling, 0.1)
-        machine = vi.Scene(vi.Oscillator(xi), drive, stops=(vi.RigidStop(gap, k),))
+        machine = vi.Scene(xi, drive, stops=(vi.RigidStop(gap, k),))
         method = vi.FixedStep(steps_per_cycle=40)
         return vi.simulate(machine, machine.start(Y=Y, V=V, W=0.7), 2, method=method)
 

@@ -88,7 +88,7 @@ def test_derivatives_of_all_that_is_recorded(kind, clock, method):
         drive = vi.Motor(0.6, speed, 0.1, 0.05) if kind == "motor" else vi.IdealDrive(speed)
         stops = (vi.RigidStop(gap, k), vi.RigidStop(1.3 + gap, 0.5 * k, side="left"))
         scene = vi.Scene(
-            oscillator=vi.Oscillator(xi), drive=drive, stops=stops, clock_name=clock,
+            damping_ratio=xi, drive=drive, stops=stops, clock_name=clock,
             section_phase=section,
         )  # fmt: skip
         start = scene.start(V=V, W=speed) if kind == "motor" else scene.start(V=V)

@@ -12,7 +12,7 @@ from vi_jax.machine.numbers import by_name, unit_of
 M = vi.machines
 MACHINES = [
     vi.Scene.ideal(frequency_ratio=0.9, gap=1.25, damping_ratio=0.0625),
-    vi.Parameters(electrical_time=0.01).scene(crank="slider"),
+    vi.Parameters().scene(crank="slider"),
     M.UnbalancedRotor(gap=1.0), M.Woodpecker(), vi.SoftStop(1.5, stiffness=30.0), vi.Parameters(),
 ]  # fmt: skip
 SCENE = MACHINES[0]

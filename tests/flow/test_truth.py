@@ -144,7 +144,7 @@ def machine(drive, clock, stops):
         turning = vi.Motor(MOTOR["tau0"], MOTOR["kappa"], MOTOR["eps"], MOTOR["mu"])
     walls = [vi.RigidStop(gap, k, "right" if sign > 0 else "left") for sign, gap, k in stops]
     return vi.Scene(
-        oscillator=vi.Oscillator(0.05), drive=turning, stops=walls, clock_name=clock
+        damping_ratio=0.05, drive=turning, stops=walls, clock_name=clock
     )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pint
 import pytest
 import vi_jax as vi
 
@@ -61,13 +60,13 @@ def test_slider_crank_kinematics(ratio):
         (lambda: vi.Scene.ideal(frequency_ratio=0.9).start(W=1.0), r"`W` must be left out"),
         (
             lambda: vi.Scene(
-                oscillator=vi.Oscillator(), drive=vi.IdealDrive(1.0), stops=[vi.RigidStop(1, 1)] * 2
+                damping_ratio=0.0, drive=vi.IdealDrive(1.0), stops=[vi.RigidStop(1, 1)] * 2
             ),
             r"`stops` must hold at most one stop on each side.*'right', 'right'",
         ),
         (
             lambda: vi.Scene(
-                oscillator=vi.Oscillator(), drive=vi.IdealDrive(1.0),
+                damping_ratio=0.0, drive=vi.IdealDrive(1.0),
                 stops=(vi.RigidStop(1, 1), vi.RigidStop(-1.5, 1, "left")),
             ),
             r"`stops` must leave room.*-0.5",
@@ -83,23 +82,3 @@ def test_errors_name_argument_requirement_and_value(make, message):
 def test_values_that_are_not_real_numbers_raise(value):
     with pytest.raises(TypeError, match=r"`frequency_ratio` must be a real number, but"):
         vi.IdealDrive(value)
-
-
-def test_parameters_take_quantities_with_units():
-    unit = pint.UnitRegistry()
-    given = vi.Parameters(
-        body_mass=350 * unit.gram,
-        gap=8 * unit.cm,
-        torque=np.array([1.0, 2.0]) * unit("kN*cm"),
-        no_load_speed=60 * unit.rpm,
-        restitution=0.5 * unit.dimensionless,
-    )
-    plain = vi.Parameters(
-        body_mass=0.35, gap=0.08, torque=np.array([10.0, 20.0]), no_load_speed=2 * np.pi
-    )
-    for a, b in zip(jax.tree.leaves(given), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-14)
-    with pytest.raises(ValueError, match=r"`gap` must be in m, .* but got 8 gram"):
-        vi.Parameters(gap=8 * unit.gram)
-    with pytest.raises(ValueError, match="`restitution` must be in no unit"):
-        vi.Parameters(restitution=0.5 * unit.m)

@@ -138,7 +138,7 @@ def test_restitution_of_hunt_and_crossley_falls_with_the_speed():
 def scene_of(stiffness, **options):
     options = {"restitution": 0.5, "exponent": 1.0, **options}
     return vi.Scene(
-        oscillator=vi.Oscillator(0.0),
+        damping_ratio=0.0,
         drive=vi.IdealDrive(0.9),
         soft_stops=(vi.SoftStop(0.7, stiffness, **options),),
     )
@@ -146,9 +146,7 @@ def scene_of(stiffness, **options):
 
 def test_stiff_stop_approaches_a_rigid_one():
     """The time in contact falls as K^-½, and so does the difference between the motions."""
-    rigid = vi.Scene(
-        oscillator=vi.Oscillator(0.0), drive=vi.IdealDrive(0.9), stops=(vi.RigidStop(0.7, 0.5),)
-    )
+    rigid = vi.Scene(damping_ratio=0.0, drive=vi.IdealDrive(0.9), stops=(vi.RigidStop(0.7, 0.5),))
     start = rigid.start(Y=0.2, V=0.3)
     limit = vi.simulate(rigid, start, 1, method="reference")
     assert int(limit.impacts[0]) >= 1
@@ -203,9 +201,9 @@ def test_wrong_arguments_raise_with_their_names(arguments, told):
 
 def test_scene_raises_for_stops_of_the_wrong_kind():
     with pytest.raises(TypeError, match="`soft_stops`"):
-        vi.Scene(vi.Oscillator(), vi.IdealDrive(1.0), soft_stops=(vi.RigidStop(1.0, 0.5),))
+        vi.Scene(0.0, vi.IdealDrive(1.0), soft_stops=(vi.RigidStop(1.0, 0.5),))
     with pytest.raises(TypeError, match="`stops`"):
-        vi.Scene(vi.Oscillator(), vi.IdealDrive(1.0), stops=(vi.SoftStop(1.0, 10.0),))
+        vi.Scene(0.0, vi.IdealDrive(1.0), stops=(vi.SoftStop(1.0, 10.0),))
     with pytest.raises(ValueError, match="ExactFlight"):
         scene = scene_of(50.0)
         vi.simulate(scene, scene.start(), 1, method=vi.ExactFlight())
@@ -225,7 +223,7 @@ def test_change_of_a_motion_is_a_power_of_the_grazing_depth(prestress, exponent)
     """The power is 3/2 if the force begins at zero (Kundu et al., Physica D 241, 2012), and 1/2 if
     the stop is prestressed."""
     law = {"damping": 0.3, "prestress": prestress}
-    free = vi.Scene(oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.7))
+    free = vi.Scene(damping_ratio=0.05, drive=vi.IdealDrive(0.7))
     start, method = free.start(V=-1.0), vi.Adaptive(rtol=1e-13, atol=1e-15)
     beside = vi.simulate(free, start, 2, method=method)
     top, depth = beside.y_max.max(), jnp.logspace(-7, -5, 9)
@@ -233,7 +231,7 @@ def test_change_of_a_motion_is_a_power_of_the_grazing_depth(prestress, exponent)
     def changed(depth):
         stop = vi.SoftStop(top - depth, 30.0, **law)
         run = vi.simulate(
-            vi.Scene(free.oscillator, free.drive, soft_stops=(stop,)), start, 2, method=method
+            vi.Scene(free.damping_ratio, free.drive, soft_stops=(stop,)), start, 2, method=method
         )
         return jnp.hypot(run.last.Y - beside.last.Y, run.last.V - beside.last.V)
 

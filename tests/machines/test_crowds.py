@@ -15,7 +15,7 @@ LANES, CYCLES = 10_000, 12
 M = vi.machines
 
 # Ranges of random parameters and starts. A rotor with more coupling often stalls.
-PAPER = {"oscillator.damping_ratio": (0.0, 0.5), "stops.0.gap": (-1.0, 3.0),
+PAPER = {"damping_ratio": (0.0, 0.5), "stops.0.gap": (-1.0, 3.0),
          "stops.0.restitution": (0.0, 1.0)}  # fmt: skip
 BELOW = {"Y": (-3.0, -1.0), "V": (-3.0, 3.0)}
 KINDS = {

@@ -164,7 +164,7 @@ def test_branches_do_not_depend_on_where_they_begin(short):
 
 @pytest.mark.slow
 def test_boundaries_in_a_second_parameter(short, tmp_path):
-    doubling, xi = first_of(short, "period-doubling"), "oscillator.damping_ratio"
+    doubling, xi = first_of(short, "period-doubling"), "damping_ratio"
     curve = vi.boundary(doubling, parameter=xi, bounds=((0.5, 1.2), (0.0, 0.1)))
     scenes = lambda z, xi: vi.Scene.ideal(frequency_ratio=z, damping_ratio=xi)
     closed = jax.jit(jax.vmap(lambda *x: vi.closed_form_orbits(scenes(*x)).multipliers[0]))

@@ -60,7 +60,7 @@ def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
     and a false torus. Compare the grazing and the fold with SciPy, which integrates in time. A
     branch with too few steps gives a warning."""
     scene = vi.Scene(
-        oscillator=vi.Oscillator(0.02),
+        damping_ratio=0.02,
         drive=vi.Motor(strength=0.08, control=0.9, coupling=0.35, slider_inertia=0.02),
         stops=(vi.RigidStop(1.0, 0.8),),
     )

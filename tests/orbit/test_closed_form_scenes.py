@@ -11,12 +11,12 @@ from closed_forms import ideal
 
 def driven_by_a_motor():
     motor = vi.Motor(strength=1.0, control=1.0, coupling=0.01, slider_inertia=0.01)
-    return vi.Scene(vi.Oscillator(0.0), motor, (vi.RigidStop(2.0, 0.5),))
+    return vi.Scene(0.0, motor, (vi.RigidStop(2.0, 0.5),))
 
 
 def stopped_on_the_left():
     stop = vi.RigidStop(2.0, 0.5, side="left")
-    return vi.Scene(vi.Oscillator(0.0), vi.IdealDrive(0.9), (stop,))
+    return vi.Scene(0.0, vi.IdealDrive(0.9), (stop,))
 
 
 class Doubled(vi.CosineCrank):
@@ -36,7 +36,7 @@ class Hardening(vi.Scene):
 
 def scene_of(kind=vi.Scene, crank=None, stop=None):
     crank, stop = crank or vi.CosineCrank(), stop or vi.RigidStop(1.5, 0.9)
-    return kind(vi.Oscillator(0.05), vi.IdealDrive(0.9), (stop,), crank)
+    return kind(0.05, vi.IdealDrive(0.9), (stop,), crank)
 
 
 def falling(approach):

@@ -12,7 +12,7 @@ from vi_jax.orbit import Orbits, _conditions
 from vi_jax.orbit._shooting import Observed
 from vi_jax.orbit.results import compound
 
-ZETA, XI, GAP = "drive.frequency_ratio", "oscillator.damping_ratio", "stops.0.gap"
+ZETA, XI, GAP = "drive.frequency_ratio", "damping_ratio", "stops.0.gap"
 
 
 @pytest.fixture(scope="module")

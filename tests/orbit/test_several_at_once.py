@@ -204,7 +204,7 @@ def test_a_fold_and_a_branch_point_in_one_step():
 def test_a_curve_of_touches_ends_where_the_other_stop_is_touched():
     """The amplitude of the linear oscillator equals the other gap at the end."""
     stops = vi.RigidStop(9.0, 0.5), vi.RigidStop(10.0, 0.5, "left")
-    scene = vi.Scene(oscillator=vi.Oscillator(0.005), drive=vi.IdealDrive(0.9), stops=stops)
+    scene = vi.Scene(damping_ratio=0.005, drive=vi.IdealDrive(0.9), stops=stops)
     orbit = vi.find_orbit(scene, scene.start(Y=5.2, V=0.2), throw=True)
     branch = vi.continue_orbit(orbit, parameter="stops.0.gap", bounds=(3.0, 9.5))
     (touch,) = branch.special

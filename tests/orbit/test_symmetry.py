@@ -70,7 +70,7 @@ def test_a_scene_between_equal_stops_loses_its_symmetry(whole):
 def test_a_curve_of_symmetry_breaking_of_a_scene(whole):
     """Each motion has a multiplier 1. Simulations of both ends are symmetric."""
     curve = vi.boundary(
-        whole.special[1], parameter="oscillator.damping_ratio", bounds=((0.3, 2.5), (0.0, 0.1))
+        whole.special[1], parameter="damping_ratio", bounds=((0.3, 2.5), (0.0, 0.1))
     )  # fmt: skip
     assert len(np.unique(curve.parameters, axis=0)) == len(curve.parameters) > 8
     assert (curve.parameters[[0, -1], 1] == 0).all()

@@ -20,7 +20,7 @@ MACHINES = {
     "ideal": vi.Scene.ideal(frequency_ratio=0.9, damping_ratio=0.05), "pair": M.ImpactPair(),
     "motor": vi.Parameters().scene(crank="slider"),
     "soft stop": vi.Scene(
-        oscillator=vi.Oscillator(0.05), drive=vi.IdealDrive(0.9),
+        damping_ratio=0.05, drive=vi.IdealDrive(0.9),
         soft_stops=(vi.SoftStop(1.2, 50.0, restitution=0.5),),
     ),
 }  # fmt: skip

@@ -47,7 +47,7 @@ def test_path_holds_the_samples_and_the_impacts(scene, run):
 
 def test_stop_on_the_left():
     left = vi.Scene(
-        oscillator=vi.Oscillator(0.01),
+        damping_ratio=0.01,
         drive=vi.IdealDrive(0.9),
         stops=(vi.RigidStop(1.0, 0.7, side="left"),),
     )

@@ -18,7 +18,7 @@ def _regimes_of(lanes, settle):
     axes = {
         "drive.frequency_ratio": zeta,
         "stops.0.restitution": k,
-        "oscillator.damping_ratio": xi,
+        "damping_ratio": xi,
     }
     return vi.scan(SCENE, axes, measure="regime", settle=settle, paired=True)
 

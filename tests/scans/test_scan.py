@@ -73,7 +73,7 @@ def test_blocks_do_not_change_results(data):
 def test_paired_lanes_are_checked_one_by_one():
     """The smallest gap on one side is paired with a large one on the other."""
     scene = vi.Scene(
-        oscillator=vi.Oscillator(0.05),
+        damping_ratio=0.05,
         drive=vi.IdealDrive(0.9),
         stops=(vi.RigidStop(2.0, 0.5), vi.RigidStop(2.0, 0.5, side="left")),
     )

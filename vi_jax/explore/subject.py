@@ -336,7 +336,7 @@ class Subject:
 
 
 # Ranges of the sliders of the paper's scene with either drive, and with one of them.
-_SCENE = {"stops.0.gap": (0.0, 5.0), "oscillator.damping_ratio": (0.0, 0.2),
+_SCENE = {"stops.0.gap": (0.0, 5.0), "damping_ratio": (0.0, 0.2),
           "start.Y": (-5.0, 5.0), "start.V": (-5.0, 5.0)}  # fmt: skip
 _IDEAL = {"drive.frequency_ratio": (0.3, 2.5), **_SCENE}
 _MOTOR = {"drive.control": (0.3, 2.5), "start.W": (0.1, 2.5), **_SCENE}

@@ -27,8 +27,7 @@ from .declared import (
     switches_of, with_earlier_clock,
 )
 from .drives import (
-    AbstractCrank, AbstractDrive, CosineCrank, DCMotor, DCMotorState, IdealDrive, Motor,
-    MotorState, OscillatorState, SliderCrank, TimedDCMotorState, TimedMotorState,
+    AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, SliderCrank,
 )
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
@@ -46,6 +45,6 @@ from .numbers import (
     name_in, number_in_words, plain, quantity_of, size_of, state_in_words, stated, unit_of,
     units_of, with_leaf, with_leaves, with_unit, with_units,
 )
-from .scene import Oscillator, Parameters, Scene
+from .scene import Parameters, Scene
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop

@@ -1,8 +1,7 @@
 """Cranks, drives of unlimited and of limited power, and states of the paper's scene."""
 
 import abc
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,18 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, number, real, require, require_ranges
-from .._types import Scalar, State
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, real, require_ranges
+from .._types import State
 from ..lanes import sincos
-from .declared import overridden
 from .numbers import Shown
 
 # The units of the paper's scene, by the names of quantities, components and parameters.
 UNITS: Mapping[str, str] = MappingProxyType({
     "position": "a", "velocity": "a ω", "time": "1/ω", "rate": "ω", "energy": "m_C a² ω²",
-    "power": "m_C a² ω³", "Y": "a", "V": "a ω", "W": "ω", "M": "J ω²", "phase": "rad",
-    "gap": "a", "frequency_ratio": "ω", "no_load_speed": "ω", "electrical_time": "1/ω",
-    "section_phase": "rad", "": "1",
+    "power": "m_C a² ω³", "Y": "a", "V": "a ω", "W": "ω", "phase": "rad", "gap": "a",
+    "frequency_ratio": "ω", "no_load_speed": "ω", "section_phase": "rad", "": "1",
 })  # fmt: skip
 
 Number = Float[Array, "..."]
@@ -36,35 +33,6 @@ class OscillatorState(Shown):
     """dY/dτ (unit: a ω)."""
 
 
-class MotorState(OscillatorState):
-    """State of a motor scene whose independent variable is the crank angle."""
-
-    units: ClassVar = UNITS
-    W: Number
-    """Speed of the crank dφ/dτ (unit: ω)."""
-
-
-class TimedMotorState(MotorState):
-    """State of a motor scene whose independent variable is time."""
-
-    phase: Number
-    """Crank angle since the last section (radians)."""
-
-
-class DCMotorState(MotorState):
-    """State of a scene with a `DCMotor` whose independent variable is the crank angle."""
-
-    M: Number
-    """Torque of the motor, which its armature current gives (unit: J ω²)."""
-
-
-class TimedDCMotorState(DCMotorState):
-    """State of a scene with a `DCMotor` whose independent variable is time."""
-
-    phase: Number
-    """Crank angle since the last section (radians)."""
-
-
 class Slide(NamedTuple):
     """The slider's displacement U, dU/dφ and d²U/dφ², with the crank angle φ (unit: a)."""
 
@@ -76,16 +44,6 @@ class Slide(NamedTuple):
 class AbstractCrank(Shown):
     """The kinematics of a crank; a subclass defines one method, `slide(phase)`."""
 
-    @property
-    def is_odd(self) -> bool:
-        """True if the slider is at the opposite place half a turn later: U(φ + π) = -U(φ)."""
-        return False
-
-    @property
-    def drawn_rod(self) -> Scalar | float:
-        """The length of the rod in pictures (unit: a)."""
-        return 3.0
-
     @abc.abstractmethod
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Return the slider's displacement at crank angle `phase` (radians), in crank radii."""
@@ -93,10 +51,6 @@ class AbstractCrank(Shown):
 
 class CosineCrank(AbstractCrank):
     """The first approximation of the paper (Eq. 4): U = cos φ."""
-
-    @property
-    def is_odd(self):
-        return overridden(self, CosineCrank, "slide") is None
 
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Return U = cos φ and its derivatives (dimensionless)."""
@@ -114,10 +68,6 @@ class SliderCrank(AbstractCrank):
     def __check_init__(self):
         require_ranges(self)
 
-    @property
-    def drawn_rod(self):
-        return 1 / self.ratio
-
     def slide(self, phase: Float[Array, "..."]) -> Slide:
         """Return the exact U and its derivatives (dimensionless)."""
         sine, cosine = sincos(phase)
@@ -129,28 +79,21 @@ class SliderCrank(AbstractCrank):
         return Slide(cosine - lag, -sine - slope, -cosine - bend)
 
 
-# Reasons for the absence of a component, for error messages.
-_WITHOUT = {
-    "W": "an ideal drive turns at its frequency ratio",
-    "M": "only a `DCMotor` has a torque of its own",
-}
-
-
 class AbstractDrive(Shown):
     """The drive of the crank of a `Scene`.
 
-    A subclass defines the equations of body and shaft (`field`) and the class of its states. States
-    have `Y` and `V` of the body, then the components of the drive. The crank speed `W` is one of
-    them, unless `fixed_speed` returns it.
+    A subclass defines the equations of body and shaft (`field`), and its components of a state
+    (`components`). The crank speed `W` is one of them, unless `fixed_speed` returns it.
     """
 
-    state: ClassVar[type]
-    """The class of its states by crank angle."""
-    timed_state: ClassVar[type | None] = None
-    """The class of its states by time, with the crank angle `phase` as last component; `None` if
-    the angle is a function of time."""
     caption: ClassVar[str] = "drive"
     """The label of the crank in pictures."""
+
+    @property
+    def components(self) -> dict[str, Any]:
+        """The drive's components of a state, which follow `Y` and `V` of the body, with their
+        default values in `scene.start`."""
+        return {}
 
     @property
     def fixed_speed(self) -> Float[Array, "..."] | None:
@@ -158,55 +101,15 @@ class AbstractDrive(Shown):
         return None
 
     @abc.abstractmethod
-    def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> State:
-        """Return d(state)/ds by crank angle or, if `scene.clock_name` is `"time"`, by time τ.
-        **Arguments:** `scene`, for its `crank`, `phase_at` and `pull`; `s`; `state`; `pushes`, the
-        accelerations of the body by compliant stops."""
+    def field(self, scene: Any, s: Any, state: State, pushes: Iterable[Any]) -> Any:
+        """Return d(state)/ds, as a state or by name: by crank angle or, if `scene.clock_name` is
+        `"time"`, by time τ. Without a `fixed_speed`, the state in the time clock has the crank
+        angle `phase` as last component. **Arguments:** `scene`, for its `crank`, `phase_at` and
+        `pull`; `s`; `state`; `pushes`, the accelerations of the body by compliant stops."""
 
     def rate(self) -> Float[Array, "..."] | None:
         """Return the fastest decay rate with respect to τ, or `None` if nothing decays."""
         return None
-
-    def usual(self, name: str, known: dict[str, Any]) -> Any:
-        """Return the default of a component in a start; `known` are the components before it."""
-        raise ValueError(
-            f"Argument `{name}` of `start` must be given for a `{type(self).__name__}`, which has "
-            "no `usual` for it."
-        )
-
-    def check(self) -> None:
-        """Raise `TypeError` for a drive without a member that a scene needs."""
-        kind, state = type(self), getattr(self, "state", None)
-        if not isinstance(state, type):
-            raise TypeError(
-                f"Drive `{kind.__name__}` must define `state`, the class of its states."
-            )
-        if self.fixed_speed is None and not isinstance(kind.timed_state, type):
-            raise TypeError(
-                f"Drive `{kind.__name__}` has no `fixed_speed`, so it must define `timed_state`: "
-                "the class of its states by time, with the crank angle `phase` as last component."
-            )
-
-    def begin(self, **given: Any) -> dict[str, Any]:
-        """Return the drive's components of a start, by name. A component that is not given, or
-        `None`, has its `usual` value. **Raises:** `ValueError` if a number is not finite, or not a
-        component of its state."""
-        names = [part.name for part in dataclasses.fields(self.state)][2:]
-        for name, value in given.items():
-            if value is not None and name not in names:
-                known = ["Y", "V", *names]
-                near = [x for x in known if x.lower() == name.lower()]
-                hint = f"it is called `{near[0]}`" if near else f"a state has {', '.join(known)}"
-                reason = _WITHOUT.get(name, hint)
-                raise ValueError(
-                    f"Argument `{name}` must be left out: {reason}, but got {name}={value!r}."
-                )
-        found: dict[str, Any] = {}
-        for name in names:
-            value = given.get(name)
-            found[name] = number(name, self.usual(name, found) if value is None else value)
-            require(name, found[name])
-        return found
 
     def speed(self, state: State) -> Float[Array, "..."]:
         """Return the absolute speed of the crank (unit: ω)."""
@@ -220,7 +123,6 @@ class IdealDrive(AbstractDrive):
     frequency_ratio: Float[Array, "..."] = eqx.field(converter=real("frequency_ratio"))
     """ζ = Ω/ω (dimensionless), positive."""
     ranges: ClassVar = {"frequency_ratio": POSITIVE}
-    state: ClassVar = OscillatorState
     caption: ClassVar = "$\\varphi' = \\Omega$"
 
     def __check_init__(self):
@@ -265,12 +167,15 @@ class Motor(AbstractDrive):
         "slider_inertia": NOT_NEGATIVE,
         "no_load_speed": POSITIVE,
     }
-    state: ClassVar = MotorState
-    timed_state: ClassVar = TimedMotorState
     caption: ClassVar = "motor, $J$"
 
     def __check_init__(self):
         require_ranges(self)
+
+    @property
+    def components(self):
+        """The crank speed `W`, by default the no-load speed κ w0."""
+        return {"W": self.control * self.no_load_speed}
 
     def field(self, scene, s, state, pushes):
         """Return d(state)/ds by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5 to 7)."""
@@ -284,82 +189,19 @@ class Motor(AbstractDrive):
 
         speed, stretch = paced(state.V), paced(slide.U - state.Y)
         pull = scene.pull(stretch, speed, map(paced, pushes))
-        torque, more = self.torque(state, pace, paced)
         square = state.W if by_angle else state.W * state.W
-        shaft = self.shaft(slide, torque, stretch, square)
-        clock = () if by_angle else (state.W,)
-        return type(state)(speed, pull, shaft, *more, *clock)
+        load = self.coupling * stretch + self.slider_inertia * slide.U_phiphi * square
+        inertia = 1 + self.slider_inertia * slide.U_phi**2
+        shaft = (self._torque(state.W, pace) - slide.U_phi * load) / inertia
+        return {"Y": speed, "V": pull, "W": shaft} | ({} if by_angle else {"phase": state.W})
 
-    def torque(
-        self, state: State, pace: Number | None, paced: Callable[[Any], Any]
-    ) -> tuple[Number, tuple[Number, ...]]:
-        """Return the motor's torque (per J ω²), and the rates of the components after W. By crank
-        angle, both are divided by W: by the function `paced`, or with `pace` = 1/W."""
-        return self.line(state.W, pace), ()
-
-    def usual(self, name, known):
-        return self.control * self.no_load_speed
-
-    def rate(self):
-        """Return the rate, with respect to τ, at which the shaft returns to its speed."""
-        return self.strength / self.no_load_speed
-
-    def line(self, W: Number, pace: Number | None = None) -> Number:
-        """Return the motor's steady torque at speed `W`, per J ω²; divided by W if `pace` = 1/W."""
+    def _torque(self, W: Number, pace: Number | None) -> Number:
+        """Return the motor's torque at speed W, per J ω²; divided by W if `pace` = 1/W."""
         slope = 1 / self.no_load_speed
         if pace is None:
             return self.strength * (self.control - W * slope)
         return self.strength * (self.control * pace - slope)
 
-    def shaft(self, slide: Slide, torque: Number, stretch: Number, square: Number) -> Number:
-        """Return dW/dτ from the motor's torque (per J ω²), U - Y and W². It is linear in these
-        three: divided by W they give dW/dφ."""
-        load = self.coupling * stretch + self.slider_inertia * slide.U_phiphi * square
-        return (torque - slide.U_phi * load) / self.inertia(slide)
-
-    def inertia(self, slide: Slide) -> Number:
-        """Return the effective inertia of the shaft, per J."""
-        return 1 + self.slider_inertia * slide.U_phi**2
-
-
-class DCMotor(Motor):
-    """A DC motor with the inductance of its armature, at a constant voltage.
-
-    The armature has L i' + R i + K_e φ' = u and the torque K_t i (primes: d/dt). The state has one
-    more component, the torque M = K_t i/(J ω²), with
-
-        τe dM/dτ = τ0 (κ - W/w0) - M,
-        τe = ω L/R,  κ τ0 = K_t u/(R J ω²),  κ w0 = u/(K_e ω).
-
-    M replaces the steady torque in `Motor`'s equation of the shaft. As τe → 0, the motor becomes a
-    `Motor`, with a difference of first order in τe. The source gives the power κ w0 M, the armature
-    turns M² w0/τ0 into heat, and the shaft gets M W (unit: J ω³). The armature holds the energy τe
-    M² w0/(2 τ0) (unit: J ω²).
-
-    Explicit methods are limited to steps of about τe, so that a small τe is expensive: below 0.05
-    use `Motor`, unless you need the current itself.
-    """
-
-    electrical_time: Float[Array, "..."] = eqx.field(
-        kw_only=True, converter=real("electrical_time")
-    )
-    """τe = ω L/R, the electrical time constant (dimensionless), positive."""
-    ranges: ClassVar = {**Motor.ranges, "electrical_time": POSITIVE}
-    state: ClassVar = DCMotorState
-    timed_state: ClassVar = TimedDCMotorState
-
-    def torque(self, state, pace, paced):
-        return paced(state.M), (paced(self.build_up(state.W, state.M)),)
-
-    def usual(self, name, known):
-        return self.line(known["W"]) if name == "M" else super().usual(name, known)
-
-    def build_up(self, W: Float[Array, "..."], M: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return dM/dτ at this speed and torque."""
-        return (self.line(W) - M) / self.electrical_time
-
-    def rate(self) -> Float[Array, "..."]:
-        """Return the fastest rate of shaft and armature together, with respect to τ: 1/τe of the
-        current or, if that is slow, √(τ0/(w0 τe)) of the oscillation of speed and current."""
-        decay = 1 / self.electrical_time
-        return jnp.maximum(decay, jnp.sqrt(decay * self.strength / self.no_load_speed))
+    def rate(self):
+        """Return the rate, with respect to τ, at which the shaft returns to its speed."""
+        return self.strength / self.no_load_speed

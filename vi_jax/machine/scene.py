@@ -2,7 +2,7 @@
 units, with conversions to a scene and back."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import cos, pi, sin
 from typing import Any, ClassVar
 
@@ -41,38 +41,23 @@ from .drives import (
     AbstractCrank,
     AbstractDrive,
     CosineCrank,
-    DCMotor,
     IdealDrive,
     Motor,
+    OscillatorState,
     SliderCrank,
 )
 from .numbers import Shown
+from .state import State as Named
+from .state import like
 from .stop import RigidStop, SoftStop
 
 # The largest error of a state on the section. In single precision, that of a turn is 5e-7.
 _ON_SECTION = 1e-5
 
 
-def _require_state(name: str, state: object, wanted: type) -> None:
-    if type(state) is wanted:
-        return
-    parts = [x for x in ("last", "state") if type(getattr(state, x, None)) is wanted]
-    hint = f"; take its `{parts[0]}`" if parts else ""
-    raise TypeError(
-        f"Argument `{name}` must be a `{wanted.__name__}` for this machine (use its "
-        f"`start(...)`), but got a `{type(state).__name__}`{hint}."
-    )
-
-
-class Oscillator(Shown):
-    """The body C on its spring, in units of its natural frequency."""
-
-    damping_ratio: Float[Array, "..."] = eqx.field(default=0.0, converter=real("damping_ratio"))
-    """ξ = c/(2 m_C ω) (dimensionless), not negative."""
-    ranges: ClassVar = {"damping_ratio": NOT_NEGATIVE}
-
-    def __check_init__(self):
-        require_ranges(self)
+def _state(components: Mapping[str, Any]) -> State:
+    """Return the state of a scene with these components."""
+    return (OscillatorState if len(components) == 2 else Named)(**components)
 
 
 class Scene(AbstractMachine):
@@ -86,7 +71,8 @@ class Scene(AbstractMachine):
     For an ideal drive both agree up to the factor ζ.
     """
 
-    oscillator: Oscillator
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=real("damping_ratio"))
+    """ξ = c/(2 m_C ω) (dimensionless), not negative."""
     drive: AbstractDrive
     stops: tuple[RigidStop, ...] = eqx.field(
         default=(), converter=lambda x: tuple_of("stops", x, RigidStop)
@@ -102,16 +88,16 @@ class Scene(AbstractMachine):
         default=(), converter=lambda x: tuple_of("soft_stops", x, SoftStop)
     )
     """Compliant stops; the unit of their stiffness is that of the body's own spring."""
-    ranges: ClassVar = {"section_phase": Range(-2 * pi, 2 * pi), "room": POSITIVE}
+    ranges: ClassVar = {
+        "damping_ratio": NOT_NEGATIVE, "section_phase": Range(-2 * pi, 2 * pi), "room": POSITIVE,
+    }  # fmt: skip
     units: ClassVar = UNITS  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
     labels: ClassVar = ("Y = y/a", "V = dY/dτ")  # pyright: ignore
 
     def __check_init__(self):
         one_of("clock_name", self.clock_name, ("phase", "time"))
-        instance_of("oscillator", self.oscillator, Oscillator, "an `Oscillator`")
         instance_of("crank", self.crank, AbstractCrank, "a `CosineCrank()` or another crank")
         instance_of("drive", self.drive, AbstractDrive, "an `IdealDrive` or a `Motor`")
-        self.drive.check()
         if len(self.stops) > 2 or len({stop.side for stop in self.stops}) != len(self.stops):
             raise ValueError(
                 "Argument `stops` must hold at most one stop on each side, but holds "
@@ -144,16 +130,11 @@ class Scene(AbstractMachine):
         """
         stops = () if gap is None else (RigidStop(gap, restitution),)
         return cls(
-            oscillator=Oscillator(damping_ratio),
+            damping_ratio=damping_ratio,
             drive=IdealDrive(frequency_ratio),
             stops=stops,
             crank=CosineCrank() if crank is None else crank,
         )
-
-    @property
-    def damping_ratio(self) -> Float[Array, "..."]:
-        """ξ, the damping ratio of the body on its spring (dimensionless)."""
-        return self.oscillator.damping_ratio
 
     @property
     def cycle(self) -> Scalar | float:
@@ -179,38 +160,35 @@ class Scene(AbstractMachine):
         """Return the crank angle for an angle since the section."""
         return since_section if self.section_phase is None else since_section + self.section_phase
 
-    def start(
-        self,
-        *,
-        Y: Number = 0.0,
-        V: Number = 0.0,
-        W: Number | None = None,
-        M: Number | None = None,
-        **others,
-    ) -> State:
+    def start(self, *, Y: Number = 0.0, V: Number = 0.0, **others: Any) -> State:
         """Return a state on the section.
 
-        `W` belongs to motor scenes and defaults to the motor's no-load speed κ w0. `M` defaults to
-        the steady torque at that speed. A motor that is being switched on has `W=0, M=0`.
-
-        **Arguments:** position `Y` (unit: a), velocity `V` (a ω), crank speed `W` (ω) and the
-        torque `M` of a `DCMotor` (J ω²); `others` are further components of your own drive.
+        **Arguments:** position `Y` (unit: a), velocity `V` (a ω), and in `others` the drive's
+        components: the crank speed `W` (ω) of a motor, by default its no-load speed κ w0 (0 for a
+        motor that is being switched on).
 
         **Raises:** `ValueError` if a number is not finite, or the drive has no such component.
         """
-        Y, V = number("Y", Y), number("V", V)
-        require("Y", Y)
-        require("V", V)
-        drive_part = self.drive.begin(M=M, W=W, **others)
-        return self.convert_start(self.state_type(Y, V, *drive_part.values()))
+        usual = {"Y": 0.0, "V": 0.0} | self.drive.components
+        for name in others:
+            if name not in usual:
+                raise ValueError(
+                    f"Argument `{name}` must be left out: with a {type(self.drive).__name__}, a "
+                    f"state has {', '.join(usual)}."
+                )
+        given = {name: x for name, x in others.items() if x is not None}
+        values = {x: number(x, y) for x, y in (usual | {"Y": Y, "V": V} | given).items()}
+        for name, value in values.items():
+            require(name, value)
+        return self.convert_start(_state(values))
 
     def is_timed(self, state: State) -> bool:
         """Return whether the angle of the shaft is part of the state."""
-        return type(state) is self.timed_type
+        return hasattr(state, "phase")
 
     def is_paced(self, state: State) -> bool:
         """Return whether the angle is the independent variable, and dτ/dφ depends on the state."""
-        return self.timed_type is not None and type(state) is self.state_type
+        return self.drive.fixed_speed is None and not self.is_timed(state)
 
     def in_clock(self, clock: str) -> Any:
         """Return the same machine in the `"phase"` or the `"time"` clock."""
@@ -219,28 +197,40 @@ class Scene(AbstractMachine):
 
     def convert_start(self, start: State) -> State:
         """Return a start made for either clock in the form of this machine's clock."""
-        wanted = self.state_type
-        if self.clock_name == "time" and self.timed_type is not None:
-            if type(start) is wanted:
-                return self.timed_type(*vars(start).values(), jnp.zeros_like(start.Y))
-            wanted = self.timed_type
-        _require_state("start", start, wanted)
-        return state_of_numbers("start", start)
+        timed = self.clock_name == "time" and self.drive.fixed_speed is None
+        parts = self._components("start", start, timed=timed)
+        if timed and "phase" not in parts:
+            parts["phase"] = jnp.zeros_like(parts["Y"])
+        return state_of_numbers("start", _state(parts))
 
     def in_cycle_state(self, name: str, state: State) -> State:
         """Return a section state without the shaft's angle, if it is of the time clock. **Raises:**
         `ValueError` with the argument's name if the angle is known and not 0, `TypeError` for
         another object than a state of this machine."""
-        if not self.is_timed(state):
-            _require_state(name, state, self.state_type)
-            return state
-        phase = concrete(state.phase)
+        parts = self._components(name, state, timed=True)
+        phase = concrete(parts.pop("phase", 0.0))
         if phase is not None and not (abs(phase) <= _ON_SECTION).all():
             raise ValueError(
                 f"Argument `{name}` must lie on the section, where its phase is 0, but has "
                 f"{abs(phase).max():g}."
             )
-        return self.state_type(*list(vars(state).values())[:-1])
+        return _state(parts)
+
+    def _components(self, name: str, state: object, *, timed: bool) -> dict[str, Any]:
+        """Return the components of a state by name, of a `timed` one also with the shaft's angle.
+        **Raises:** `TypeError` for another object."""
+        names = ["Y", "V", *self.drive.components]
+        kinds, found = (Named, OscillatorState), getattr(state, "__dict__", {})
+        names += ["phase"] * (timed and "phase" in found)
+        if isinstance(state, kinds) and set(found) == set(names):
+            return {x: found[x] for x in names}
+        parts = [x for x in ("last", "state") if isinstance(getattr(state, x, None), kinds)]
+        hint = f"; take its `{parts[0]}`" if parts else ""
+        has = f" of {', '.join(found)}" if isinstance(state, kinds) else ""
+        raise TypeError(
+            f"Argument `{name}` must be a state of {', '.join(names)} for this machine (use its "
+            f"`start(...)`), but got a `{type(state).__name__}`{has}{hint}."
+        )
 
     def _clock(self, state: State) -> Scalar | None:
         return state.phase if self.is_timed(state) else None
@@ -272,17 +262,6 @@ class Scene(AbstractMachine):
                 )
 
     @property
-    def state_type(self) -> type:
-        """The class of a state in the phase clock, that of the drive."""
-        return self.drive.state
-
-    @property
-    def timed_type(self) -> type | None:
-        """The class of a state in the time clock, with `phase` as last component; `None` if the
-        speed of the shaft is not part of the state."""
-        return self.drive.timed_state
-
-    @property
     def _stops(self) -> tuple[RigidStop, ...]:
         return self.stops
 
@@ -292,7 +271,8 @@ class Scene(AbstractMachine):
 
     def field(self, s: Scalar, state: State, *modes: Scalar) -> State:
         """Return d(state)/ds by crank angle (Eq. 8 to 9 of the paper) or by time τ (Eq. 5 to 7)."""
-        return self.drive.field(self, s, state, self._pushes(s, state, modes))
+        rates = self.drive.field(self, s, state, self._pushes(s, state, modes))
+        return like(state, rates, f"`field` of a {type(self.drive).__name__}")
 
     def pull(self, stretch: Any, speed: Number, pushes: Iterable[Any]) -> Any:
         """Return d²Y/dτ² from U - Y, V and the accelerations by compliant stops. With all three
@@ -333,7 +313,7 @@ class Scene(AbstractMachine):
 
     def relaxation(self, s: Scalar, state: State) -> Scalar:
         """Return the shortest decay time: 1/2ξ of the body, or that of the drive: the time w0/τ0 in
-        which a motor returns to its speed, or in which the current of a `DCMotor` settles."""
+        which a motor returns to its speed."""
         rate, drive_rate = 2 * self.damping_ratio, self.drive.rate()
         if drive_rate is not None:
             rate = jnp.maximum(rate, drive_rate)
@@ -345,8 +325,8 @@ class Scene(AbstractMachine):
         for stops in (self.stops, self.soft_stops):
             if not all(any(stop.mirrors(other) for other in stops) for stop in stops):
                 return None
-        if not self.crank.is_odd:
-            return None
+        if not isinstance(self.crank, CosineCrank) or overridden(self.crank, CosineCrank, "slide"):
+            return None  # U(φ + π) is not -U(φ)
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     def may_rest(self) -> bool:
@@ -387,7 +367,7 @@ class Scene(AbstractMachine):
     def sketch(self, pen: Any, state: State, phase: float) -> None:
         crank = self.crank
         size = pen.size = max(0.8, 0.25 * pen.reach)  # the crank has radius 1
-        rod = float(crank.drawn_rod)
+        rod = 1 / float(crank.ratio) if isinstance(crank, SliderCrank) else 3.0
         pin = cos(phase), sin(phase)
         slider = rod + float(crank.slide(jnp.asarray(phase)).U)
         spring = pen.reach + 1.0 + size + 0.5  # never shorter than half a crank in this motion
@@ -452,37 +432,18 @@ _Plain = Float[Array, "..."] | float
 
 
 def _si(name: str, unit: str, default: float | None, allowed: Range = REAL) -> Any:
-    """Return a field for a number in this unit, or for a quantity of `pint` that converts to it."""
+    """Return a field for a number in this unit."""
     convert = real(name) if default is not None else optional_real(name)
-    return eqx.field(
-        default=default,
-        converter=lambda x: convert(_magnitude(name, unit, x)),
-        kw_only=True,
-        metadata={"unit": unit, "range": allowed},
-    )
-
-
-def _magnitude(name: str, unit: str, value: Any) -> Any:
-    if not (hasattr(value, "magnitude") and hasattr(value, "to")):
-        return value
-    try:
-        return value.to(unit).magnitude
-    except Exception as error:  # of a class that only its library defines
-        raise ValueError(
-            f"Argument `{name}` must be in {unit or 'no unit'}, or in one that can be converted, "
-            f"but got {value}."
-        ) from error
+    about = {"unit": unit, "range": allowed}
+    return eqx.field(default=default, converter=convert, kw_only=True, metadata=about)
 
 
 class Parameters(Shown):
     """The machine in SI units; the defaults are Table 1 of the paper (T0 = 10 N·m, κ = 0.9).
 
-    Each number may be a quantity of `pint`, in any unit of its kind.
-
     The dimensionless groups, with ω = √(k0/m_C), are ξ = c/(2 m_C ω), d = Δ/a, μ = m_B a²/J,
-    ε = m_C a²/J. For the motor they are τ0 = T0/(J ω²), w0 = Ω0/ω and, with `electrical_time`,
-    τe = ωL/R. The crank has λ = a/l. With motor constants K_t, K_e and a voltage u, κT0 = K_t u/R,
-    κΩ0 = u/K_e.
+    ε = m_C a²/J, for the motor τ0 = T0/(J ω²), w0 = Ω0/ω, and for the crank λ = a/l. A DC motor
+    with constants K_t, K_e, resistance R and voltage u has κT0 = K_t u/R, κΩ0 = u/K_e.
     """
 
     body_mass: _Plain = _si("body_mass", "kg", 0.35, POSITIVE)
@@ -510,9 +471,6 @@ class Parameters(Shown):
     no_load_speed: _Plain | None = _si("no_load_speed", "rad/s", None, POSITIVE)
     """Ω0, no-load speed of the motor at κ = 1, rad/s. `None` means ω, for which the tabulated κ =
     0.5…1.9 are the tabulated range of ζ; the paper does not give Ω0."""
-
-    electrical_time: _Plain | None = _si("electrical_time", "s", None, POSITIVE)
-    """L/R, the armature's inductance over its resistance, s. `None` leaves the armature out."""
 
     def __check_init__(self):
         require_ranges(self)
@@ -555,15 +513,12 @@ class Parameters(Shown):
         else:
             per_inertia = self.crank_radius**2 / self.inertia
             no_load = 1.0 if self.no_load_speed is None else self.no_load_speed / omega
-            time = self.electrical_time
-            electrical = {} if time is None else {"electrical_time": time * omega}
-            scene_drive = (DCMotor if electrical else Motor)(
+            scene_drive = Motor(
                 strength=self.torque / (self.inertia * omega**2),
                 control=self.control,
                 coupling=self.body_mass * per_inertia,
                 slider_inertia=self.slider_mass * per_inertia,
                 no_load_speed=no_load,
-                **electrical,
             )
         damping = self.damping / (2 * self.body_mass * omega)
         if any(isinstance(x, Tracer) for x in jtu.tree_leaves(self)):
@@ -571,7 +526,7 @@ class Parameters(Shown):
             damping = jnp.where(in_range(self), damping, jnp.nan)
         exact = SliderCrank(self.crank_radius / self.rod_length) if crank == "slider" else None
         return Scene(
-            oscillator=Oscillator(damping),
+            damping_ratio=damping,
             drive=scene_drive,
             stops=(RigidStop(_ratio(self.gap, self.crank_radius), self.restitution),),
             crank=exact or CosineCrank(),

@@ -33,7 +33,7 @@ def final(task: Task, how: vi.AbstractMethod, theta: jax.Array, Y0: jax.Array) -
     kappa, xi, tau0, eps, gap, k = theta
     drive = vi.Motor(tau0, kappa, eps, task.mu) if task.motor else vi.IdealDrive(kappa)
     stops = (vi.RigidStop(gap, k),)
-    scene = vi.Scene(oscillator=vi.Oscillator(xi), drive=drive, stops=stops)
+    scene = vi.Scene(damping_ratio=xi, drive=drive, stops=stops)
     start = scene.start(Y=Y0, W=kappa) if task.motor else scene.start(Y=Y0)
     # With d = 2 no force holds the body on the stop, but a traced gap does not show this.
     run = vi.simulate(scene, start, task.cycles, method=how, record="sections", rests=False)
