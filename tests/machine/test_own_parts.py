@@ -77,7 +77,7 @@ def test_own_drive_matches_scipy(clock):
 
 
 def test_wrong_starts_and_drives_raise():
-    with pytest.raises(ValueError, match=r"`torque` must be left out.*state has Y, V, W, wound"):
+    with pytest.raises(ValueError, match=r"`torque` must be left out.*has Y, V, W, wound"):
         clockwork().start(torque=1.0)
     with pytest.raises(TypeError, match="drive"):
         vi.Scene(0.1, "motor")

@@ -173,8 +173,8 @@ class Scene(AbstractMachine):
         for name in others:
             if name not in usual:
                 raise ValueError(
-                    f"Argument `{name}` must be left out: with a {type(self.drive).__name__}, a "
-                    f"state has {', '.join(usual)}."
+                    f"Argument `{name}` must be left out: a state with drive "
+                    f"`{type(self.drive).__name__}` has {', '.join(usual)}."
                 )
         given = {name: x for name, x in others.items() if x is not None}
         values = {x: number(x, y) for x, y in (usual | {"Y": Y, "V": V} | given).items()}
