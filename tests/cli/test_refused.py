@@ -60,7 +60,7 @@ def test_a_byte_order_mark_is_accepted(here):
         (DUFFING + "start = {Y = 3}" + ONE, "[simulate]: Argument `start` must not lie beyond"),
         (DUFFING + "method = {class = 'vi_jax:Adaptive', rtol = 2}" + ONE,
          "[simulate]: `method`: Argument `rtol` must be finite and in (0, 1], but got 2"),
-        ("[start]\nW = 1" + ONE, "Argument `W` must be left out: a state with drive `IdealDrive` has Y, V"),
+        ("[start]\nW = 1" + ONE, "`W` must be left out: a state with drive `IdealDrive` has Y, V"),
     ],
 )  # fmt: skip
 def test_mistakes_in_a_machine_or_a_table_are_errors(run, here, monkeypatch, text, words):

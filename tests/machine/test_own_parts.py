@@ -109,8 +109,6 @@ def test_wrong_contact_laws_raise():
     law = Hardening(cubic=1.0)
     with pytest.raises(ValueError, match="`restitution` must be given without `damping`"):
         vi.SoftStop(0.2, 100.0, law=law, restitution=0.5)
-    with pytest.raises(ValueError, match="`exponent` must be left out"):
-        vi.SoftStop(0.2, 100.0, law=law, exponent=1.5)
     with pytest.raises(TypeError, match="law"):
         vi.SoftStop(0.2, 100.0, law=lambda depth: depth)  # pyright: ignore
 

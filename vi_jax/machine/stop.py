@@ -294,9 +294,6 @@ def power(x: Any, n: float) -> Any:
 # Modes: the body touches; it is released, but not yet out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 
-# Laws with names.
-_LAWS: dict[str, type[AbstractContactLaw]] = {"power": PowerLaw, "hunt-crossley": HuntCrossley}
-
 # Within this distance (unit: that of the coordinate) the contact's time scale matters: a choice,
 # since a step that ends on first touch may end a little short of it.
 _NEAR = 1e-6
@@ -325,8 +322,8 @@ class SoftStop(Wall, AbstractSwitch):
       `HuntCrossley`); no damping by default.
     - `dashpot` c of a power law, not negative: a force by speed, N s/m for a spring in SI units.
       The term c δ^((p-1)/2) δ' is added to the force.
-    - `law`: `"power"` or `"hunt-crossley"`, and `exponent` p, at least 1 (1 by default); or any
-      `AbstractContactLaw`, which has its own exponent.
+    - `law`: `PowerLaw(p)` or `HuntCrossley(p)` with an exponent p of at least 1 (`PowerLaw()` by
+      default, with p = 1), or any `AbstractContactLaw`.
     - `prestress` F0: the force at first touch, not negative; 0 by default.
     - `adhesive`: whether the dashpot may pull at the end of its stroke; `False` releases the body
       when the force decreases to zero. Static.
@@ -365,8 +362,7 @@ class SoftStop(Wall, AbstractSwitch):
         restitution: Number | None = None,
         damping: Number | None = None,
         dashpot: Number | None = None,
-        exponent: float | None = None,
-        law: str | AbstractContactLaw = "power",
+        law: AbstractContactLaw | None = None,
         prestress: Number | None = None,
         adhesive: bool = True,
         side: str = "right",
@@ -377,7 +373,8 @@ class SoftStop(Wall, AbstractSwitch):
         name: str = "",
         acts: bool = False,
     ):
-        self.law = _law(law, exponent)
+        self.law = PowerLaw() if law is None else law
+        instance_of("law", self.law, AbstractContactLaw, "a `PowerLaw()` or another contact law")
         if restitution is not None:
             given = f"{restitution!r} with damping={damping!r} and law={law!r}"
             damping = _damping_of(self.law, restitution, damping, given)
@@ -386,8 +383,8 @@ class SoftStop(Wall, AbstractSwitch):
         self.damping = number("damping", 0.0 if damping is None else damping)
         if dashpot is not None and not isinstance(self.law, PowerLaw):
             raise ValueError(
-                f'Argument `dashpot` belongs to the law "power", but got {dashpot!r} with '
-                f"law={law!r}. Give `damping` to other laws."
+                f"Argument `dashpot` belongs to a `PowerLaw`, but got {dashpot!r} with {law!r}. "
+                "Give `damping` to other laws."
             )
         self.dashpot = optional_real("dashpot")(dashpot)
         self.prestress = optional_real("prestress")(prestress)
@@ -480,19 +477,6 @@ def _is_one(mass: Any) -> bool:
     return isinstance(mass, float | int) and mass == 1
 
 
-def _law(law: str | AbstractContactLaw, exponent: float | None) -> AbstractContactLaw:
-    if isinstance(law, str):
-        one_of("law", law, tuple(_LAWS))
-        return _LAWS[law](1.0 if exponent is None else exponent)
-    instance_of("law", law, AbstractContactLaw, f"one of {list(_LAWS)} or an `AbstractContactLaw`")
-    if exponent is not None:
-        raise ValueError(
-            "Argument `exponent` must be left out if `law` is an object, which has its own, but "
-            f"got {exponent!r} with {law!r}."
-        )
-    return law
-
-
 def _damping_of(
     law: AbstractContactLaw, restitution: Number, damping: Number | None, given: str
 ) -> Any:
@@ -501,6 +485,6 @@ def _damping_of(
     if found is None:
         raise ValueError(
             "Argument `restitution` must be given without `damping`, and for a law such as "
-            f'"power", whose restitution is one number, but got {given}.'
+            f"`PowerLaw`, whose restitution is one number, but got {given}."
         )
     return found
