@@ -330,30 +330,17 @@ class Scene(AbstractMachine):
         return dataclasses.replace(state, Y=-state.Y, V=-state.V)
 
     def may_rest(self) -> bool:
-        """Return False if all gaps are known and beyond the reach of the crank."""
-        if not self._is_within_reach() or any(map(self._may_be_pressed, self.stops)):
-            return True
-        gaps = [concrete(stop.gap) for stop in self.stops]
-        return any(gap is None or not (gap > 1).all() for gap in gaps)
-
-    def _is_within_reach(self) -> bool:
-        """Return whether only a slider within |U| ≤ 1 pulls, by the library's equations."""
-        return (
+        """Return False if only a slider within |U| ≤ 1 pulls the body, by the library's equations,
+        and all gaps are known and larger."""
+        known = (
             type(self.crank).slide in (CosineCrank.slide, SliderCrank.slide)
             and type(self.drive).field in (IdealDrive.field, Motor.field)
             and overridden(self, Scene, "field", "pull", "_pushes", "_switches") is None
         )
-
-    def _may_be_pressed(self, stop: RigidStop) -> bool:
-        """Return whether a compliant stop may press the body on a rigid one."""
-        for soft in self.soft_stops:
-            depth = concrete(soft.beyond(stop.place))
-            is_clear = depth is not None and bool((depth <= 0).all())
-            if overridden(soft, SoftStop, "force", "contribution") or not (
-                is_clear or soft.side == stop.side
-            ):
-                return True
-        return False
+        if self.soft_stops or not known:
+            return True
+        gaps = [concrete(stop.gap) for stop in self.stops]
+        return any(gap is None or not (gap > 1).all() for gap in gaps)
 
     @property
     def room(self) -> Any:
