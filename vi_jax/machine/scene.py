@@ -338,7 +338,7 @@ class Scene(AbstractMachine):
             and overridden(self, Scene, "field", "pull", "_pushes", "_switches") is None
         )
         if self.soft_stops or not known:
-            return True
+            return bool(self.stops)
         gaps = [concrete(stop.gap) for stop in self.stops]
         return any(gap is None or not (gap > 1).all() for gap in gaps)
 

@@ -180,17 +180,13 @@ class RigidStop(Wall, AbstractEvent):
         """Return k at this speed of approach."""
         return self.restitution(approach) if callable(self.restitution) else self.restitution
 
-    def velocity_after(self, V: Number) -> Any:
-        """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper). It is zero
-        for a speed whose square is below the smallest number, so that a body may come to rest."""
+    def velocity_after(self, V: Number, coefficient: Any = None) -> Any:
+        """Return the velocity after an impact with velocity `V` (Eq. 17 of the paper), with this
+        coefficient of restitution or that of the speed. It is zero for a speed whose square is
+        below the smallest number, so that a body may come to rest."""
         V = _unless_tiny(V)
-        return -self.coefficient(self.approach(V)) * V
-
-    def velocity_and_coefficient(self, approach: Any) -> tuple[Any, Any]:
-        """Return the velocity after an impact at this speed of approach, and the coefficient of
-        restitution. The law, which may be a network, is evaluated once for both."""
-        k = self.coefficient(approach)
-        return -k * _unless_tiny(self.sign * approach), k
+        k = self.coefficient(self.approach(V)) if coefficient is None else coefficient
+        return -k * V
 
     def loss(self, approach: Any, coefficient: Any) -> Any:
         """Return the energy lost in an impact per unit of mass, ½(1 - k²) V⁻²."""

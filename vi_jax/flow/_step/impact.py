@@ -99,7 +99,8 @@ def resolve_impact(
     for number, met in landed.items():
         stop = stops_of(machine)[number]
         approach = jnp.maximum(stop.approach(velocity), 0.0)
-        rebound, coefficient = stop.velocity_and_coefficient(approach)
+        coefficient = stop.coefficient(approach)
+        rebound = stop.velocity_after(stop.sign * approach, coefficient)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
         lane = log_impact(plan, lane._replace(state=state), at_event, taken & met, number, approach)
