@@ -267,6 +267,16 @@ class Blind(Machine):
         return super().field(s, x)
 
 
+class Stopped(Machine):
+    @property
+    def cycle(self):
+        return 2 / 0.0
+
+
+class Driving(Machine):
+    contacts = (vi.DryFriction(0.1, on="V", load=lambda x: -9.81),)
+
+
 class Spare(Machine):
     events = vi.Switch(lambda m, s, x, side: x.V)
 
@@ -290,6 +300,8 @@ class Spare(Machine):
             ),
             "Soft stop 0 of a Scene must have no `mass`",
         ),
+        (lambda: simulate(Stopped()), "`cycle` of a Stopped divides by zero"),
+        (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),
         (continue_clocked, "must not have cycles that end at a given time"),

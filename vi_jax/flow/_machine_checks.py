@@ -145,6 +145,8 @@ def explain_errors(label: str) -> Iterator[None]:
             f"{label} must be written for numbers that are traced: with the functions of "
             "`jax.numpy`, not with those of `numpy` or `math`, `float` or `int`."
         ) from error
+    except ZeroDivisionError as error:
+        raise ValueError(f"{label} divides by zero: a number of the machine is 0.") from error
     except dataclasses.FrozenInstanceError as error:
         raise TypeError(
             f"{label} must return new numbers, and change neither machine nor state: {error}."
@@ -191,6 +193,7 @@ def check_values(machine: AbstractMachine, start: State) -> None:
     if is_builtin or any(isinstance(x, Tracer) for x in leaves):
         return
     _check_slips(machine, start)
+    _check_friction_forces(machine, start)
     try:
         ticks = clock_of(machine, start) is None and not is_autonomous(machine, start)
         zero, state = jtu.tree_map(np.asarray, (np.zeros(()), start))
@@ -292,6 +295,31 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
                 f"thousandth of a cycle, at t = {time:.6g}: steps may be too long. Give it "
                 "a `step_limit`, or let the surface's speed jump by a `Reset`.",
             )
+
+
+def _check_friction_forces(machine: AbstractMachine, start: State) -> None:
+    """**Raises:** `ValueError` if the force of a friction is negative at the start."""
+    for number, friction in enumerate(switches_of(machine)):
+        if not isinstance(friction, DryFriction) or not (callable(friction.level) or friction.load):
+            continue
+        try:
+            with jax.ensure_compile_time_eval():
+                force = float(_friction_force(machine, number, start))
+        except Exception:  # the error is raised with a better message when the friction is traced
+            return
+        if force < 0:
+            raise ValueError(
+                f"The force of a DryFriction of a {type(machine).__name__} must not be negative, "
+                f"but is {force:.6g} at the start. `level` and `load` are its size: it acts "
+                "against the slip by itself."
+            )
+
+
+@eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
+def _friction_force(machine: AbstractMachine, number: int, start: State) -> Any:
+    friction: Any = switches_of(machine)[number]
+    zero = jnp.zeros_like(machine.position(start))
+    return friction.sliding(machine, zero, start, friction.slip_sign(machine, zero, start))
 
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
@@ -419,14 +447,16 @@ def check_parts(machine: AbstractMachine) -> None:
                 f"`{what}` of a {name} must be a tuple of {words}: got {parts!r}.{hint}"
             )
     _check_names(machine)
-    if callable(machine.cycle):
+    with explain_errors(f"`cycle` of a {name}"):
+        cycle = machine.cycle
+    if callable(cycle):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
-    if jnp.shape(machine.cycle):
+    if jnp.shape(cycle):
         raise ValueError(
-            f"`cycle` of a {name} must be one number, but has shape {jnp.shape(machine.cycle)}."
+            f"`cycle` of a {name} must be one number, but has shape {jnp.shape(cycle)}."
             f"{batch_hint(machine)}"
         )
-    cycle = concrete(machine.cycle)
+    cycle = concrete(cycle)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
     if isinstance(machine, LinearMachine | Scene):

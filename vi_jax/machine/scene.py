@@ -172,9 +172,11 @@ class Scene(AbstractMachine):
         usual = {"Y": 0.0, "V": 0.0} | self.drive.components
         for name in others:
             if name not in usual:
+                drive, near = type(self.drive).__name__, [x for x in usual if x == name.upper()]
+                hint = f"it is called `{near[0]}`; " if near else ""
                 raise ValueError(
-                    f"Argument `{name}` must be left out: a state with drive "
-                    f"`{type(self.drive).__name__}` has {', '.join(usual)}."
+                    f"Argument `{name}` must be left out: {hint}a state with drive `{drive}` has "
+                    f"{', '.join(usual)}."
                 )
         given = {name: x for name, x in others.items() if x is not None}
         values = {x: number(x, y) for x, y in (usual | {"Y": Y, "V": V} | given).items()}
