@@ -68,6 +68,23 @@ def test_sticking_begins_on_den_hartogs_curve():
             assert friction == pytest.approx(den_hartog(omega, 0.0)[1], abs=1e-8)
 
 
+class Walled(Rough):
+    """The same body with a wall that it does not reach."""
+
+    contacts = property(lambda self: (vi.RigidStop(5.0, 0.5), Rough.contacts.fget(self)))
+
+
+def test_clearance_where_friction_reverses_the_body_at_its_turn():
+    limit = den_hartog(0.75, 0.0)[1]
+    start = vi.OscillatorState(jnp.asarray(0.1), jnp.asarray(0.0))
+    machine = Walled(omega=0.75, level=0.7 * limit)
+    orbit = vi.find_orbit(machine, vi.simulate(machine, start, 1, settle=200).last)
+    bounds = (0.6 * limit, 0.9 * limit)
+    branch = vi.continue_orbit(orbit, parameter="level", bounds=bounds, progress=False)
+    amplitudes = [den_hartog(0.75, level)[0] for level in branch.parameter]
+    np.testing.assert_allclose(branch.clearance, 5 - np.array(amplitudes), rtol=1e-8)
+
+
 class Damped(Belt):
     """A belt whose section is at the body's greatest position."""
 

@@ -22,6 +22,10 @@ from ._flight import Flight, force_on
 # The remainder changes the height in second order and is subtracted.
 _TURNED = 1e-3
 
+# A body has stopped at an event if its speed there is this share of its greatest since the last
+# event: a choice, above the residuals of orbits.
+_STOPPED = 1e-9
+
 # A guard is zero within this share of its largest modulus along a flight: a choice.
 _ROUNDED = 1e-12
 
@@ -189,6 +193,8 @@ def _turns_in(path: Path, watched: _Quantity) -> _Turns:
     # A turn on the section itself is at the begin or the end of a closed flight. Its rate there is
     # rounding of either sign, so both must have the same sign.
     end = v[0] if closed else watched.rate(flight, places[-1] + h, last)
+    if isinstance(watched, _Body) and not closed:  # friction may act from its turn on
+        end = jnp.where(jnp.abs(end) <= _STOPPED * jnp.max(jnp.abs(v)), 0.0, end)
     v1 = jnp.concatenate([v[1:], end[None]])
     return jax.vmap(lambda *x: flight.once(partial(_turn, watched), (h, *x)))(places, states, v, v1)
 
