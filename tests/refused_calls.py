@@ -60,7 +60,7 @@ def orbit(guess=START, **options):
     return lambda: vi.find_orbit(SCENE, guess, 2, **options)
 
 
-COUNT, REAL = "must be an integer", "must be a real number"
+REAL = "must be a real number"
 ROW = "must be one row of finite real numbers"
 CALLS = {
     "cycles=0": (simulate(cycles=0), "`cycles` must be at least 1, but got 0"),

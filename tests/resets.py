@@ -88,31 +88,6 @@ class StickSlip(vi.AbstractMachine):
         return x.v
 
 
-ROOTS = (-0.1 + 0.2j, -0.1 - 0.2j, -0.5)
-A = np.column_stack([-np.poly(ROOTS).real[1:], [1, 0, 0], [0, 1, 0]])
-
-
-class ThreeStates(vi.AbstractMachine):
-    """x' = A x; when x1 falls through 1 with velocity v, x2 -= b v and x3 -= 1.6 v."""
-
-    b: jax.Array = eqx.field(converter=jnp.asarray)
-    cycle = 5.0
-
-    @property
-    def events(self):
-        def reset(machine, s, x):
-            v = machine.velocity(x)
-            return x[0], x[1] - machine.b * v, x[2] - 1.6 * v
-
-        return (vi.Reset(lambda machine, s, x: 1 - x[0], reset, ends_cycle=True),)
-
-    def field(self, s, x):
-        return tuple(sum(a * y for a, y in zip(row, x, strict=True)) for row in A.tolist())
-
-    def velocity(self, x):
-        return A[0, 0] * x[0] + x[1]
-
-
 class Excited(vi.AbstractMachine):
     """x'' = 0.2 x' - x with a stop; a cycle ends at an impact."""
 

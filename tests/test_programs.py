@@ -53,18 +53,3 @@ def test_a_machine_may_close_over_differentiated_numbers(derivative):
     up, down = jax.jit(jax.vmap(jax.vmap(last)))(jnp.stack([at + steps, at - steps]))
     truth = (up - down) / 2e-5
     np.testing.assert_allclose(found, truth, rtol=1e-7)
-
-
-@pytest.mark.slow
-def test_a_law_may_close_over_a_differentiated_number():
-    """Without `jit` too, where no argument is traced."""
-
-    def speed(k):
-        stop = vi.RigidStop(0.4, lambda approach: k + 0 * approach)
-        scene = vi.Scene(damping_ratio=0.1, drive=vi.IdealDrive(0.9), stops=(stop,))
-        return vi.simulate(scene, scene.start(), 3, method=vi.ExactFlight()).last.V
-
-    slope = (speed(0.6 + 1e-6) - speed(0.6 - 1e-6)) / 2e-6
-    for along in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(along(speed)(0.6), slope, rtol=1e-6)
-        np.testing.assert_allclose(jax.jit(along(speed))(0.6), slope, rtol=1e-6)

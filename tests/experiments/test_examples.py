@@ -11,8 +11,8 @@ from PIL import Image
 
 from differences import quick
 
-# These run with the slow tests, the others before a release; Pyright checks their calls.
-SLOW = {"paper_discrepancy", "simulate"}
+# This one runs with the slow tests, the others before a release; Pyright checks their calls.
+SLOW = {"paper_discrepancy"}
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)

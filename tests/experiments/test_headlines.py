@@ -4,29 +4,19 @@ import inspect
 from pathlib import Path
 
 import pytest
-from reproduction.report import KEPT, read
-from reproduction.report import headline_numbers as of_report
 from tools.study import headlines
 
-from headline_numbers import benchmarks, machines, orbits, paper
+from headline_numbers import machines, orbits, paper
 from headline_numbers.closed_forms import Expected
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
-PATHS = {p.stem: p for kind in ("studies", "benchmarks") for p in FOLDER.glob(f"{kind}/*.py")}
-# The page of `gpu` has times only.
-NAMES = ["reproduction", *sorted(set(PATHS) - {"gpu"})]
+PATHS = {path.stem: path for path in FOLDER.glob("studies/*.py")}
 COMPUTED = {
     name: function
-    for module in (benchmarks, machines, orbits, paper)
+    for module in (machines, orbits, paper)
     for name, function in vars(module).items()
 }
-
-
-def kept_of(name: str) -> dict[str, float]:
-    if name == "reproduction":
-        return of_report(read(KEPT))
-    return headlines(PATHS[name].with_suffix(".md").read_text(encoding="utf-8"))
 
 
 def stale(kept: dict[str, float], computed: Expected) -> list[str]:
@@ -40,8 +30,10 @@ def stale(kept: dict[str, float], computed: Expected) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+# `robust/test_minimal_kick.py` tests the kick of `robustness`.
+@pytest.mark.parametrize("name", sorted(set(PATHS) - {"robustness"}))
 def test_headline_numbers(name):
-    kept, function = kept_of(name), COMPUTED[name]
+    kept = headlines(PATHS[name].with_suffix(".md").read_text(encoding="utf-8"))
+    function = COMPUTED[name]
     computed = function(kept) if inspect.signature(function).parameters else function()
     assert computed and not stale(kept, computed)

@@ -1,5 +1,6 @@
 """States with array components, compared with the same machine in scalar components."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -140,29 +141,37 @@ MACHINE = Chain(rows)
 
 
 @pytest.mark.slow
-def test_orbits_sweeps_scans_and_basins_equal_those_with_scalars():
-    found = []
-    for made, start in ((rows, "start.q[1]"), (Numbers, "start.y")):
-        machine = Chain(made)
-        end = vi.simulate(machine, machine.start(), 1, settle=200).last
-        orbit = vi.find_orbit(machine, end, throw=True)
-        sweep = vi.sweep(machine, "gap", [0.5, 0.6], settle=20, cycles=4)
-        axes, quiet = {"gap": [0.5, 0.6], start: [0.0, 0.1]}, {"progress": False}
-        measure = ("extremes", vi.Sections(2))
-        scan = vi.scan(machine, axes, measure=measure, cycles=4, settle=20, **quiet)
-        basins = vi.basins(machine, {start: (-0.5, 0.5)}, resolution=4, longest=8, **quiet)
-        found.append((orbit, sweep, scan, basins.attractors[0]))
-    (orbit, sweep, scan, basin), others = found
-    np.testing.assert_allclose(orbit.state.q, [others[0].state.x, others[0].state.y], atol=1e-11)
-    np.testing.assert_allclose(orbit.multipliers, others[0].multipliers, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(sweep.y_min, others[1].y_min, rtol=0, atol=1e-11)
-    assert (basin.starts, basin.period) == (4, others[3].period)
-    for ours, theirs in {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}.items():
-        np.testing.assert_allclose(scan[ours], others[2][theirs], rtol=0, atol=1e-11)
-        apart = basin.sections[ours] - others[3].sections[theirs]
-        np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-7)
+def test_orbits_sweeps_scans_and_basins_agree_with_runs_of_scalars():
+    plain = Chain(Numbers)
+    end = vi.simulate(plain, plain.start(), 1, settle=200).last
+    orbit = vi.find_orbit(MACHINE, rows(end.x, end.y, end.u, end.w), throw=True)
+    np.testing.assert_allclose(np.append(orbit.state.q, orbit.state.v), table(end), atol=1e-11)
     many = vi.find_orbit(MACHINE, jax.tree.map(lambda x: jnp.stack([x, x]), orbit.state))
     np.testing.assert_allclose(many.state.q, [orbit.state.q, orbit.state.q], rtol=0, atol=1e-10)
+
+    def run(gap, y):
+        start = dataclasses.replace(plain.start(), y=y)
+        return vi.simulate(Chain(Numbers, gap), start, 4, settle=20)
+
+    gaps, places = (x.ravel() for x in np.meshgrid([0.5, 0.6], [0.0, 0.1], indexing="ij"))
+    runs = vi.jit(jax.vmap(run))(gaps, places)
+    given = {"start": MACHINE.start(), "settle": 20, "cycles": 4, "progress": False}
+    axes, measure = {"gap": [0.5, 0.6], "start.q[1]": [0.0, 0.1]}, ("extremes", vi.Sections(2))
+    scan = vi.scan(MACHINE, axes, measure=measure, **given)
+    least = np.min(runs.y_min, axis=1).reshape(2, 2)
+    np.testing.assert_allclose(scan.y_min, least, rtol=0, atol=1e-11)
+    for ours, theirs in {"q[0]": "x", "q[1]": "y", "v[0]": "u", "v[1]": "w"}.items():
+        last = np.reshape(getattr(runs.sections, theirs)[:, -2:], (2, 2, 2))
+        np.testing.assert_allclose(scan[ours], last, rtol=0, atol=1e-11)
+    sweep = vi.sweep(MACHINE, "gap", [0.6], settle=200, cycles=4)
+    np.testing.assert_allclose(sweep.y_min[0], orbit.y_min, rtol=0, atol=1e-11)
+    basins = vi.basins(
+        MACHINE, {"start.q[1]": (-0.5, 0.5)}, resolution=4, longest=8, progress=False
+    )
+    (basin,) = basins.attractors
+    assert (basin.starts, basin.period) == (4, 1)
+    for name, value in zip(("q[0]", "q[1]", "v[0]", "v[1]"), table(end), strict=True):
+        np.testing.assert_allclose(basin.sections[name], value, rtol=0, atol=1e-7)
     branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.58, 0.62), step=0.02)
     np.testing.assert_allclose(branch.y_max, branch.parameter, atol=1e-10)
 

@@ -215,42 +215,6 @@ def test_block_on_a_spring_slips_and_sticks_in_turn():
     assert abs(float(run.last.Y) - 0.0257) < 5e-5
 
 
-class Hill(vi.AbstractMachine):
-    """A ball that flies freely over y = exp(-100 (x - 4)²)."""
-
-    cycle: float = 10.0
-    contacts: tuple = (vi.RigidStop(0.0, 0.5, "left"),)
-
-    @property
-    def coordinates(self):
-        def hill(x):
-            return jnp.exp(-100 * (x - 4) ** 2)
-
-        def slope(z):
-            return jax.jvp(hill, (z[0],), (z[2],))[1]
-
-        return (
-            vi.Coordinate(
-                lambda z: z[1] - hill(z[0]),
-                lambda z: z[3] - slope(z),
-                lambda z, Y, V: (z[0], Y + hill(z[0]), z[2], V + slope(z)),
-            ),
-        )
-
-    def field(self, s, z):
-        return z[2], z[3], jnp.zeros_like(s), jnp.zeros_like(s)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [None, vi.FixedStep()], ids=["a", "f"])
-def test_a_ball_hits_a_hill_that_is_narrower_than_a_step(method):
-    start = tuple(map(jnp.array, (0.0, 0.5, 1.0, 0.0)))
-    run = vi.simulate(Hill(), start, 1, impact_log=2, method=method)
-    assert run.impact_log is not None
-    there = 4 - np.sqrt(np.log(2) / 100)
-    assert abs(float(run.impact_log.phase[0, 0]) - there) < 1e-9
-
-
 class Dips(vi.AbstractMachine):
     """y' = 2 (s - 5); a reset adds 100 when y falls through zero."""
 
@@ -280,22 +244,3 @@ def test_error_estimates_use_half_as_long_steps(name):
     method, scene = getattr(vi, name)(), vi.Scene.ideal(frequency_ratio=0.9)
     place = scene, jnp.array(0.3), scene.start()
     assert float(method.tighter().longest(*place)) <= 0.5 * float(method.longest(*place))
-
-
-@pytest.mark.slow
-def test_error_estimate_shows_pulses_between_stages():
-    """The estimated error is large wherever the run missed the pulse."""
-    places = jnp.linspace(3.0, 4.2, 25)
-
-    @jax.jit
-    @jax.vmap
-    def run(place):
-        force = {"steady": -1.0, "sizes": jnp.zeros(5), "phases": jnp.zeros(5), "cycle": 12.0}
-        machine = Floor(**force, height=2.0, place=place, width=0.06)
-        run = vi.simulate(machine, STILL, 1, estimate=True, method=vi.Taylor(rtol=1e-9))
-        return run.y_max[0], run.errors.y_max[0]
-
-    top, error = map(np.asarray, run(places))
-    missed = top == 0
-    assert missed.any()
-    assert np.all(error[missed] > 1e-3)

@@ -48,9 +48,3 @@ def fold(k: float, xi: float, low: float, high: float) -> float:
         there = bool(closed(middle, k, xi, 2.0, cycles=1).exists.any())
         low, high = (middle, high) if there else (low, middle)
     return low
-
-
-def births(xi: float) -> tuple[float, float]:
-    """Return both ζ at which the steady vibration without impacts reaches the stop at d = 2."""
-    half = np.sqrt((1 - 2 * xi**2) ** 2 - 0.75)
-    return float(np.sqrt(1 - 2 * xi**2 - half)), float(np.sqrt(1 - 2 * xi**2 + half))

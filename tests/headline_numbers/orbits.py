@@ -51,16 +51,6 @@ def grazing_forecast(kept: dict[str, float]) -> Expected:
     return numbers
 
 
-def robustness() -> Expected:
-    scene = vi.Scene.ideal(frequency_ratio=0.968, restitution=0.8, gap=2.0, damping_ratio=XI)
-    form = closed(0.968, 0.8, XI, 2.0, cycles=2)
-    best = int(np.argmin(np.where(form.admissible, np.abs(form.multipliers).max(axis=1), np.inf)))
-    orbit = vi.find_orbit(scene, scene.start(Y=form.Y[best], V=form.V[best]), 2, throw=True)
-    options = {"settle": 1500, "candidates": 1, "directions": 32, "progress": False}
-    kick = vi.minimal_kick(scene, orbit, **options)
-    return {"ζ = 0.968, 4π to 2π": (float(kick.norm), 1e-8)}
-
-
 def posterior() -> Expected:
     """Compute the plotted record, drawn from the prior, and its information from the Jacobian."""
     key, _, _ = jax.random.split(jax.random.key(1), 3)

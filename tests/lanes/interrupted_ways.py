@@ -28,7 +28,6 @@ def last(V, settle):
 
 lanes = jax.vmap(last, (0, None))
 quick = jax.jit(last)
-batch = vi.jit(lanes)
 slope = jax.jit(jax.grad(last))
 
 
@@ -40,7 +39,6 @@ def swept(settle):
 WAYS = {
     "simulate": lambda settle: vi.simulate(SCENE, SCENE.start(), 1, settle=settle).last.Y,
     "jit": lambda settle: quick(0.1, settle),
-    "vi.jit": lambda settle: batch(STARTS, settle),
     "vmap": lambda settle: lanes(STARTS, settle),
     "grad": lambda settle: slope(0.1, settle),
     "sweep": swept,
@@ -69,5 +67,5 @@ def time_to_end(way, delay):
     return time.perf_counter() - at[0]
 
 
-for name in sys.argv[1:] or WAYS:
+for name in WAYS:
     print(name, *(time_to_end(WAYS[name], delay) for delay in (0.3, 0.55)))

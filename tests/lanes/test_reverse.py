@@ -151,8 +151,7 @@ def test_gradients_of_arrays_in_memory(by_tape, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [5, 23])
-def test_gradients_of_functions_written_in_jax(by_tape, size):
+def test_gradients_of_functions_written_in_jax(by_tape, size=23):
     """Compare with JAX's derivatives of the same steps without a loop."""
     functions = (
         lambda c, p: jnp.linalg.solve(jnp.outer(p, p)[:5, :5] + jnp.eye(5), c[:5]).sum() * c,

@@ -72,15 +72,6 @@ def test_a_block_bounces_to_rest_while_it_slides():
     assert lost - held < float(run.impact_energy[0]) <= lost + 1e-9
 
 
-@pytest.mark.slow
-def test_tiny_block_slides_as_a_large_one():
-    def end(weight):
-        block = Block(0.3, 0.4, pull=0.5, lift=0.6, weight=weight)
-        return vi.simulate(block, block.at(y=0.1, v=dict(x=0.5)), 4).last.v.x
-
-    np.testing.assert_allclose(jax.vmap(end)(jnp.array([1e-15, 1e-28])), end(1.0), atol=1e-9)
-
-
 def force(machine, s, z):
     return machine.numbers["pull"] * jnp.cos(s)
 

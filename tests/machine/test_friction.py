@@ -145,17 +145,17 @@ def test_sticking_and_sliding_match_scipy():
         vi.jit(jax.vmap(lambda p, y, m=m: rubbing(tuple(p), y, 8, method=m), in_axes=(1, 0)))(
             jnp.asarray(numbers), jnp.asarray(starts)
         )
-        for m in (CLOSE, vi.FixedStep(steps_per_cycle=48), vi.Taylor(20, 16))
+        for m in (CLOSE, vi.Taylor(20, 16))
     ]
     assert all(bool(run.successful.all()) for run in runs)
     several = 0
-    for i in range(40):
+    for i in range(20):  # SciPy is slow
         wanted, changes = run_scipy(*numbers[:, i], starts[i], 16 * np.pi / numbers[1, i])
-        for run, allowed in zip(runs, (1e-8, 1e-7, 1e-8), strict=True):
+        for run in runs:
             found = [run.last.Y[i], run.last.V[i]]
-            np.testing.assert_allclose(found, wanted, atol=allowed)
+            np.testing.assert_allclose(found, wanted, atol=1e-8)
         several += changes
-    assert several > 500
+    assert several > 250
     last = runs[0].last
     energy = 0.5 * (last.Y**2 + last.V**2) - 0.5 * starts**2
     np.testing.assert_allclose(energy, last.work - last.heat, atol=1e-9)

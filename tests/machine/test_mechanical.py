@@ -117,17 +117,12 @@ def test_an_unbalanced_motor_on_a_structure():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "crank"),
-    [(SliderCrank, "cosine"), pytest.param(Buffered, "slider", marks=pytest.mark.slow)],
-)
-def test_the_machine_of_the_paper(kind, crank):
+def test_the_machine_of_the_paper():
     """Compare states, impact energies and events with `Scene` in both clocks."""
-    parameters, machine = vi.Parameters(control=1.1), kind()
-    scene, omega = parameters.scene(crank=crank), float(parameters.natural_frequency)
-    if kind is Buffered:
-        buffer = vi.SoftStop(1.3, 20.0, restitution=0.6, side="left")
-        scene = dataclasses.replace(scene, soft_stops=(buffer,))
+    parameters, machine = vi.Parameters(control=1.1), Buffered()
+    scene, omega = parameters.scene(crank="slider"), float(parameters.natural_frequency)
+    buffer = vi.SoftStop(1.3, 20.0, restitution=0.6, side="left")
+    scene = dataclasses.replace(scene, soft_stops=(buffer,))
     start = scene.start(W=15.0 / omega)
     ours = vi.simulate(machine, machine.start(), 60, method=CLOSE, event_log=8)
     length, speed = 0.04, 0.04 * omega
@@ -143,7 +138,7 @@ def test_the_machine_of_the_paper(kind, crank):
         lost = 0.35 * speed**2 * theirs.impact_energy
         np.testing.assert_allclose(ours.impact_energy, lost, atol=1e-10)
     np.testing.assert_allclose(ours.frequency_ratio, omega * theirs.frequency_ratio, rtol=1e-10)
-    assert (int(touches.sum()) > 50) == (kind is Buffered)
+    assert int(touches.sum()) > 50
 
 
 @pytest.mark.slow
@@ -160,11 +155,6 @@ def test_turns_of_a_motor_are_its_cycles():
     assert float(orbit.duration) == pytest.approx(float(wanted.duration) / omega, rel=1e-9)
     found, other = (np.sort(abs(x.multipliers))[::-1] for x in (orbit, wanted))
     np.testing.assert_allclose(found[:3], other, atol=1e-8)
-    branch = vi.continue_orbit(
-        orbit, parameter="kappa", bounds=(1.09, 1.11), max_step=0.2, progress=False
-    )
-    assert branch.ends == ("bounds", "bounds") and bool(branch.stable.all())
-    np.testing.assert_array_equal(branch.column("kappa"), branch.parameter)
     exponents = vi.lyapunov(machine, orbit.state, 100, progress=False).exponents
     decay = np.log(found[:3]) / float(orbit.duration)
     np.testing.assert_allclose(exponents, [0, *decay], rtol=2e-2, atol=1e-2)

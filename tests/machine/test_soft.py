@@ -38,13 +38,9 @@ def test_start_on_the_stop_touches_only_inwards():
 SPRING = vi.PowerLaw()
 LAWS = [
     {"damping": 1.2},
-    {"damping": 1.2, "law": vi.PowerLaw(1.5)},
     {"damping": 0.6, "law": vi.HuntCrossley(1.5)},
-    {"damping": 0.6, "law": vi.HuntCrossley()},
-    {"damping": 0.8, "prestress": 3.0},
     {"damping": 0.4, "prestress": 3.0, "law": vi.PowerLaw(2.0)},
     {"damping": 2.0, "law": vi.HuntCrossley(1.5), "prestress": 1.0},
-    {"law": vi.PowerLaw(2.5)},
 ]
 
 
@@ -104,7 +100,7 @@ def integrate_with_scipy(rate, x, contact, duration, max_step):
 
 @pytest.mark.parametrize(
     ("law", "adhesive"),
-    quick([*((x, False) for x in LAWS), *((LAWS[i], True) for i in (1, 2, 4))], (LAWS[6], False)),
+    quick([*((x, False) for x in LAWS), *((LAWS[i], True) for i in (1, 2))], (LAWS[3], False)),
     ids=str,
 )
 def test_laws_match_scipy(law, adhesive):
@@ -218,27 +214,6 @@ def test_taylor_raises_for_a_force_without_a_series():
     straight = scene_of(100.0)
     run = vi.simulate(straight, straight.start(), 1, method=vi.Taylor())
     assert bool(run.successful)
-
-
-@pytest.mark.parametrize(("prestress", "exponent"), [(None, 1.5), (0.2, 0.5)])
-def test_change_of_a_motion_is_a_power_of_the_grazing_depth(prestress, exponent):
-    """The power is 3/2 if the force begins at zero (Kundu et al., Physica D 241, 2012), and 1/2 if
-    the stop is prestressed."""
-    law = {"damping": 0.3, "prestress": prestress}
-    free = vi.Scene(damping_ratio=0.05, drive=vi.IdealDrive(0.7))
-    start, method = free.start(V=-1.0), vi.Adaptive(rtol=1e-13, atol=1e-15)
-    beside = vi.simulate(free, start, 2, method=method)
-    top, depth = beside.y_max.max(), jnp.logspace(-7, -5, 9)
-
-    def changed(depth):
-        stop = vi.SoftStop(top - depth, 30.0, **law)
-        run = vi.simulate(
-            vi.Scene(free.damping_ratio, free.drive, soft_stops=(stop,)), start, 2, method=method
-        )
-        return jnp.hypot(run.last.Y - beside.last.Y, run.last.V - beside.last.V)
-
-    changes = vi.jit(jax.vmap(changed))(depth)
-    assert np.polyfit(np.log(depth), np.log(changes), 1)[0] == pytest.approx(exponent, abs=0.005)
 
 
 class Buffers(vi.Mechanical):

@@ -53,7 +53,6 @@ def simulate_impacts(machine, x, v, cycles=1, **options):
 @pytest.mark.parametrize(
     ("k", "masses", "speeds"),
     [
-        (1.0, (1.0,) * 3, (1, 0, 0)),
         (0.9, (1.0,) * 5, (1, 0, 0, 0, 0)),
         (0.6, (1.0, 2.0, 2.0, 1.0), (1, 0, 0, -1)),
     ],

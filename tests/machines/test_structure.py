@@ -127,15 +127,8 @@ def test_derivatives_with_respect_to_matrices():
     slopes = np.stack([(last(p + e) - last(p - e)) / 2e-6 for e in h], axis=-1)
     np.testing.assert_allclose(found / size, slopes / size, rtol=0, atol=1e-6)
 
-    @jax.jit
-    def energy(stiff):
-        return jax.grad(lambda x: jnp.sum(last(p.at[jnp.array([0, 4])].set(x)) ** 2))(stiff)
-
-    # Second derivatives with respect to stiffness and frequency.
-    at = p[jnp.array([0, 4])]
-    second = jax.jacfwd(energy)(at)
-    differences = [(energy(at + e) - energy(at - e)) / 2e-5 for e in 1e-5 * jnp.eye(2)]
-    np.testing.assert_allclose(second, np.stack(differences, -1), rtol=1e-5)
+    backward = jax.grad(lambda p: jnp.sum(last(p) ** 2))(p)
+    np.testing.assert_allclose(backward / size, 2 * last(p) @ found / size, rtol=0, atol=1e-10)
 
 
 def test_both_sides_of_a_gap_are_one_coordinate():

@@ -57,25 +57,30 @@ def find_both_orbits(rotor, cycles=400):
 @pytest.mark.slow
 def test_sommerfeld_response_converges_to_the_averaged_one():
     """ε and the motor's strength fall together, which leaves the averaged response unchanged."""
-    couplings = jnp.asarray([0.005, 0.0025, 0.00125, 0.000625])
-    # Below, near and beyond the peak.
-    for zeta in (0.85, 0.98, 1.15):
-        rotor = ROTOR(strength=0.2, coupling=0.02)
-        reach = zeta**2 / ((1 - zeta**2) + 0.1j * zeta)
-        load = rotor.coupling * rotor.damping_ratio * zeta * abs(reach) ** 2
-        kappa = zeta / rotor.no_load_speed + load / rotor.strength
+    couplings = np.array([0.005, 0.0025, 0.00125, 0.000625])
+    zetas = np.array([0.85, 0.98, 1.15])  # below, near and beyond the peak
+    reach = zetas**2 / (1 - zetas**2 + 0.1j * zetas)
+    rotor = ROTOR(strength=0.2, coupling=0.02)
+    load = rotor.coupling * rotor.damping_ratio * zetas * np.abs(reach) ** 2
+    kappas = zetas / rotor.no_load_speed + load / rotor.strength
 
-        def error(coupling, kappa=kappa, zeta=zeta, reach=reach):
-            weak = ROTOR(strength=10 * coupling, control=kappa, coupling=coupling)
-            guess = weak.start(Y=reach.real, V=-zeta * reach.imag, W=zeta)
-            orbit = vi.find_orbit(weak, guess)
-            return orbit.frequency_ratio - zeta, orbit.y_max - abs(reach), orbit.successful
+    def error(coupling, kappa, zeta, real, imaginary):
+        weak = ROTOR(strength=10 * coupling, control=kappa, coupling=coupling)
+        orbit = vi.find_orbit(weak, weak.start(Y=real, V=-zeta * imaginary, W=zeta))
+        return (
+            orbit.frequency_ratio - zeta,
+            orbit.y_max - jnp.hypot(real, imaginary),
+            orbit.successful,
+        )
 
-        speed, amplitude, good = jax.vmap(error)(couplings)
-        assert bool(good.all())
-        order, _ = np.polyfit(np.log(couplings), np.log(np.abs(speed)), 1)
-        assert order == pytest.approx(1.0, abs=0.1) and abs(float(speed[-1])) < 1e-4
-        assert abs(float(amplitude[-1])) < 1e-3 * abs(reach)
+    rows = [np.repeat(x, 4) for x in (kappas, zetas, reach.real, reach.imag)]
+    found = jax.vmap(error)(np.tile(couplings, 3), *rows)
+    speed, amplitude, good = (np.asarray(x).reshape(3, 4) for x in found)
+    assert good.all()
+    orders, _ = np.polyfit(np.log(couplings), np.log(np.abs(speed)).T, 1)
+    np.testing.assert_allclose(orders, 1.0, atol=0.1)
+    assert (np.abs(speed[:, -1]) < 1e-4).all()
+    assert (np.abs(amplitude[:, -1]) < 1e-3 * np.abs(reach)).all()
 
 
 @pytest.mark.slow

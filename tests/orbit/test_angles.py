@@ -104,16 +104,6 @@ def test_an_orbit_with_its_section_at_half_a_turn_is_counted_once(orbit):
     assert len(basins.attractors) == 1
 
 
-@pytest.mark.slow
-def test_an_erosion_profile_passes_half_a_turn(orbit):
-    zero = float(orbit.state.phi) - np.pi
-    region = {"start.phi": (-3.0, 3.0), "start.dphi": (-2.0, 2.0)}
-    profile = vi.integrity_profile(
-        Pendulum(), "zero", [zero - 0.1, zero + 0.1], region, resolution=6, progress=False
-    )
-    assert profile.label.tolist() == [[0, 0]]
-
-
 REST = np.arcsin(0.3)
 
 
@@ -140,14 +130,3 @@ def test_an_edge_state_at_half_a_turn():
         assert max(float(np.nanmax(abs(jnp.diff(x.phi)))) for x in found.branches) < 0.1
         ends.append(sorted((float(x.dphi[-1]), np.sin(x.phi[-1] + zero)) for x in found.branches))
     np.testing.assert_allclose(*ends, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_local_integrity_extends_across_half_a_turn():
-    """The radius of the ball does not depend on the origin of the angle."""
-    region = {"start.phi": (-np.pi, np.pi), "start.dphi": (-4.0, 4.0)}
-    options = {"resolution": 16, "settle": 300, "longest": 4, "progress": False}
-    found = [vi.basins(Hanging(zero=x), region, **options) for x in (REST, REST + np.pi)]
-    ((here,), (there,)) = (x.integrity() for x in found)
-    np.testing.assert_allclose((here.local, here.factor), (there.local, there.factor), atol=1e-9)
-    assert here.local > 1 and not here.local_at_edge and not there.local_at_edge

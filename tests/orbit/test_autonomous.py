@@ -78,7 +78,7 @@ def test_stick_slip_branches_end_at_grazing_sliding():
     sliding = vi.OscillatorState(jnp.asarray(1.7), jnp.asarray(0.0))
     stuck = vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(1.5))
     sticking = vi.simulate(BeltAtGreatestPosition(), stuck, 1, settle=40).last
-    for start, bounds in ((sticking, (1.3, 1.9)), (sticking, (0.05, 2.0)), (sliding, (1.1, 1.9))):
+    for start, bounds in ((sticking, (1.3, 1.9)), (sliding, (1.1, 1.9))):
         orbit = vi.find_orbit(BeltAtGreatestPosition(), start)
         branch = vi.continue_orbit(orbit, parameter="speed", bounds=bounds)
         assert branch.ends[1] == "grazing-sliding"

@@ -88,23 +88,3 @@ def test_a_branch_closes_at_the_same_motion_a_cycle_later():
     assert abs(turned[-1] - turned[0]) == pytest.approx(np.pi, abs=1e-6)
     folds = [point.parameter for point in branch.special if point.kind == "fold"]
     np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)
-
-
-class Node(Kicked):
-    """x ← x + (a² - x² (x + 1))/4: a curve with a loop that crosses itself at 0."""
-
-    def kick(self, x, y):
-        return x + 0.25 * (self.a**2 - x**2 * (x + 1)), 0.3 * y
-
-
-def test_a_curve_that_crosses_itself_is_not_closed():
-    """The branch passes the crossing twice, and all its points are on the curve."""
-    orbit = vi.find_orbit(Node(np.sqrt(1.152), 0.0), at(0.8, 0.0), throw=True)
-    branch = vi.continue_orbit(orbit, parameter="a", bounds=(-1.5, 1.5))
-    assert branch.ends == ("bounds", "bounds")
-    x, a = branch.column("section_0"), branch.parameter
-    np.testing.assert_allclose(a**2, x**2 * (x + 1), atol=1e-12)
-    found = [(point.kind, point.parameter) for point in branch.special]
-    assert [kind for kind, _ in found] == ["branch-point", "fold", "fold", "branch-point"]
-    fold = np.sqrt(4 / 27)
-    np.testing.assert_allclose([place for _, place in found], [0, fold, -fold, 0], atol=1e-9)

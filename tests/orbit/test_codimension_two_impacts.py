@@ -67,6 +67,34 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     assert meets.detail.endswith("with one impact in 1 period")
 
 
+def test_resonant_grazings_of_a_linear_oscillator():
+    """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, with the damped frequency ω_d. A motion of n
+    cycles begins there if all earlier entries are positive."""
+    damped = np.sqrt(1 - 0.05**2)
+    machine = vi.machines.Duffing(
+        amplitude=0.01, frequency=1.9, damping=0.1, gap=1.0, restitution=0.8, two_sided=False
+    )
+    point = grazing_of(machine, "amplitude", (0.005, 5.0))
+    curve = vi.boundary(point, parameter="frequency", bounds=((0.001, 5.0), (0.6, 2.2)))
+    found = [point for point in curve.special if point.kind == "resonant-grazing"]
+    wanted = []
+    for n in (1, 2, 3):
+        for m in range(1, 12):
+            frequency = 2 * n * damped / m
+            before = np.sin(2 * np.pi * np.arange(1, n) * damped / frequency)
+            if 0.6 < frequency < 2.2 and (before > 1e-6).all():
+                wanted.append((n, frequency))
+    assert len(wanted) == len(found) == 5
+    for point, w in zip(
+        sorted(found, key=lambda x: x.parameters[1]), sorted(w for _, w in wanted), strict=True
+    ):
+        amplitude, frequency = point.parameters
+        assert frequency == pytest.approx(w, abs=1e-12)
+        # There the motion without impacts has the gap, 1, as its amplitude.
+        swing = np.hypot(1 - frequency**2, 0.1 * frequency)
+        assert amplitude == pytest.approx(swing, rel=1e-10)
+
+
 @pytest.mark.parametrize(
     ("to", "frequency", "force", "speed"),
     [

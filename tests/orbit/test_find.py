@@ -86,10 +86,8 @@ def test_text_and_tables_of_orbits():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cycles", [1, 2])
-def test_a_grid_of_closed_forms(cycles):
-    zetas = [0.75, 0.9, 1.0, 1.3] if cycles == 1 else [0.86, 0.9, 0.94, 1.0, 1.9, 2.2]
-    grid = [zetas, [0.3, 0.5, 0.8], [1.2, 2.0], [0.0, 0.0448, 0.2]]
+def test_a_grid_of_closed_forms(cycles=2):
+    grid = [[0.86, 0.9, 0.94, 1.0, 1.9, 2.2], [0.3, 0.5, 0.8], [1.2, 2.0], [0.0, 0.0448, 0.2]]
     zeta, k, d, xi = (jnp.asarray(x.ravel()) for x in np.meshgrid(*grid))
 
     @jax.jit
@@ -107,7 +105,7 @@ def test_a_grid_of_closed_forms(cycles):
     # a search cannot converge.
     phase = np.asarray(closed.impact_phase)[:, 0]
     there &= np.minimum(phase, 2 * np.pi * cycles - phase) > 1e-6
-    assert there.sum() > (20 if cycles == 1 else 10)
+    assert there.sum() > 10
     assert np.asarray(found.successful)[there].all()
     for a, b in ((found.state.Y, closed.Y), (found.state.V, closed.V), (found.y_min, closed.y_min)):
         np.testing.assert_allclose(np.asarray(a)[there], np.asarray(b)[there, 0], atol=1e-10)

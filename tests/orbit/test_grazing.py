@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -149,62 +147,3 @@ def test_two_stops_are_touched_at_once():
     field = np.array([[0.0, 1.0], [-1.0, -0.4]])
     np.testing.assert_allclose(found.matrix, expm(field * 2 * np.pi / 0.7), atol=1e-10)
     assert found.checked is not None and found.windows is None
-
-
-class Limit(vi.AbstractMachine):
-    """A van der Pol oscillator with a stop, and a section at rising Y."""
-
-    gap: jax.Array | float = 2.2
-
-    @property
-    def contacts(self):
-        return (vi.RigidStop(self.gap, K),)
-
-    cycle = vi.rising("Y", usual=2 * np.pi)
-
-    def field(self, s, x):
-        return vi.OscillatorState(x.V, 0.1 * (1 - x.Y**2) * x.V - x.Y)
-
-
-@pytest.mark.slow
-def test_unsupported_points_raise(half):
-    machine = Limit()
-    start = vi.simulate(machine, vi.OscillatorState(jnp.asarray(0.0), jnp.asarray(2.0)), 100).last
-    point = grazing_of(machine, "gap", (1.8, 2.3), start)
-    with pytest.raises(ValueError, match="forgotten within a period"):
-        vi.grazing(point)
-    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5)
-    closed = vi.closed_form_orbits(scene)
-    orbit = vi.find_orbit(scene, scene.start(Y=closed.Y[0], V=closed.V[0]))
-    branch = vi.continue_orbit(orbit, parameter="drive.frequency_ratio", bounds=(0.85, 1.0))
-    with pytest.raises(ValueError, match=r"must be a grazing .* but is a period-doubling"):
-        vi.grazing(branch.special[0])
-
-
-@pytest.mark.slow
-def test_resonant_grazings_of_a_linear_oscillator():
-    """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, with the damped frequency ω_d. A motion of n
-    cycles begins there if all earlier entries are positive."""
-    damped = np.sqrt(1 - 0.05**2)
-    machine = vi.machines.Duffing(
-        amplitude=0.01, frequency=1.9, damping=0.1, gap=1.0, restitution=K, two_sided=False
-    )
-    point = grazing_of(machine, "amplitude", (0.005, 5.0))
-    curve = vi.boundary(point, parameter="frequency", bounds=((0.001, 5.0), (0.6, 2.2)))
-    found = [point for point in curve.special if point.kind == "resonant-grazing"]
-    wanted = []
-    for n in (1, 2, 3):
-        for m in range(1, 12):
-            frequency = 2 * n * damped / m
-            before = np.sin(2 * np.pi * np.arange(1, n) * damped / frequency)
-            if 0.6 < frequency < 2.2 and (before > 1e-6).all():
-                wanted.append((n, frequency))
-    assert len(wanted) == len(found) == 5
-    for point, w in zip(
-        sorted(found, key=lambda x: x.parameters[1]), sorted(w for _, w in wanted), strict=True
-    ):
-        amplitude, frequency = point.parameters
-        assert frequency == pytest.approx(w, abs=1e-12)
-        # There the motion without impacts has the gap, 1, as its amplitude.
-        swing = np.hypot(1 - frequency**2, 0.1 * frequency)
-        assert amplitude == pytest.approx(swing, rel=1e-10)

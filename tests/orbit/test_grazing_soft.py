@@ -37,7 +37,7 @@ def test_orders_and_kicks_of_soft_stops():
     """Over a parabola of depth, a spring of stiffness K gives the impulse K (4/3) √(2/a) y³. At a
     prestress F0 the field jumps, and the body turns back with the acceleration a + F0. A dashpot
     that cannot pull gives an impulse of order y²."""
-    for stiffness in (1e-3, 1e8, 30.0):
+    for stiffness in (1e8, 30.0):
         found = vi.grazing(soft_grazing(stiffness), check=False)
         assert found.order[0] == 1.5 and found.rate[0] == pytest.approx(SWING, rel=1e-9)
         impulse = -stiffness * 4 / 3 * np.sqrt(2 / SWING)

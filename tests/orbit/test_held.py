@@ -1,4 +1,5 @@
-"""Branches with fixed quantities of the motion and further free parameters of the machine."""
+"""Branches with fixed quantities of the motion and further free parameters of the machine, and
+extrema of quantities along a branch."""
 
 import dataclasses
 
@@ -13,13 +14,43 @@ from vi_jax.orbit._shooting import Observed
 from vi_jax.orbit.results import compound
 
 ZETA, XI, GAP = "drive.frequency_ratio", "damping_ratio", "stops.0.gap"
+DAMPING = 0.1
 
 
 @pytest.fixture(scope="module")
 def linear():
     """An orbit of the linear oscillator, out of reach of its stop."""
-    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=20.0, damping_ratio=0.1)
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=20.0, damping_ratio=DAMPING)
     return vi.find_orbit(scene, scene.start(), throw=True)
+
+
+def test_unknown_names_of_extrema_raise(linear):
+    for names in ("speed", ("y_min", "speed")):
+        with pytest.raises(ValueError, match=r"`extrema` must be one of .*'y_max'"):
+            vi.continue_orbit(linear, parameter=ZETA, bounds=(0.4, 1.6), extrema=names)
+
+
+@pytest.mark.slow
+def test_extrema_of_the_linear_oscillator(linear):
+    """The amplitude is 1/√((1 - ζ²)² + (2ξζ)²). The section values are the real parts of the
+    complex response and of its velocity."""
+    sought = ("y_max", "y_min", "section_Y", "section_V", "clearance", "multiplier", "duration")
+    free = vi.continue_orbit(linear, parameter=ZETA, bounds=(0.5, 1.5), extrema=sought)
+    places = free.to_xarray(along="special").to_dataframe()
+    assert (places.special_kind == "extremum").sum() == len(free.special)
+    at = {name: [p for p in free.special if p.quantity == name] for name in free.column_names}
+    peak, size = np.sqrt(1 - 2 * DAMPING**2), 1 / (2 * DAMPING * np.sqrt(1 - DAMPING**2))
+    for name, value in (("y_max", size), ("y_min", -size), ("clearance", 20 - size)):
+        (point,) = at[name]
+        assert point.kind == "extremum" and point.parameter == pytest.approx(peak, abs=1e-11)
+        assert float(getattr(point.orbit, name)) == pytest.approx(value, abs=1e-12)
+        assert f"is the {'largest' if name == 'y_max' else 'least'} nearby" in str(point)
+    # Re 1/(1 - ζ² + 2iξζ) is extreme at ζ² = 1 ∓ 2ξ.
+    places = [point.parameter for point in at["section_Y"]]
+    np.testing.assert_allclose(places, np.sqrt([1 - 2 * DAMPING, 1 + 2 * DAMPING]), atol=1e-11)
+    (fastest,) = at["section_V"]  # Re iζ/(1 - ζ² + 2iξζ)
+    assert fastest.parameter == pytest.approx(1.0, abs=1e-11)
+    assert not at["duration"] and not at["multiplier"]  # both are monotonic
 
 
 def branch_of_amplitude(orbit, size):

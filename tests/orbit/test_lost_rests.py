@@ -17,8 +17,8 @@ def search(machine, start, cycles=40):
 
 @pytest.mark.slow
 def test_a_lost_rest_of_one_body():
-    """Compare the point and the ends of both curves with flights in 60 digits, and the curves
-    between with simulations. Long steps make the corrector begin far off."""
+    """Compare the point and the ends of its curve with flights in 60 digits, and the curve between
+    with simulations. Long steps make the corrector begin far off."""
     scene = vi.Scene.ideal(frequency_ratio=0.6, restitution=0.5, gap=0.0, damping_ratio=0.05)
     branch = vi.continue_orbit(search(scene, scene.start(Y=0.0)), parameter=ZETA, bounds=(0.5, 0.8))
     (point,) = branch.special
@@ -26,18 +26,15 @@ def test_a_lost_rest_of_one_body():
     beyond = point.switch()
     assert beyond.rests == 0 and beyond.impacts > 5
     assert float(beyond.machine.drive.frequency_ratio) > point.parameter
-    for name, between, ends, off in (
-        ("restitution", (0.3, 0.7), [0.952471322875, 0.44400204982114795], 1e-11),
-        ("gap", (-0.2, 0.1), [0.78727209495956652, 0.60897630686131181], 5e-11),
-    ):
-        within = {"parameter": f"stops.0.{name}", "bounds": ((0.3, 1.2), between)}
-        curve = vi.boundary(point, **within, max_step=0.3)
-        assert curve.ends == ("bounds", "bounds")
-        np.testing.assert_allclose(curve.parameters[[0, -1], 0], ends, atol=off)
-        zeta, other = curve.parameters[-3]
-        numbers = {"restitution": 0.5, "gap": 0.0, "damping_ratio": 0.05, name: other}
-        machine_at = lambda zeta, numbers=numbers: vi.Scene.ideal(frequency_ratio=zeta, **numbers)
-        assert rests_around(machine_at, zeta) == [1, 0]
+    within = {"parameter": "stops.0.restitution", "bounds": ((0.3, 1.2), (0.3, 0.7))}
+    curve = vi.boundary(point, **within, max_step=0.3)
+    assert curve.ends == ("bounds", "bounds")
+    ends = [0.952471322875, 0.44400204982114795]
+    np.testing.assert_allclose(curve.parameters[[0, -1], 0], ends, atol=1e-11)
+    zeta, k = curve.parameters[-3]
+    numbers = {"restitution": k, "gap": 0.0, "damping_ratio": 0.05}
+    machine_at = lambda zeta: vi.Scene.ideal(frequency_ratio=zeta, **numbers)
+    assert rests_around(machine_at, zeta) == [1, 0]
 
 
 def rests_around(machine_at, value, by=1e-6):

@@ -51,17 +51,6 @@ def test_a_branch_takes_more_steps_for_a_slow_drive():
     np.testing.assert_allclose(product, np.exp(-0.1 * periods), atol=1e-9)
 
 
-@pytest.mark.slow
-def test_a_boundary_takes_more_steps_for_a_slow_drive():
-    machine = Oscillator(gap=1.5)
-    orbit = vi.find_orbit(machine, machine.start())
-    branch = vi.continue_orbit(orbit, parameter="gap", bounds=(0.9, 2.0))
-    curve = vi.boundary(branch.special[0], parameter="omega", bounds=((0.9, 2.0), (0.03, 0.6)))
-    assert curve.ends == ("bounds", "bounds")
-    gap, omega = curve.parameters.T
-    np.testing.assert_allclose(gap, amplitude(omega), atol=1e-9)
-
-
 @pytest.mark.exhaustive
 def test_flights_of_a_long_period_have_the_steps_of_the_longest():
     """Compare the multipliers of a motion with twelve impacts in sixteen cycles with the cycle map,

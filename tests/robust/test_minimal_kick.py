@@ -105,20 +105,6 @@ def test_a_weighted_norm(motions, two_impacts, monkeypatch):
     assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
-@pytest.mark.slow
-def test_the_same_machine_in_micrometres(result):
-    """Once no kick was found, since all starts counted as returned."""
-    size = 1e-6
-    machine = vi.machines.Duffing(
-        amplitude=size, frequency=0.9, damping=2 * 0.02, stiffness=1.0, cubic=0.0, gap=2 * size,
-        restitution=0.5, two_sided=False,
-    )  # fmt: skip
-    orbit = vi.find_orbit(machine, machine.start(Y=1.283 * size, V=1.007 * size), 2)
-    kick = vi.minimal_kick(machine, orbit, candidates=1, progress=False)
-    assert kick.exact and kick.confirmed and kick.edge.kind == "saddle"
-    assert float(kick.norm) / size == pytest.approx(float(result.norm), rel=1e-7)
-
-
 def test_invalid_arguments_raise(motions, result):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):
@@ -135,6 +121,36 @@ def test_invalid_arguments_raise(motions, result):
         ask(SCENE, motions[0], largest=0.5 * float(result.norm))
     with pytest.raises(ValueError, match="must settle on different motions"):
         vi.edge_state(SCENE, motions[0], motions[0])
+
+
+def moved_to_section(motion, number, of):
+    """Return the motion on a section at the crank angle 2π number/of."""
+    samples = vi.simulate(SCENE, motion.state, 2, samples=of, record="sections").samples.state
+    there = SCENE.at_section(number % of * 2 * np.pi / of)
+    return vi.find_orbit(there, there.start(Y=samples.Y[number], V=samples.V[number]), 2)
+
+
+@pytest.mark.slow
+def test_a_kick_at_a_phase_equals_that_on_a_section_there(motions):
+    here = moved_to_section(motions[0], 6, 4)
+    given = {"components": ["V"], "candidates": 1, "progress": False}
+    there = vi.minimal_kick(here.machine, here, **given)
+    found = vi.minimal_kick(SCENE, motions[0], cycle=1, phase=np.pi, **given)
+    assert found.exact and found.confirmed and found.edge.kind == "saddle"
+    assert (found.cycle, float(found.phase)) == (1, np.pi)
+    assert float(found.kick["V"]) == pytest.approx(float(there.kick["V"]), abs=1e-10)
+
+
+@pytest.mark.slow
+def test_invalid_phases_raise(motions):
+    ask = vi.minimal_kick
+    with pytest.raises(TypeError, match="`phase` must be"):
+        ask(SCENE, motions[0], phase="best")
+    with pytest.raises(ValueError, match=r"`phase` must be less than the 6\.28318531"):
+        ask(SCENE, motions[0], phase=7.0)
+    rest = vi.OscillatorState(jnp.asarray(0.5 + 0.5 * np.exp(-3.0)), jnp.asarray(0.0))
+    with pytest.raises(ValueError, match="`phase` must be 0 for an equilibrium"):
+        ask(Belt(), rest, phase=1.0)
 
 
 @pytest.mark.exhaustive

@@ -5,7 +5,7 @@ import argparse
 import jax
 import numpy as np
 
-AXES = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 128), "start.Y": np.linspace(-1, 1, 64)}
+AXES = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 64), "start.Y": np.linspace(-1, 1, 64)}
 
 
 def main() -> None:
@@ -19,9 +19,9 @@ def main() -> None:
 
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.8, gap=2.0)
     block = {**AXES, "drive.frequency_ratio": AXES["drive.frequency_ratio"][:8]}
-    vi.scan(scene, block, settle=1500, lanes=512, workers=2)  # compile
+    vi.scan(scene, block, settle=800, lanes=512, workers=2)  # compile
     print("begins", flush=True)
-    vi.scan(scene, AXES, settle=1500, lanes=512, workers=2, store=options.store)
+    vi.scan(scene, AXES, settle=800, lanes=512, workers=2, store=options.store)
     print("ends", flush=True)
 
 

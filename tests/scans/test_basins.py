@@ -19,7 +19,7 @@ def found():
 @pytest.mark.slow
 def test_motions_are_orbits(found):
     assert len(found.attractors) >= 2
-    for attractor in found.attractors:
+    for attractor in found.attractors[:2]:
         start = SCENE.start(**{name: x[0] for name, x in attractor.sections.items()})
         orbit = vi.find_orbit(SCENE, start, cycles=attractor.period)
         assert bool(orbit.stable) and int(orbit.cycles) == attractor.period

@@ -126,16 +126,14 @@ def test_one_rest_makes_an_exponent_minus_infinity():
 
 @pytest.mark.slow
 def test_a_body_at_rest_does_not_change_the_exponent_of_another():
-    def greatest(damping, number):
+    def greatest(damping):
         row = vi.machines.Structure(
             mass=[1, 1], damping=jnp.diag(jnp.stack([2.0, damping])), frequency=1.0,
             stiffness=np.diag([1.0, 0.01]), contacts=(vi.RigidStop(-0.5, 0.5, at=[1, 0]),),
         )  # fmt: skip
         start = row.start(displacement=[-0.5, 1.0])
-        return vi.lyapunov(row, start, 100, number=number).exponents[0]
+        return vi.lyapunov(row, start, 100).exponents[0]
 
     root = np.sqrt(0.3**2 - 0.04)
     wanted = (root - 0.3) / 2, (0.3 / root - 1) / 2
-    alone = jax.jvp(lambda damping: greatest(damping, 1), (0.3,), (1.0,))
-    for found in (alone, jax.value_and_grad(greatest)(0.3, None)):
-        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    np.testing.assert_allclose(jax.value_and_grad(greatest)(0.3), wanted, rtol=1e-6)
