@@ -68,7 +68,7 @@ CALLS = {
     "record='all'": (simulate(record="all"), "`record` must be one of 'motion', 'sections'"),
     "NaN in a start": (simulate(vi.OscillatorState(np.nan, 0.0)), "must be finite"),
     "machine and start swapped": (lambda: vi.simulate(START, SCENE, 2), "`machine` must be a"),
-    "a list as start": (simulate([0.0, 0.0]), "`start` must be a `OscillatorState`"),
+    "a list as start": (simulate([0.0, 0.0]), "`start` must be a state of Y, V for"),
     **{f"{x!r} in {who}": (call(vi.OscillatorState(x, 0.0)), "must hold real numbers, but its Y")
        for x in (1j, jnp.array(True), "a")
        for who, call in {
@@ -78,8 +78,8 @@ CALLS = {
            "an own scene's start": lambda start: lambda: vi.simulate(Own(), start, 2)}.items()},
     "a list for an own scene": (lambda: vi.simulate(Own(), [0.0], 2), "`start` must be a state"),
     "a text for an own scene": (lambda: vi.simulate(Own(), "ab", 2), "`start` must hold real"),
-    "a list as a scan's start": (scan(start=[0.0]), "`start` must be a `OscillatorState`"),
-    "a text as a sweep's start": (sweep(start="ab"), "`start` must be a `OscillatorState`"),
+    "a list as a scan's start": (scan(start=[0.0]), "`start` must be a state of Y, V for"),
+    "a text as a sweep's start": (sweep(start="ab"), "`start` must be a state of Y, V for"),
     "cycles=2*10**9": (simulate(cycles=2 * 10**9), "results that fit into the memory"),
     "samples=10**12": (simulate(samples=10**12), "`samples` must be at most"),
     "a grid": (scan({ZETA: np.linspace(0.5, 1, 10**6), "start.Y": np.linspace(0, 1, 10**6)}),
