@@ -136,7 +136,7 @@ def test_sweep(run):
     name = "Sweep of drive.frequency_ratio, 11 values"
     assert f"up: {name}:\n  2π with 1 impact from 1.2\n" in out
     assert f"down: {name}:\n  2π with 0 impacts from 1.7\n" in out
-    assert out.count(", jump since ") == 2 and is_png("s.png")
+    assert out.count(", large change since ") == 2 and is_png("s.png")
     table = rows("s.csv")
     assert [row["direction"] for row in table] == ["up"] * 11 + ["down"] * 11
     assert {row["result"] for row in table} == {"successful"}

@@ -105,6 +105,9 @@ def test_branches_of_4pi(family):
     assert "period-doubling" in doubled.ends
     springs = next(p for p in doubled.special if "begins at" in p.detail)
     at = first_of(single, "period-doubling").parameter
+    assert "right stop at crank angle φ = " in str(springs.orbit) and " rad, V⁻" in str(
+        springs.orbit
+    )
     assert springs.kind == "period-doubling" and springs.parameter == pytest.approx(at, abs=1e-11)
     assert float(springs.orbit.residual) < 1e-12
     # The 4π motion with one impact begins where the doubled motion loses an impact.
@@ -116,6 +119,7 @@ def test_branches_of_4pi(family):
     for point in touches:  # the message gives a phase in the period, with the body at the stop
         matched = re.search(r"touches a stop at crank angle φ = ([0-9.]+) of 4π", str(point))
         assert matched is not None and 0 <= float(matched[1]) < 4 * np.pi
+        assert str(point).startswith(f"grazing at {point.parameter:.10g} ω: ")
         run = point.orbit.trajectory(samples=4096)
         there = np.interp(float(matched[1]) / (2 * np.pi), run.samples.cycles, run.samples.state.Y)
         assert float(there) == pytest.approx(2.0, abs=1e-4)

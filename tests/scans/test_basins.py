@@ -49,7 +49,7 @@ def test_regimes_have_one_code(found):
     free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)  # undamped: not periodic
     swept = vi.sweep(free, "drive.frequency_ratio", [0.77], start=free.start(Y=0.3), settle=5)
     assert int(swept.period[0]) == vi.REGIMES.unsettled
-    assert str(swept).endswith("no period, or unsettled from 0.77")
+    assert str(swept).endswith("no period, or unsettled from 0.77 ω")
     flags = [found.data[x].attrs["flag_values"] for x in ("period", "label")]
     assert flags[0] == flags[1] == sorted(vi.REGIMES) and max(vi.REGIMES) < 0
     beyond = vi.basins(SCENE, {"start.Y": (0.05, 2.05)}, resolution=4, settle=200)

@@ -134,6 +134,7 @@ def disc_and_rest(size=40, *, beyond=0.8):
 def test_integrity_of_motions():
     found = disc_and_rest(200)
     inside, outside = found.integrity()
+    assert str(inside).startswith("Integrity(\n  label=0,\n  local=") and "array" not in str(inside)
     assert inside.resolution == pytest.approx(np.sqrt(2) / 200)
     np.testing.assert_allclose(inside.sections, [0.5, 0.3], atol=inside.resolution)
     assert inside.local == inside.sections.min() and not inside.local_at_edge

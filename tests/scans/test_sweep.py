@@ -1,4 +1,4 @@
-"""Sweeps: the state carried from value to value, and the text about jumps."""
+"""Sweeps: the state carried from value to value, and the text about large changes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,17 +41,19 @@ def _described(y_min, period, impacts, zeta=None):
     return str(sweep).splitlines()[1:]
 
 
-def test_the_text_of_a_sweep_reports_jumps():
+def test_the_text_of_a_sweep_reports_large_changes():
     # The period is constant, but the motion jumps.
     lost = _described([-3.3, -3.4, -0.7, -0.68], [1] * 4, [1.0, 1.0, 0.0, 0.0], [1.0, 1, 1.3, 1.3])
     assert lost == [
         "  2π with 1 impact from 1",
-        "  2π with 0 impacts from 1.2, jump since 1.1: min Y -3.4 → -0.7 a, ζ 1 → 1.3 ω",
+        "  2π with 0 impacts from 1.2, large change since 1.1: min Y -3.4 → -0.7 a, ζ 1 → 1.3 ω",
     ]
     # A jump to another branch with the same period and impacts.
     other = _described([-1.0, -1.05, -1.1, -2.0, -2.04, -2.08], [2] * 6, [3.0] * 6)
-    assert other[1] == "  still 4π with 3 impacts from 1.3, jump since 1.2: min Y -1.1 → -2 a"
-    # Neither a steep steady change nor chaos is a jump.
+    assert (
+        other[1] == "  still 4π with 3 impacts from 1.3, large change since 1.2: min Y -1.1 → -2 a"
+    )
+    # Neither a steep steady change nor chaos is reported.
     assert len(_described([-1.0, -2.0, -3.0, -4.2], [1] * 4, [1.0] * 4)) == 1
     assert (
         len(_described([-1.0, -1.01, -2.3, -2.31, -1.2], [-2] * 5, [0.4, 0.5, 0.6, 0.3, 0.4])) == 1

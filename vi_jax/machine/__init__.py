@@ -9,7 +9,7 @@ from .base import (
     names_on, number_on, renews,
 )
 from .clocks import (
-    as_logged, at_section, clock_in_words, convert_start, cycle_time, cycles_in_words,
+    as_logged, at_section, clock_in_words, clock_word, convert_start, cycle_time, cycles_in_words,
     frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive, is_in_range,
     logged_turn, may_rest, phase_at, prepared, scales_known,
 )
@@ -40,10 +40,10 @@ from .friction import ContactFriction, DryFriction
 from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (
-    PLAIN, Shown, Stated, Summarized, attributes, by_name, check_again, check_leaf, check_name,
-    components, drive_speed, first_few, in_brackets, in_rows, in_unit, leaf, leaf_names,
-    name_in, number_in_words, plain, quantity_of, size_of, state_in_words, stated, unit_of,
-    units_of, with_leaf, with_leaves, with_unit, with_units,
+    PLAIN, QUANTITIES, Shown, Stated, Summarized, attributes, by_name, check_again, check_leaf,
+    check_name, components, drive_speed, first_few, in_brackets, in_rows, in_unit, in_words, leaf,
+    leaf_names, name_in, near_names, number_in_words, plain, quantity_of, size_of, state_in_words,
+    stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
 )
 from .scene import Parameters, Scene
 from .state import State, like

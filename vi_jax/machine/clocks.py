@@ -85,13 +85,17 @@ def cycles_in_words(machine: Machine, cycles: int) -> str:
     return f"{2 * cycles}π" if isinstance(machine, Scene) else count_of(cycles, "cycle")
 
 
+def clock_word(machine: Machine) -> str:
+    """Return the words before a clock reading."""
+    return "crank angle φ =" if isinstance(machine, Scene) else "clock"
+
+
 def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
     """Return a clock reading in words, within a motion of this number of cycles."""
+    word = clock_word(machine)
     if isinstance(machine, Scene):
-        angle = float(machine.phase_at(since_section))
-        return f"crank angle φ = {angle:.6g} of {2 * cycles}π"
-    words = count_of(cycles, "cycle")
-    return f"clock {since_section:.6g} after its section (motion of {words})"
+        return f"{word} {float(machine.phase_at(since_section)):.6g} of {2 * cycles}π"
+    return f"{word} {since_section:.6g} after its section (motion of {count_of(cycles, 'cycle')})"
 
 
 def scales_known(machine: Machine) -> bool:

@@ -138,13 +138,24 @@ def check_name(names: list[str], name: str, argument: str, machine: object = Non
             f"Argument `{argument}` must be a number of the machine, but {name!r} has no type in "
             f"the class. Write `{name}: float = {untyped!r}`."
         )
-    similar = difflib.get_close_matches(str(name), names, n=3, cutoff=0.3)
-    ending = [other for other in names if str(name).split(".")[-1] in other]
-    similar = list(dict.fromkeys(ending + similar))
-    hint = f"near names: {', '.join(similar)}" if similar else f"its names: {', '.join(names)}"
     raise ValueError(
-        f"Argument `{argument}` must be a number of the machine, but got {name!r}; {hint}."
+        f"Argument `{argument}` must be a number of the machine, but got {name!r}; "
+        f"{near_names(name, names)}."
     )
+
+
+def near_names(name: object, names: list[str]) -> str:
+    """Return the names that are near `name`, or else all of them, in words."""
+    last = str(name).split(".")[-1]
+    ends = {other: other.split(".")[-1] for other in names}
+    near = [
+        other
+        for other, end in ends.items()
+        if (len(last) > 1 and last in end) or difflib.get_close_matches(last, [end])
+    ]
+    near = list(dict.fromkeys(near + difflib.get_close_matches(str(name), names)))
+    found = "near" if near else "its"
+    return f"{found} names: {', '.join(first_few(near or names))}"
 
 
 def check_again(machine: Machine) -> None:

@@ -33,6 +33,7 @@ from ..machine import (
     AbstractMachine,
     Summarized,
     angles_in,
+    clock_word,
     cycles_in_words,
     first_few,
     in_rows,
@@ -328,15 +329,15 @@ class Orbit(Summarized):
             f"  section: {state_in_words(without_modes(self.state), 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
-        clock = "time" if is_autonomous(self.machine, self.state) else "phase"
-        if clock == "time":
+        if is_autonomous(self.machine, self.state):
             lines.append(f"  duration: {in_unit(f'{float(self.duration):.9g}', units, 'time')}")
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
                 name = stops_of(self.machine)[int(stop)].side
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
-                lines.append(f"  impact: {name} stop at {clock} {float(phase):.6f}, V⁻ = {fast}")
+                clock = in_unit(f"{clock_word(self.machine)} {float(phase):.6f}", units, "phase")
+                lines.append(f"  impact: {name} stop at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(jnp.sum(self.impact_stop >= 0))

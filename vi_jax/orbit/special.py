@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._checks import given_number, one_of
+from ..machine import in_unit, units_of
 from ._conditions import in_one_parameter
 from ._shooting import Shooting
 from ._sliding import SLIDING
@@ -139,8 +140,10 @@ class Point:
         return start(self, distance)
 
     def __repr__(self) -> str:
-        values = self.parameters[: 1 if self.curve is None else None]
-        place = ", ".join(f"{x:.10g}" for x in values)
+        units, names = units_of(self.problem.machine), (self.problem.parameters[-1], *self.further)
+        values = zip(names, self.parameters, strict=True)
+        found = [in_unit(f"{x:.10g}", units, name) for name, x in values]
+        place = found[0] if self.curve is None else ", ".join(found)
         return f"{self.kind} at {f'({place})' if self.curve else place}: {self.detail}"
 
 

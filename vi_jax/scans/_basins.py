@@ -35,6 +35,7 @@ from ..machine import (
     components,
     cycles_in_words,
     in_rows,
+    in_words,
     is_angle,
     nearest_images,
     state_in_words,
@@ -70,6 +71,9 @@ class Attractor(NamedTuple):
     """Standard error of `fraction` for random starts, √(p(1 - p)/N); on a grid it is an upper
     estimate."""
 
+    def __repr__(self) -> str:
+        return in_words(self)
+
 
 class Integrity(NamedTuple):
     """Measures of the basin of a motion, after Soliman and Thompson (1989), and Lenci and Rega
@@ -92,6 +96,9 @@ class Integrity(NamedTuple):
     """True if the edge of the region limits the ball of `factor`."""
     resolution: float
     """The uncertainty of the radii: half a diagonal of the grid's cells."""
+
+    def __repr__(self) -> str:
+        return in_words(self)
 
 
 class Basins(NamedTuple):

@@ -42,6 +42,7 @@ from ..machine import (
     drive_speed,
     frequency_ratio,
     in_clock,
+    in_unit,
     may_rest,
     name_in,
     replaced,
@@ -56,9 +57,9 @@ from ..machine import (
 from .measures import CODES, REGIMES, Regime, Usual, flags
 from .program import lane_noise_of
 
-# A jump is this many times the change at the neighbouring values, and this share of the largest
-# position, or of ζ: choices.
-_JUMP, _LEAST_JUMP = 3.0, 0.01
+# A change is large from this many times the changes at neighbouring values, and this share of the
+# largest position, or of ζ, on: choices. It may be a jump, or a steep change in a coarse sweep.
+_TIMES_USUAL, _LEAST_CHANGE = 3.0, 0.01
 
 # The variables with one number at each value of every sweep.
 COLUMNS = (
@@ -131,19 +132,20 @@ class Sweep(Summarized):
                 f"Sweeps of {self.parameter}, shape {self.values.shape} with the values last; "
                 f"{good} of {self.values.size} successful"
             )
-        values, lines = np.asarray(self.values), []
-        kinds, jumps = self._motions_in_words(), self._jumps()
-        for i, value in enumerate(values):
+        units, lines = dict(self.units), []
+        places = [in_unit(f"{x:.6g}", units, self.parameter) for x in np.asarray(self.values)]
+        kinds, changes = self._motions_in_words(), self._large_changes()
+        for i in range(len(places)):
             same = bool(i) and kinds[i] == kinds[i - 1]
-            if same and not jumps[i]:
+            if same and not changes[i]:
                 continue
-            line = f"  {'still ' if same else ''}{kinds[i]} from {value:.6g}"
-            if jumps[i]:
-                line += f", jump since {values[i - 1]:.6g}: {', '.join(jumps[i])}"
+            line = f"  {'still ' if same else ''}{kinds[i]} from {places[i]}"
+            if changes[i]:
+                line += f", large change since {places[i - 1]}: {', '.join(changes[i])}"
             lines.append(line)
         if len(lines) > 12:
             lines = [*lines[:12], f"  {len(lines) - 12} further changes"]
-        return "\n".join([f"Sweep of {self.parameter}, {values.size} values:", *lines])
+        return "\n".join([f"Sweep of {self.parameter}, {len(places)} values:", *lines])
 
     def _motions_in_words(self) -> list[str]:
         special = {int(REGIMES.unsettled): "no period, or unsettled"}
@@ -157,7 +159,7 @@ class Sweep(Summarized):
             )
         ]
 
-    def _jumps(self) -> list[list[str]]:
+    def _large_changes(self) -> list[list[str]]:
         """Return the changes at each value that are far larger than at neighbours, if periodic."""
         name, units = name_in(self.labels[0]), dict(self.units)
         unit = unit_of(units, "frequency_ratio")
@@ -178,9 +180,9 @@ class Sweep(Summarized):
             usual = np.maximum(neighbours[:-2], neighbours[2:])
             size = np.abs(x) if name == speed else np.asarray(reach)
             scale = np.maximum(size[1:], size[:-1])
-            is_jump = (steps > _JUMP * usual) & (steps > _LEAST_JUMP * scale)
-            is_jump &= (period[1:] > 0) | (period[:-1] > 0)
-            for i in np.flatnonzero(is_jump) + 1:
+            is_large = (steps > _TIMES_USUAL * usual) & (steps > _LEAST_CHANGE * scale)
+            is_large &= (period[1:] > 0) | (period[:-1] > 0)
+            for i in np.flatnonzero(is_large) + 1:
                 found[i].append(with_unit(f"{name} {x[i - 1]:.6g} → {x[i]:.6g}", unit))
         return found
 
