@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -87,6 +88,21 @@ class CycleByNumpy(Harmonic):
     @property
     def cycle(self):
         return np.sqrt(self.length)
+
+
+class CycleByZero(Harmonic):
+    frequency: float = 0.0
+
+    @property
+    def cycle(self):
+        return 1 / self.frequency
+
+
+class WithUnits(Harmonic):
+    units: ClassVar = {"x": "mm", "spede": "mm/s"}
+
+    def quantities(self, t, z):
+        return {"speed": jnp.abs(z.u)}
 
 
 class StopByNumpy(Harmonic):
@@ -267,12 +283,6 @@ class Blind(Machine):
         return super().field(s, x)
 
 
-class Stopped(Machine):
-    @property
-    def cycle(self):
-        return 2 / 0.0
-
-
 class Driving(Machine):
     contacts = (vi.DryFriction(0.1, on="V", load=lambda x: -9.81),)
 
@@ -294,13 +304,15 @@ class Spare(Machine):
         ),
         (lambda: NoType(stiffness=3.0), "in the class, `stiffness: float = 2.0`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
+        (lambda: simulate(CycleByZero()), "`cycle` of a CycleByZero must be finite, but divides"),
+        (lambda: simulate(WithUnits()), "but has 'spede'; near names: speed"),
+        (lambda: vi.sweep(SCENE, "start.Y", [1.0]), "its names: damping_ratio, drive.freq"),
         (
             lambda: vi.simulate(
                 dataclasses.replace(SCENE, soft_stops=(vi.SoftStop(1.0, 9.0, mass=2.0),)), None, 1
             ),
             "Soft stop 0 of a Scene must have no `mass`",
         ),
-        (lambda: simulate(Stopped()), "`cycle` of a Stopped divides by zero"),
         (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),

@@ -133,7 +133,7 @@ def _is_traceable(function: Callable[..., Any], *arguments: Any) -> bool:
 
 @contextlib.contextmanager
 def explain_errors(label: str) -> Iterator[None]:
-    """Turn errors about traced numbers and assignments into one sentence with the remedy."""
+    """Turn errors about traced numbers, assignments and division by zero into one sentence."""
     try:
         yield
     except jax.errors.TracerBoolConversionError as error:
@@ -145,11 +145,13 @@ def explain_errors(label: str) -> Iterator[None]:
             f"{label} must be written for numbers that are traced: with the functions of "
             "`jax.numpy`, not with those of `numpy` or `math`, `float` or `int`."
         ) from error
-    except ZeroDivisionError as error:
-        raise ValueError(f"{label} divides by zero: a number of the machine is 0.") from error
     except dataclasses.FrozenInstanceError as error:
         raise TypeError(
             f"{label} must return new numbers, and change neither machine nor state: {error}."
+        ) from error
+    except ZeroDivisionError as error:
+        raise ValueError(
+            f"{label} must be finite, but divides by zero. One of its numbers is 0."
         ) from error
 
 
@@ -440,7 +442,8 @@ def check_parts(machine: AbstractMachine) -> None:
     `ValueError` for an invalid one."""
     name = type(machine).__name__
     for what, (belongs, words) in _KINDS.items():
-        parts = listed(getattr(machine, what))
+        with explain_errors(f"`{what}` of a {name}"):
+            parts = listed(getattr(machine, what))
         if not isinstance(parts, tuple) or not all(map(belongs, parts)):
             hint = " Write `@property` above its `def`." if callable(parts) else ""
             raise TypeError(
@@ -448,15 +451,15 @@ def check_parts(machine: AbstractMachine) -> None:
             )
     _check_names(machine)
     with explain_errors(f"`cycle` of a {name}"):
-        cycle = machine.cycle
-    if callable(cycle):
+        length = machine.cycle
+    if callable(length):
         raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
-    if jnp.shape(cycle):
+    if jnp.shape(length):
         raise ValueError(
-            f"`cycle` of a {name} must be one number, but has shape {jnp.shape(cycle)}."
+            f"`cycle` of a {name} must be one number, but has shape {jnp.shape(length)}."
             f"{batch_hint(machine)}"
         )
-    cycle = concrete(cycle)
+    cycle = concrete(length)
     if cycle is not None and not (np.isfinite(cycle) & (cycle > 0)).all():
         raise ValueError(f"`cycle` of a {name} must be positive and finite, but is {cycle}.")
     if isinstance(machine, LinearMachine | Scene):

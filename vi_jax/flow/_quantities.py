@@ -10,8 +10,19 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._checks import fields_with
 from .._types import State
-from ..machine import AbstractMachine, begin_modes, components, leaf_names, overridden, shown_modes
+from ..machine import (
+    PLAIN,
+    QUANTITIES,
+    AbstractMachine,
+    begin_modes,
+    components,
+    leaf_names,
+    near_names,
+    overridden,
+    shown_modes,
+)
 from ._machine_checks import explain_errors
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.
@@ -22,6 +33,9 @@ _RESERVED = frozenset(
     rejected residual rests result row sample sections section stability stable start state
     steps y_max y_min""".split()
 )
+
+# Names that `units` may have for any machine.
+_WITH_UNITS = sorted({*PLAIN, *QUANTITIES.values(), "power"})
 
 
 def has_averages(machine: AbstractMachine) -> bool:
@@ -55,6 +69,23 @@ def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
         return ()
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
     return _checked_names(machine, "quantities", machine.quantities, start, (zero, start))
+
+
+def check_units(machine: AbstractMachine, start: State) -> None:
+    """**Raises:** `ValueError` if the user's `units` of a machine have a name of nothing in it."""
+    owner = next(kind for kind in type(machine).__mro__ if "units" in vars(kind))
+    if owner.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return
+    words = [*leaf_names(machine), *leaf_names(start), *components(start)]
+    words += [name.rpartition(".")[2] for name in words]
+    words += [*fields_with(type(machine), "unit"), *_WITH_UNITS]
+    words += average_names(machine, start) + quantity_names(machine, start)
+    for name in machine.units:
+        if name and name not in words and not hasattr(machine, name):
+            raise ValueError(
+                f"`units` of a {type(machine).__name__} must name its parameters, components and "
+                f"quantities, but has {name!r}; {near_names(name, list(dict.fromkeys(words)))}."
+            )
 
 
 def quantities_on(machine: AbstractMachine, sections: State, lead: int = 0) -> dict[str, Array]:

@@ -62,7 +62,7 @@ from ._machine_checks import (
     check_values,
     explain_errors,
 )
-from ._quantities import average_names, quantity_names
+from ._quantities import average_names, check_units, quantity_names
 from .methods import AbstractMethod, MethodLike, chosen
 from .smooth import rounding_bounds
 
@@ -165,6 +165,7 @@ def make_plan(
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
     quantity_names(machine, start)  # invalid quantities are refused
+    check_units(machine, start)
     columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]

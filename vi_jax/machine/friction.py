@@ -152,8 +152,8 @@ class DryFriction(Friction):
     **Arguments:**
 
     - `level`: μN in the machine's unit of force, or a function of the sliding speed (Stribeck's
-      curve), smooth from a little below zero on. Its values must not be negative; those of a
-      function are not checked. A function with parameters is an `equinox.Module` with `__call__`.
+      curve), smooth from a little below zero on. Its values must not be negative. A function with
+      parameters is an `equinox.Module` with `__call__`.
     - `on`: the name of the velocity that it acts on, `"u"`; of a `Mechanical` a coordinate, or a
       function of its coordinates: `on=lambda q: q.b - q.a` is friction between two bodies.
     - `mass`: the mass of that body, 1 by default; a `Mechanical` computes it.
