@@ -134,8 +134,8 @@ def test_sweep(run):
         output = "s.csv"
         """)  # fmt: skip
     name = "Sweep of drive.frequency_ratio, 11 values"
-    assert f"up: {name}:\n  2π with 1 impact from 1.2\n" in out
-    assert f"down: {name}:\n  2π with 0 impacts from 1.7\n" in out
+    assert f"up: {name}:\n  2π with 1 impact from 1.2 ω\n" in out
+    assert f"down: {name}:\n  2π with 0 impacts from 1.7 ω\n" in out
     assert out.count(", large change since ") == 2 and is_png("s.png")
     table = rows("s.csv")
     assert [row["direction"] for row in table] == ["up"] * 11 + ["down"] * 11

@@ -273,3 +273,57 @@ def test_a_turn_where_friction_reverses_counts_for_the_stop_ahead_only():
     assert int(alone.impacts.min()) > 0 and float(alone.y_min.min()) < -0.2
     np.testing.assert_allclose(between.clearance, 9.0 + between.y_min, atol=1e-9)
     assert bool((alone.clearance == jnp.inf).all())
+
+
+class Carried(vi.Mechanical):
+    """A body on a belt, one on another, and one pressed onto a stop: all stick."""
+
+    q = ("x", "a", "b", "c", "d")
+    mass = (1.0, 2.0, 3.0, 1.0, 1.0)
+    cycle = 4.0
+    belt: float = 0.5
+
+    @property
+    def contacts(self):
+        return (
+            vi.DryFriction(1.0, on="x", slip=lambda z: z.v.x - self.belt),
+            vi.DryFriction(1.0, on=lambda q: q.b - q.a),
+            vi.RigidStop(0.0, 0.4, "left", on="c", friction=0.8, along="d"),
+        )
+
+    def force(self, t, q, v):
+        push = 0.3 * jnp.sin(jnp.pi * t / 2)
+        return dict(x=0.0, a=push, b=0.0, c=-1.0, d=push)
+
+
+def test_derivatives_from_a_start_that_sticks():
+    """A small slip stops at once: the belt keeps its speed, and the two bodies their momentum."""
+
+    def last(numbers):
+        belt, x, a, b, d = numbers
+        machine = Carried(belt=belt)
+        run = vi.simulate(machine, machine.at(v=dict(x=x, a=a, b=b, d=d)), 1)
+        return jnp.stack([run.last.x, run.last.a, run.last.b, run.last.d])
+
+    numbers = jnp.array([0.5, 0.5, 0.2, 0.2, 0.0])
+    together = [0, 0, 4 * 2 / 5, 4 * 3 / 5, 0]
+    truth = [[4.0, 0, 0, 0, 0], together, together, [0.0] * 5]
+    np.testing.assert_allclose(jax.jacfwd(last)(numbers), truth, atol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(last)(numbers), truth, atol=1e-9)
+
+
+class OnSurface(vi.AbstractMachine):
+    """The speed slides along the surface u = c."""
+
+    c: float = 0.0
+    cycle = 2 * np.pi
+    events = vi.Switch(lambda m, t, z: z.u - m.c, slides=True)
+
+    def field(self, t, z, side):
+        return dict(x=z.u, u=0.3 * jnp.sin(t) - 0.1 * z.x - side)
+
+
+def test_derivatives_from_a_start_that_slides_along_a_surface():
+    last = lambda u, c: vi.simulate(OnSurface(c=c), vi.State(x=0.2, u=u), 1).last.x
+    found = jax.grad(last, (0, 1))(0.0, 0.0)
+    np.testing.assert_allclose(found, [0.0, 2 * np.pi], atol=1e-9)

@@ -32,6 +32,7 @@ from ..machine import (
     longest_step,
     mode_number,
     modes_of,
+    on_held_surfaces,
     outcomes_of,
     prepared,
     replaced,
@@ -39,6 +40,7 @@ from ..machine import (
     size_of,
     stops_of,
     struck_modes,
+    switches_of,
     without_modes,
 )
 from ._lane import Lane, Plan, Record, to_event, total
@@ -215,6 +217,8 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
+    if any(x.is_dry or x.blends or x.friction_stop is not None for x in switches_of(machine)):
+        start = on_held_surfaces(machine, s, start, modes, contact or ())
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8

@@ -14,8 +14,8 @@ from .clocks import (
     logged_turn, may_rest, phase_at, prepared, scales_known,
 )
 from .contacts import (
-    added, check_takes, constrained_rate, contact_constraints, field_in, forces, push_gains,
-    push_of, shown_modes, velocity_change, with_friction_impulse,
+    added, check_takes, constrained_rate, contact_constraints, field_in, forces, on_held_surfaces,
+    push_gains, push_of, shown_modes, velocity_change, with_friction_impulse,
 )
 from .coordinates import (
     Coordinate, angles_in, component, has_component, is_angle, nearest_images, with_component,

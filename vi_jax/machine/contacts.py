@@ -199,16 +199,10 @@ def constrained_rate(
     bodies, pushes, acts, stop_frictions, masses = contact_constraints(
         machine, s, state, modes, contact
     )
-    wanted = [-velocity_change(body, state, flow) for body in bodies]
-    first, dry = len(bodies), []
-    for i, friction in enumerate(switches_of(machine)):
-        if friction.is_dry:  # not in impacts: its forces are finite
-            push, mass = friction.row(machine, s, state)
-            dry.append((i, mass))
-            bodies.append(friction.as_velocity(machine, s))
-            pushes.append(push)
-            acts.append(modes[i] == 0)
-            wanted.append(-friction.slip_rate(machine, s, state, flow))
+    wanted, first = [-velocity_change(body, state, flow) for body in bodies], len(bodies)
+    dry = _add_dry_frictions(machine, s, state, modes, (bodies, pushes, acts))
+    for i, _ in dry:
+        wanted.append(-switches_of(machine)[i].slip_rate(machine, s, state, flow))
     amounts = forces(push_gains(bodies, state, pushes), acts, wanted)
     pace, found = machine.pace(s, state), {}
     for (i, mass), amount in zip(dry, amounts[first:], strict=True):
@@ -218,6 +212,45 @@ def constrained_rate(
         sign = stops_of(machine)[friction.friction_stop].sign
         found[i] = amounts[row] * masses[row], -sign * amounts[stop] * masses[stop], masses[row]
     return added(flow, amounts, pushes), found
+
+
+def _add_dry_frictions(
+    machine: Machine, s: Scalar, state: State, modes: Sequence[Scalar], rows: tuple[list, ...]
+) -> list[tuple[int, Any]]:
+    """Add a row for each friction on a body to `ContactConstraints`. Return the frictions' indices
+    and masses. They take no part in impacts, since their forces are finite."""
+    found = []
+    for i, friction in enumerate(switches_of(machine)):
+        if friction.is_dry:
+            push, mass = friction.row(machine, s, state)
+            row = friction.as_velocity(machine, s), push, modes[i] == 0
+            for part, value in zip(rows, row, strict=True):
+                part.append(value)
+            found.append((i, mass))
+    return found
+
+
+def on_held_surfaces(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Sequence[Scalar]
+) -> State:
+    """Return a state in which bodies stick, or that slides along surfaces, without the rounding of
+    its slips and of its distances from the surfaces. A motion that begins with a small slip sticks
+    at once, so a slip has no derivatives."""
+    bodies, pushes, acts, _, _ = contact_constraints(machine, s, state, modes, contact)
+    _add_dry_frictions(machine, s, state, modes, (bodies, pushes, acts))
+    wanted = [-body.velocity(state) for body in bodies]
+    state = added(state, forces(push_gains(bodies, state, pushes), acts, wanted), pushes)
+    for i, switch in enumerate(switches_of(machine)):
+        if switch.blends:  # both fields lead to the same place of the surface
+            both = ((*modes[:i], jnp.full_like(s, m), *modes[i + 1 :]) for m in (1.0, -1.0))
+            up, down = (stop_gradient(field_in(machine, s, state, x)) for x in both)
+            across = jtu.tree_map(jnp.subtract, up, down)
+            rates = (rate_of(switch.function, machine, s, state, x) for x in (up, down))
+            rate = jnp.subtract(*stop_gradient(tuple(rates)))
+            slides = (modes[i] == 0) & (rate != 0)
+            amount = -switch.function(machine, s, state) / jnp.where(slides, rate, 1.0)
+            state = added(state, (jnp.where(slides, amount, 0.0),), (across,))
+    return state
 
 
 def shown_modes(machine: Machine, modes: Scalars) -> Scalars:
