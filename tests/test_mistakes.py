@@ -201,6 +201,7 @@ def test_4_arguments_in_another_order():
 def test_5_a_field_with_another_period():
     said = warned(lambda: simulate(OtherPeriod()))
     assert "`cycle` must be a period of the field" in said
+    assert "the value of its w differs" in warned(lambda: simulate(Masses()))
     assert "is not the same a `cycle` = 3.14159 later" in warned(lambda: simulate(HalfPeriod()))
     assert "but an event ends its cycles" in warned(lambda: simulate(DrivenSection()))
     assert not warned(lambda: simulate(Machine()))
@@ -283,6 +284,31 @@ class Blind(Machine):
         return super().field(s, x)
 
 
+class Masses(vi.Mechanical):
+    q = ("x", "w")
+    mass = (1.0,)
+    cycle = 2.0
+
+    def prescribed(self, t):
+        return {"w": 0.3 * t}
+
+    def force(self, t, q, v):
+        return {"x": -q.x}
+
+
+class ByNumber(Masses):
+    def prescribed(self, t):
+        return 0.3 * t
+
+
+class OtherGap(Masses):
+    contacts = vi.RigidStop(1.0, 0.5, on=lambda q: q.y - q.x)
+
+
+class WithoutMode(Masses):
+    contacts, events = vi.DryFriction(0.1, on="x"), vi.Switch(lambda m, t, z: z.x)
+
+
 class Driving(Machine):
     contacts = (vi.DryFriction(0.1, on="V", load=lambda x: -9.81),)
 
@@ -313,6 +339,11 @@ class Spare(Machine):
             ),
             "Soft stop 0 of a Scene must have no `mass`",
         ),
+        (lambda: vi.simulate(Masses(), vi.State(x=0.0, w=0.0), 1), "a state with x, w, v.x, v.w"),
+        (lambda: simulate(ByNumber()), "must return positions by name, `dict(w=...)`"),
+        (lambda: simulate(OtherGap()), "must be a function of the coordinates: The state has no"),
+        (lambda: simulate(WithoutMode()), "must take `t`, `q`, `v` and 1 modes"),
+        (lambda: vi.SoftStop(0.1, 9.0, restitution=0.5, dashpot=1.0), "`dashpot` must be left out"),
         (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),

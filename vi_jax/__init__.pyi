@@ -46,6 +46,7 @@ from .machine import PowerLaw as PowerLaw
 from .machine import Reset as Reset
 from .machine import RigidStop as RigidStop
 from .machine import Scene as Scene
+from .machine import Slide as Slide
 from .machine import SliderCrank as SliderCrank
 from .machine import SoftStop as SoftStop
 from .machine import State as State

@@ -321,8 +321,8 @@ def test_masses_that_depend_on_coordinates_are_the_same_in_an_array():
 
 
 WRONG = [
-    ({"mass": (1.0, 2.0, 3.0)}, "`mass` of a Wrong must be one for each of its 2"),
-    ({"mass": 2.0}, "must be one for each of its 2 coordinates, or 2 rows, but has 1"),
+    ({"mass": (1.0, 2.0, 3.0)}, "`mass` of a Wrong must be one for each of left, right"),
+    ({"mass": 2.0}, "must be one for each of left, right, or 2 rows, but has 1"),
     ({"mass": [[1.0, 2.0], [2.0, 1.0]]}, "positive, or a symmetric and positive definite matrix"),
     ({"mass": [[1.0, 0.1], [0.0, 1.0]]}, "positive, or a symmetric and positive definite matrix"),
     ({"mass": lambda _, q: (q.left - 0.5, 1.0)}, "positive, or a symmetric and positive definite"),

@@ -242,13 +242,17 @@ def _check_period(kind: type, start: State, fields: list[np.ndarray], cycle: Any
         return bool(np.any(abs(rates[a] - rates[b]) > _PERIODIC * size))
 
     several = any(not any(differ(x, 1, k) for x in fields) for k in (4, 5, 6))
-    for (path, _), rates in zip(jtu.tree_leaves_with_path(start), fields, strict=False):
-        if differ(rates, 0, 2) or (several and differ(rates, 1, 3)):
+    paths = [jtu.keystr(path).lstrip(".") for path, _ in jtu.tree_leaves_with_path(start)]
+    parts = [("field", f"rate of its {path or 'state'}") for path in paths]
+    parts += [("prescribed", f"value of its {path}") for path in paths]
+    for (member, what), values in zip(parts, fields, strict=False):
+        if differ(values, 0, 2) or (several and differ(values, 1, 3)):
+            of = "the field" if member == "field" else "prescribed motions"
             _warn_once(
                 kind,
-                f"The `field` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} later: "
-                f"the rate of its {jtu.keystr(path).lstrip('.') or 'state'} differs. Time restarts "
-                "from 0 in each cycle: `cycle` must be a period of the field, unless it jumps.",
+                f"The `{member}` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} "
+                f"later: the {what} differs. Time restarts from 0 in each cycle: `cycle` must be a "
+                f"period of {of}, unless it jumps.",
             )
             return
 
@@ -348,15 +352,20 @@ def _steepest(machine: AbstractMachine, number: int, start: State) -> Any:
 
 @eqx.filter_jit(compiler_options={"xla_backend_optimization_level": "0"})  # pyright: ignore
 def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -> Any:
-    """Return the cycle; if `ticks`, the rates at the start, within the cycle, a cycle after both
-    and up to four cycles after the second; for each event, whether its guard is negative in any
-    state around the start. `zero` is an argument: JAX compiles expressions of constants alone."""
+    """Return the cycle; if `ticks`, the rates and prescribed values at the start, within the cycle,
+    a cycle after both and up to four cycles after the second; for each event, whether its guard is
+    negative in any state around the start. `zero` is an argument: JAX compiles expressions of
+    constants alone."""
     zero = zero.astype(jnp.result_type(machine.position(start)))
     modes, cycle = begin_modes(machine, zero, start), zero + machine.cycle
     later = np.arange(1, 5) + INNER_INSTANT
     instants = zero + cycle * np.array([0.0, INNER_INSTANT, 1.0, *later])
     prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
-    rates = lambda s: field_in(machine, s, prescribed(s, start), modes)
+
+    def rates(s: Scalar) -> tuple[State, State]:
+        state = prescribed(s, start)
+        return field_in(machine, s, state, modes), state
+
     fields = jax.vmap(rates)(instants) if ticks else ()
     around = _states_around(zero, cycle, start, modes)
 
@@ -487,6 +496,15 @@ def check_parts(machine: AbstractMachine) -> None:
             )
 
 
+def _check_gap(machine: Mechanical, gap: Callable[..., Any]) -> None:
+    label = f"The gap `on` of a contact of a {type(machine).__name__}"
+    try:
+        with explain_errors(label):
+            jax.eval_shape(lambda: gap(machine.places(machine.at())))
+    except AttributeError as error:
+        raise TypeError(f"{label} must be a function of the coordinates: {error}") from None
+
+
 def _check_ignored(what: str, parts: Sequence[Any], name: str) -> None:
     for i, part in enumerate(parts):
         for given in ("on", "mass", "friction"):
@@ -508,12 +526,6 @@ def _check_names(machine: AbstractMachine) -> None:
                 f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
                 "method of every machine."
             )
-    if isinstance(machine, Mechanical) and not isinstance(machine.q, str):
-        if len(machine.q_names) < len(machine.q) or "v" in machine.q_names:
-            raise ValueError(
-                f"`q` of a {kind.__name__} must have different names, and none of them `v`, but is "
-                f"{machine.q}."
-            )
     pairs = [x.on for x in contacts_in(machine) if isinstance(getattr(x, "on", None), tuple)]
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)
@@ -534,6 +546,10 @@ def _check_names(machine: AbstractMachine) -> None:
                     f"Argument `mass` of a {type(stop).__name__} must be left out in a "
                     f"{type(machine).__name__}, whose own masses are used."
                 )
+            if callable(on):
+                _check_gap(machine, on)
+            elif getattr(stop, "push", None) is None:
+                machine._names_on(on)
             continue
         is_position = any(on == position for position, *_ in pairs)
         if isinstance(stop, DryFriction) and (isinstance(on, tuple) or is_position):

@@ -327,6 +327,13 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
     `TypeError` for an invalid state of this machine."""
     check_reals(argument, state)
+    if isinstance(machine, Mechanical):
+        wanted = components(machine.at())
+        if not isinstance(state, NamedState) or components(state).keys() != wanted.keys():
+            raise TypeError(
+                f"Argument `{argument}` must be a state with {', '.join(wanted)}, as "
+                f"`machine.at(...)` returns, but got {state!r}."
+            )
     try:
         shape = jnp.shape(machine.position(state)) or jnp.shape(machine.velocity(state))
     except (AttributeError, TypeError, LookupError) as error:

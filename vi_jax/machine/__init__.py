@@ -27,7 +27,8 @@ from .declared import (
     switches_of, with_earlier_clock,
 )
 from .drives import (
-    AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, SliderCrank,
+    AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
+    SliderCrank,
 )
 from .event import AbstractEvent, AbstractSwitch
 from .events import (

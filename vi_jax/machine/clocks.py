@@ -100,8 +100,11 @@ def clock_in_words(machine: Machine, since_section: float, cycles: int) -> str:
 
 def scales_known(machine: Machine) -> bool:
     """Return whether the default number of fixed steps in a cycle is known to be enough. Contacts
-    with soft stops may be much briefer than a cycle. Static."""
-    return isinstance(machine, Scene) and not machine.soft_stops
+    with soft stops may be much briefer than a cycle, and so may be the decay of a user's drive.
+    Static."""
+    return (
+        isinstance(machine, Scene) and not machine.soft_stops and machine.drive.rate() is not None
+    )
 
 
 def is_alive(machine: Machine, state: State) -> Flag | None:

@@ -42,11 +42,13 @@ class Slide(NamedTuple):
 
 
 class AbstractCrank(Shown):
-    """The kinematics of a crank; a subclass defines one method, `slide(phase)`."""
+    """The kinematics of a crank; a subclass defines one method, `slide(phase)`, which returns the
+    three arrays of a `Slide`."""
 
     @abc.abstractmethod
     def slide(self, phase: Float[Array, "..."]) -> Slide:
-        """Return the slider's displacement at crank angle `phase` (radians), in crank radii."""
+        """Return the slider's displacement at crank angle `phase` (radians), and its first two
+        derivatives with respect to it, in crank radii: `vi.Slide(U, U_phi, U_phiphi)`."""
 
 
 class CosineCrank(AbstractCrank):
@@ -107,8 +109,10 @@ class AbstractDrive(Shown):
         angle `phase` as last component. **Arguments:** `scene`, for its `crank`, `phase_at` and
         `pull`; `s`; `state`; `pushes`, the accelerations of the body by compliant stops."""
 
-    def rate(self) -> Float[Array, "..."] | None:
-        """Return the fastest decay rate with respect to τ, or `None` if nothing decays."""
+    def rate(self) -> Float[Array, "..."] | float | None:
+        """Return the fastest decay rate with respect to τ; 0 if nothing decays, `None` if it is
+        unknown. Then the default method is `Adaptive`, since explicit fixed steps may be unstable.
+        """
         return None
 
     def speed(self, state: State) -> Float[Array, "..."]:
@@ -132,6 +136,10 @@ class IdealDrive(AbstractDrive):
     def fixed_speed(self):
         """The frequency ratio ζ, the speed of the crank under any load."""
         return self.frequency_ratio
+
+    def rate(self):
+        """Return 0."""
+        return 0.0
 
     def field(self, scene, s, state, pushes):
         """Return d(state)/ds of the body by crank angle (Eq. 8 of the paper) or by time (Eq. 5)."""

@@ -20,6 +20,7 @@ from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace
+from .contacts import check_takes
 from .coordinates import Coordinate, component
 from .numbers import split_index
 from .state import State as Named
@@ -78,7 +79,10 @@ class Mechanical(AbstractMachine):
         v = dict(vars(v) if isinstance(v, Named) else v)
         wrong = [x for x in (*places, *v) if x not in names]
         if wrong:
-            raise ValueError(f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}.")
+            raise ValueError(
+                f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}"
+                f"{', which have no prescribed motion' * (len(names) < len(self.q_names))}."
+            )
         zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
         at, rate = zeros | places, zeros | v
         for name, zero in zeros.items():
@@ -111,7 +115,14 @@ class Mechanical(AbstractMachine):
                 f'A {type(self).__name__} must have `q`: write `q = ("x", "y")` in the class, the '
                 "names of its coordinates."
             )
-        return dict(map(split_index, (self.q,) if isinstance(self.q, str) else self.q))
+        given = (self.q,) if isinstance(self.q, str) else self.q
+        shapes = dict(map(split_index, given))
+        if len(shapes) < len(given) or "v" in shapes:
+            raise ValueError(
+                f"`q` of a {type(self).__name__} must have different names, and none of them `v`, "
+                f"but is {given}."
+            )
+        return shapes
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -119,6 +130,11 @@ class Mechanical(AbstractMachine):
         if type(self).prescribed is Mechanical.prescribed:
             return self.q_names
         given = jax.eval_shape(self.prescribed, 0.0)
+        if not isinstance(given, Mapping):
+            raise TypeError(
+                f"`prescribed` of a {type(self).__name__} must return positions by name, "
+                f"`dict({self.q_names[-1]}=...)`."
+            )
         unknown = [x for x in given if x not in self.q_names]
         if unknown:
             raise ValueError(
@@ -132,7 +148,11 @@ class Mechanical(AbstractMachine):
         q, v, names = self.places(state), state.v, self.free_names
         whose = f"`force` of a {type(self).__name__}"
         free = Named(**{name: getattr(v, name) for name in names})
-        given = self.force(t, q, v, *modes)
+        try:
+            given = self.force(t, q, v, *modes)
+        except TypeError:
+            check_takes(self.force, whose, "`t`, `q`, `v`", (t, q, v, *modes), len(modes))
+            raise
         applied = like(free, given, whose)
         if not isinstance(applied, Named):
             by_name = ", ".join(f"{name}=..." for name in names)
@@ -371,7 +391,7 @@ def matrix_of(given: Any, shapes: Mapping[str, tuple[int, ...]], whose: str) -> 
     rows = [given] if alone or (n == 1 and _is_mass(given, *shapes.values())) else list(given)
     if len(rows) != n:
         raise ValueError(
-            f"`mass` of a {whose} must be one for each of its {n} coordinates, or {n} rows, but "
+            f"`mass` of a {whose} must be one for each of {', '.join(shapes)}, or {n} rows, but "
             f"has {len(rows)}."
         )
     if all(map(_is_mass, rows, shapes.values())):
