@@ -296,6 +296,7 @@ class Carried(vi.Mechanical):
         return dict(x=0.0, a=push, b=0.0, c=-1.0, d=push)
 
 
+@pytest.mark.slow
 def test_derivatives_from_a_start_that_sticks():
     """A small slip stops at once: the belt keeps its speed, and the two bodies their momentum."""
 

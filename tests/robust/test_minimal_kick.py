@@ -105,6 +105,7 @@ def test_a_weighted_norm(motions, two_impacts, monkeypatch):
     assert np.asarray(two_impacts(begin + (1 + 1e-7) * around)).any()
 
 
+@pytest.mark.slow
 def test_invalid_arguments_raise(motions, result):
     ask = vi.minimal_kick
     with pytest.raises(ValueError, match="`orbit` must be a stable orbit"):

@@ -13,6 +13,7 @@ import xarray as xr
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
 
+@pytest.mark.slow
 def test_a_store_resumes_and_rejects_another_scan(tmp_path, monkeypatch):
     work = importlib.import_module("vi_jax.scans._scan")
     axes = {"drive.frequency_ratio": np.linspace(0.6, 1.4, 40), "start.Y": np.linspace(-1, 1, 30)}

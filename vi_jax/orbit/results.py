@@ -138,7 +138,7 @@ class ORBIT_RESULTS(NamedEnumeration):
     )
     not_simulated = (
         "The guess cannot be simulated: it lies beyond a stop, say, or a number of the machine is "
-        "not finite. Simulate from it to see the reason."
+        "not finite, or the motion ends with an outcome. Simulate from it to see the reason."
     )
     other_modes = (
         "No orbit was found: the motion comes back to its state in other modes of the machine. Its "
