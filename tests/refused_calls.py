@@ -100,6 +100,7 @@ CALLS = {
     "a region of texts": (basins({"start.Y": ("0", "1")}), ROW),
     "crank='cosine'": (lambda: vi.Scene.ideal(frequency_ratio=0.9, crank="cosine"),
                        "`crank` must be a `CosineCrank()`"),
+    "damping_ratio='0.1'": (built(damping_ratio="0.1"), "`damping_ratio` must be a real number"),
     "one stop": (built(stops=vi.RigidStop(1.0, 0.5)), "`stops` must be a tuple"),
     **{f"frequency_ratio={x!r}": (
         lambda x=x: vi.Scene.ideal(frequency_ratio=x), "Argument `frequency_ratio` must be") for x

@@ -76,6 +76,17 @@ def test_own_drive_matches_scipy(clock):
     vi.plot_sketch(scene, start)
 
 
+@pytest.mark.parametrize("rate", [25.0, np.asarray(25.0)])
+def test_the_decay_of_a_drive_limits_steps(rate):
+    class Stiff(vi.IdealDrive):
+        def rate(self):
+            return rate
+
+    scene = vi.Scene(0.05, Stiff(0.9))
+    found = scene.relaxation(jnp.asarray(0.0), scene.start())
+    assert float(found) == pytest.approx(0.9 / 25)
+
+
 def test_wrong_starts_and_drives_raise():
     with pytest.raises(ValueError, match=r"`torque` must be left out.*has Y, V, W, wound"):
         clockwork().start(torque=1.0)

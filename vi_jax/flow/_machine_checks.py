@@ -48,6 +48,7 @@ from ..machine import (
     stops_of,
     switches_of,
 )
+from ..machine import State as NamedState
 
 _TRACER_ERRORS = (
     jax.errors.ConcretizationTypeError,
@@ -186,13 +187,17 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
 _SAMPLES, _MODES, _DISTANCES = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 
+def is_builtin(kind: type) -> bool:
+    """Return whether a class is one of this package."""
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
 def check_values(machine: AbstractMachine, start: State) -> None:
     """Check numbers of a machine around its start. Warn once if the field is not periodic, or if an
     event's guard is not negative in any of many states. Machines of this package and machines with
     traced numbers are not checked."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
-    is_builtin = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
-    if is_builtin or any(isinstance(x, Tracer) for x in leaves):
+    if is_builtin(kind) or any(isinstance(x, Tracer) for x in leaves):
         return
     _check_slips(machine, start)
     _check_friction_forces(machine, start)
@@ -498,9 +503,10 @@ def check_parts(machine: AbstractMachine) -> None:
 
 def _check_gap(machine: Mechanical, gap: Callable[..., Any]) -> None:
     label = f"The gap `on` of a contact of a {type(machine).__name__}"
+    places = NamedState(**{name: np.zeros(shape) for name, shape in machine.q_shapes.items()})
     try:
         with explain_errors(label):
-            jax.eval_shape(lambda: gap(machine.places(machine.at())))
+            jax.eval_shape(gap, places)
     except AttributeError as error:
         raise TypeError(f"{label} must be a function of the coordinates: {error}") from None
 

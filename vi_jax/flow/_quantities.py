@@ -23,7 +23,7 @@ from ..machine import (
     overridden,
     shown_modes,
 )
-from ._machine_checks import explain_errors
+from ._machine_checks import explain_errors, is_builtin
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.
 _RESERVED = frozenset(
@@ -71,17 +71,19 @@ def quantity_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     return _checked_names(machine, "quantities", machine.quantities, start, (zero, start))
 
 
-def check_units(machine: AbstractMachine, start: State) -> None:
-    """**Raises:** `ValueError` if the user's `units` of a machine have a name of nothing in it."""
+def check_units(machine: AbstractMachine, start: State, observed: tuple[str, ...]) -> None:
+    """**Raises:** `ValueError` if the user's `units` of a machine have a name of nothing in it.
+    `observed` are names of quantities, and of averages if these are computed."""
     owner = next(kind for kind in type(machine).__mro__ if "units" in vars(kind))
-    if owner.__module__.partition(".")[0] == __name__.partition(".")[0]:
+    if is_builtin(owner):
         return
     words = [*leaf_names(machine), *leaf_names(start), *components(start)]
     words += [name.rpartition(".")[2] for name in words]
-    words += [*fields_with(type(machine), "unit"), *_WITH_UNITS]
-    words += average_names(machine, start) + quantity_names(machine, start)
-    for name in machine.units:
-        if name and name not in words and not hasattr(machine, name):
+    words += [*fields_with(type(machine), "unit"), *_WITH_UNITS, *observed]
+    unknown = [x for x in machine.units if x and x not in words and not hasattr(machine, x)]
+    words += average_names(machine, start) if unknown else ()
+    for name in unknown:
+        if name not in words:
             raise ValueError(
                 f"`units` of a {type(machine).__name__} must name its parameters, components and "
                 f"quantities, but has {name!r}; {near_names(name, list(dict.fromkeys(words)))}."

@@ -164,8 +164,7 @@ def make_plan(
     machine, start = of_one_type(machine, start)
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
-    quantity_names(machine, start)  # invalid quantities are refused
-    check_units(machine, start)
+    check_units(machine, start, averages + quantity_names(machine, start))
     columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -328,8 +327,8 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     `TypeError` for an invalid state of this machine."""
     check_reals(argument, state)
     if isinstance(machine, Mechanical):
-        wanted = components(machine.at())
-        if not isinstance(state, NamedState) or components(state).keys() != wanted.keys():
+        wanted = [*machine.q_names, *(f"v.{name}" for name in machine.q_names)]
+        if not isinstance(state, NamedState) or set(components(state)) != set(wanted):
             raise TypeError(
                 f"Argument `{argument}` must be a state with {', '.join(wanted)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."

@@ -217,7 +217,8 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
-    if any(x.is_dry or x.blends or x.friction_stop is not None for x in switches_of(machine)):
+    slides = any(x.blends for x in switches_of(machine))
+    if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:

@@ -138,7 +138,6 @@ class IdealDrive(AbstractDrive):
         return self.frequency_ratio
 
     def rate(self):
-        """Return 0."""
         return 0.0
 
     def field(self, scene, s, state, pushes):

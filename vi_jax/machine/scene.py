@@ -316,11 +316,10 @@ class Scene(AbstractMachine):
     def relaxation(self, s: Scalar, state: State) -> Scalar | None:
         """Return the shortest decay time: 1/2ξ of the body, or that of the drive: the time w0/τ0 in
         which a motor returns to its speed. `None` if that of the drive is unknown."""
-        rate, drive_rate = 2 * self.damping_ratio, self.drive.rate()
+        drive_rate = self.drive.rate()
         if drive_rate is None:
             return None
-        if not isinstance(drive_rate, float):
-            rate = jnp.maximum(rate, drive_rate)
+        rate = jnp.maximum(2 * self.damping_ratio, drive_rate)
         pace = self.drive.speed(state) if self.clock_name == "phase" else 1.0
         return pace / jnp.maximum(rate, 1e-6)
 

@@ -374,11 +374,11 @@ class SoftStop(Wall, AbstractSwitch):
         if restitution is not None:
             given = f"{restitution!r} with damping={damping!r} and law={law!r}"
             damping = _damping_of(self.law, restitution, damping, given)
-        if restitution is not None and dashpot is not None:
-            raise ValueError(
-                "Argument `dashpot` must be left out with `restitution`, which determines the "
-                f"damping, but got {dashpot!r}."
-            )
+            if dashpot is not None:
+                raise ValueError(
+                    "Argument `dashpot` must be left out with `restitution`, which determines the "
+                    f"damping, but got {dashpot!r}."
+                )
         self.gap = number("gap", gap)
         self.stiffness = number("stiffness", stiffness)
         self.damping = number("damping", 0.0 if damping is None else damping)
