@@ -327,10 +327,13 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
     `TypeError` for an invalid state of this machine."""
     check_reals(argument, state)
     if isinstance(machine, Mechanical):
-        wanted = [*machine.q_names, *(f"v.{name}" for name in machine.q_names)]
-        if not isinstance(state, NamedState) or set(components(state)) != set(wanted):
+        q = machine.q_shapes
+        wanted = q | {f"v.{name}": shape for name, shape in q.items()}
+        given = {part: jnp.shape(x) for part, x in named_leaves(state)}
+        if not isinstance(state, NamedState) or given != wanted:
+            words = (f"{name} of shape {shape}" if shape else name for name, shape in wanted.items())
             raise TypeError(
-                f"Argument `{argument}` must be a state with {', '.join(wanted)}, as "
+                f"Argument `{argument}` must be a state with {', '.join(words)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."
             )
     try:
