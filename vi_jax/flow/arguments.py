@@ -331,7 +331,9 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
         wanted = q | {f"v.{name}": shape for name, shape in q.items()}
         given = {part: jnp.shape(x) for part, x in named_leaves(state)}
         if not isinstance(state, NamedState) or given != wanted:
-            words = (f"{name} of shape {shape}" if shape else name for name, shape in wanted.items())
+            words = (
+                f"{name} of shape {shape}" if shape else name for name, shape in wanted.items()
+            )
             raise TypeError(
                 f"Argument `{argument}` must be a state with {', '.join(words)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."
