@@ -368,6 +368,25 @@ def test_invalid_starts_raise():
         vi.simulate(SliderCrank(), SliderCrank().at(phi=7.0, v=dict(phi=15.0)), 1)
 
 
+class Row(vi.Mechanical):
+    """A coordinate that is an array."""
+
+    q, mass, cycle = ("left", "x[3]"), (1.0, 2.0), 1.0
+
+    def force(self, t, q, v):
+        return dict(left=q.x[0], x=-q.x)
+
+
+def test_starts_with_an_array_of_coordinates():
+    start = Row().at(x=jnp.arange(3.0))
+    last = jax.eval_shape(lambda x: vi.simulate(Row(), x, 1).last, start)
+    assert last.x.shape == last.v.x.shape == (3,)
+    assert Row().velocity(start.replace(v=start.v.replace(left=2.0))) == 2.0  # no contact names it
+    short = start.replace(x=jnp.zeros(2))
+    with pytest.raises(TypeError, match=r"a state with left, x of shape \(3,\), v\.left, v\.x of"):
+        vi.simulate(Row(), short, 1)
+
+
 def test_missing_masses_and_forces_raise():
     class Array(Pair):
         q, mass = ("left[2]", "right"), ((1.0, 0.0), (0.0, 1.0))

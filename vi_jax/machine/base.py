@@ -457,11 +457,12 @@ def has_velocity(machine: AbstractMachine, state: State) -> bool:
 
 
 def names_coordinates(machine: AbstractMachine) -> bool:
-    """Return whether a machine has `coordinates`, or contacts that name coordinates."""
+    """Return whether a machine has coordinates by name: a `Mechanical`, one with `coordinates`, or
+    one whose contacts name them."""
     if defines(machine, "coordinates"):
         return True
-    walls = (x for x in contacts_in(machine) if isinstance(x, Wall))
-    return any(x.on is not None for x in walls)  # pyright: ignore[reportAttributeAccessIssue]
+    ons = (x.on for x in contacts_in(machine) if isinstance(x, Wall))  # pyright: ignore[reportAttributeAccessIssue]
+    return any(on is not None for on in ons) or machine._names_on(None) is not None
 
 
 def renews(machine: AbstractMachine) -> bool:

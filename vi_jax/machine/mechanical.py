@@ -19,12 +19,13 @@ import numpy as np
 from .._checks import concrete
 from .._types import Scalar, State
 from ..lanes import dependent_results
-from .base import AbstractMachine, cached_in_trace
+from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
 from .coordinates import Coordinate, component
 from .numbers import split_index
 from .state import State as Named
 from .state import like
+from .stop import Wall
 
 # A mass matrix as rows of numbers.
 Matrix = list[list[Any]]
@@ -259,8 +260,11 @@ def _mass_of(machine: Any) -> Any:
 
 
 def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
-    """Return the name of a coordinate, or `None` for a gap."""
+    """Return the name of a coordinate, or `None` for a gap. Without stops, the first number of the
+    first coordinate is the one of which extremes are recorded."""
     name = machine.q_names[0] if on is None else on
+    if on is None and not any(isinstance(x, Wall) for x in contacts_in(machine)):
+        name += str([0] * len(machine.q_shapes[name])) * bool(machine.q_shapes[name])
     if callable(name):
         return None
     base, index = split_index(name) if isinstance(name, str) else ("", ())
