@@ -22,5 +22,7 @@ from .results import (
     EVENTS, REASON_NAMES, RESULTS, Errors, EventKind, EventLog, ImpactLog, NamedEnumeration,
     Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
 )
-from .smooth import TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means
+from .smooth import (
+    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means, rounding_bounds,
+)
 from .suggest import Suggestion, suggest_method

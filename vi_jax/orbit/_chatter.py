@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, State, Vector
-from ..flow import TIME, Integrals, Rates, force_rate, guard_rates
+from ..flow import TIME, Integrals, Rates, force_rate, guard_rates, rounding_bounds
 from ..machine import RigidStop, push_of, stops_of
 from ._flight import Flight, force_on
 
@@ -31,7 +31,8 @@ _HOPS, _CORRECTIONS = 400, 7
 _CLOSE = 1e-9
 
 # A landing is found if the remaining distance is below this share of the hop's height. That
-# distance must exceed so many roundings of the stop's place. Both are choices.
+# distance must exceed so many roundings of the stop's place, and those of the body's. Both are
+# choices.
 _LANDED, _ROUNDINGS = 1e-6, 10
 
 # A hop is the last one if its rebound is slower than this share of the fastest. Its error of third
@@ -69,8 +70,11 @@ def last_hop(free: Flight, number: int, begin: Chatter, *, until: Scalar, steps:
     def continues(carry: tuple[Chatter, Scalar, int]) -> Flag:
         hops, fastest, count = carry
         here = rates(hops.s, hops.u)
-        least = _ROUNDINGS * jnp.finfo(here.v.dtype).eps / _LANDED * jnp.abs(stop.place * here.a)
-        fast = (-here.v > _SLOW * fastest) & (here.v**2 > least)
+        rounding = _ROUNDINGS * jnp.finfo(here.v.dtype).eps * jnp.abs(stop.place)
+        # A distance that is a function of several numbers has the rounding of all of them.
+        state = free.unravel(hops.u)
+        rounding += rounding_bounds(free.machine, stop.coordinate, state, 0.0)[0]
+        fast = (-here.v > _SLOW * fastest) & (here.v**2 > rounding / _LANDED * jnp.abs(here.a))
         return ~hops.is_over & (fast | (here.a < 0)) & (count < _HOPS)
 
     def hop(carry: tuple[Chatter, Scalar, int]) -> tuple[Chatter, Scalar, int]:
