@@ -227,3 +227,51 @@ def test_every_event_is_logged_in_order():
     assert (table.cycle == 1 + np.nonzero(kinds >= 0)[0]).all()
     np.testing.assert_array_equal(split.event_log.kind, kinds)
     np.testing.assert_allclose(split.event_log.phase, log.phase, atol=1e-7)
+
+
+class _Lever(vi.Mechanical):
+    """A body beats another one, with a lever in between whose height is the sine of its angle."""
+
+    q = ("x", "th", "y")
+    mass = (1.9, 1.2e-3, 0.6)
+    cycle = 1 / 14
+    contacts = vi.RigidStop(0.15e-3, 0.6, on=lambda q: q.y - q.x + 0.02 * jnp.sin(q.th))
+
+    def force(self, t, q, v):
+        spring = 3e4 * (q.y - q.x) + 15 * (v.y - v.x)
+        turn = 2 * jnp.pi * 14 * t
+        return dict(
+            x=60 * jnp.sin(turn) - 2e4 * q.x - 20 * v.x + spring,
+            th=-0.2 * q.th - 2e-3 * v.th + 0.02 * jnp.cos(turn),
+            y=-spring,
+        )
+
+
+class _StraightLever(_Lever):
+    """The same, with y + 0.02 sin(th) for y: the gap is straight, and the masses depend on th."""
+
+    contacts = vi.RigidStop(0.15e-3, 0.6, on=lambda q: q.y - q.x)
+
+    def mass(self, q):
+        arm = 0.02 * jnp.cos(q.th)
+        return [[1.9, 0, 0], [0, 1.2e-3 + 0.6 * arm**2, -0.6 * arm], [0, -0.6 * arm, 0.6]]
+
+    def force(self, t, q, v):
+        arm = 0.02 * jnp.cos(q.th)
+        y, speed = q.y - 0.02 * jnp.sin(q.th), v.y - arm * v.th
+        forces = super().force(t, q.replace(y=y), v.replace(y=speed))
+        return forces | dict(th=forces["th"] - arm * forces["y"])
+
+
+def test_releases_from_a_curved_gap():
+    """Its rounding once showed an impact at the release, and every lane failed."""
+    angles = jnp.linspace(-0.002, 0.002, 8)
+    bent, straight = _Lever(), _StraightLever()
+    run = jax.vmap(lambda th: vi.simulate(bent, bent.at(x=1e-4, th=th), 60))(angles)
+    assert run.successful.all() and (run.rests.sum(axis=1) > 5).all()
+    start = dict(x=1e-4, th=angles[0])
+    height = 0.02 * jnp.sin(angles[0])
+    same = vi.simulate(straight, straight.at(**start, y=height), 18)
+    assert same.rests.sum() > 0 and (run.rests[0, :18] == same.rests).all()
+    np.testing.assert_allclose(run.sections.x[0, :19], same.sections.x, atol=1e-10)
+    np.testing.assert_allclose(run.sections.th[0, :19], same.sections.th, atol=1e-9)

@@ -207,6 +207,25 @@ def test_a_ball_on_a_table_whose_motion_is_prescribed():
         Table().at(table=1.0)
 
 
+@pytest.mark.slow
+def test_a_rest_on_a_moving_table_is_lost_where_that_in_the_distance_is():
+    """The distance has the rounding of two positions, which once ended branches too early."""
+
+    def found(machine, start):
+        last = vi.simulate(machine, start, 1, settle=50).last
+        orbit = vi.find_orbit(machine, last, impact_log=40, throw=True)
+        name = next(x for x in ("shaking", "acceleration") if hasattr(machine, x))
+        branch = vi.continue_orbit(orbit, parameter=name, bounds=(1.01, 1.5), progress=False)
+        return branch.ends, [(x.kind, x.parameter) for x in branch.special]
+
+    table = Table(shaking=1.1, restitution=0.7)
+    ball = vi.machines.BouncingBall(acceleration=1.1, restitution=0.7)
+    ends, special = found(table, table.at(ball=-1.1))
+    wanted_ends, wanted = found(ball, ball.start(height=0.0))
+    assert ends == wanted_ends and [x for x, _ in special] == [x for x, _ in wanted] == ["rest"]
+    np.testing.assert_allclose(special[0][1], wanted[0][1], atol=1e-9)
+
+
 class Pendulums(vi.Mechanical):
     """A double pendulum whose lower bob strikes a wall."""
 

@@ -28,7 +28,7 @@ from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
-from ..smooth import hold_contacts, in_modes, limited_of, stops_are_exact
+from ..smooth import hold_contacts, in_modes, is_affine, limited_of, stops_are_exact
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
@@ -450,7 +450,10 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
     if not stops_are_exact(plan.machine, state):
-        state = select(contact[k] > 0, on_its_stops(plan, lane._replace(state=state)), state)
+        on_stops = on_its_stops(plan, lane._replace(state=state))
+        if not is_affine(plan.machine.coordinates[k].position, state):
+            on_stops = _just_inside(plan, k, contact[k], on_stops)
+        state = select(contact[k] > 0, on_stops, state)
     direction = jnp.where(free, -step.old.direction[k], lane.direction[k])
     s, stop = lane.s + jnp.where(free, offset, 0.0), contact[k] - to_event(0)
     lane = lane.log_event(step.taken & free, plan.clock(s, state), EventKind.release, stop, jnp.nan)
@@ -461,6 +464,14 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
         direction=with_item(lane.direction, k, direction),
         contact=with_item(contact, k, jnp.where(free, 0.0, contact[k])),
     )
+
+
+def _just_inside(plan: Plan, k: int, contact: Scalar, state: State) -> State:
+    """Return the state with coordinate number k within its gap and moving inward, by rounding: a
+    curved gap that is evaluated within steps would else show an impact at once."""
+    slack, slow = plan.rounding_bounds(k, state)
+    sign, gap = plan.sign_and_gap(k, contact)
+    return plan.machine.coordinates[k].placed(state, sign * (gap - slack), -sign * slow)
 
 
 def on_its_stops(plan: Plan, lane: Lane) -> State:
