@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._checks import concrete
+from .._checks import concrete, named_leaves
 from .._messages import warn
 from .._types import Scalar, Scalars, State
 from ..lanes import dependent_results
@@ -32,6 +32,8 @@ from ..machine import (
     begin_modes,
     check_takes,
     clock_of,
+    component,
+    components,
     contacts_in,
     event_of,
     events_of,
@@ -65,7 +67,8 @@ _PERIODIC, INNER_INSTANT = 1e-4, 0.29
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
     """Check the field and the section, while the loop is traced, at no cost at run time.
     **Raises:** `TypeError` if one cannot be traced, takes other arguments or returns no state."""
-    label = f"`field` of a {type(machine).__name__}"
+    member = "`force` or `mass`" if isinstance(machine, Mechanical) else "`field`"
+    label = f"{member} of a {type(machine).__name__}"
     modes = shown_modes(machine, modes)
     check_takes(machine.field, label, "`s`, the state", (s, state, *modes), len(modes))
 
@@ -76,22 +79,32 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
     try:
         with explain_errors(label):
             flow = jax.eval_shape(checked_field, s, state, *modes)
-    except (AttributeError, TypeError, LookupError):
+    except (AttributeError, TypeError, LookupError) as error:
         if _is_traceable(machine.field, state, s, *modes):
             raise TypeError(
                 f"{label} must take `s` first and then the state, but takes them the other way "
                 "round."
             ) from None
-        raise
+        if isinstance(error, TypeError):  # it says what must be
+            raise
+        raise TypeError(f"{label} cannot be computed: {error}") from error
     if flow is None:
         raise TypeError(
             f"{label} must return the components of its state, but its `return` is missing."
         )
     wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
-    if jtu.tree_structure(state) != jtu.tree_structure(flow) or wanted != got:
+    if jtu.tree_structure(state) == jtu.tree_structure(flow) and wanted != got:
+        pairs = zip(named_leaves(state), jtu.tree_leaves(flow), strict=True)
+        for (part, x), rate in pairs:
+            if jnp.shape(x) != jnp.shape(rate):
+                raise TypeError(
+                    f"{label} must return the components of its state, but its rate of {part} has "
+                    f"shape {jnp.shape(rate)}, not {jnp.shape(x)}.{batch_hint(machine)}"
+                )
+    if jtu.tree_structure(state) != jtu.tree_structure(flow):
         raise TypeError(
             f"{label} must return the components of its state, {tree_text(state)}, but returned "
-            f"{tree_text(flow)}.{batch_hint(machine) if wanted != got else ''}"
+            f"{tree_text(flow)}."
         )
     _output_shapes(
         f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state
@@ -306,6 +319,48 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
                 f"thousandth of a cycle, at t = {time:.6g}: steps may be too long. Give it "
                 "a `step_limit`, or let the surface's speed jump by a `Reset`.",
             )
+
+
+def check_frictions(machine: AbstractMachine, state: State) -> None:
+    """**Raises:** `TypeError` if a function of a user's friction cannot be computed, `ValueError`
+    if it is `on` a position. The state may be traced."""
+    frictions = [x for x in contacts_in(machine) if isinstance(x, DryFriction)]
+    if is_builtin(type(machine)) or not frictions:
+        return
+    zero, name = jnp.zeros(()), type(machine).__name__
+    for friction in frictions:
+        slip = "on" if friction.slip is None else "slip"
+        checks = {slip: friction.speed_of_slip, "level` or `load": friction.sticking}
+        for part, function in checks.items():
+            label = f"`{part}` of a DryFriction of a {name}"
+            try:
+                with explain_errors(label):
+                    jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, zero, x)), state)
+            except (AttributeError, LookupError, TypeError) as error:
+                if str(error).startswith(label):
+                    raise
+                raise TypeError(f"{label} cannot be computed: {error}") from None
+        if friction.slip is None and not isinstance(machine, Mechanical):
+            _check_is_velocity(machine, friction.on, zero, state)
+
+
+def _check_is_velocity(machine: AbstractMachine, on: str, s: Scalar, state: State) -> None:
+    """**Raises:** `ValueError` if a component is a position: its rate is another component."""
+    if has_own_modes(machine) or not isinstance(on, str):
+        return
+    try:
+        flow = machine.field(s, state)
+        rate = flow[on] if isinstance(flow, Mapping) else component(on, flow)
+    except Exception:  # `check_field` raises it with a better message
+        return
+    others = components(state)
+    velocity = next((name for name, x in others.items() if x is rate and name != on), None)
+    if velocity is not None:
+        raise ValueError(
+            f"Argument `on` of a DryFriction of a {type(machine).__name__} must be the name of a "
+            f"velocity, but {on!r} is a position: its rate is {velocity!r}. Write "
+            f"`on={velocity!r}`."
+        )
 
 
 def _check_friction_forces(machine: AbstractMachine, start: State) -> None:

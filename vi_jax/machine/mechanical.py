@@ -265,6 +265,11 @@ def _coordinate_name(machine: Mechanical, on: Any) -> str | None:
     name = machine.q_names[0] if on is None else on
     if on is None and not any(isinstance(x, Wall) for x in contacts_in(machine)):
         name += str([0] * len(machine.q_shapes[name])) * bool(machine.q_shapes[name])
+    elif on is None and len(machine.q_names) > 1:
+        raise ValueError(
+            f"Argument `on` of a contact of a {type(machine).__name__} must be given: "
+            f"`on={name!r}`, or another of the coordinates {', '.join(machine.q_names)}."
+        )
     if callable(name):
         return None
     base, index = split_index(name) if isinstance(name, str) else ("", ())
