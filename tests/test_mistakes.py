@@ -309,6 +309,33 @@ class WithoutMode(Masses):
     contacts, events = vi.DryFriction(0.1, on="x"), vi.Switch(lambda m, t, z: z.x)
 
 
+class RubsPosition(vi.AbstractMachine):
+    cycle, contacts = 1.0, vi.DryFriction(0.1, on="x")
+
+    def field(self, t, z):
+        return dict(x=z.u, u=-z.x)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class RubbedByIf(RubsPosition):
+    contacts = vi.DryFriction(lambda u: 0.2 if u < 0.1 else 0.1, on="u")
+
+
+class RubbedByNobody(RubsPosition):
+    contacts = vi.DryFriction(0.1, on="u", slip=lambda z: z.w - 0.2)
+
+
+class OnNothing(Masses):
+    contacts = vi.SoftStop(0.1, 9.0)
+
+
+class RowOfForces(Masses):
+    def force(self, t, q, v):
+        return dict(x=jnp.array([1.0]))
+
+
 class Driving(Machine):
     contacts = (vi.DryFriction(0.1, on="V", load=lambda x: -9.81),)
 
@@ -344,6 +371,14 @@ class Spare(Machine):
         (lambda: simulate(OtherGap()), "must be a function of the coordinates: The state has no"),
         (lambda: simulate(WithoutMode()), "must take `t`, `q`, `v` and 1 modes"),
         (lambda: vi.SoftStop(0.1, 9.0, restitution=0.5, dashpot=1.0), "`dashpot` must be left out"),
+        (lambda: vi.simulate(RubsPosition(), cycles=1), "its rate is 'u'. Write `on='u'`"),
+        (
+            lambda: vi.simulate(RubbedByIf(), cycles=1),
+            "`level` or `load` of a DryFriction of a Rub",
+        ),
+        (lambda: vi.simulate(RubbedByNobody(), cycles=1), "`slip` of a DryFriction of a Rubbed"),
+        (lambda: simulate(OnNothing()), "OnNothing must be given: `on='x'`, or another of"),
+        (lambda: simulate(RowOfForces()), "its rate of v.x has shape (1,), not ()"),
         (lambda: simulate(Driving()), "must not be negative, but is -0.981 at the start"),
         (lambda: simulate(PushedPosition()), "must be the name of a velocity"),
         (lambda: simulate(Method()), "'velocity' of a Method must have another name"),

@@ -78,6 +78,7 @@ def test_mistakes_in_a_machine_or_a_table_are_errors(run, here, monkeypatch, tex
         ("scan", AXES + "measure = 'extrems'", "Argument `measure` must name a measure"),
         ("scan", AXES + "store = 'file.toml/x'", "Argument `store` must be a path"),
         ("scan", "[scan]\naxes.start.Y = {from = 0, to = 1, count = -3}", "is no row of numbers"),
+        ("scan", "[scan]\naxes.start.Y = {from = 0, to = 1, n = 3}", "has `from`, `to` and"),
         ("sweep", "[sweep]\nparameter = 'gap'\nvalues = [1]", "near names: stops.0.gap"),
         ("sweep", "[sweep]\nparameter = 'stops.0.gap'\nvalues = [1]\noutput = 'x.txt'",
          "`output` in [sweep] must end in .csv, .nc"),

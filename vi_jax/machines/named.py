@@ -112,7 +112,9 @@ def value_of(value: Any, place: str) -> Any:
     if "class" in value:
         keywords = {key: x for key, x in value.items() if key != "class"}
         return make_object(value["class"], keywords, place)
-    if value.keys() == {"from", "to", "count"}:
+    if "from" in value:
+        if value.keys() != {"from", "to", "count"}:
+            raise InputError(f"{place}: a row of numbers has `from`, `to` and `count`: {value}")
         try:
             return np.linspace(value["from"], value["to"], value["count"]).tolist()
         except (TypeError, ValueError, MemoryError) as error:

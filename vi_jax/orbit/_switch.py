@@ -213,7 +213,8 @@ def _check_plain(problem: Shooting) -> None:
     if problem.modes[0] or others_of(problem.machine):
         raise ValueError(
             "`switch` at a grazing needs a machine without soft stops, friction or other switches, "
-            "discrete modes and `events`: find the motion beyond it with `find_orbit`."
+            "discrete modes and `events`: find the motion beyond it with `find_orbit`, or with "
+            "`all_orbits` if it is unstable."
         )
 
 
