@@ -327,6 +327,17 @@ class RubbedByNobody(RubsPosition):
     contacts = vi.DryFriction(0.1, on="u", slip=lambda z: z.w - 0.2)
 
 
+class FixedStop(Machine):
+    wall: float = 0.5
+    cycle = 2 * jnp.pi
+    contacts = vi.RigidStop(wall, 0.5)
+
+
+def test_a_parameter_that_the_class_body_has_used():
+    with pytest.warns(UserWarning, match="reads its parameter 'wall', which may have no effect"):
+        vi.sweep(FixedStop(), "wall", [0.5, 0.6], start=FixedStop().start(), cycles=2, settle=1)
+
+
 class OnNothing(Masses):
     contacts = vi.SoftStop(0.1, 9.0)
 

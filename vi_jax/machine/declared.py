@@ -2,11 +2,14 @@
 
 import copy
 import dataclasses
+import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from operator import attrgetter
+from types import CodeType, FunctionType
 from typing import Any, ClassVar
 
+from .._messages import warn
 from .._types import Machine, Scalar, State
 
 
@@ -30,6 +33,63 @@ def with_own_defaults(kind: type) -> None:
             setattr(kind, name, field)
             types[name] = field.type
     kind.__annotations__ = types
+
+
+# Members that a class body may hold as plain objects, which then keep the defaults of parameters.
+_FIXED = ("contacts", "events", "cycle", "mass")
+
+
+@functools.lru_cache(maxsize=256)
+def warn_of_unread(kind: type, name: str) -> None:
+    """Warn of a parameter that no function in a user's class reads, while the class body has plain
+    contacts, a cycle or masses: those were made once, with its default."""
+    library = __name__.partition(".")[0]
+    own = [
+        x for x in kind.__mro__ if library in {y.__module__.partition(".")[0] for y in x.__mro__}
+    ]
+    own = [x for x in own if x.__module__.partition(".")[0] != library]
+    members = [(key, x) for base in own for key, x in vars(base).items() if key[:2] != "__"]
+    fields = getattr(kind, "__dataclass_fields__", {})
+    fixed = [
+        key for key, x in members if key in _FIXED and key not in fields and not _is_function(x)
+    ]
+    if name in fields and fixed and name not in set(_names_read([x for _, x in members])):
+        warn(
+            f"No method of a {kind.__name__} reads its parameter {name!r}, which may have no "
+            f"effect: what the class body makes of it (as {', '.join(dict.fromkeys(fixed))}) keeps "
+            "the default. Write a `@property`."
+        )
+
+
+def _is_function(member: Any) -> bool:
+    return isinstance(member, property | FunctionType) or hasattr(member, "__wrapped__")
+
+
+def _names_read(parts: list[Any]) -> Iterator[str]:
+    """Yield names of attributes and variables, and texts, in the code of these objects, of those in
+    them, and of functions that they call."""
+    seen, waiting = set(), list(parts)
+    while waiting:
+        part = waiting.pop()
+        if id(part) in seen or isinstance(part, type | str | float | int):
+            continue
+        seen.add(id(part))
+        if isinstance(part, CodeType):
+            yield from part.co_names
+            yield from (x for x in part.co_consts if isinstance(x, str))
+            waiting += [x for x in part.co_consts if isinstance(x, CodeType)]
+        elif isinstance(part, FunctionType):
+            called = [part.__globals__.get(x) for x in part.__code__.co_names]
+            cells = [x.cell_contents for x in part.__closure__ or ()]
+            waiting += [x for x in called if getattr(x, "__module__", "") == part.__module__]
+            waiting += [part.__code__, *cells]
+        elif isinstance(part, tuple | list):
+            waiting += part
+        elif isinstance(part, Mapping):
+            waiting += part.values()
+        inner = (getattr(part, x, None) for x in ("fget", "func", "__func__", "__wrapped__"))
+        waiting += [x for x in inner if x is not None]
+        waiting += getattr(part, "__dict__", {}).values() if not callable(part) else ()
 
 
 class derived:

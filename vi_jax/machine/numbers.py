@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._types import Machine, Scalar, State
+from .declared import warn_of_unread
 
 
 def leaf_names(tree: object) -> list[str]:
@@ -124,8 +125,10 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
 
 def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
     """Return `name`, if it is that of a number, of an array, or of an array's number `name[i]`."""
-    names = leaf_names(tree)
-    return name if name in names else check_name(list(components(tree)), name, argument, tree)
+    if name not in leaf_names(tree):
+        check_name(list(components(tree)), name, argument, tree)
+    warn_of_unread(type(tree), name.partition(".")[0].partition("[")[0])
+    return name
 
 
 def check_name(names: list[str], name: str, argument: str, machine: object = None) -> str:

@@ -40,6 +40,7 @@ from ..machine import (
     AbstractMachine,
     Mechanical,
     check_again,
+    check_leaf,
     check_name,
     components,
     convert_start,
@@ -439,6 +440,8 @@ def check_leaf_name(
     if key not in leaf_names(tree):
         names = names if of_start else [*components(machine), *names]
         check_name(names, name, argument, machine)
+    elif not of_start:
+        check_leaf(machine, name)
 
 
 def start_with(start: State, values: Mapping[str, Any]) -> State:
