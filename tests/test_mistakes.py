@@ -329,7 +329,7 @@ class RubbedByNobody(RubsPosition):
 
 class FixedStop(Machine):
     wall: float = 0.5
-    cycle = 2 * jnp.pi
+    cycle = 2 * jnp.pi / 0.9
     contacts = vi.RigidStop(wall, 0.5)
 
 
