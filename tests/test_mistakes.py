@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from vi_jax._checks import instance_of
+from vi_jax.machine import check_leaf
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.05)
 
@@ -336,6 +337,14 @@ class FixedStop(Machine):
 def test_a_parameter_that_the_class_body_has_used():
     with pytest.warns(UserWarning, match="reads its parameter 'wall', which may have no effect"):
         vi.sweep(FixedStop(), "wall", [0.5, 0.6], start=FixedStop().start(), cycles=2, settle=1)
+
+
+class Unlimited(vi.machines.Duffing):
+    contacts = ()
+
+
+def test_a_parameter_of_a_ready_machine_is_read_there():
+    assert not warned(lambda: check_leaf(Unlimited(), "damping"))
 
 
 class OnNothing(Masses):

@@ -387,6 +387,14 @@ def test_invalid_starts_raise():
         vi.simulate(SliderCrank(), SliderCrank().at(phi=7.0, v=dict(phi=15.0)), 1)
 
 
+@pytest.mark.slow
+def test_given_motion_has_no_exponents():
+    """The other body is an oscillator without damping."""
+    machine = Driven(restitution=1.0)
+    found = vi.lyapunov(machine, machine.at(right=0.9), 64, settle=0, progress=False)
+    assert found.exponents.shape == (2,)
+
+
 class Row(vi.Mechanical):
     """A coordinate that is an array."""
 

@@ -42,6 +42,7 @@ from ..machine import (
     has_own_modes,
     is_angle,
     is_autonomous,
+    is_builtin,
     like,
     listed,
     others_of,
@@ -92,30 +93,28 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
         raise TypeError(
             f"{label} must return the components of its state, but its `return` is missing."
         )
-    wanted, got = (jtu.tree_map(jnp.shape, x) for x in (state, flow))
-    if jtu.tree_structure(state) == jtu.tree_structure(flow) and wanted != got:
-        pairs = zip(named_leaves(state), jtu.tree_leaves(flow), strict=True)
-        for (part, x), rate in pairs:
-            if jnp.shape(x) != jnp.shape(rate):
-                raise TypeError(
-                    f"{label} must return the components of its state, but its rate of {part} has "
-                    f"shape {jnp.shape(rate)}, not {jnp.shape(x)}.{batch_hint(machine)}"
-                )
     if jtu.tree_structure(state) != jtu.tree_structure(flow):
         raise TypeError(
             f"{label} must return the components of its state, {tree_text(state)}, but returned "
             f"{tree_text(flow)}."
         )
+    for (part, x), rate in zip(named_leaves(state), jtu.tree_leaves(flow), strict=True):
+        if jnp.shape(x) != jnp.shape(rate):
+            raise TypeError(
+                f"{label} must return the components of its state, but its rate of {part} has "
+                f"shape {jnp.shape(rate)}, not {jnp.shape(x)}.{batch_hint(machine)}"
+            )
     _output_shapes(
         f"`cycle` of a {type(machine).__name__}", lambda x: section_in(machine, x), state
     )
 
 
 def check_before_modes(machine: AbstractMachine, s: Scalar, state: State) -> None:
-    """Check the cycle, and the field if it needs no modes: those of friction depend on the forces.
-    **Raises:** as `check_field`."""
+    """Check the cycle and the frictions, and the field if it needs no modes: those of friction
+    depend on the forces. **Raises:** as `check_field`, and as `_check_frictions`."""
     with explain_errors(f"`cycle` of a {type(machine).__name__}"):
         jnp.asarray(machine.cycle)
+    _check_frictions(machine, s, state)
     switches = switches_of(machine)
     if switches and all(x.acts for x in switches) and not has_own_modes(machine):
         check_field(machine, s, state, ())
@@ -198,11 +197,6 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
 # A guard is evaluated in this many states around the start. Their modes are those of the start or
 # these. Each number is moved by these distances, relative to 1 + its size. Choices.
 _SAMPLES, _MODES, _DISTANCES = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
-
-
-def is_builtin(kind: type) -> bool:
-    """Return whether a class is one of this package."""
-    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def check_values(machine: AbstractMachine, start: State) -> None:
@@ -321,27 +315,26 @@ def _check_slips(machine: AbstractMachine, start: State) -> None:
             )
 
 
-def check_frictions(machine: AbstractMachine, state: State) -> None:
+def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
     """**Raises:** `TypeError` if a function of a user's friction cannot be computed, `ValueError`
-    if it is `on` a position. The state may be traced."""
+    if it is `on` a position."""
     frictions = [x for x in contacts_in(machine) if isinstance(x, DryFriction)]
     if is_builtin(type(machine)) or not frictions:
         return
-    zero, name = jnp.zeros(()), type(machine).__name__
     for friction in frictions:
         slip = "on" if friction.slip is None else "slip"
         checks = {slip: friction.speed_of_slip, "level` or `load": friction.sticking}
         for part, function in checks.items():
-            label = f"`{part}` of a DryFriction of a {name}"
+            label = f"`{part}` of a DryFriction of a {type(machine).__name__}"
             try:
                 with explain_errors(label):
-                    jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, zero, x)), state)
+                    jax.eval_shape(lambda x, f=function: jnp.asarray(f(machine, s, x)), state)
             except (AttributeError, LookupError, TypeError) as error:
                 if str(error).startswith(label):
                     raise
-                raise TypeError(f"{label} cannot be computed: {error}") from None
+                raise TypeError(f"{label} must be computable, but: {error}") from None
         if friction.slip is None and not isinstance(machine, Mechanical):
-            _check_is_velocity(machine, friction.on, zero, state)
+            _check_is_velocity(machine, friction.on, s, state)
 
 
 def _check_is_velocity(machine: AbstractMachine, on: str, s: Scalar, state: State) -> None:

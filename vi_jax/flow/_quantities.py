@@ -18,12 +18,13 @@ from ..machine import (
     AbstractMachine,
     begin_modes,
     components,
+    is_builtin,
     leaf_names,
     near_names,
     overridden,
     shown_modes,
 )
-from ._machine_checks import explain_errors, is_builtin
+from ._machine_checks import explain_errors
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.
 _RESERVED = frozenset(

@@ -58,7 +58,6 @@ from ._lane import Plan
 from ._machine_checks import (
     INNER_INSTANT,
     check_before_modes,
-    check_frictions,
     check_parts,
     check_values,
     explain_errors,
@@ -348,8 +347,6 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             'Contacts name position and velocity by `on=("x", "u")`, and act on `Y` and `V` if '
             "they name none; `position` and `velocity` of a machine pick other numbers."
         ) from None
-    if not shape:
-        check_frictions(machine, state)
     if not shape and not has_velocity(machine, state):
         _check_flow(argument, machine, state)
     return shape

@@ -23,7 +23,7 @@ from .coordinates import (
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
 from .declared import (
-    clock_of, has_own_modes, others_of, outcomes_of, overridden, section_in, stops_of,
+    clock_of, has_own_modes, is_builtin, others_of, outcomes_of, overridden, section_in, stops_of,
     switches_of, with_earlier_clock,
 )
 from .drives import (

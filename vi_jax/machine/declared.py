@@ -19,6 +19,11 @@ def overridden(part: object, base: type, *names: str) -> str | None:
     return next((x for x in names if getattr(kind, x, None) is not getattr(base, x, None)), None)
 
 
+def is_builtin(kind: type) -> bool:
+    """Return whether a class is one of this package."""
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
 def with_own_defaults(kind: type) -> None:
     """Let a class replace fields of its parent without a type, which a dataclass ignores: a plain
     value becomes the field's default, and a property replaces the field."""
@@ -41,14 +46,14 @@ _FIXED = ("contacts", "events", "cycle", "mass")
 
 @functools.lru_cache(maxsize=256)
 def warn_of_unread(kind: type, name: str) -> None:
-    """Warn of a parameter that no function in a user's class reads, while the class body has plain
-    contacts, a cycle or masses: those were made once, with its default."""
-    library = __name__.partition(".")[0]
-    own = [
-        x for x in kind.__mro__ if library in {y.__module__.partition(".")[0] for y in x.__mro__}
-    ]
-    own = [x for x in own if x.__module__.partition(".")[0] != library]
-    members = [(key, x) for base in own for key, x in vars(base).items() if key[:2] != "__"]
+    """Warn of a parameter of a user's class that no function in it reads, while the class body has
+    plain contacts, a cycle or masses: those were made once, with its default."""
+    name = name.partition(".")[0].partition("[")[0]
+    base = next((x for x in kind.__mro__ if is_builtin(x)), None)
+    if base is None or name in getattr(base, "__dataclass_fields__", {}):
+        return
+    own = kind.__mro__[: kind.__mro__.index(base)]
+    members = [(key, x) for each in own for key, x in vars(each).items() if key[:2] != "__"]
     fields = getattr(kind, "__dataclass_fields__", {})
     fixed = [
         key for key, x in members if key in _FIXED and key not in fields and not _is_function(x)

@@ -127,7 +127,7 @@ def check_leaf(tree: object, name: str, *, argument: str = "parameter") -> str:
     """Return `name`, if it is that of a number, of an array, or of an array's number `name[i]`."""
     if name not in leaf_names(tree):
         check_name(list(components(tree)), name, argument, tree)
-    warn_of_unread(type(tree), name.partition(".")[0].partition("[")[0])
+    warn_of_unread(type(tree), name)
     return name
 
 
