@@ -24,6 +24,7 @@ from ..machine import (
     angles_in,
     begin_modes,
     events_of,
+    frictions_in,
     guard_of,
     has_contact_friction,
     holds_anywhere,
@@ -197,12 +198,12 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
-    current = [rates(free.field, x.position, s, start) for x in machine.coordinates]
+    current = [rates(free.field, x, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.
     direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in current)
     contact = None
     if plan.rests:
-        jerks = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
+        jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
         contact = _contacts_at(plan, start, current, jerks)
         if len(limited_of(machine)) > 1:
             contact = _pressed_together(plan, s, start, modes, contact)
@@ -220,6 +221,9 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
+    fault = jnp.where(bad, code("bad_start"), zero)
+    for i in frictions_in(machine):
+        fault = jnp.where(jnp.isnan(modes[i]) & ~bad, code("jammed"), fault)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8
@@ -237,7 +241,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         attempts=zero,
         part=plan.first_part(zero) if plan.instants > 1 else zero,
         done=zero,
-        fault=jnp.where(bad, code("bad_start"), zero),
+        fault=fault,
         steps=zero,
         spent=zero,
         rejected=zero,
@@ -267,8 +271,8 @@ def _pressed_together(
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
         held = stop_gradient(hold_contacts(plan.machine, modes, contact))
-        current = [rates(held.field, x.position, s, start) for x in bodies]
-        jerks = [force_rate(held, x.position, held, s, start) for x in bodies]
+        current = [rates(held.field, x, s, start) for x in bodies]
+        jerks = [force_rate(held, x, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)
         return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
 

@@ -313,6 +313,10 @@ class RESULTS(NamedEnumeration):
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
     )
+    jammed = (
+        "No motion with a closed contact or a sticking body fulfils Coulomb's law of friction, as "
+        "for a rod that is pushed into rough ground (Painlevé's paradox)."
+    )
     ended = "An event of the machine ended the motion, with the outcome `Run.outcome`."
 
 

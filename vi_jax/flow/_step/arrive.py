@@ -11,8 +11,10 @@ from ...machine import (
     AbstractEvent,
     AbstractMachine,
     after_event,
+    constant_modes,
     event_of,
     events_of,
+    frictions_in,
     guard_of,
     has_velocity,
     holds_anywhere,
@@ -20,6 +22,7 @@ from ...machine import (
     others_of,
     outcomes_of,
     section_number,
+    settled_modes,
     stops_of,
     struck_modes,
     switches_of,
@@ -115,6 +118,7 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     none = jnp.zeros_like(taken)
     new, modes, any_chosen, happens, jumps = old, modes_before, none, none, none
     kind, logged_number, value, chosen = EventKind.mode, 0.0, jnp.nan, {}
+    frictions, released = frictions_in(machine), {}
     for number, due in zip(numbers, x.due, strict=True):
         event, part, _ = event_of(machine, number, modes_before, ())
         before = machine, lane.s, old, *modes_before[part]
@@ -127,7 +131,9 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if event.holds_mode:
             slides = _must_slide(plan, number, lane._replace(state=its_state, modes=its_modes))
             lane = lane.end_if(chosen[number], slides, "sliding")
-            its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
+            its_kind, its_value = EventKind.mode, its_modes[part.start]
+            if part.start in frictions:
+                released[part.start] = here & (modes_before[part.start] == 0), here
         else:
             jumps = jumps | here
             its_kind, its_value = EventKind.reset, event.value(*before)
@@ -140,6 +146,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if len(numbers) > 1:
             its_entry = select(here, its_entry, (kind, logged_number, value))
         (kind, logged_number, value), happens = its_entry, happens | here
+    if released:
+        modes, value = _after_friction(plan, lane._replace(state=new, modes=modes), released, value)
     clock = plan.clock(lane.s, old)
     lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
@@ -156,6 +164,28 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     if section is not None:
         lane = lane.complete_interval(section)
     return _DueEvents(lane, tuple(due), near)
+
+
+def _after_friction(
+    plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]], value: Scalar | float
+) -> tuple[Scalars, Scalar]:
+    """Return the modes after an event of a friction, and the new mode for the log, if it happened;
+    else those of the lane and `value`. `events`: for each friction's mode, whether its force became
+    too large, and whether its event happened."""
+    any_event = any_of(jnp.zeros((), bool), (here for _, here in events.values()))
+    released = {i: when for i, (when, _) in events.items()}
+
+    def settled(modes: Scalars) -> Scalars:
+        contact = lane.contact or ()
+        return constant_modes(
+            settled_modes(plan.machine, lane.s, lane.state, modes, contact, released), lane.s
+        )
+
+    modes = jax.lax.cond(any_event, settled, lambda modes: modes, lane.modes)
+    found = jnp.asarray(value, lane.s.dtype)
+    for i, (_, here) in events.items():
+        found = jnp.where(here, modes[i], found)
+    return modes, found
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -212,7 +242,7 @@ def release_pulled(
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = hold_contacts(machine, modes, contact, but=k)
-            return rates(free.field, machine.coordinates[k].position, s, state).a
+            return rates(free.field, machine.coordinates[k], s, state).a
 
         sign, _ = plan.sign_and_gap(k, contact[k])
         pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
@@ -269,7 +299,7 @@ def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> S
     for k, coordinate in enumerate(plan.machine.coordinates):
         after, known = coordinate.velocity(new), has_velocity(plan.machine, new)
         if not known or after is not coordinate.velocity(old):
-            here = rates(smooth.field, coordinate.position, lane.s, new)
+            here = rates(smooth.field, coordinate, lane.s, new)
             # The second number of a state without velocities may be anything.
             after = after if known else here.v
             after = stop_gradient(jnp.where(after == 0, here.a, after))

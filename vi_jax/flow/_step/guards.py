@@ -118,7 +118,7 @@ def inner_guards(
     checked = events_within_step(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
-        return rates(free_machines[k].field, machine.coordinates[k].position, s, state)
+        return rates(free_machines[k].field, machine.coordinates[k], s, state)
 
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):

@@ -26,6 +26,7 @@ from ...machine import (
     DryFriction,
     SoftStop,
     counts_turns,
+    frictions_in,
     is_alive,
     others_of,
     section_in,
@@ -222,11 +223,13 @@ def _faults(
     """Return conditions that end a lane, and the reasons' numbers; the first true one is the
     reason. `new` is the lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
+    jams = [(jnp.isnan(new.modes[i]), code("jammed")) for i in frictions_in(plan.machine)]
     many = impacts > _MOST_IMPACTS
     if is_alive(plan.machine, trial.state) is not None:
         # If a clock breaks down, the steps shrink to zero.
         broken = code("stalled")
     ends = [
+        *jams,
         (impacts > plan.max_impacts, code("chatter")),
         (((new.attempts >= _MOST_ATTEMPTS) | (new.spent >= _MOST_STEPS)) & many, code("chatter")),
         (new.attempts >= _MOST_ATTEMPTS, _reason_for_giving_up(plan, lane, new.target)),

@@ -19,6 +19,7 @@ from ...machine import (
     AbstractMachine,
     Coordinate,
     RigidStop,
+    Row,
     added,
     contact_constraints,
     forces,
@@ -27,7 +28,7 @@ from ...machine import (
     holds_anywhere,
     longest_step,
     push_gains,
-    push_of,
+    row_of,
     stops_of,
     struck_modes,
     with_friction_impulse,
@@ -214,8 +215,9 @@ def _before_impacts(
 ) -> _Instant:
     bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
     coordinates = list(bodies.values())
-    pushes = [push_of(body, at_event) for body in coordinates]
-    gains = push_gains(coordinates, at_event, pushes)
+    rows = [row_of(body, lane.s, at_event) for body in coordinates]
+    pushes = [row.push for row in rows]
+    gains = push_gains(coordinates, rows, at_event, pushes)
     met = jnp.zeros_like(taken)
     coupled, touches = dict.fromkeys(bodies, met), {}
     for number, stop in enumerate(stops_of(plan.machine)):
@@ -227,7 +229,7 @@ def _before_impacts(
         if lane.contact is not None:
             closed = closed | (lane.contact[k] == to_event(number))
         touches[number] = closed
-    acts = _acting(plan.machine, bodies, gains, pushes, at_event)
+    acts = _acting(plan.machine, lane.s, bodies, gains, rows, at_event)
     coupled = _coupled(plan, acts, touches, coupled)
     before = {k: body.velocity(at_event) for k, body in bodies.items()}
     slow = {k: plan.rounding_bounds(k, at_event)[1] for k in bodies}
@@ -237,8 +239,8 @@ def _before_impacts(
 
 
 def _acting(
-    machine: AbstractMachine, bodies: dict[int, Coordinate], gains: list[list[Scalar]],
-    pushes: list[State], state: State,
+    machine: AbstractMachine, s: Scalar, bodies: dict[int, Coordinate], gains: list[list[Scalar]],
+    rows: list[Row], state: State,
 ) -> list[list[Flag]]:  # fmt: skip
     """Return for each pair of coordinates whether impacts change each other's velocity, also by
     friction. Products of both changes do not depend on units."""
@@ -248,8 +250,10 @@ def _acting(
         friction = friction_on(machine, number)
         if friction is not None:
             along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
-            response = push_gains([*bodies.values()], state, [push_of(along, state)])
-            for i, change in enumerate(push_gains([along], state, pushes)[0]):
+            row = row_of(along, s, state)
+            response = push_gains([*bodies.values()], rows, state, [row.push])
+            pushes = [x.push for x in rows]
+            for i, change in enumerate(push_gains([along], [row], state, pushes)[0]):
                 dragged = jnp.abs(change * response[i][0])
                 both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
     return [[stop_gradient(x) > _UNCOUPLED**2 for x in row] for row in both]
@@ -502,12 +506,10 @@ def _without_rebounds(
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
         contact[k] = jnp.where(ends, contacts[k], zero)
-    held = contact_constraints(machine, s, state, modes, contact)
+    held = contact_constraints(machine, s, state, modes, contact, with_dry=False)
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
-    amounts = forces(
-        push_gains(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
-    )
+    amounts = held.amounts(state, [-velocity for velocity in before])
     new, pushed = added(state, amounts, held.pushes), list(amounts)
     for row, (_, _, index, drag) in enumerate(
         held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
@@ -532,7 +534,8 @@ def stop_bodies(
         shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
         coordinates, on = list(bodies.values()), list(rests.values())
-        gains = push_gains(coordinates, state, [push_of(body, state) for body in coordinates])
+        rows = [row_of(body, s, state) for body in coordinates]
+        gains = push_gains(coordinates, rows, state, [row.push for row in rows])
         deltas, shifts = forces(gains, on, deltas), forces(gains, on, shifts)
     new, lost = state, jnp.zeros_like(deltas[0])
     for (k, body), change, shift, V in zip(bodies.items(), deltas, shifts, velocities, strict=True):
@@ -556,7 +559,7 @@ def _remaining_chatter(
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
     at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
-    pressing = sign * rates(free.field, body.position, s, at_rest).a
+    pressing = sign * rates(free.field, body, s, at_rest).a
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
@@ -564,7 +567,7 @@ def _remaining_chatter(
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     if growth is None:  # another impact of this instant may have changed it
-        growth = force_rate(free, body.position, free, s, at_rest)
+        growth = force_rate(free, body, free, s, at_rest)
     not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
@@ -621,7 +624,7 @@ def _resting_bodies(
     for k, hit in impacts.items():
         sign, _ = plan.sign_and_gap(k, hit.contact)
         speeds[k] = jnp.maximum(
-            -sign * rates(free.field, plan.machine.coordinates[k].position, s, state).v, 0.0
+            -sign * rates(free.field, plan.machine.coordinates[k], s, state).v, 0.0
         )
         stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
         closed[k] = jnp.where(stays, hit.contact, contact[k])

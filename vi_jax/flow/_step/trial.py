@@ -191,8 +191,8 @@ def try_step(
     ends: list[tuple[Rates, Rates]] = []
     if plan.records_motion or stops_of(machine):
         for free_k, body in zip(free_machines, machine.coordinates, strict=True):
-            begin = rates(free_k.field, body.position, lane.s, lane.state)
-            ends.append((begin, rates(free_k.field, body.position, s1, new)))
+            begin = rates(free_k.field, body, lane.s, lane.state)
+            ends.append((begin, rates(free_k.field, body, s1, new)))
 
     def at(share: Scalar) -> State:
         if motion is not None:
@@ -251,7 +251,7 @@ def _path(
     """Return the path of coordinate number k during a step. Its body is free in `free`, with rates
     `ends` there; `at_end` is s, state, the step's length and the longest length."""
     (begin, end), (s1, new, h, limit) = ends, at_end
-    position = plan.machine.coordinates[k].position
+    body = plan.machine.coordinates[k]
     if lane.contact is not None and not stops_are_exact(plan.machine, lane.state):
         # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
@@ -274,8 +274,8 @@ def _path(
     if lane.contact is not None and limited:
         release = locate_release(plan, lane, k, begin, end, good, h)
         force_rates = (
-            force_rate(free, position, smooth, lane.s, lane.state),
-            force_rate(free, position, smooth, s1, new),
+            force_rate(free, body, smooth, lane.s, lane.state),
+            force_rate(free, body, smooth, s1, new),
             stop_gradient(_SLIVER * limit + jnp.zeros_like(h)),
         )
         if k in inner.forces:
