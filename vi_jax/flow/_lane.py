@@ -253,6 +253,15 @@ class Plan(eqx.Module):
         in_mode_zero = lane.modes[mode_number(self.machine, number)] == 0
         return jnp.where(in_mode_zero, extent[1], extent[0])
 
+    def slip_rounding(self, switch: int, lane: "Lane") -> Scalar | float:
+        """Return a bound of the rounding error of a slip; `switch` is the friction's index."""
+        rounding = 256 * float(jnp.finfo(lane.s.dtype).eps)
+        if self.extents is None:
+            return rounding
+        number = len(stops_of(self.machine)) + switch
+        place = len(self.machine.coordinates) + self.others(lane.state).index(number)
+        return rounding * self.extents[place][0]
+
     def rounding_bounds(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""
         return rounding_bounds(self.machine, k, state, self.extent(k), self.unit)
