@@ -8,8 +8,8 @@ from jax.lax import stop_gradient
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import is_alive, stops_of
-from .._lane import FREE, Lane, Plan, to_event, to_release, to_turn_of, total
+from ...machine import is_alive, stops_of, switches_of
+from .._lane import FREE, Lane, Plan, any_of, to_event, to_release, to_turn_of, total
 from ..drift import FlowToEvent
 from ..events import Rates, force_rate, rates, turns_within
 from ..methods import Foreseen, stages_to_step_to
@@ -193,6 +193,7 @@ def try_step(
         for free_k, body in zip(free_machines, machine.coordinates, strict=True):
             begin = rates(free_k.field, body, lane.s, lane.state)
             ends.append((begin, rates(free_k.field, body, s1, new)))
+    ends = _without_rounding_while_held(plan, lane, ends)
 
     def at(share: Scalar) -> State:
         if motion is not None:
@@ -222,6 +223,28 @@ def try_step(
         h, s1, new, elapsed(old, integrals, h), error, good, last, met, tuple(paths), below, shares,
         smooth, free_machines, is_clear,
     )  # fmt: skip
+
+
+# A body that friction holds moves by this many roundings of its usual speed: a choice. Of 768 random
+# chains of three blocks with a full mass matrix 169 turned without end, by 1 or 2 roundings.
+_HELD = 64.0
+
+
+def _without_rounding_while_held(
+    plan: Plan, lane: Lane, ends: list[tuple[Rates, Rates]]
+) -> list[tuple[Rates, Rates]]:
+    """Return the rates at both ends of a step; while a body sticks, velocities that are rounding are
+    zero, since they would show turning points."""
+    dry = [i for i, x in enumerate(switches_of(plan.machine)) if x.is_dry]
+    if not dry:
+        return ends
+    sticks = any_of(lane.modes[dry[0]] == 0, (lane.modes[i] == 0 for i in dry))
+
+    def still(k: int, here: Rates) -> Rates:
+        least = _HELD * float(jnp.finfo(here.v.dtype).eps) * plan.extent(k) / plan.unit
+        return here._replace(v=jnp.where(sticks & (jnp.abs(here.v) <= least), 0.0, here.v))
+
+    return [(still(k, begin), still(k, end)) for k, (begin, end) in enumerate(ends)]
 
 
 def _clear_time(plan: Plan, lane: Lane) -> Scalar | None:
