@@ -47,5 +47,6 @@ from .numbers import (
     stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
 )
 from .scene import Parameters, Scene
+from .settle import Strike, strike
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop

@@ -290,8 +290,6 @@ def _settle_one(x: Contacts) -> Settled:
 class Blow(NamedTuple):
     """The result of impacts on several contacts at once."""
 
-    velocity: Array
-    """After the impact, (n + t,)."""
     impulse: Array
     """(n + t,)."""
     share: Array
@@ -300,44 +298,105 @@ class Blow(NamedTuple):
     unsolved: Array
 
 
-def strike(
-    gains: Array, velocity: Array, friction: Array, restitution: Array, tangential: Array,
-    struck: Array, of: tuple[int, ...],
-) -> Blow:  # fmt: skip
-    """Return the impact of the contacts `struck` together, by Moreau's law. Restitutions are (n,)
-    and (t,).
+class Strike(NamedTuple):
+    """The numbers of an impact on n contacts, t of them with friction."""
+
+    gains: Array
+    """(n + t, n + t)."""
+    velocity: Array
+    """Before the impact, (n + t,); that of a normal is negative if the contact closes."""
+    friction: Array
+    """(t,)."""
+    restitution: Array
+    """(n,)."""
+    tangential: Array
+    """(t,)."""
+    struck: Array
+    """True for the contacts that take part, (n,)."""
+
+
+def strike(x: Strike, of: tuple[int, ...]) -> Blow:
+    """Return the impact of the contacts `struck` together, by Moreau's law.
 
     Newton's law and Coulomb's may gain energy together (T. R. Kane). Impulses without restitution
     never do, and both satisfy the conditions of contact, which are convex. Then the result is the
     mean of both with the largest share θ of restitution that gains none.
     """
-    n, t = struck.shape[0], len(of)
-    none = jnp.zeros((t,), velocity.dtype)
+    several = jnp.sum(jnp.where(x.struck, 1.0, 0.0)) > 1
+    one = _strike_one(x, of)
+    if x.struck.shape[0] == 1:
+        return one
+    return jax.lax.cond(several, lambda: _strike_together(x, of), lambda: one)
 
-    def moreau(e: Array, along: Array) -> tuple[Array, Array]:
-        target = jnp.concatenate([e * jnp.minimum(velocity[:n], 0.0), along * velocity[n:]])
+
+def _strike_together(x: Strike, of: tuple[int, ...]) -> Blow:
+    n, none = x.struck.shape[0], jnp.zeros((len(of),), x.velocity.dtype)
+
+    def moreau(_: None, share: Array) -> tuple[None, tuple[Array, Array]]:
+        closing = share * x.restitution * jnp.minimum(x.velocity[:n], 0.0)
+        target = jnp.concatenate([closing, share * x.tangential * x.velocity[n:]])
         question = Contacts(
-            gains, velocity + target, friction, struck, none, none[:0], jnp.ones_like(none)
+            x.gains, x.velocity + target, x.friction, x.struck, none, none[:0], none + 1
         )
         pushes, holds, mode, code = _decide(question, of)
-        return forces_in(question, of, pushes, holds, mode), code
+        return None, (forces_in(question, of, pushes, holds, mode), code)
 
-    def both(_: None, share: Array) -> tuple[None, tuple[Array, Array]]:
-        return None, moreau(share * restitution, share * tangential)
+    shares = jnp.asarray([0.0, 1.0], x.velocity.dtype)
+    _, ((inelastic, full), codes) = jax.lax.scan(moreau, None, shares)
+    return _without_gain(x, inelastic, jnp.where(codes[1] == SOLVED, full, inelastic), codes[0])
 
-    _, (impulses, codes) = jax.lax.scan(both, None, jnp.asarray([0.0, 1.0], velocity.dtype))
-    inelastic, change = impulses[0], impulses[1] - impulses[0]
+
+def _strike_one(x: Strike, of: tuple[int, ...]) -> Blow:
+    """Return the impact of one contact, in closed form."""
+    n, here = x.struck.shape[0], jnp.where(x.struck, 1.0, 0.0)
+    restitution = jnp.sum(here * x.restitution)
+    speed = jnp.sum(here * x.velocity[:n])
+    across = jnp.sum(here[:, None] * x.gains[:n], 0)  # the row of the struck contact
+    normal = jnp.sum(here * across[:n])
+    zeros, code = jnp.zeros_like(x.velocity), jnp.zeros((), x.velocity.dtype)
+    if not of:
+        impulse = here * (-(1 + restitution) * speed / normal)
+        return Blow(impulse, jnp.ones_like(speed), code != SOLVED)
+    along = here[np.asarray(of)]
+    level = jnp.sum(along * x.friction)
+    slip, kept = (jnp.sum(along * y) for y in (x.velocity[n:], x.tangential))
+    gain, both = jnp.sum(along * across[n:]), jnp.sum(along[:, None] * x.gains[n:], 0)
+    back, tangent = jnp.sum(here * both[:n]), jnp.sum(along * both[n:])
+
+    def impulses(e: Array, et: Array) -> tuple[Array, Array]:
+        wanted, stop = -(1 + e) * speed, -(1 + et) * slip
+        det = normal * tangent - gain * back
+        det = jnp.where(det == 0, 1.0, det)
+        sticks = (tangent * wanted - gain * stop) / det, (normal * stop - back * wanted) / det
+        forward, backward = (wanted / (normal - sign * level * gain) for sign in (1.0, -1.0))
+        # The slip after the impact with the friction against it.
+        is_forward = (back - level * tangent) * forward - stop > 0
+        push = jnp.where(is_forward, forward, backward)
+        drag = jnp.where(is_forward, -level, level) * push
+        stays = jnp.abs(sticks[1]) <= level * jnp.maximum(sticks[0], 0.0)
+        stays = stays & (jnp.sum(along) > 0)
+        return jnp.where(stays, sticks[0], push), jnp.where(stays, sticks[1], drag)
+
+    def in_rows(pair: tuple[Array, Array]) -> Array:
+        return zeros.at[:n].set(here * pair[0]).at[n:].set(along * pair[1])
+
+    inelastic, full = (in_rows(impulses(f * restitution, f * kept)) for f in (0.0, 1.0))
+    # Where a push along the slip closes the contact (Painlevé), only sticking is left.
+    return _without_gain(x, inelastic, full, code)
+
+
+def _without_gain(x: Strike, inelastic: Array, full: Array, code: Array) -> Blow:
+    """Return the mean of two impulses with the largest share of the second that gains no energy."""
+    change = full - inelastic
     # The energy gained with the share θ: c0 + c1 θ + c2 θ², where c0 ≤ 0.
-    c0 = jnp.dot(inelastic, velocity) + 0.5 * jnp.dot(inelastic, gains @ inelastic)
-    c1 = jnp.dot(change, velocity + gains @ inelastic)
-    c2 = 0.5 * jnp.dot(change, gains @ change)
-    size = jnp.abs(jnp.dot(inelastic, velocity)) + jnp.abs(jnp.dot(impulses[1], velocity))
-    gained = stop_gradient(c0 + c1 + c2) > _GAIN * stop_gradient(size)
-    root = jnp.sqrt(jnp.maximum(jnp.where(gained, c1 * c1 - 4 * c0 * c2, 1.0), 0.0))
-    stable = -2 * c0 / jnp.where(gained & (c1 > 0), c1 + root, 1.0)
-    other = (root - c1) / jnp.where(gained, 2 * c2, 1.0)
-    share = jnp.clip(jnp.where(c1 > 0, stable, other), 0.0, 1.0)
-    share = jnp.where(gained, share, jnp.ones_like(share))
-    share = jnp.where(codes[1] == SOLVED, share, 0.0)
-    impulse = jnp.where(share == 1, impulses[1], inelastic + share * jnp.where(codes[1] == SOLVED, change, 0.0))
-    return Blow(velocity + gains @ impulse, impulse, share, codes[0] != SOLVED)
+    c0 = jnp.dot(inelastic, x.velocity) + 0.5 * jnp.dot(inelastic, x.gains @ inelastic)
+    c1 = jnp.dot(change, x.velocity + x.gains @ inelastic)
+    c2 = 0.5 * jnp.dot(change, x.gains @ change)
+    size = jnp.abs(jnp.dot(inelastic, x.velocity)) + jnp.abs(jnp.dot(full, x.velocity))
+    gains = stop_gradient(c0 + c1 + c2) > _GAIN * stop_gradient(size)
+    root = jnp.sqrt(jnp.where(gains, jnp.maximum(c1 * c1 - 4 * c0 * c2, 0.0), 1.0))
+    stable = -2 * c0 / jnp.where(gains & (c1 > 0), c1 + root, 1.0)
+    other = (root - c1) / jnp.where(gains, 2 * c2, 1.0)
+    share = jnp.where(gains, jnp.clip(jnp.where(c1 > 0, stable, other), 0.0, 1.0), 1.0)
+    impulse = jnp.where(gains, inelastic + share * change, full)
+    return Blow(impulse, share, code != SOLVED)
