@@ -30,12 +30,14 @@ from ..machine import (
     holds_anywhere,
     in_rows,
     is_in_range,
+    limited_in,
     longest_step,
     mode_number,
     modes_of,
     on_held_surfaces,
     outcomes_of,
     prepared,
+    pressed_contacts,
     replaced,
     scales_known,
     size_of,
@@ -53,10 +55,11 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._step.hybrid import iterate
+from ._step.impact import is_compound
 from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
-from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
+from .smooth import hold_contacts, in_modes, stops_are_exact
 
 # A number of the state below this share of the change that the other numbers cause has still to
 # grow. Rates are evaluated at this many instants of a cycle. Choices.
@@ -205,7 +208,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     if plan.rests:
         jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
         contact = _contacts_at(plan, start, current, jerks)
-        if len(limited_of(machine)) > 1:
+        if len(limited_in(machine)) > 1:
             contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
@@ -218,6 +221,8 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
+        if is_compound(machine):
+            contact = pressed_contacts(machine, s, start, modes, contact)
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
@@ -276,7 +281,7 @@ def _pressed_together(
         more = _contacts_at(plan, start, current, jerks)
         return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
 
-    return jax.lax.scan(add_contacts, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
+    return jax.lax.scan(add_contacts, contact, None, length=len(limited_in(plan.machine)) - 1)[0]
 
 
 def _rests_on(

@@ -23,10 +23,10 @@ from ..machine import (
     field_in,
     has_contact_friction,
     holds_anywhere,
+    limited_in,
     push_of,
     scales_known,
     shown_modes,
-    stops_of,
     velocity_change,
 )
 
@@ -43,11 +43,6 @@ def unit_of(machine: AbstractMachine) -> Scalar | float:
         return 1.0
     unit = stop_gradient(jnp.asarray(cycle)) / (2 * pi)
     return jnp.where((unit > 1 / _USUAL) & (unit < _USUAL), 1.0, unit)
-
-
-def limited_of(machine: AbstractMachine) -> list[int]:
-    """Return the numbers of the coordinates that stops limit."""
-    return sorted({stop.coordinate for stop in stops_of(machine)})
 
 
 class SmoothMachine(eqx.Module):
@@ -70,7 +65,7 @@ class SmoothMachine(eqx.Module):
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
             return flow
-        limited = limited_of(machine) if self.contact else []
+        limited = limited_in(machine) if self.contact else []
         several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
             flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]

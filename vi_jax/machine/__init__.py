@@ -23,7 +23,7 @@ from .coordinates import (
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
 from .declared import (
-    clock_of, has_own_modes, is_builtin, others_of, outcomes_of, overridden, section_in, stops_of,
+    clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in, stops_of,
     switches_of, with_earlier_clock,
 )
 from .drives import (
@@ -37,7 +37,7 @@ from .events import (
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )
-from .friction import ContactFriction, DryFriction, frictions_in, settled_modes
+from .friction import ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes
 from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (

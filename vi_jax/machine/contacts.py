@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
-from .declared import stops_of, switches_of
+from .declared import limited_in, stops_of, switches_of
 from .state import like
 
 # A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other
@@ -198,7 +198,7 @@ def contact_constraints(
     """Return the constraints of bodies at rest on stops, and of dry frictions if `with_dry`; these
     take no part in impacts, since their forces are finite. **Arguments:** `modes`, those of
     switches first; `contact`, as in `EventContext`; empty for no rest."""
-    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
+    limited = limited_in(machine) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
     stops, switches = stops_of(machine) if contact else (), switches_of(machine)
     frictions = [(i, x) for i, x in enumerate(switches) if contact and x.friction_stop is not None]

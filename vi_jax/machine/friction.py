@@ -36,10 +36,11 @@ from .contacts import (
     velocity_change,
 )
 from .coordinates import Row
-from .declared import stops_of, switches_of
+from .declared import limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .settle import Contacts, settle
 from .state import with_components
+
 
 class Friction(AbstractSwitch):
     """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
@@ -326,43 +327,64 @@ def settled_modes(
             ratio = jnp.where(begins, 1 - _RELEASED, ratio)
         slips.append(slip)
         holds.append(ratio + jnp.zeros_like(s))
-    settled: Any = _settled
-    found = settled(machine, s, state, modes, contact, tuple(slips), tuple(holds))
+    solve: Any = _settled
+    found, _ = solve(machine, s, state, modes, contact, tuple(slips), tuple(holds))
     new = list(modes)
     for i, mode in zip(indices, found, strict=True):
         new[i] = mode
     return tuple(new)
 
 
+def pressed_contacts(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
+) -> Scalars:
+    """Return the contacts (as in `EventContext`) without those that the forces of this state open,
+    in these modes of frictions."""
+    indices, switches = frictions_in(machine), switches_of(machine)
+    slips = tuple(modes[i] for i in indices)
+    ratios = (getattr(switches[i], "static_ratio", 1.0) for i in indices)
+    solve: Any = _settled
+    holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
+    return solve(machine, s, state, modes, contact, slips, holds)[1]
+
+
 @eqx.filter_jit
 def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     slips: Scalars, holds: Scalars,
-) -> Scalars:  # fmt: skip
-    """Return the modes of frictions by their slips, jitted like `_solve_forces`."""
+) -> tuple[Scalars, Scalars]:  # fmt: skip
+    """Return the modes of frictions by their slips, and the contacts that stay closed; jitted like
+    `_solve_forces`."""
     indices, switches = frictions_in(machine), switches_of(machine)
-    order = [i for i in indices if not switches[i].is_dry] if contact else []
-    order += [i for i in indices if switches[i].is_dry]
-    by_index = dict(zip(indices, zip(slips, holds, strict=True), strict=True))
-    found = {i: slip for i, (slip, _) in by_index.items()}
-    if not order:
-        return tuple(found.values())
-    free = [0.0 * x if i in indices else x for i, x in enumerate(modes)]
+    order = [i for i in indices if switches[i].is_dry or contact]
+    order.sort(key=lambda i: switches[i].is_dry)
+    slip_of, hold_of = (
+        dict(zip(indices, slips, strict=True)),
+        dict(zip(indices, holds, strict=True)),
+    )
+    if not order and not contact:
+        return slips, contact
+    free = tuple(0.0 * x if i in indices else x for i, x in enumerate(modes))
     held = contact_constraints(machine, s, state, free, contact)
-    level = [switches[i].sliding(machine, s, state, by_index[i][0]) for i in held.dry]
-    question, of = _question(machine, s, state, free, contact, held)
     touches = [switches[i].touches(machine, contact) for i in order]
-    slip = jnp.stack([jnp.where(x, by_index[i][0], 0.0) for i, x in zip(order, touches, strict=True)])
-    hold = jnp.stack([by_index[i][1] for i in order])
+    slip = [jnp.where(x, slip_of[i], 0.0) for i, x in zip(order, touches, strict=True)]
+    level = [switches[i].sliding(machine, s, state, slip_of[i]) for i in held.dry]
+    none = jnp.zeros((0,), s.dtype)
+    question, of = _question(machine, s, state, free, contact, held)
     question = question._replace(
-        level=jnp.stack([x + 0 * s for x in level]) if level else jnp.zeros((0,), s.dtype),
-        slip=slip, hold=hold, touches=jnp.stack(touches[: len(of)]) if of else None,
-    )  # fmt: skip
+        level=jnp.stack([x + 0 * s for x in level]) if level else none,
+        slip=jnp.stack(slip) if slip else none,
+        hold=jnp.stack([hold_of[i] for i in order]) if order else none,
+        touches=jnp.stack(touches[: len(of)]) if of else None,
+    )
     answer = settle(stop_gradient(question), of)
     for n, i in enumerate(order):
         mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
-        found[i] = jnp.where(touches[n], mode, by_index[i][0])
-    return tuple(found[i] for i in indices)
+        slip_of[i] = jnp.where(touches[n], mode, slip_of[i])
+    kept = list(contact)
+    for row, k in enumerate(limited_in(machine) if contact else ()):
+        kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
+    return tuple(slip_of.values()), tuple(kept)
 
 
 def _question(
@@ -376,8 +398,7 @@ def _question(
     first = len(held.rows) - len(held.dry)
     n = first - len(of)
     outward, closed = [one] * len(held.rows), []
-    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
-    for row, k in enumerate(limited):
+    for row, k in enumerate(limited_in(machine) if contact else ()):
         for number, stop in enumerate(stops_of(machine)):
             if stop.coordinate == k:
                 on = contact[k] == 1.0 + number

@@ -18,9 +18,10 @@ from ...machine import (
     guard_of,
     has_velocity,
     holds_anywhere,
-    mode_number,
+    limited_in,
     others_of,
     outcomes_of,
+    pressed_contacts,
     section_number,
     settled_modes,
     stops_of,
@@ -31,7 +32,7 @@ from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
-from ..smooth import hold_contacts, in_modes, is_affine, limited_of, stops_are_exact
+from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
@@ -238,15 +239,21 @@ def release_pulled(
         return lane
     old, modes_before = before
     contacts, direction = list(contact), list(lane.direction)
-    for k in limited_of(machine):
+    together = is_compound(machine)
+    kept = pressed_contacts(machine, s, lane.state, modes, contact) if together else contact
+    for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = hold_contacts(machine, modes, contact, but=k)
             return rates(free.field, machine.coordinates[k], s, state).a
 
         sign, _ = plan.sign_and_gap(k, contact[k])
-        pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
-        leaves = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
+        if together:
+            leaves = kept[k] == 0
+        else:
+            pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
+            leaves = stop_gradient((pressed >= 0) & (pulled < 0))
+        leaves = when & (contact[k] > 0) & leaves
         if contact_before is not None:
             leaves = leaves & (contact_before[k] == contact[k])
         clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
@@ -508,7 +515,7 @@ def on_its_stops(plan: Plan, lane: Lane) -> State:
     """Return the state with the bodies that rest, at least one, exactly on their stops. While they
     are held, their positions are accurate to the method's error only."""
     assert lane.contact is not None
-    codes = {k: lane.contact[k] for k in limited_of(plan.machine)}
+    codes = {k: lane.contact[k] for k in limited_in(plan.machine)}
     return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in codes.items()}, codes)[0]
 
 

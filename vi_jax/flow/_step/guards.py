@@ -26,6 +26,7 @@ from ...machine import (
     clock_of,
     events_of,
     guard_of,
+    limited_in,
     section_number,
     sides_of,
     stops_of,
@@ -33,7 +34,7 @@ from ...machine import (
 from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
-from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
+from ..smooth import SmoothMachine, is_affine, stops_are_exact
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -113,7 +114,7 @@ def inner_guards(
     if not stages:
         return InnerGuards({}, {}, {}, {})
     machine, arguments = plan.machine, (lane.modes, lane.contact or ())
-    limited = limited_of(machine) if plan.rests else []
+    limited = limited_in(machine) if plan.rests else []
     contacts: Any = lane.contact
     checked = events_within_step(plan, lane.state)
 

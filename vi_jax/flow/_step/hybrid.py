@@ -25,12 +25,12 @@ from ...lanes import pin_flag
 from ...machine import (
     DryFriction,
     SoftStop,
+    constant_modes,
     counts_turns,
     frictions_in,
     is_alive,
     others_of,
     section_in,
-    constant_modes,
     section_number,
     settled_modes,
     stops_of,

@@ -27,6 +27,7 @@ from ...machine import (
     friction_on,
     has_contact_friction,
     holds_anywhere,
+    limited_in,
     longest_step,
     push_gains,
     row_of,
@@ -38,7 +39,7 @@ from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
 from ..drift import FlowToEvent
 from ..events import force_rate, rates
 from ..results import EventKind
-from ..smooth import SmoothMachine, hold_contacts, in_modes, limited_of
+from ..smooth import SmoothMachine, hold_contacts, in_modes
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -59,7 +60,7 @@ class ImpactResult(NamedTuple):
 
 def is_compound(machine: AbstractMachine) -> bool:
     """Return whether several velocities change in an impact, across stops or along them; static."""
-    return len(limited_of(machine)) > 1 or has_contact_friction(machine)
+    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -221,7 +222,7 @@ def resolve_impact_sequence(
         lane = lane.update_record(impact_energy=energy + lost)
     state = select(instant.met, instant.after(end.impulse), lane.state)
     results = {}
-    for k in limited_of(machine):
+    for k in limited_in(machine):
         body, contact, fastest, latest = machine.coordinates[k], zero, zero, zero
         for i, stop in enumerate(stops):
             if stop.coordinate == k:
@@ -229,7 +230,10 @@ def resolve_impact_sequence(
                 moved = body.placed(state, stop.place, -stop.sign * end.velocity[i])
                 state = select(last, moved, state)
                 contact = jnp.where(last, to_event(i), contact)
-                latest, fastest = jnp.maximum(latest, end.struck[i]), jnp.maximum(fastest, end.approach[i])
+                latest, fastest = (
+                    jnp.maximum(latest, end.struck[i]),
+                    jnp.maximum(fastest, end.approach[i]),
+                )
         leaves = -plan.sign_and_gap(k, contact)[0] * body.velocity(state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
         results[k] = ImpactResult(contact, fastest, jnp.clip(share, 0.0, 1.0))
@@ -341,7 +345,11 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     new = instant.after(total) if any(x.modes is not None for x in stops) else None
     for i, stop in enumerate(stops):
         hit = hits[i] & acted
-        lane = lane.end_if(hit, gains_speed(stop, speed[i], stop.velocity_after(stop.sign * speed[i])), "bad_impact")
+        lane = lane.end_if(
+            hit,
+            gains_speed(stop, speed[i], stop.velocity_after(stop.sign * speed[i])),
+            "bad_impact",
+        )
         lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, i, speed[i])
         if stop.modes is not None:
             given = plan.machine, lane.s, instant.after(sequence.impulse), new, lane.modes
