@@ -23,8 +23,8 @@ from .coordinates import (
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
 from .declared import (
-    clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in, stops_of,
-    switches_of, with_earlier_clock,
+    clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in,
+    stops_of, switches_of, with_earlier_clock,
 )
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
@@ -32,8 +32,8 @@ from .drives import (
 )
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes, event_of, events_of,
-    friction_on, guard_of, has_contact_friction, holds_anywhere, is_autonomous, jump_of,
+    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes, event_of,
+    events_of, friction_on, guard_of, has_contact_friction, holds_anywhere, is_autonomous, jump_of,
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )

@@ -357,8 +357,9 @@ def _row(machine: Mechanical, on: Any, state: State) -> Row:
     zero = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
 
     def as_velocities(values: Iterable[Any]) -> Any:
+        both = zip(vars(machine.places(zero)).items(), values, strict=True)
         v = {x: (jnp if isinstance(value, jax.Array) else np).full_like(y, value)
-             for (x, y), value in zip(vars(machine.places(zero)).items(), values, strict=True)}  # fmt: skip
+             for (x, y), value in both}  # fmt: skip
         return zero.replace(v=Named(**v))
 
     return Row(as_velocities(push.values()), mass, as_velocities(slopes))

@@ -230,8 +230,8 @@ def _decide(x: Contacts, of: tuple[int, ...]) -> tuple[Array, Array, Array, Arra
 def forces_in(
     x: Contacts, of: tuple[int, ...], pushes: Array, holds: Array, mode: Array
 ) -> Array:  # fmt: skip
-    """Return the forces λ, (m,), with derivatives, if these contacts push, these frictions hold, and
-    the others slip as in `mode`, or have no force where it is 0."""
+    """Return the forces λ, (m,), with derivatives, if these contacts push, these frictions hold,
+    and the others slip as in `mode`, or have no force where it is 0."""
     n, d = x.closed.shape[0], x.level.shape[0]
     tangents = jnp.concatenate([x.friction, jnp.zeros((d,), x.rates.dtype)])
     slip = jnp.where(holds, 0.0, mode)

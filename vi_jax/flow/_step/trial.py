@@ -225,16 +225,16 @@ def try_step(
     )  # fmt: skip
 
 
-# A body that friction holds moves by this many roundings of its usual speed: a choice. Of 768 random
-# chains of three blocks with a full mass matrix 169 turned without end, by 1 or 2 roundings.
+# A body that friction holds moves by this many roundings of its usual speed: a choice. Of 768
+# random chains of three blocks with a full mass matrix 169 turned without end, by 1 or 2 roundings.
 _HELD = 64.0
 
 
 def _without_rounding_while_held(
     plan: Plan, lane: Lane, ends: list[tuple[Rates, Rates]]
 ) -> list[tuple[Rates, Rates]]:
-    """Return the rates at both ends of a step; while a body sticks, velocities that are rounding are
-    zero, since they would show turning points."""
+    """Return the rates at both ends of a step. While a body sticks, velocities that are rounding
+    are zero, since they would show turning points."""
     dry = [i for i, x in enumerate(switches_of(plan.machine)) if x.is_dry]
     if not dry:
         return ends
