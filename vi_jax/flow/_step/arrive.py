@@ -28,8 +28,9 @@ from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
+from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, limited_of, stops_are_exact
-from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
+from .guards import JUMPED, Crossing, furthest_landing
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
 

@@ -33,6 +33,7 @@ from ...machine import (
 from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
+from ..sizes import guard_rounding
 from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
@@ -153,7 +154,7 @@ def inner_guards(
     if not limited:
         return InnerGuards({}, events, slow, {})
     # The integral of a force is a velocity.
-    size = 1.0 if isinstance(plan.unit, float) else 1 / plan.unit
+    size = 1 / plan.unit
 
     def of_forces(places: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
         forces, error, slack = at_places(pulls)(places), jnp.zeros_like(h), {}
@@ -262,6 +263,9 @@ class Crossing(NamedTuple):
     """The coordinate that a stop limits."""
     slack: Scalar | None = None
     """A step may be beyond the event by this rounding; `None` if positions on it are exact."""
+    zero: Scalar | None = None
+    """Values up to this count as zero at the start of the step, if the guard falls; `None` for an
+    event that need not come from below."""
     above: Flag | None = None
     """True if the guard has jumped above zero at the start of the step, for example with the clock
     of a new cycle; `None` for a stop."""
@@ -310,13 +314,9 @@ def crossings(
 def _mark_jump(guard: Crossing) -> Crossing:
     """Set `above` of an event: its guard is above zero at the start of the step, by more than
     `_from_below` takes for zero in a guard that falls."""
-    x = stop_gradient(guard.begin.x)
-    return guard._replace(above=x > JUMPED * jnp.abs(x) + guard_rounding(guard.scale))
-
-
-def guard_rounding(scale: Scalar) -> Scalar:
-    """Return the rounding error of a guard of this size at its zero after a search."""
-    return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
+    x, eps = stop_gradient(guard.begin.x), float(jnp.finfo(guard.scale.dtype).eps)
+    zero = eps**0.5 * guard.scale if guard.zero is None else guard.zero
+    return guard._replace(above=x > JUMPED * jnp.abs(x) + zero)
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -375,9 +375,12 @@ def _other_events(
         scale = plan.guard_extent(number, lane) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         )
+        zero = None
         if event.from_below:
             (side,) = sides
-            armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
+            was_below = lane.below[len(below)]
+            zero = _zero_of(plan, was_below, plan.guard_extent(number, lane), side)
+            armed, risen = _from_below(was_below, side.begin, side.end, zero)
             begin, end = _rates_if_armed(armed, side.begin), _rates_if_armed(armed, side.end)
             sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
@@ -387,7 +390,7 @@ def _other_events(
         for side in sides[1:]:  # the side that is the guard at the step's end
             greater = stop_gradient(side.end.x > end.x)
             begin, end = select(greater, (side.begin, side.end), (begin, end))
-        crossing = Crossing(event, number, begin, end, scale)
+        crossing = Crossing(event, number, begin, end, scale, zero=zero)
         found.append(crossing._replace(sides=tuple(sides)) if number in inner.events else crossing)
     if clocked:
         number, (begin,), (end,) = section_number(machine), begin_rates[-1], end_rates[-1]
@@ -406,11 +409,21 @@ def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
     return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
-def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
+def _zero_of(plan: Plan, below: Scalar, extent: Scalar | float, side: Side) -> Scalar:
+    """Return the distance from zero up to which a guard of this extent counts as zero: the rounding
+    of its evaluation, and what the location of an event leaves. At the start of a motion it is what
+    a search for an orbit leaves, in units of the guard's change: no cycle is this short."""
+    begin, end = stop_gradient((side.begin, side.end))
+    near, left = landing_tolerance(begin.x), furthest_landing(begin.x)
+    rate = plan.in_units(jnp.maximum(jnp.abs(begin.v), jnp.abs(end.v)))
+    bend = plan.in_units(plan.in_units(jnp.maximum(jnp.abs(begin.a), jnp.abs(end.a))))
+    change = jnp.where(below < 0, near * (rate + bend), left * left * bend)
+    return guard_rounding(extent + jnp.abs(begin.x)) + change
+
+
+def _from_below(below: Scalar, begin: Rates, end: Rates, rounding: Scalar) -> tuple[Flag, Scalar]:
     """Return whether a guard that must have been negative counts now, and `Lane.below` at the
     step's end. A guard that begins at zero and falls counts."""
-    # A point that a search left this close to the surface is on it too: no cycle is this short.
-    rounding = guard_rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     # If the motion began on the surface, a falling guard may be rounding alone.
