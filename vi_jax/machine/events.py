@@ -140,11 +140,13 @@ def struck_modes(
     contact: Scalars = (),
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
-    event_modes = []
+    event_modes, flow = [], None
     solve_together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
+    if solve_together:
+        flow = field_in(machine, s, state, modes)
     for number, event in enumerate(events_of(machine)):
         if solve_together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
-            event_modes.append(event.slip_sign(machine, s, state))  # pyright: ignore
+            event_modes.append(event.slip_sign(machine, s, state, flow))  # pyright: ignore
         elif event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
             event_modes.append(event.struck(machine, s, state, *modes[part], **keywords))

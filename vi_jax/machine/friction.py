@@ -5,6 +5,7 @@ import functools
 import inspect
 import itertools
 from collections.abc import Callable, Mapping
+from math import pi
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -37,6 +38,7 @@ from .contacts import (
 )
 from .declared import stops_of, switches_of
 from .event import AbstractSwitch, EventContext
+from .numbers import size_of
 from .state import with_components
 
 # In a tried set of modes, a force may have the wrong sign up to this share of the largest friction
@@ -49,7 +51,7 @@ class Friction(AbstractSwitch):
     """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
 
     roundings: ClassVar[int]
-    """A slip below this number of roundings of the state counts as zero."""
+    """A slip below this number of roundings of its size counts as zero."""
 
     needs_all_modes: ClassVar = True  # a holding force depends on all other forces
     may_slide: ClassVar = False  # there the body sticks
@@ -77,18 +79,25 @@ class Friction(AbstractSwitch):
         """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
-    def slip_sign(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """Return the sign of the slip; zero if the slip is rounding."""
-        slip = self.speed_of_slip(machine, s, state)
-        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
-        least = stop_gradient(self.roundings * jnp.finfo(slip.dtype).eps * size)
+    def slip_sign(
+        self, machine: Machine, s: Scalar, state: State, flow: State | None = None
+    ) -> Scalar:
+        """Return the sign of the slip; zero if the slip is rounding. Its size is that of its terms,
+        and its change by the rate `flow` in 1/2π of a cycle."""
+        slip, sizes = self.speed_of_slip(machine, s, state), jtu.tree_map(jnp.abs, state)
+        size = size_of(lambda x: self.speed_of_slip(machine, s, x), state, sizes)
+        if flow is not None:
+            rate = jnp.abs(self.slip_rate(machine, s, state, flow))
+            size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
+        least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
         return self.slip_sign(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
-        slips = self.slip_sign(machine, s, state)
+        flow = None if around is None else field_in(machine, s, state, around.modes)
+        slips = self.slip_sign(machine, s, state, flow)
         if not self.is_known(around):
             return slips
         return jnp.where(slips == 0, self._mode_at_rest(machine, s, state, around, True), slips)
@@ -327,7 +336,8 @@ def choose_modes(
     sticks or slips either way."""
     indices = frictions_in(machine)
     switches = switches_of(machine)
-    signs = [switches[i].slip_sign(machine, s, state) for i in indices]
+    flow = field_in(machine, s, state, modes)
+    signs = [switches[i].slip_sign(machine, s, state, flow) for i in indices]
     slips = [x != 0 for x in signs]
     if released is not None:  # the slip of a sticking body is rounding
         slips = [
