@@ -495,8 +495,8 @@ def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(step.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # These derivatives have no meaning if the event was not met.
-    met = flow.event_offset(flow.guard(c.number), offset)
-    return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
+    lost = None if c.jumped is None or not c.event.is_plain else c.jumped
+    return flow.event_offset(flow.guard(c.number), offset, c.landed, lost)
 
 
 def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:

@@ -28,6 +28,7 @@ from ...machine import (
     guard_of,
     section_number,
     sides_of,
+    size_of,
     stops_of,
 )
 from .._lane import Lane, Plan, any_of, select, to_event
@@ -277,7 +278,10 @@ class Crossing(NamedTuple):
     again: Any = None
     """The step was aimed at the event and has to be corrected by δ."""
     sudden: Any = None
-    """True if the guard jumped above zero there, so that δ has no meaning; `None` if none can."""
+    """True if the event was located by its sign alone, so that δ has no meaning; `None` if none
+    can."""
+    jumped: Any = None
+    """True if the guard jumped above zero there, so that the event's time has no derivative."""
     sides: tuple[Side, ...] = ()
     """The smooth functions whose maximum is g, if they were evaluated at stages."""
 
@@ -307,8 +311,45 @@ def crossings(
     if plan.others(lane.state) or not stops_are_exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
+        guards = _with_own_rounding(plan, lane, (s1, new), guards)
         guards = [guard if guard.coordinate is not None else _mark_jump(guard) for guard in guards]
     return tuple(_landed(plan, lane, good & last, good, h, each, guards) for each in guards), below
+
+
+def _with_own_rounding(
+    plan: Plan, lane: Lane, at_end: tuple[Scalar, State], guards: list[Crossing]
+) -> list[Crossing]:
+    """Return the guards with a smaller slack where one ends the step at zero to rounding, but is
+    known better: a guard without a slope, such as (x - p)³, whose sign is that of x - p."""
+    own = [guard for guard in guards if guard.event.is_plain]
+    if not own:
+        return guards
+    s, state = stop_gradient(at_end)
+    sizes = jtu.tree_map(lambda x: jnp.maximum(1.0, jnp.abs(x)), state)
+    if plan.sizes is not None:
+        sizes = jtu.tree_map(lambda size, x: jnp.maximum(size, jnp.abs(x)), plan.sizes, state)
+    arguments, eps = (lane.modes, lane.contact or ()), float(jnp.finfo(s.dtype).eps)
+
+    def of_each(_: None) -> Scalars:
+        found = []
+        for guard in own:
+            value = lambda s, x, i=guard.number: guard_of(plan.machine, i, s, x, *arguments)
+            rate = jax.jvp(lambda s, f=value: f(s, state), (s,), (jnp.ones_like(s),))[1]
+            size = size_of(lambda x, f=value: f(s, x), state, sizes)
+            size = size + jnp.maximum(plan.unit, jnp.abs(s)) * jnp.abs(rate)
+            found.append(jnp.where(jnp.isfinite(size), 4 * eps * size, jnp.inf))
+        return tuple(found)
+
+    near = any_of(lane.s > 0, (jnp.abs(x.end.x) <= x.slack for x in own))
+    far = tuple(jnp.full_like(s, jnp.inf) for _ in own)
+    slack = jax.lax.cond(stop_gradient(near), of_each, lambda _: far, None)
+    by_number = {guard.number: x for guard, x in zip(own, slack, strict=True)}
+    return [
+        guard._replace(slack=jnp.minimum(guard.slack, by_number[guard.number]))
+        if guard.number in by_number
+        else guard
+        for guard in guards
+    ]
 
 
 def _mark_jump(guard: Crossing) -> Crossing:
@@ -476,7 +517,8 @@ def _landed(
     size = stop_gradient(jnp.abs(offset))
     # Two tests of being on the event to rounding: along the path, or, near grazing, in position.
     close = size <= landing_tolerance(h) * tolerance_factor(plan, lane)
-    on_event = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
+    slack = 4 * eps * guard.scale if guard.slack is None else guard.slack
+    on_event = (jnp.abs(end.x) <= slack) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # On the event a parabola may have no root: a body that is at rest on a surface.
     near = close & real | on_event
@@ -485,16 +527,20 @@ def _landed(
     # When bodies touch at rest, their remaining speed is rounding.
     rises = end.v > 0 if guard.slack is None else end.v * lane.length > guard.slack
     again = again | ends & on_event & close & rises
-    sudden = None
+    sudden, jumped = None, None
     if guard.above is not None:
-        shortest = jnp.maximum(
-            plan.in_units(_SUDDEN), 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
-        )
+        # A guard without a slope is followed further, to the clock's rounding.
+        jumped = stop_gradient(end.x) > JUMPED * guard.scale
+        shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
+        shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.attempts < _PATIENCE)
-    return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
+    jumped = None if sudden is None else sudden & jumped
+    return guard._replace(
+        offset=offset, landed=landed, again=again, near=near, sudden=sudden, jumped=jumped
+    )
 
 
 def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
