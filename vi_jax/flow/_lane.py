@@ -29,7 +29,8 @@ from ..machine import (
 )
 from .methods import AbstractMethod
 from .results import EventKind, code
-from .smooth import TIME, Integrals, rounding_bounds, unit_of
+from .sizes import rounding_bounds, unit_of
+from .smooth import TIME, Integrals
 
 # Targets of the next step, as numbers, which the loop carries: none, or one of the following.
 FREE = 0.0
@@ -233,7 +234,7 @@ class Plan(eqx.Module):
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
 
     sizes: State | None = None
-    """The size of each number of the state (see `loop.sizes_of`), at most 1."""
+    """The size of each number of the state (see `sizes.sizes_of`), at most 1."""
     extents: tuple[Any, ...] | None = None
     """The size, at most 1, of each coordinate, then that of the guard of each of `others`; `None`
     for a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
@@ -298,7 +299,7 @@ class Plan(eqx.Module):
     def in_units(self, threshold: Any) -> Any:
         """Return a threshold in `s`, given for a cycle of about 2π, in the unit of `s`."""
         unit = self.unit
-        return threshold if isinstance(unit, float) else threshold * unit
+        return threshold if isinstance(unit, float) and unit == 1.0 else threshold * unit
 
     def cycle_of(self, done: Scalar) -> Scalar:
         """Return the number of the current cycle, from the start, after `done` intervals."""

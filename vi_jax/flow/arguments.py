@@ -64,7 +64,7 @@ from ._machine_checks import (
 )
 from ._quantities import average_names, check_units, quantity_names
 from .methods import AbstractMethod, MethodLike, chosen
-from .smooth import rounding_bounds
+from .sizes import rounding_bounds
 
 _TRACED = ["settle", "method", "begin", "until", "stop"]
 _STATIC = [

@@ -21,8 +21,8 @@ from .._types import Scalar, State
 from ..machine import AbstractMachine, convert_start, in_rows, longest_step, size_of, without_modes
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
-from .loop import row_sizes, sizes_on_host
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
+from .sizes import row_sizes, sizes_on_host
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.

@@ -265,6 +265,8 @@ class Switch(AbstractSwitch):
     function: Callable[..., Any] = eqx.field(static=True)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
 
+    is_plain: ClassVar = True
+
     @property
     def may_slide(self) -> bool:  # pyright: ignore
         return not self.slides
@@ -341,7 +343,9 @@ class Reset(AbstractEvent):
     ends a cycle belongs to the next cycle.
 
     A guard may jump, such as `where(x > 1, 1.0, -1.0)`. Its zero is found by bisection, to 1e-12 in
-    `s`, in many steps; the time of such an event has no derivative.
+    `s`, in many steps. The time of such an event has no derivative, so that derivatives are NaN. A
+    guard without a slope at its zero, such as `(x - 1)**3`, takes many steps too; its derivatives
+    are right, or NaN where JAX's derivative of the guard is 0.
 
     **Arguments:**
 

@@ -4,6 +4,7 @@ import abc
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from math import pi
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -38,6 +39,7 @@ from .contacts import (
 from .coordinates import Row
 from .declared import limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
+from .numbers import size_of
 from .settle import Contacts, settle
 from .state import with_components
 
@@ -46,7 +48,7 @@ class Friction(AbstractSwitch):
     """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
 
     roundings: ClassVar[int]
-    """A slip below this number of roundings of the state counts as zero."""
+    """A slip below this number of roundings of its size counts as zero."""
 
     needs_all_modes: ClassVar = True  # a holding force depends on all other forces
     may_slide: ClassVar = False  # there the body sticks
@@ -74,11 +76,17 @@ class Friction(AbstractSwitch):
         """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
-    def slip_sign(self, machine: Machine, s: Scalar, state: State) -> Scalar:
-        """Return the sign of the slip; zero if the slip is rounding."""
-        slip = self.speed_of_slip(machine, s, state)
-        size = sum((jnp.sum(jnp.abs(x)) for x in jtu.tree_leaves(state)), start=jnp.asarray(0.0))
-        least = stop_gradient(self.roundings * jnp.finfo(slip.dtype).eps * size)
+    def slip_sign(
+        self, machine: Machine, s: Scalar, state: State, flow: State | None = None
+    ) -> Scalar:
+        """Return the sign of the slip; zero if the slip is rounding. Its size is that of its terms,
+        and its change by the rate `flow` in 1/2π of a cycle."""
+        slip, sizes = self.speed_of_slip(machine, s, state), jtu.tree_map(jnp.abs, state)
+        size = size_of(lambda x: self.speed_of_slip(machine, s, x), state, sizes)
+        if flow is not None:
+            rate = jnp.abs(self.slip_rate(machine, s, state, flow))
+            size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
+        least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
@@ -317,10 +325,10 @@ def settled_modes(
     large.
     """
     indices, switches = frictions_in(machine), switches_of(machine)
-    slips, holds = [], []
+    slips, holds, flow = [], [], field_in(machine, s, state, modes)
     for i in indices:
         friction, ratio = switches[i], getattr(switches[i], "static_ratio", 1.0)
-        slip = friction.slip_sign(machine, s, state)
+        slip = friction.slip_sign(machine, s, state, flow)
         if released is not None:  # the slip of a sticking body is rounding
             slip = jnp.where(modes[i] == 0, 0.0, slip)
             begins = released.get(i, jnp.zeros((), bool))

@@ -32,8 +32,9 @@ from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
 from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
+from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
-from .guards import JUMPED, Crossing, furthest_landing, guard_rounding
+from .guards import JUMPED, Crossing, furthest_landing
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
 
@@ -531,8 +532,8 @@ def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:
         beyond = trial.s + offset - plan.end(step.old.part)
         offset = offset - jnp.maximum(stop_gradient(beyond), 0.0)
     # These derivatives have no meaning if the event was not met.
-    met = flow.event_offset(flow.guard(c.number), offset)
-    return met if c.sudden is None else jnp.where(c.sudden, 0.0, met)
+    lost = None if c.jumped is None or not c.event.is_plain else c.jumped
+    return flow.event_offset(flow.guard(c.number), offset, c.landed, lost)
 
 
 def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_event: State) -> Lane:

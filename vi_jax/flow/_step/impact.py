@@ -397,7 +397,10 @@ def bring_to_rest(
         ((k, impact),) = impacts.items()
         sign, _ = step.plan.sign_and_gap(k, impact.contact)
         path, free = step.trial.paths[k], step.trial.free_machines[k]
-        speed = impact.share * jnp.maximum(sign * path.end.v, 0.0)
+        # At the event, not at the step's end: its derivatives include the event's time.
+        position = step.plan.machine.coordinates[k].position
+        rate = rates(free.field, position, lane.s, at_event).v
+        speed = impact.share * jnp.maximum(sign * rate, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
         arguments = k, impact, speed, lane._replace(state=at_event), growth
         ends, time = _remaining_chatter(step.plan, free, *arguments)

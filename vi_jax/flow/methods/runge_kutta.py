@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
-from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals, unit_of
+from ..sizes import unit_of
+from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals
 from .base import AbstractMethod, Stage, has_relaxation
 from .verner import Verner9
 
@@ -383,7 +384,7 @@ class Adaptive(_RungeKutta):
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
-        atol = atol if isinstance(size, float) else atol * size
+        atol = atol if isinstance(size, float) and size == 1.0 else atol * size
         if self.sizes is not None:
             atol = atol * functools.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(self.sizes)))
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
@@ -454,7 +455,8 @@ class FixedStep(_RungeKutta):
         # For bodies at rest in zero only rounding is left.
         rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
         before, after = (jnp.maximum(_size(x), rounding) for x in ends)
-        if not isinstance(unit, float):  # in other units of time rates are much larger, or smaller
+        # In other units of time rates are much larger, or smaller.
+        if not (isinstance(unit, float) and unit == 1.0):
             after = jnp.maximum(after, jnp.where(unit == 1, 0.0, unit * _size(slopes[0])))
 
         def unstable(size, h, slopes):
