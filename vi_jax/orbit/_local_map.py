@@ -68,11 +68,12 @@ def soft_kick(
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deepest) = fields(u), deepest_at(length)
-    deep_change = fields(deepest)[1]
+    deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
     # A stiff stop pushes by rounding, up to the error of the touch's place.
     place_error = _TOUCH_ERROR * np.abs(gradient) @ np.abs(u) / y**2
-    rounding = max(_CONTINUOUS * np.abs(field).max(), place_error * np.abs(deep_change).max())
-    if np.abs(change).max() > rounding:
+    largest = lambda rates: np.abs(rates / sizes).max()
+    rounding = max(_CONTINUOUS * largest(field), place_error * largest(deep_change))
+    if largest(change) > rounding:
         rate_beyond = rate + float(fast @ change)
         if rate_beyond <= 0:
             raise ValueError(
@@ -93,7 +94,8 @@ def soft_kick(
         measured.append((y, _change_by_contact(problem, x, number, leg, clock, deepest, length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
-            order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
+            order = log2(np.linalg.norm(k0 / sizes) / np.linalg.norm(k1 / sizes))
+            order /= 2 * log2(y0 / y1)
             orders.append(order)
             if len(orders) > 1 and abs(orders[-1] - orders[-2]) < _AGREE:
                 break
@@ -205,7 +207,8 @@ class Touch(NamedTuple):
 
 @on_host
 def _turn_margins(problem: Shooting, x):
-    """Return distance and clock of each turn; (legs, events, steps) each."""
+    """Return the distance of each turn, as a share of its size along the motion, and its clock;
+    (legs, events, steps) each."""
     machine = problem.at(x)
     clock, states = problem.parts(x)
 
@@ -215,21 +218,23 @@ def _turn_margins(problem: Shooting, x):
         _, _, path = flight.fly(s0, s1, after, problem.steps, rows=problem.steps)
         h = (s1 - s0) / problem.steps
         _, margins = turning_points(Path(flight, path[0], path[1], h, not problem.events))
-        return jnp.stack([margin for margin, _ in margins]), jnp.stack([s for _, s in margins])
+        sizes = problem.guard_sizes(flight, s0, after)
+        shares = [margin / size for (margin, _), size in zip(margins, sizes, strict=False)]
+        return jnp.stack(shares), jnp.stack([s for _, s in margins])
 
     ends = problem.ends(clock, problem.period(x))
     return jax.vmap(follow)(jnp.arange(problem.legs), clock, ends, states)
 
 
 def find_touches(
-    problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
+    problem: Shooting, x: np.ndarray, number: int, clock: float
 ) -> list[tuple[int, int, float]]:
-    """Return event, leg and clock of each touch of a motion of extent `length`, each once. The
-    known touch may fall on the end of a flight, where no turn is found."""
+    """Return event, leg and clock of each touch of a motion, each once. The known touch may fall on
+    the end of a flight, where no turn is found."""
     (distances, places), period = _turn_margins(problem, x), float(problem.period(x))
     leg, leg_clock = problem.leg_at(x, clock)
     found = [(number, int(leg), float(leg_clock))]
-    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES * length):
+    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES):
         place = float(places[leg, other, step])
         time_differences = [
             abs((place - known + period / 2) % period - period / 2)
@@ -306,7 +311,7 @@ _STEEP = 1e-6
 
 class LocalMap(eqx.Module):
     """The map z ↦ N (z + kick·(-h)₊^order), h = slope·(p - p*) + ∂h·z, of neighbours of a grazing
-    motion, with their displacement z from it at the touch.
+    motion, with their displacement z from it at the touch, in the sizes of the state.
 
     A motion that grazes several times in its period has such a map for each touch, from which it
     leads to the next. Host arrays; m touches, n states.
@@ -367,7 +372,8 @@ class Section(NamedTuple):
     slope: np.ndarray
     """Derivative of the state with respect to the parameter."""
     matrix: np.ndarray
-    """The matrix from just after the first touch's kick to the next section."""
+    """The matrix from just after the first touch's kick to the next section, in the state's sizes.
+    """
 
 
 class LocalGrazing(NamedTuple):
@@ -377,6 +383,11 @@ class LocalGrazing(NamedTuple):
     touches: list[Touch]
     map: LocalMap
     section: Section
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """The sizes of the state, the units of the map's displacements."""
+        return np.asarray(self.problem.sizes)[1:]
 
 
 def graze_at(point: Point) -> LocalGrazing:
@@ -390,7 +401,7 @@ def graze_at(point: Point) -> LocalGrazing:
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(x))
-    places = find_touches(problem, x, number, clock, point.step.observed.length)
+    places = find_touches(problem, x, number, clock)
     touches = [touch_at(problem, x, along, *place) for place in places]
     touches.sort(key=lambda touch: touch.clock % period)
     touches = touches[-1:] + touches[:-1]  # the section follows the first touch
@@ -398,13 +409,15 @@ def graze_at(point: Point) -> LocalGrazing:
         touch.clock + (np.mod(following.clock - touch.clock, period) or period)
         for touch, following in zip(touches, [*touches[1:], touches[0]], strict=True)
     ]
+    sizes = np.asarray(problem.sizes)[1:]
+    matrices = [
+        transport(problem, x, touch.leg, touch.clock, end)
+        for touch, end in zip(touches, ends, strict=True)
+    ]
     local = LocalMap(
-        np.stack([
-            transport(problem, x, touch.leg, touch.clock, end)
-            for touch, end in zip(touches, ends, strict=True)
-        ]),
-        np.stack([touch.gradient for touch in touches]),
-        np.stack([touch.kick.vector for touch in touches]),
+        np.stack(matrices) * sizes / sizes[:, None],
+        np.stack([touch.gradient for touch in touches]) * sizes,
+        np.stack([touch.kick.vector for touch in touches]) / sizes,
         np.array([touch.kick.order for touch in touches]),
         np.array([touch.slope for touch in touches]),
     )  # fmt: skip
@@ -482,7 +495,8 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
     matrix = transport(problem, x, touch.leg, touch.clock, place)
     if problem.events and problem.events[0].cycle is not None:  # the section is an event
         matrix = _event_matrix(problem, x, 0) @ matrix
-    return Section(state, slope, matrix)
+    sizes = np.asarray(problem.sizes)[1:]
+    return Section(state, slope, matrix * sizes / sizes[:, None])
 
 
 @on_host

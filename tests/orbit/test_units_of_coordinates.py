@@ -1,0 +1,54 @@
+"""The units of one coordinate do not change what is found of another."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from grazings import grazing_of
+
+OMEGA = 1.3
+
+
+class Uncoupled(vi.Mechanical):
+    """Two bodies without a spring between them. The first coordinate has a unit of its own; the
+    second body touches a stop, and stays 1e-4 away from another one."""
+
+    q = ("y", "x")
+    cycle = 2 * np.pi / OMEGA
+    unit: float = 1.0
+    amplitude: float = 0.3
+
+    @property
+    def contacts(self):
+        return (
+            vi.RigidStop(5.0 * self.unit, 0.8, on="y"),
+            vi.RigidStop(1.0, 0.8, on="x"),
+            vi.RigidStop(1.0001, 0.8, "left", on="x"),
+        )
+
+    def mass(self, q):
+        return 1 / self.unit**2, 1.0
+
+    def force(self, t, q, v):
+        drive = jnp.cos(OMEGA * t)
+        y = (-4 * q.y / self.unit - 0.2 * v.y / self.unit + drive) / self.unit
+        return {"y": y, "x": -q.x - 0.3 * v.x + self.amplitude * drive}
+
+
+@pytest.mark.slow
+def test_local_map_of_a_grazing():
+    """The motion is linear up to the touch, whose kick changes the velocity of x alone."""
+    grazes = np.hypot(1 - OMEGA**2, 0.3 * OMEGA)
+    reference = None
+    for unit in (1.0, 1e6, 1e-6):
+        machine = Uncoupled(unit=unit)
+        found = vi.grazing(grazing_of(machine, "amplitude", (0.1, 2.0), machine.at()), check=False)
+        assert found.value == pytest.approx(grazes, rel=1e-11)
+        assert (found.touched, found.outcome) == ("right stop", vi.SCENARIOS.nonsmooth_fold)
+        kick = -np.sqrt(2.0) * OMEGA * 1.8  # a = 1 by the phase
+        by_size = found.kick * [1 / unit, 1, 1 / unit, 1]
+        np.testing.assert_allclose(np.sort(by_size[0]), [kick, 0, 0, 0], rtol=1e-8, atol=1e-9)
+        reference = found if reference is None else reference
+        np.testing.assert_allclose(found.entries, reference.entries, rtol=1e-8)
+        np.testing.assert_array_equal(found.forecast.period, reference.forecast.period)
