@@ -8,6 +8,7 @@ Quantities of a motion have names and are differentiable functions of its unknow
 import abc
 import dataclasses
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -296,5 +297,6 @@ def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
     matrix = M * sizes / sizes[:, None]
     is_equal = lambda value: abs(value - multiplier) <= _DOUBLE
     # Only the part of the matrix in the plane of both counts: near a grazing the others are large.
-    triangle, _, equal = schur(matrix, output="complex", sort=is_equal)
+    found: Any = schur(matrix, output="complex", sort=is_equal)
+    triangle, _, equal = found
     return bool(equal < 2 or abs(triangle[0, 1]) > _DOUBLE)
