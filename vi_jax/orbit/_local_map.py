@@ -41,6 +41,10 @@ _SHARE, _TRIES, _AGREE, _STEPS = 0.02, 10, 0.03, 8
 _WEAK = 0.03
 
 
+class NoLocalMapError(ValueError):
+    """A grazing has no local map; the message is that of an argument `point`."""
+
+
 class Kick(NamedTuple):
     """The change of the state by an impact: vector·(-h)^order at a fixed reading of the clock, with
     the least distance h without the impact."""
@@ -76,7 +80,7 @@ def soft_kick(
     if largest(change) > rounding:
         rate_beyond = rate + float(fast @ change)
         if rate_beyond <= 0:
-            raise ValueError(
+            raise NoLocalMapError(
                 "Argument `point` must be a grazing at which the motion leaves the surface again, "
                 "but beyond the surface it would stick or continue: d²h/ds² changes from "
                 f"{rate:.3g} to {rate_beyond:.3g}."
@@ -140,7 +144,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     def root(function: Any, low: float, high: float) -> float:
         guard = lambda s1: float(function(s1)[1])
         if guard(low) * guard(high) > 0:
-            raise ValueError(
+            raise NoLocalMapError(
                 "Argument `point` must be a grazing of a stop that is less stiff: a contact so "
                 "brief that it bends the motion little is less deep than rounding. Take a "
                 "`RigidStop`."
@@ -163,7 +167,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     first = negative[0] if negative else 0
     end_index = next((i for i in range(first, len(values)) if values[i] >= 0), None)
     if end_index is None:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing at which the motion leaves the surface again, but "
             "a brief contact does not end."
         )
@@ -288,7 +292,7 @@ def touch_at(
     event = events_of(problem.machine)[number]
     u, gradient, rate, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
-        raise ValueError(
+        raise NoLocalMapError(
             f"Argument `point` must be a grazing at which the motion turns, but the "
             f"distance's second derivative is {float(rate):.3g} there."
         )
@@ -298,7 +302,7 @@ def touch_at(
         kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
     else:
         called = Event(number).name_on(problem.machine)
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be the grazing of a stop or a switch, but it touches the "
             f"{called}, whose jump does not vanish with the speed."
         )
@@ -395,7 +399,7 @@ def graze_at(point: Point) -> LocalGrazing:
     problem, x = with_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
     if abs(tangent[-1]) < _STEEP:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing away from a fold, but the motion without the "
             "impact turns back there in its parameter."
         )
@@ -427,12 +431,12 @@ def graze_at(point: Point) -> LocalGrazing:
 def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
     """Return the motion without the grazing impact, the event's number and its clock."""
     if point.kind != "grazing" or not point.touches:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing at which something is touched, but is "
             f"{with_article(point.kind)}: {point.detail}."
         )
     if point.problem.landings:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing of a motion without rest on a stop, but this one "
             "rests."
         )
@@ -442,7 +446,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
         clock = since_section(old, x, float(nearest.clock))
         return *with_sections(old, x), int(nearest.event), clock
     if old.events[i].cycle is not None:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing of a stop, but there the section of the machine "
             "is touched: beyond it the motion has another number of cycles."
         )
