@@ -52,3 +52,32 @@ def test_local_map_of_a_grazing():
         reference = found if reference is None else reference
         np.testing.assert_allclose(found.entries, reference.entries, rtol=1e-8)
         np.testing.assert_array_equal(found.forecast.period, reference.forecast.period)
+
+
+class Slaved(vi.AbstractMachine):
+    """A van der Pol oscillator with a spring that lags: p' = x - p, in units of p and of the
+    parameter of their own. At rest λ³ + (1 - g) λ² + (1 - g) λ + 0.9 = 0."""
+
+    unit: float
+    scale: float
+    growth: float
+    cycle = vi.rising("v", usual=6.3)
+
+    def field(self, s, state):
+        growth = self.growth / self.scale - state.x**2
+        pull = growth * state.v - state.x + 0.1 * state.p / self.unit
+        return {"x": state.v, "v": pull, "p": self.unit * state.x - state.p}
+
+
+@pytest.mark.slow
+def test_hopf_bifurcation():
+    """There (1 - g)² = 0.9, and the frequency is 0.9^(1/4)."""
+    for unit, scale in ((1.0, 1.0), (1e6, 1.0), (1e-6, 1.0), (1.0, 1e6), (1.0, 1e-6)):
+        machine = Slaved(unit, scale, 0.5 * scale)
+        start = vi.simulate(machine, vi.State(x=-1.0, v=0.0, p=-0.5 * unit), 1, settle=60).last
+        orbit = vi.find_orbit(machine, start, throw=True)
+        branch = vi.continue_orbit(orbit, parameter="growth", bounds=(-0.5 * scale, 0.6 * scale))
+        assert branch.ends == ("hopf", "bounds"), (unit, scale)
+        (point,) = branch.special
+        assert point.parameter / scale == pytest.approx(1 - np.sqrt(0.9), abs=1e-12)
+        assert float(point.orbit.duration) == pytest.approx(2 * np.pi / 0.9**0.25, rel=1e-10)
