@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,8 @@ from ..machine import AbstractMachine, convert_start, in_rows, longest_step, siz
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .loop import row_sizes, sizes_on_host
-from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
+from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
+from .methods.verner import Verner9
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.
@@ -115,7 +115,7 @@ def suggest_method(
     if exact:
         reference = best.tighter()
     elif stiff:
-        reference = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
+        reference = Adaptive(_stiff_solver(), rtol=1e-12, steps_per_cycle=10)
     else:  # at most half as long as the shortest steps that are tried
         reference = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
     bench.set_reference(reference)
@@ -130,7 +130,7 @@ def suggest_method(
     else:
         tried = [] if stiff else _fixed(bench, error)
         tried += _until(bench, error, _adaptive(Verner9()))
-        tried += _until(bench, error, _adaptive(diffrax.Kvaerno5())) if stiff else []
+        tried += _until(bench, error, _adaptive(_stiff_solver())) if stiff else []
         with contextlib.suppress(NotImplementedError):  # a primitive has no recursion
             tried += _until(bench, error, _series(error))
     accurate = [t for t in tried if t.error <= error]
@@ -160,7 +160,13 @@ def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMetho
     return tried
 
 
-def _adaptive(solver: diffrax.AbstractSolver) -> list[tuple[str, AbstractMethod]]:
+def _stiff_solver() -> Any:
+    import diffrax  # slow to load
+
+    return diffrax.Kvaerno5()
+
+
+def _adaptive(solver: Any) -> list[tuple[str, AbstractMethod]]:
     name = f"Adaptive({type(solver).__name__}(), rtol="
     return [(f"{name}{x:.0e})", Adaptive(solver, rtol=x)) for x in _TOLERANCES[:-1]]
 
