@@ -35,20 +35,21 @@ from ..machine import (
     size_of,
     without_past,
 )
-from .smooth import SmoothMachine
+from .smooth import SmoothMachine, unit_of
 
-# The numbers of a piece besides its coefficients: its length; its start since that of the piece
-# before; the level of a jump at its start, or -1; the derivative of the jump's time relative to it.
-_HEAD = 4
+# The numbers of a piece besides its coefficients: its start since that of the piece before; and the
+# level of a jump at its start, or -1, with the derivative of the jump's time relative to the start.
+_HEAD = 2
 
-# Each step reads at most this many pieces of a delay. More numbers are read, but fewer steps are
-# shortened to end with them. A choice.
-_WINDOW = 4
+# Each step reads at most this many pieces of a delay. With more, more numbers are read, and fewer
+# steps are shortened to end with the pieces. Two would repeat the shortest steps for ever.
+_WINDOW = 3
 
-# The pieces of a ring if the lengths of delays are not known, and the fewest. Choices.
-_UNKNOWN, _FEWEST = 256, 64
+# The pieces of a ring: the fewest, and those per cycle in the longest delay, or the number if its
+# length is not known. Choices; the "reference" preset takes some 70 steps in a cycle.
+_FEWEST, _PER_CYCLE, _UNKNOWN = 32, 128, 257
 
-# Pieces of a history before the start that is a function.
+# Pieces of a history before the start that is a function, at most half of the ring.
 _BEFORE = 64
 
 
@@ -65,7 +66,8 @@ class History(NamedTuple):
     """The history of a lane, of which times are relative to the beginning of the cycle."""
 
     rows: Array
-    """The pieces, a ring: (pieces, 4 + 8 numbers)."""
+    """The pieces, a ring: (pieces, 2 + 8 numbers), with coefficients by power of the time since a
+    piece's start in the unit of `s`."""
     head: Scalar
     """The place of the next piece."""
     newest: Scalar
@@ -87,9 +89,9 @@ class Window(NamedTuple):
     keys: tuple[Scalar, ...]
     """The instants from which pieces are read: their starts, infinite for a piece that is not read,
     minus infinite for one that has begun, whatever the rounding of its start."""
-    lengths: tuple[Scalar, ...]
     pieces: tuple[Array, ...]
     """Coefficients by power: (8, numbers)."""
+    unit: Scalar | float
 
 
 class Windows(eqx.Module):
@@ -104,16 +106,16 @@ class Windows(eqx.Module):
 
 def _value(window: Window, s: Scalar) -> Vector:
     place = s - window.delay
-    start, length, piece = window.starts[0], window.lengths[0], window.pieces[0]
+    start, piece = window.starts[0], window.pieces[0]
     for n in range(1, len(window.starts)):
         here = window.keys[n] <= stop_gradient(place)
         start = jnp.where(here, window.starts[n], start)
-        length = jnp.where(here, window.lengths[n], length)
         piece = jnp.where(here, window.pieces[n], piece)
-    theta = (place - start) / length
+    time = place - start
+    time = time if isinstance(window.unit, float) else time / window.unit
     value = piece[7]
     for n in range(6, -1, -1):
-        value = value * theta + piece[n]
+        value = value * time + piece[n]
     return value
 
 
@@ -149,7 +151,7 @@ def with_history(
     lags = [jnp.asarray(x, dtype) for x in delays.values()]
     pieces = _number_of_pieces(machine, lags) if given is None else given.rows.shape[0]
     if given is None:
-        given = _from_before(machine, form, before, lags)
+        given = _from_before(machine, form, before, lags, min(_BEFORE, pieces // 2))
     elif given.rows.shape[1] != _HEAD + 8 * form.size:
         raise ValueError(
             f"Argument `start` must have the history of a {type(machine).__name__}, but has that "
@@ -161,7 +163,7 @@ def with_history(
 
 
 def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
-    """Return the size of a ring: the machine's `history_size`, or what 50 steps in a cycle need."""
+    """Return the size of a ring: the machine's `history_size`, or from its longest delay."""
     size = getattr(machine, "history_size", None)
     if size is not None:
         if not isinstance(size, int) or size < 8:
@@ -174,16 +176,16 @@ def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
     if any(x is None or x.ndim for x in known):
         return _UNKNOWN
     cycle, *lengths = (float(x) for x in known)
-    wanted = _FEWEST + 100 * max(lengths) / cycle
-    return 2 ** int(np.ceil(np.log2(wanted))) if wanted < 2**16 else 2**16
+    # An odd number: places of many lanes at multiples of a power of two share the cache's lines.
+    return int(min(_FEWEST + _PER_CYCLE * max(lengths) / cycle, 1e5)) | 1
 
 
 def _from_before(
-    machine: AbstractMachine, form: Recorded, before: Any, lags: list[Any]
+    machine: AbstractMachine, form: Recorded, before: Any, lags: list[Any], most: int
 ) -> History:
-    """Return a history of one constant piece, or of many of equal length if it is a function."""
-    longest = functools.reduce(jnp.maximum, lags)
-    number = _BEFORE if callable(machine.before) else 1
+    """Return a history of one constant piece, or of `most` of equal length if it is a function."""
+    longest, unit = functools.reduce(jnp.maximum, lags), unit_of(machine)
+    number = most if callable(machine.before) else 1
     length = longest * (1 + 1e-6) / number
 
     def record(t: Scalar) -> Vector:
@@ -191,8 +193,8 @@ def _from_before(
 
     def piece(n: Scalar) -> Array:
         ends = [_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0)]
-        head = jnp.stack([length, length, -jnp.ones_like(length), jnp.zeros_like(length)])
-        return jnp.concatenate([head, hermite(*ends, length).ravel()])
+        head = jnp.stack([length, -jnp.ones_like(length)])
+        return jnp.concatenate([head, _in_time(hermite(*ends, length), length, unit)])
 
     rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
     zero = jnp.zeros_like(longest)
@@ -230,7 +232,7 @@ def begun(plan: Any, machine: AbstractMachine, s: Scalar) -> History:
     missing = memory.pieces - given.rows.shape[0]
     rows = jnp.concatenate([given.rows, jnp.zeros((missing, given.rows.shape[1]), s.dtype)])
     order = jnp.mod(stop_gradient(given.head) - 1 - jnp.arange(memory.pieces), memory.pieces)
-    spans = rows[order.astype(jnp.int32), 1]  # from the newest to the oldest
+    spans = rows[order.astype(jnp.int32), 0]  # from the newest to the oldest
     back = jnp.concatenate([jnp.zeros_like(spans[:1]), jnp.cumsum(spans)[:-1]])
     exists = stop_gradient(spans) > 0
     places, starts = [], []
@@ -313,28 +315,31 @@ def _window(
     passed = stop_gradient(s - delay) + slack
     width = history.rows.shape[1]
     number = jnp.mod(stop_gradient(history.head - place), size)
-    starts, keys, lengths, pieces, known = [start], [-jnp.inf], [], [], [start]
+    starts, keys, pieces, known = [start], [-jnp.inf], [], [start]
     closed = jnp.zeros_like(start, bool)
-    image, level = jnp.full_like(start, jnp.inf), -jnp.ones_like(start)
-    for n in range(_WINDOW):
-        at = jnp.mod(stop_gradient(place) + n, size).astype(jnp.int32)
-        row = jax.lax.dynamic_slice(history.rows, (at, jnp.zeros_like(at)), (1, width))[0]
-        lengths.append(row[0])
-        pieces.append(row[_HEAD:].reshape(8, -1))
-        if n == 0:
-            reach = start + row[0] + delay
-            continue
-        start = start + row[1]
+    image, level, reach = jnp.full_like(start, jnp.inf), -jnp.ones_like(start), s + delay
+    for n in range(_WINDOW + 1):  # of the last, only the start is used
         exists = n < number
+        at = stop_gradient(place) + n
+        at = jnp.where(at < size, at, at - size).astype(jnp.int32)
+        row = jax.lax.dynamic_slice(history.rows, (at, jnp.zeros_like(at)), (1, width))[0]
+        if n < _WINDOW:
+            pieces.append(row[_HEAD:].reshape(8, -1))
+        if n == 0:
+            continue
+        start = start + row[0]
         known.append(jnp.where(exists, start, jnp.inf))
         ahead = stop_gradient(start) > passed
-        jumps = exists & ~closed & ahead & (stop_gradient(row[2]) >= 0)
-        image = jnp.where(jumps, start + row[3] + delay, image)
-        level = jnp.where(jumps, row[2], level)
-        reach = jnp.where(jumps, start + delay, reach)
+        its_level = stop_gradient(row[1])
+        jumps = exists & ~closed & ahead & (its_level >= 0)
+        image = jnp.where(jumps, start + (row[1] - its_level) + delay, image)
+        level = jnp.where(jumps, its_level, level)
+        ends = jumps | (exists & ~closed if n == _WINDOW else jumps)
+        reach = jnp.where(ends, start + delay, reach)
         closed = closed | jumps
+        if n == _WINDOW:
+            break
         used = exists & ~closed
-        reach = jnp.where(used, start + row[0] + delay, reach)
         key = jnp.where(ahead, stop_gradient(start), -jnp.inf)
         starts.append(start)
         keys.append(jnp.where(used, key, jnp.inf))
@@ -343,7 +348,7 @@ def _window(
     image = jnp.where(jumps, s + history.slip + delay, image)
     level = jnp.where(jumps, history.level, level)
     reach = jnp.where(jumps, s + delay, reach)
-    window = Window(*map(tuple, ((), starts, keys, lengths, pieces)))._replace(delay=delay)
+    window = Window(delay, tuple(starts), tuple(keys), tuple(pieces), plan.unit)
     return window, tuple(known), reach, image, level
 
 
@@ -403,6 +408,11 @@ def hermite(begin: Any, end: Any, h: Scalar) -> Array:
     return jnp.stack([*first, *more])
 
 
+def _in_time(piece: Array, h: Scalar, unit: Scalar | float) -> Vector:
+    """Return the coefficients of a piece of length h by power of the time, in this unit."""
+    return (piece * (unit / h) ** np.arange(8)[:, None]).ravel()
+
+
 def piece_error(plan: Any, piece: Array, h: Scalar) -> Scalar:
     """Return the largest error of a piece of length h relative to the tolerance, for an adaptive
     method; 0 for one that is too short to be kept.
@@ -437,8 +447,9 @@ def extended(
     `jumps`: an event happened there, so that the motion is not smooth."""
     (old, trial, taken), view, size = step, plan.view, plan.memory.pieces
     kept = taken & (stop_gradient(trial.h) > view.slack)
-    head = jnp.stack([trial.h, old.s - history.newest, history.level, history.slip])
-    row = jnp.concatenate([head, trial.piece.ravel()])[None]
+    head = jnp.stack([old.s - history.newest, history.level + history.slip])
+    length = jnp.where(kept, trial.h, plan.unit)
+    row = jnp.concatenate([head, _in_time(trial.piece, length, plan.unit)])[None]
     # The place is that of no piece in use. The piece counts if it is kept.
     place = stop_gradient(history.head).astype(jnp.int32)
     rows = jax.lax.dynamic_update_slice(history.rows, row, (place, jnp.zeros_like(place)))

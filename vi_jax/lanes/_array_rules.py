@@ -310,6 +310,22 @@ def _(t, p, avals, d, x, update, *starts):
     return _with_blocks(t, x, update, axes, axes, lambda _: ([*begin], inside))
 
 
+def updated_in_place(
+    t: Text, dtypes: Sequence[Any], mask: Value, x: Strided, update: Array, *starts: Array
+) -> Strided:
+    """Return an array in memory after `dynamic_update_slice` in the lanes of a mask, without a
+    copy: the old numbers must not be used any more."""
+    begin = _starts(t, starts, dtypes, update.shape, x.shape)
+    update = update if isinstance(update, Registers) else stored(t, update)
+
+    def put(index: tuple[Index, ...]) -> None:
+        place = [plus(t, b, i) for b, i in zip(begin, index, strict=True)]
+        x.put(t, place, update.at(t, index), mask)
+
+    write_for_each(t, update, put)
+    return x
+
+
 def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
     """Return a large array with other numbers in a window, without a copy. The window is the first
     index and the size along each axis; `new` maps an index in it to a number. `None` unless it

@@ -1,7 +1,7 @@
 """Writing a jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts
+from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts, updated_in_place
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
@@ -29,6 +29,7 @@ from ._arrays import (
     reserve,
     same,
     selected,
+    separate,
     stored,
     table,
     times,
@@ -92,11 +93,15 @@ def constants(t: Text, array: object) -> Array:
     return Registers.of(array.shape, kind, lambda i: t.constant(array[i], kind))
 
 
-def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
+def write(
+    t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value, owned: Sequence[Any] = ()
+) -> list[Any]:
     """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes; return its
     results as `Array`s. `mask` holds in the lanes that need them. Code that none of them needs may
-    be skipped. Results of other lanes are arbitrary."""
+    be skipped. Results of other lanes are arbitrary. Arguments that are `owned` may be changed in
+    place, in the lanes of the mask: a block of one that is not used any more."""
     jaxpr, env = inner(closed), {}
+    own = {v for v, x in zip(jaxpr.invars, args, strict=True) if any(x is y for y in owned)}
     needed = _needed_equations(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
@@ -114,7 +119,17 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
-        put(eqn.outvars, _write_equation(t, eqn, [read(a) for a in eqn.invars], mask))
+        given, first = [read(a) for a in eqn.invars], next(iter(eqn.invars), None)
+        in_place = eqn.primitive.name == "dynamic_update_slice" and isinstance(given[0], Strided)
+        if in_place and first in last.get(number, ()) and first in own:
+            for var, x in env.items():  # what may read the old numbers later
+                if var is not first and not isinstance(x, Registers):
+                    env[var] = separate(t, x, [given[0]])
+            dtypes = [a.aval.dtype for a in eqn.invars[2:]]
+            put(eqn.outvars, [updated_in_place(t, dtypes, mask, *given)])
+            own.add(eqn.outvars[0])
+        else:
+            put(eqn.outvars, _write_equation(t, eqn, given, mask))
         for var in last.get(number, ()):  # so that its memory is reused
             env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
