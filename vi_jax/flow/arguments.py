@@ -154,7 +154,7 @@ def make_plan(
     require_session("start", start)
     method.check(machine)
     if has_delays(machine):
-        machine, memory, history = with_history(machine, as_floats(machine, start), history)
+        machine, memory = with_history(machine, as_floats(machine, start), history)
     if samples and is_autonomous(machine, start):
         raise ValueError(
             "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
@@ -199,7 +199,7 @@ def make_plan(
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
         start_modes=_own_modes(machine, start, modes, dtype),
-        history=None if memory is None else jtu.tree_map(lambda x: x.astype(dtype), history),
+        history=jtu.tree_map(lambda x: x.astype(dtype), history),
         memory=memory,
     )
     return plan, start

@@ -141,25 +141,24 @@ class View(eqx.Module):
 
 def with_history(
     machine: AbstractMachine, start: State, given: History | None
-) -> tuple[AbstractMachine, Memory, History]:
-    """Return a machine with delays with a past bound to it, and its history at the start: `given`,
-    or else `before`. **Raises:** `TypeError` or `ValueError` for invalid delays or histories."""
+) -> tuple[AbstractMachine, Memory]:
+    """Return a machine with delays with a past bound to it, and the constants of its history. The
+    history at the start is `given`, or `None` for `before`. **Raises:** `TypeError` or `ValueError`
+    for invalid delays or histories."""
     machine = without_past(machine)
     before = history_before(machine, start)
     form, delays = form_of(machine, start, before), delays_in(machine)
     dtype = jnp.result_type(float, *jax.tree.leaves(start))
     lags = [jnp.asarray(x, dtype) for x in delays.values()]
     pieces = _number_of_pieces(machine, lags) if given is None else given.rows.shape[0]
-    if given is None:
-        given = _from_before(machine, form, before, lags, min(_BEFORE, pieces // 2))
-    elif given.rows.shape[1] != _HEAD + 8 * form.size:
+    if given is not None and given.rows.shape[1] != _HEAD + 8 * form.size:
         raise ValueError(
             f"Argument `start` must have the history of a {type(machine).__name__}, but has that "
             "of another machine."
         )
     past = [form.pack(before(-lag)) for lag in lags]
     bound = reading(machine, FixedPast(form.by_name(past)))
-    return bound, Memory(form, pieces, jnp.ones(form.size, dtype)), given
+    return bound, Memory(form, pieces, jnp.ones(form.size, dtype))
 
 
 def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
@@ -226,9 +225,13 @@ def with_sizes(plan: Any, s: Scalar, start: State, modes: Scalars) -> Any:
     return dataclasses.replace(plan, memory=memory)
 
 
-def begun(plan: Any, machine: AbstractMachine, s: Scalar) -> History:
+def begun(plan: Any, start: State, s: Scalar) -> History:
     """Return the history of a lane at its start, with the places of its delays."""
-    memory, given = plan.memory, plan.history
+    memory, given, machine = plan.memory, plan.history, without_past(plan.machine)
+    if given is None:
+        before, lags = history_before(machine, start), delays_in(machine).values()
+        lags, most = [jnp.asarray(x, s.dtype) for x in lags], min(_BEFORE, memory.pieces // 2)
+        given = _from_before(machine, memory.form, before, lags, most)
     missing = memory.pieces - given.rows.shape[0]
     rows = jnp.concatenate([given.rows, jnp.zeros((missing, given.rows.shape[1]), s.dtype)])
     order = jnp.mod(stop_gradient(given.head) - 1 - jnp.arange(memory.pieces), memory.pieces)
@@ -236,7 +239,7 @@ def begun(plan: Any, machine: AbstractMachine, s: Scalar) -> History:
     back = jnp.concatenate([jnp.zeros_like(spans[:1]), jnp.cumsum(spans)[:-1]])
     exists = stop_gradient(spans) > 0
     places, starts = [], []
-    for delay in delays_in(without_past(machine)).values():
+    for delay in delays_in(machine).values():
         later = given.newest - back > stop_gradient(-jnp.asarray(delay)) + slack_of(plan, s)
         number = jnp.minimum(jnp.sum(later & exists), jnp.sum(exists) - 1)
         places.append(jnp.mod(given.head - 1 - number, memory.pieces).astype(s.dtype))

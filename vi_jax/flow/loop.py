@@ -370,7 +370,7 @@ def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
     """Return the initial lane of a machine with delays."""
     zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
-    history = begun(plan, plan.machine, s)
+    history = begun(plan, start, s)
     lane = initial_lane(with_view(plan, history, s), start, wanted)
     bad = (lane.fault == 0) & ~stop_gradient(is_covered(plan, history, s))
     return lane._replace(history=history, fault=jnp.where(bad, code("bad_start"), lane.fault))

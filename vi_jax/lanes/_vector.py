@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts, updated_in_place
+from ._array_rules import IN_PLACE, PLACED, STRUCTURAL, any_in, select_parts
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
@@ -120,13 +120,12 @@ def write(
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
         given, first = [read(a) for a in eqn.invars], next(iter(eqn.invars), None)
-        in_place = eqn.primitive.name == "dynamic_update_slice" and isinstance(given[0], Strided)
+        in_place = eqn.primitive.name in IN_PLACE and isinstance(given[0], Strided)
         if in_place and first in last.get(number, ()) and first in own:
             for var, x in env.items():  # what may read the old numbers later
                 if var is not first and not isinstance(x, Registers):
                     env[var] = separate(t, x, [given[0]])
-            dtypes = [a.aval.dtype for a in eqn.invars[2:]]
-            put(eqn.outvars, [updated_in_place(t, dtypes, mask, *given)])
+            put(eqn.outvars, _write_equation(t, eqn, given, mask, in_place=True))
             own.add(eqn.outvars[0])
         else:
             put(eqn.outvars, _write_equation(t, eqn, given, mask))
@@ -159,7 +158,9 @@ def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
+def _write_equation(
+    t: Text, eqn: Any, args: list[Any], mask: Value, in_place: bool = False
+) -> list[Any]:
     name, params = eqn.primitive.name, eqn.params
     if (body := called(eqn)) is not None:
         return write(t, body, args, mask)
@@ -178,7 +179,7 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
         return _elementwise(t, name, params, dtypes, args, avals)
     if name in PLACED:
         dtypes = [a.aval.dtype for a in eqn.invars]
-        out = PLACED[name](t, params, avals, dtypes, *args)
+        out = PLACED[name](t, params, avals, dtypes, *args, **({"mask": mask} if in_place else {}))
     else:
         out = STRUCTURAL[name](t, params, avals, *args)
     return [to_registers(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
