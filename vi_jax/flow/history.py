@@ -79,6 +79,24 @@ class History(NamedTuple):
     places: tuple[Scalar, ...]
     """For each delay, the place of the first piece that the next step reads, and its start."""
     starts: tuple[Scalar, ...]
+    unit: Scalar
+    """The unit of `s`."""
+
+    def in_order(self) -> tuple[Array, Array, Array]:
+        """Return the places of all pieces from the newest to the oldest, their starts, and whether
+        they exist."""
+        size = self.rows.shape[0]
+        places = jnp.mod(stop_gradient(self.head) - 1 - jnp.arange(size), size).astype(jnp.int32)
+        spans = self.rows[places, 0]
+        back = jnp.concatenate([jnp.zeros_like(spans[:1]), jnp.cumsum(spans)[:-1]])
+        return places, self.newest - back, stop_gradient(spans) > 0
+
+    def at(self, t: Scalar) -> Vector:
+        """Return the recorded numbers at a time before the end of the history, t ≤ 0."""
+        places, starts, exists = self.in_order()
+        number = jnp.minimum(jnp.sum((starts > t) & exists), jnp.sum(exists) - 1)
+        powers = ((t - starts[number]) / self.unit) ** jnp.arange(8)
+        return powers @ self.rows[places[number], _HEAD:].reshape(8, -1)
 
 
 class Window(NamedTuple):
@@ -198,7 +216,7 @@ def _from_before(
     rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
     zero = jnp.zeros_like(longest)
     nothing = (zero,) * len(lags)
-    return History(rows, zero + number, -length, zero, zero, nothing, nothing)
+    return History(rows, zero + number, -length, zero, zero, nothing, nothing, zero + unit)
 
 
 def _derivatives(function: Any, t: Scalar) -> list[Vector]:
@@ -234,22 +252,19 @@ def begun(plan: Any, start: State, s: Scalar) -> History:
         given = _from_before(machine, memory.form, before, lags, most)
     missing = memory.pieces - given.rows.shape[0]
     rows = jnp.concatenate([given.rows, jnp.zeros((missing, given.rows.shape[1]), s.dtype)])
-    order = jnp.mod(stop_gradient(given.head) - 1 - jnp.arange(memory.pieces), memory.pieces)
-    spans = rows[order.astype(jnp.int32), 0]  # from the newest to the oldest
-    back = jnp.concatenate([jnp.zeros_like(spans[:1]), jnp.cumsum(spans)[:-1]])
-    exists = stop_gradient(spans) > 0
+    given = given._replace(rows=rows)
+    order, begins, exists = given.in_order()
     places, starts = [], []
     for delay in delays_in(machine).values():
-        later = given.newest - back > stop_gradient(-jnp.asarray(delay)) + slack_of(plan, s)
+        later = begins > stop_gradient(-jnp.asarray(delay)) + slack_of(plan, s)
         number = jnp.minimum(jnp.sum(later & exists), jnp.sum(exists) - 1)
-        places.append(jnp.mod(given.head - 1 - number, memory.pieces).astype(s.dtype))
-        starts.append(s + given.newest - back[number])
+        places.append(order[number].astype(s.dtype))
+        starts.append(s + begins[number])
     places_and_starts = {"places": tuple(places), "starts": tuple(starts)}
     # The start may differ from the end of the history.
     level, slip = jnp.zeros_like(s), jnp.zeros_like(s)
-    return given._replace(
-        rows=rows, newest=s + given.newest, level=level, slip=slip, **places_and_starts
-    )
+    newest = s + given.newest
+    return given._replace(newest=newest, level=level, slip=slip, **places_and_starts)
 
 
 def is_covered(plan: Any, history: History, s: Scalar) -> Flag:
@@ -479,6 +494,7 @@ def extended(
         slip=jnp.where(waits, history.slip, slip),
         places=tuple(places),
         starts=tuple(starts),
+        unit=history.unit,
     )
 
 

@@ -356,9 +356,7 @@ class Strided(Array):
     def at(self, t: Text, index: Sequence[Index]) -> Value:
         return self.source.load(t, place_of(t, index, self.strides, self.offset), self.kind)
 
-    def put(
-        self, t: Text, index: Sequence[Index], value: Value, mask: Value | None = None
-    ) -> None:
+    def put(self, t: Text, index: Sequence[Index], value: Value, mask: Value | None = None) -> None:
         assert isinstance(self.source, Memory)
         self.source.store(t, place_of(t, index, self.strides, self.offset), value, mask)
 

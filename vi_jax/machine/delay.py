@@ -80,7 +80,9 @@ class Recorded(eqx.Module):
     @property
     def size(self) -> int:
         """The number of numbers that are recorded."""
-        return sum(jnp.zeros(x).size for x, used in zip(self.shapes, self.used, strict=True) if used)
+        return sum(
+            jnp.zeros(x).size for x, used in zip(self.shapes, self.used, strict=True) if used
+        )
 
     def pack(self, recorded: Any) -> Vector:
         """Return the numbers that are used, as a vector."""
@@ -119,23 +121,29 @@ def reading(machine: Machine, past: Callable[[Scalar], Any]) -> Machine:
     """Return the form of a machine with delays that reads this past, a function of `s`."""
     machine = without_past(machine)
     new = object.__new__(_reading_kind(type(machine)))
-    return with_static(new, **_values(machine), _past=past)
+    return with_static(new, **values_of(machine), _past=past)
 
 
 def without_past(machine: Machine) -> Machine:
     """Return the machine as the user defined it."""
-    return _original(machine) if hasattr(machine, "_past") else machine
+    return original(machine) if hasattr(machine, "_past") else machine
 
 
-def _values(machine: Machine) -> dict[str, Any]:
-    names = (field.name for field in dataclasses.fields(machine) if field.name != "_past")
-    return {name: getattr(machine, name) for name in names}
+def values_of(machine: Machine) -> dict[str, Any]:
+    """Return the values of the machine's own fields."""
+    names = [field.name for field in dataclasses.fields(machine)]
+    return {name: getattr(machine, name) for name in names if name not in _ADDED}
+
+
+# The fields that other forms of a machine have besides its own.
+_ADDED = ("_past", "_chain", "_begin")
 
 
 @cached_in_trace
-def _original(machine: Machine) -> Machine:
+def original(machine: Machine) -> Machine:
+    """Return the machine as the user defined it, from one of its other forms."""
     kind = type(machine).__mro__[1]
-    return with_static(object.__new__(kind), **_values(machine))
+    return with_static(object.__new__(kind), **values_of(machine))
 
 
 @functools.lru_cache(maxsize=64)
@@ -144,7 +152,7 @@ def _reading_kind(kind: type) -> type:
         def function(self: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
             given = s, state, self._past(s), *modes
             whose = f"`{'force' if hasattr(kind, 'force') else name}` of a {kind.__name__}"
-            call = getattr(_original(self), name)
+            call = getattr(original(self), name)
             check_takes(call, whose, "`s`, the state, the past", given, len(modes))
             return call(*given)
 
@@ -156,8 +164,8 @@ def _reading_kind(kind: type) -> type:
         "__annotations__": {"_past": Any},
         "_past": eqx.field(default=None, kw_only=True),
         "field": with_past("field"),
-        "_switches": property(lambda self: tuple(map(_given_past, _original(self)._switches))),
-        "_others": property(lambda self: tuple(map(_given_past, _original(self)._others))),
+        "_switches": property(lambda self: tuple(map(given_past, original(self)._switches))),
+        "_others": property(lambda self: tuple(map(given_past, original(self)._others))),
     }
     if overridden(object.__new__(kind), _base(kind), "averages"):
         body["averages"] = with_past("averages")
@@ -169,24 +177,27 @@ def _base(kind: type) -> type:
 
 
 @dataclasses.dataclass(frozen=True)
-class _WithPast:
+class WithPast:
     """A function of an event, which receives the past after the state."""
 
     function: Callable[..., Any]
 
     def __call__(self, machine: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
-        given = without_past(machine), s, state, machine._past(s), *modes
+        return self.call((without_past(machine), s, state, machine._past(s), *modes))
+
+    def call(self, given: tuple[Any, ...]) -> Any:
         return call_checked(self.function, "A function of an event", *given)
 
 
-def _given_past(event: Any) -> Any:
+def given_past(event: Any, wrapper: type = WithPast) -> Any:
+    """Return an event whose functions, if it is a switch or a reset, are wrapped."""
     names = ()
     if isinstance(event, Switch):
         names = ("function",)
     elif isinstance(event, Reset):
         names = ("_guard", "_reset", "_when", "_modes", "_value")
     functions = {name: getattr(event, name) for name in names}
-    return with_static(event, **{k: f and _WithPast(f) for k, f in functions.items()})
+    return with_static(event, **{k: f and wrapper(f) for k, f in functions.items()})
 
 
 # --- what is recorded
@@ -197,15 +208,15 @@ def history_before(machine: Machine, start: State) -> Callable[[Scalar], Any]:
     not known, `TypeError` if it cannot be computed."""
     whose, given = f"`before` of a {type(machine).__name__}", machine.before
     if callable(given):
-        return lambda t: _as_state(given(t), whose)
+        return lambda t: as_state(given(t), whose)
     if given is not None:
-        value = _as_state(given, whose)
+        value = as_state(given, whose)
         return lambda t: value
     if overridden(machine, _base(type(machine)), "recorded") is None:
         return lambda t: start
     zero = jnp.zeros((), float)
     modes = shown_modes(machine, _modes_at(machine, zero, start))
-    value = _as_state(machine.recorded(zero, start, _Unknown(whose), *modes), "`recorded`")
+    value = as_state(machine.recorded(zero, start, _Unknown(whose), *modes), "`recorded`")
     return lambda t: value
 
 
@@ -228,9 +239,9 @@ def _modes_at(machine: Machine, s: Scalar, state: State) -> Scalars:
     return (jnp.ones_like(s),) * number
 
 
-def _as_state(found: Any, whose: str) -> Any:
+def as_state(found: Any, whose: str) -> Any:
     if isinstance(found, Mapping):
-        found = Named(**{name: _as_state(x, whose) for name, x in found.items()})
+        found = Named(**{name: as_state(x, whose) for name, x in found.items()})
     if not jtu.tree_leaves(found):
         raise TypeError(f"{whose} must be a state, or numbers by name, but is {found!r}.")
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(float, x)), found)
@@ -283,7 +294,7 @@ def form_of(machine: Machine, start: State, before: Callable[[Scalar], Any]) -> 
     given = [form.unpack(x) for x in blank], start, modes
     traced, shape = jax.make_jaxpr(at, return_shape=True)(*given)
     pasts, states, rest = (len(jtu.tree_leaves(x)) for x in given)
-    flows, others, records = (len(jtu.tree_leaves(x)) for x in shape)
+    flows, others, _ = (len(jtu.tree_leaves(x)) for x in shape)
 
     def marks(sources: list[bool]) -> tuple[list[bool], list[bool], list[bool]]:
         found = dependent_results(traced.jaxpr, sources, smooth=False)
