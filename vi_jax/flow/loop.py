@@ -41,6 +41,7 @@ from ._machine_checks import (
 from ._step.hybrid import iterate
 from ._step.impact import is_compound
 from .events import Rates, force_rate, rates
+from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code
 from .sizes import at_most_one, extents_of, sizes_of
@@ -179,6 +180,8 @@ class Ends(NamedTuple):
     rejected: Scalar
     at: tuple[Scalar, Scalar, State] | None
     """The cycle, the clock and the state at the end; `None` for a machine without outcomes."""
+    history: Any = None
+    """The history at the end, of a machine with delays."""
 
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
@@ -207,6 +210,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         sizes = jtu.tree_map(at_most_one, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
+        if plan.memory is not None:
+            plan = with_sizes(plan, s, start, modes)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), partial(_end, rest),
@@ -223,9 +228,22 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
 def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
-    lane = initial_lane(plan, start, wanted)
+    if plan.memory is None:
+        lane = initial_lane(plan, start, wanted)
+    else:
+        lane = _with_history(plan, start, wanted)
     first, state = plan.settle <= 0, plan.recorded_state(start, lane.modes)
     return lane, lanes.Emitted(_is_active(plan, lane), first, (state, plan.empty_record(start)))
+
+
+def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
+    """Return the initial lane of a machine with delays."""
+    zero = jnp.zeros_like(plan.machine.position(start))
+    s = zero if plan.begin is None else zero + plan.begin
+    history = begun(plan, start, s)
+    lane = initial_lane(with_view(plan, history, s), start, wanted)
+    bad = (lane.fault == 0) & ~stop_gradient(is_covered(plan, history, s))
+    return lane._replace(history=history, fault=jnp.where(bad, code("bad_start"), lane.fault))
 
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
@@ -245,4 +263,4 @@ def _end(rest: Plan, inputs: _Inputs, lane: Lane) -> Ends:
     plan, at = eqx.combine(inputs[0], rest), None
     if outcomes_of(plan.machine):
         at = plan.cycle_of(lane.done), plan.clock(lane.s, lane.state), lane.state
-    return Ends(lane.fault, lane.steps, lane.rejected, at)
+    return Ends(lane.fault, lane.steps, lane.rejected, at, lane.history)

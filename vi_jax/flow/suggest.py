@@ -24,7 +24,7 @@ from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
 from .methods.verner import Verner9
-from .sizes import row_sizes, sizes_on_host
+from .sizes import row_sizes
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.

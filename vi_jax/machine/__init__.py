@@ -26,6 +26,11 @@ from .declared import (
     clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in,
     stops_of, switches_of, with_earlier_clock,
 )
+from .delay import (
+    FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
+    recorded_numbers, without_past,
+)
+from .delay_chain import delay_chain
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
     SliderCrank,
@@ -33,7 +38,8 @@ from .drives import (
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
     HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes, event_of,
-    events_of, friction_on, guard_of, has_contact_friction, holds_anywhere, is_autonomous, jump_of,
+    events_of, friction_on, guard_of, has_contact_friction, history_of, holds_anywhere,
+    is_autonomous, jump_of,
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )

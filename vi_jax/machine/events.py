@@ -5,6 +5,7 @@ An argument `number` is that of an event. `modes` are all of the machine, before
 `contact` is as in `EventContext`.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -198,13 +199,16 @@ class HybridState(Shown):
 
     - `state`: the state, as the machine's field receives it.
     - `modes`: the machine's discrete modes, a tuple in the order of its `modes`.
+    - `history`: the history of a machine with delays, as a run returns it; by default `None`, the
+      machine's `before`.
     """
 
     state: Any
     modes: tuple[Any, ...]
+    history: Any = None
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("state", "modes") or name.startswith("__"):
+        if name in ("state", "modes", "history") or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.state, name)
 
@@ -222,14 +226,20 @@ def modes_of(state: State) -> tuple[Any, ...] | None:
     return state.modes if isinstance(state, HybridState) else None
 
 
-def with_modes(state: State, modes: tuple[Any, ...] | None) -> State:
-    """Return the state with these own modes of the machine; unchanged without modes."""
-    return HybridState(state, modes) if modes else state
+def history_of(state: State) -> Any:
+    """Return the history of a machine with delays in a state, or `None`."""
+    return state.history if isinstance(state, HybridState) else None
+
+
+def with_modes(state: State, modes: tuple[Any, ...] | None, history: Any = None) -> State:
+    """Return the state with these own modes of the machine, and this history; unchanged without
+    both."""
+    return HybridState(state, modes or (), history) if modes or history is not None else state
 
 
 def replaced(state: State, new: State) -> State:
-    """Return another state in the same modes."""
-    return HybridState(new, state.modes) if isinstance(state, HybridState) else new
+    """Return another state in the same modes, with the same history."""
+    return dataclasses.replace(state, state=new) if isinstance(state, HybridState) else new
 
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:

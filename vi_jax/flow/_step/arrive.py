@@ -355,7 +355,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         ),
         **{
             name: select(taken, getattr(arrived, name), getattr(lane, name))
-            for name in ("state", "direction", "contact", "modes", "below")
+            for name in ("state", "direction", "contact", "modes", "below", "slip")
         },
     )
     return arrived, completed
@@ -477,7 +477,8 @@ def _at_fixed_clock(step: AppliedStep, lane: Lane) -> Lane:
     moving = lane.s, lane.state, lane.record.integrals
     flow = FlowToEvent(step.plan, smooth, lane.part, moving)
     _, state, integrals = flow.with_flow_derivatives(s - lane.s)
-    return lane._replace(s=s, state=state).update_record(integrals=integrals)
+    slip = None if lane.slip is None else lane.slip + (lane.s - s)
+    return lane._replace(s=s, state=state, slip=slip).update_record(integrals=integrals)
 
 
 def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:

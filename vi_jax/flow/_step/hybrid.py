@@ -39,6 +39,7 @@ from ...machine import (
     with_earlier_clock,
 )
 from .._lane import FREE, Lane, Plan, Record, any_of, select, to_event, total
+from ..history import extended, is_full, opened
 from ..noise import with_impulse
 from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
@@ -65,6 +66,9 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     """Take one step of one lane: advance, aim or land. A lane that has ended is unchanged. Returns
     the lane; whether an interval ended; the record of that interval."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
+    history = lane.history
+    if history is not None:
+        plan, lane = opened(plan, lane)
     smooth = hold_contacts(plan.machine, lane.modes, lane.contact)
     integrals = carried(smooth, lane.s, lane.state, lane.record.integrals)
     motion = plan.method.foresee(smooth, lane.s, lane.state, integrals)
@@ -98,11 +102,23 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
         spent=jnp.where(reached, 0.0, lane.spent + 1.0),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
-    fault = new.fault
-    for condition, reason in _faults(plan, lane, trial, taken, rejected, new):
+    fault, ends = new.fault, _faults(plan, lane, trial, taken, rejected, new)
+    if history is not None:
+        step, jumps = (lane, trial, taken), _jumps(plan, trial)
+        history = extended(plan, history, step, arrived, new.s, jumps)
+        new = new._replace(history=history, slip=None)
+        ends.append((is_full(plan, history), code("full_history")))
+    for condition, reason in ends:
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, reason, fault)
     return new._replace(fault=fault), completed, arrived.record
+
+
+def _jumps(plan: Plan, trial: Trial) -> Flag:
+    """Return whether a step ended at an event after which the motion is not smooth."""
+    events = [c for c in trial.crossings if c.number != section_number(plan.machine)]
+    released = [path.release.landed for path in trial.paths if path.release is not None]
+    return any_of(trial.good, [*(c.landed for c in events), *released])
 
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
@@ -12,6 +13,7 @@ from ...machine import is_alive, stops_of, switches_of
 from .._lane import FREE, Lane, Plan, any_of, to_event, to_release, to_turn_of, total
 from ..drift import FlowToEvent
 from ..events import Rates, force_rate, rates, turns_within
+from ..history import end_of_step, new_piece, piece_error
 from ..methods import Foreseen, stages_to_step_to
 from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, stops_are_exact
 from .guards import (
@@ -134,6 +136,8 @@ class Trial(NamedTuple):
     """For each coordinate, the machine with its body free and other resting bodies held."""
     clear: Flag | None
     """True if nothing can be met within the step; `None` if that is never known in advance."""
+    piece: Array | None = None
+    """The polynomial of what the step records, of a machine with delays."""
 
 
 class AppliedStep(NamedTuple):
@@ -161,10 +165,12 @@ def try_step(
     h, clear = jnp.minimum(lane.attempt, limit), _clear_time(plan, lane)
     h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
     is_clear = None if clear is None else free & (h <= clear)
-    s1, last = lane.s + h, jnp.zeros_like(free)
+    s1, last, may_end = lane.s + h, jnp.zeros_like(free), free
+    if plan.view is not None:
+        h, s1, may_end = end_of_step(plan, lane, free, h, bound)
     if plan.s_counts_cycles(lane.state):
         # The margin avoids an extra step for a remainder of rounding.
-        last = free & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
+        last = may_end & (stop_gradient(bound - lane.s) <= h * (1 + 1e-6))
         s1 = jnp.where(last, bound, s1)
     s1 = jnp.where(active, s1, lane.s)
     s1 = pin(s1)
@@ -204,6 +210,10 @@ def try_step(
     inner = inner_guards(plan, lane, free_machines, ends, stages, at, h, longest)
     guard_error = guards_error(plan, inner, stages, h, longest)
     error = error if guard_error is None else jnp.maximum(error, guard_error)
+    piece = None
+    if plan.view is not None:
+        piece = new_piece(plan, lane, smooth, s1, new, h)
+        error = jnp.maximum(error, piece_error(plan, piece, h)) if method.adaptive else error
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
     alive = is_alive(machine, new)
     if alive is not None:
@@ -221,7 +231,7 @@ def try_step(
     met, below = crossings(plan, lane, smooth, paths, (s1, h, new), (good, last), inner)
     return Trial(
         h, s1, new, elapsed(old, integrals, h), error, good, last, met, tuple(paths), below, shares,
-        smooth, free_machines, is_clear,
+        smooth, free_machines, is_clear, piece,
     )  # fmt: skip
 
 

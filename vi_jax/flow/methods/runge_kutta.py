@@ -346,7 +346,7 @@ class Adaptive(_RungeKutta):
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, its error norm (root mean square over the
         components of the state and the integrals of averages), and its stages."""
-        rtol, atol, floor = self._tolerances(s0)
+        rtol, atol, floor = self.tolerances(s0)
         solver = self.solver
         if solver.implicit:
             solver = _implicit_solver(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
@@ -364,7 +364,7 @@ class Adaptive(_RungeKutta):
         norm = jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
         return new, integrals, norm, stages
 
-    def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
+    def tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
         """Return rtol, atol and the floor of both, below which rounding would reject all steps."""
         floor = 8 * float(jnp.finfo(like.dtype).eps)
         rtol = jnp.maximum(jnp.asarray(self.rtol, like.dtype), floor)
@@ -374,7 +374,7 @@ class Adaptive(_RungeKutta):
     def guard_error(self, stages, values, h, longest, *, acts, size):
         """Return the error of a component whose rate is the guard, such as the impulse of a force
         that holds a body. A guard that is not such a force has the tolerance 1e-6."""
-        rtol, atol, _ = self._tolerances(h)
+        rtol, atol, _ = self.tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
