@@ -35,7 +35,8 @@ from ..machine import (
     size_of,
     without_past,
 )
-from .smooth import SmoothMachine, unit_of
+from .sizes import unit_of
+from .smooth import SmoothMachine
 
 # The numbers of a piece besides its coefficients: its start since that of the piece before; and the
 # level of a jump at its start, or -1, with the derivative of the jump's time relative to the start.

@@ -150,7 +150,8 @@ def without_history(state: Any) -> Any:
 
 
 def _with_rates(machine: Any, flow: Any, s: Scalar, state: Any, modes: Any) -> Any:
-    """Return the rate of a state of a chain: `flow`, and d(history)/ds by the transport equation."""
+    """Return the rate of a state of a chain: `flow`, and that of its history by the transport
+    equation."""
     chain, h = machine._chain, state.history
     held = with_static(machine, _past=_Held(past_in(machine, state)))
     now = recorded_numbers(held, chain.form, s, without_history(state), modes)
