@@ -385,7 +385,7 @@ def _settled(
         hold=jnp.stack([hold_of[i] for i in order]) if order else none,
         touches=jnp.stack(touches[: len(of)]) if of else None,
     )
-    answer = settle(stop_gradient(question), of)
+    answer = settle(question, of, has_ratios=bool(held.dry))
     for n, i in enumerate(order):
         mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
         slip_of[i] = jnp.where(touches[n], mode, slip_of[i])

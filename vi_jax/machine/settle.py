@@ -59,7 +59,7 @@ class Contacts(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """The answer to a question. It has no derivatives but for `force`."""
+    """The answer to a question, without derivatives."""
 
     force: Array
     """λ, (m,)."""
@@ -73,9 +73,9 @@ class Settled(NamedTuple):
     """True if no solution was found."""
 
 
-def lemke(matrix: Array, constant: Array) -> tuple[Array, Array]:
-    """Return which variables z are basic in the solution of w = M z + q, w ⊥ z, both not negative,
-    and `SOLVED` or `UNSOLVED`. Ties are decided lexicographically."""
+def lemke(matrix: Array, constant: Array) -> tuple[Array, Array, Array]:
+    """Return the solution z of w = M z + q, w ⊥ z, both not negative; which z are basic; and
+    `SOLVED` or `UNSOLVED`. Ties are decided lexicographically."""
     m, dtype = constant.shape[0], constant.dtype
     rows, columns = np.arange(m), np.arange(2 * m + 2)
     eps = float(jnp.finfo(dtype).eps)
@@ -84,9 +84,6 @@ def lemke(matrix: Array, constant: Array) -> tuple[Array, Array]:
     # Columns: w, z, the artificial variable, the right side.
     parts = np.eye(m), -matrix, -np.ones((m, 1)), constant[:, None]
     table = jnp.concatenate([jnp.asarray(x, dtype) for x in parts], 1)
-
-    def column_of(table: Array, number: Array) -> Array:
-        return jnp.sum(jnp.where((columns == number)[None, :], table, 0.0), 1)
 
     def leaving(table: Array, column: Array, allowed: Array, artificial: Array) -> Array:
         scale = 1 / jnp.where(allowed, column, 1.0)
@@ -107,34 +104,33 @@ def lemke(matrix: Array, constant: Array) -> tuple[Array, Array]:
         _, is_left, _ = jax.lax.while_loop(lambda x: (x[0] <= m) & (x[2] > 1.5), narrow, begin)
         return jnp.min(jnp.where(is_left > 0, rows * 1.0, m))
 
-    def pivot(table: Array, basis: Array, row: Array, number: Array) -> tuple[Array, Array, Array]:
-        is_row, column = rows == row, column_of(table, number)
-        chosen = jnp.sum(jnp.where(is_row[:, None], table, 0.0), 0)
-        chosen = chosen / jnp.sum(jnp.where(is_row, column, 0.0))
-        table = jnp.where(is_row[:, None], chosen, table - column[:, None] * chosen)
-        return table, jnp.where(is_row, number, basis), jnp.sum(jnp.where(is_row, basis, 0.0))
-
-    def step(state: tuple) -> tuple:
-        table, basis, entering, _, count = state
-        column = column_of(table, entering)
-        allowed = column > least * jnp.maximum(size, jnp.max(jnp.abs(column)))
-        is_ray = ~jnp.any(allowed)
-        row = leaving(table, column, allowed, jnp.where(basis == 2 * m, 1.0, 0.0))
-        new, new_basis, left = pivot(table, basis, jnp.where(is_ray, 0.0, row), entering)
-        code = jnp.where(left == 2 * m, SOLVED, jnp.where(count > 10 * m + 20, UNSOLVED, WORKING))
-        table, basis = jnp.where(is_ray, table, new), jnp.where(is_ray, basis, new_basis)
-        complement = jnp.where(left < m, left + m, left - m)
-        return table, basis, complement, jnp.where(is_ray, UNSOLVED, code), count + 1.0
-
     # The first pivot: the most negative q. The last of ties keeps rows lexicographically positive.
     lowest = jnp.min(constant)
     first = jnp.max(jnp.where(constant <= lowest * (1 - 16 * eps), rows * 1.0, 0.0))
-    begun, basis, left = pivot(table, rows * jnp.ones((), dtype), first, jnp.asarray(2.0 * m))
-    needed = lowest < 0
-    basis = jnp.where(needed, basis, rows)
-    begin = begun, basis, left + m, jnp.where(needed, WORKING, SOLVED), jnp.zeros((), dtype)
-    _, basis, _, code, _ = jax.lax.while_loop(lambda x: x[3] == WORKING, step, begin)
-    return jnp.any(basis[None, :] == (m + rows)[:, None], 1), code
+
+    def step(state: tuple) -> tuple:
+        table, basis, entering, _, count = state
+        column = jnp.sum(jnp.where((columns == entering)[None, :], table, 0.0), 1)
+        allowed = column > least * jnp.maximum(size, jnp.max(jnp.abs(column)))
+        is_ray = ~jnp.any(allowed) & (count > 0)
+        row = leaving(table, column, allowed, jnp.where(basis == 2 * m, 1.0, 0.0))
+        is_row = (rows == jnp.where(count == 0, first, row)) & ~is_ray
+        chosen = jnp.sum(jnp.where(is_row[:, None], table, 0.0), 0)
+        pivot = jnp.sum(jnp.where(is_row, column, 0.0))
+        chosen = chosen / jnp.where(is_ray, 1.0, pivot)
+        table = jnp.where(is_row[:, None], chosen, table - column[:, None] * chosen)
+        left = jnp.sum(jnp.where(is_row, basis, 0.0))
+        basis = jnp.where(is_row, entering, basis)
+        code = jnp.where(left == 2 * m, SOLVED, jnp.where(count > 10 * m + 20, UNSOLVED, WORKING))
+        complement = jnp.where(left < m, left + m, left - m)
+        return table, basis, complement, jnp.where(is_ray, UNSOLVED, code), count + 1.0
+
+    zero = jnp.zeros((), dtype)
+    code = jnp.where(lowest < 0, WORKING, SOLVED).astype(dtype)
+    begin = table, rows * (1 + zero), 2.0 * m + zero, code, zero
+    table, basis, _, code, _ = jax.lax.while_loop(lambda x: x[3] == WORKING, step, begin)
+    is_z = basis[None, :] == (m + rows)[:, None]
+    return jnp.sum(jnp.where(is_z, table[:, -1], 0.0), 1), jnp.any(is_z, 1), code
 
 
 def solve_modes(matrix: Array, right: Array) -> Array:
@@ -160,18 +156,20 @@ def solve_modes(matrix: Array, right: Array) -> Array:
     return jnp.sum(jnp.where(place[None, :] == rows[:, None], table[None, :, -1], 0.0), 1)
 
 
-def _scaled(x: Contacts) -> Contacts:
-    """Return the question with rows in units of their gain, and rates in units of the largest."""
+def _scaled(x: Contacts) -> tuple[Contacts, Array]:
+    """Return the question with rows in units of their gain, and rates in units of the largest; and
+    that unit."""
     n, t = x.closed.shape[0], x.friction.shape[0]
     own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)
     unit = 1 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
     top = jnp.maximum(jnp.max(jnp.abs(x.rates * unit)), 1e-300)
     if x.level.shape[0]:
         top = jnp.maximum(top, jnp.max(jnp.abs(x.level / unit[n + t :])))
-    return x._replace(
+    scaled = x._replace(
         gains=x.gains * unit[:, None] * unit, rates=x.rates * unit / top,
         level=x.level / (unit[n + t :] * top),
     )  # fmt: skip
+    return scaled, top
 
 
 def _normals(x: Contacts, of: tuple[int, ...]) -> np.ndarray:
@@ -181,9 +179,19 @@ def _normals(x: Contacts, of: tuple[int, ...]) -> np.ndarray:
     return matrix
 
 
-def _decide(x: Contacts, of: tuple[int, ...]) -> tuple[Array, Array, Array, Array]:
-    """Return which contacts push; which frictions hold; the slip of each other one, or 0 without a
-    force; and `SOLVED` or `UNSOLVED`."""
+class _Decided(NamedTuple):
+    pushes: Array
+    """True for contacts that push, (n,)."""
+    holds: Array
+    """True for frictions that hold, (t + d,)."""
+    mode: Array
+    """The slip of each other friction, or 0 without a force, (t + d,)."""
+    force: Array
+    """(m,)."""
+    code: Array
+
+
+def _decide(x: Contacts, of: tuple[int, ...]) -> _Decided:
     x = stop_gradient(x)
     n, t, all_t = x.closed.shape[0], len(of), x.slip.shape[0]
     own = jnp.sum(x.gains * np.eye(n + all_t), 1)
@@ -191,7 +199,7 @@ def _decide(x: Contacts, of: tuple[int, ...]) -> tuple[Array, Array, Array, Arra
     normal_of, dtype = _normals(x, of), x.rates.dtype
     ratio = normal_of @ unit[:n] / unit[n:] if n else jnp.zeros((all_t,), dtype)
     friction = jnp.concatenate([x.friction, jnp.zeros((all_t - t,), dtype)]) * ratio
-    x = _scaled(x)
+    x, top = _scaled(x)
     coupling = normal_of * friction[:, None]
     touches = (normal_of @ jnp.where(x.closed, 1.0, 0.0))[:t] > 0
     touches = touches if x.touches is None else touches & x.touches
@@ -218,13 +226,16 @@ def _decide(x: Contacts, of: tuple[int, ...]) -> tuple[Array, Array, Array, Arra
     # A variable that takes no part: w = z + 1.
     acts = jnp.concatenate([x.closed, free, free, free])
     matrix = jnp.where(acts[:, None] & acts, matrix, np.eye(n + 3 * all_t))
-    basic, code = lemke(matrix, jnp.where(acts, constant, 1.0))
+    z, basic, code = lemke(matrix, jnp.where(acts, constant, 1.0))
     pushes, (forward, backward, at_bound) = basic[:n], jnp.split(basic[n:], 3)
     holds = free & jnp.where(at_bound, forward & backward, forward != backward)
     slips = free & at_bound & (forward != backward)
     # Without a force: no direction yet.
     mode = jnp.where(slips, jnp.where(forward, -1.0, 1.0), x.slip)
-    return pushes, holds, mode, code
+    tangent = z[n : n + all_t] - z[n + all_t : n + 2 * all_t]
+    given = known - x.slip * (normal_of * friction[:, None] @ z[:n])
+    force = jnp.concatenate([z[:n], jnp.where(free, tangent, given)]) * unit * top
+    return _Decided(pushes, holds, mode, force, code)
 
 
 def forces_in(
@@ -243,46 +254,46 @@ def forces_in(
     return solve_modes(matrix, jnp.where(held, -x.rates, known))
 
 
-def settle(x: Contacts, of: tuple[int, ...] = ()) -> Settled:
+def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) -> Settled:
     """Return which contacts push, stick, slip or open, and their forces. **Arguments:** `of`, the
-    number of each tangent's contact.
+    number of each tangent's contact; `has_ratios`, whether some `hold` is not 1.
 
     A friction whose largest force without slip exceeds that of a slipping body is asked again with
     the slip that it begins, until no other begins to slip.
     """
-    n, dtype = x.closed.shape[0], x.rates.dtype
+    x, n = stop_gradient(x), x.closed.shape[0]
     if x.rates.shape == x.level.shape == (1,):
         return _settle_one(x)
-
-    def ask(state: tuple) -> tuple:
-        slip, *_, count = state
-        pushes, holds, mode, code = _decide(x._replace(slip=slip), of)
-        begins = (mode != slip) & (stop_gradient(x.hold) != 1)
-        again = jnp.any(begins) & (code == SOLVED)
-        flags = (jnp.where(flag, 1.0, 0.0).astype(dtype) for flag in (pushes, holds))
-        return jnp.where(begins, mode, slip), *flags, mode, code, jnp.where(again, count + 1, 0.0)
-
-    zero, slip = jnp.zeros((), dtype), stop_gradient(x.slip)
-    begin = slip, jnp.zeros((n,), dtype), 0 * slip, slip, zero, zero + 1
-    _, pushes, holds, mode, code, _ = jax.lax.while_loop(
-        lambda state: (state[-1] > 0) & (state[-1] <= slip.shape[0] + 1), ask, begin
-    )
-    pushes, holds = pushes > 0, holds > 0
-    force = forces_in(x, of, pushes, holds, mode)
-    pushed = x.gains @ force
+    found = _decide_with_ratios(x, of) if has_ratios else _decide(x, of)
+    pushed = x.gains @ found.force
     rate = pushed + x.rates
-    size = stop_gradient(jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed)))
-    moves = stop_gradient(jnp.where(jnp.abs(rate) > _OPENS * size, jnp.sign(rate), 0.0))
+    size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
+    moves = jnp.where(jnp.abs(rate) > _OPENS * size, jnp.sign(rate), 0.0)
     # A slip without a force goes where it is accelerated.
-    mode = jnp.where(~holds & (mode == 0), moves[n:], mode)
-    return Settled(force, rate, x.closed & (pushes | (moves[:n] <= 0)), mode, code != SOLVED)
+    mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
+    kept = x.closed & (found.pushes | (moves[:n] <= 0))
+    return Settled(found.force, rate, kept, mode, found.code != SOLVED)
+
+
+def _decide_with_ratios(x: Contacts, of: tuple[int, ...]) -> _Decided:
+    def ask(state: tuple) -> tuple:
+        slip, _, _, count = state
+        new = _decide(x._replace(slip=slip), of)
+        begins = (new.mode != slip) & (x.hold != 1) & (new.code == SOLVED)
+        again = jnp.any(begins) & (count < slip.shape[0])
+        return jnp.where(begins, new.mode, slip), new, jnp.where(again, 1.0, 0.0), count + 1.0
+
+    shapes, zero = jax.eval_shape(lambda: _decide(x, of)), jnp.zeros((), x.rates.dtype)
+    nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), shapes)
+    begin = x.slip, nothing, zero + 1, zero
+    return jax.lax.while_loop(lambda state: state[2] > 0, ask, begin)[1]
 
 
 def _settle_one(x: Contacts) -> Settled:
     """Return `settle` of a single dry friction: its problem has a closed form."""
     needed = -x.rates / x.gains[0]
     slip = jnp.where(jnp.abs(needed) <= x.hold * x.level, 0.0, -jnp.sign(needed))
-    mode = stop_gradient(jnp.where(x.slip != 0, x.slip, slip))
+    mode = jnp.where(x.slip != 0, x.slip, slip)
     force = jnp.where(mode == 0, needed, jnp.where(x.slip != 0, 0.0, -mode * x.level))
     return Settled(force, x.rates + x.gains[0] * force, x.closed, mode, jnp.zeros((), bool))
 
@@ -338,8 +349,9 @@ def _strike_together(x: Strike, of: tuple[int, ...]) -> Blow:
         question = Contacts(
             x.gains, x.velocity + target, x.friction, x.struck, none, none[:0], none + 1
         )
-        pushes, holds, mode, code = _decide(question, of)
-        return None, (forces_in(question, of, pushes, holds, mode), code)
+        found = _decide(question, of)
+        force = forces_in(question, of, found.pushes, found.holds, found.mode)
+        return None, (force, found.code)
 
     shares = jnp.asarray([0.0, 1.0], x.velocity.dtype)
     _, ((inelastic, full), codes) = jax.lax.scan(moreau, None, shares)
