@@ -239,8 +239,8 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
     return list(outs)
 
 
-# A part with at least so many operations that is called more than once becomes a function. A choice:
-# a call of 20 vectors costs about as much as 10 operations.
+# A part that is called more than once becomes a function if it has at least so many operations. A
+# choice, since a call of 20 vectors costs about as much as 10 operations.
 _LEAST_FUNCTION = 100
 
 
