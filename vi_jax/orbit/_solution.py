@@ -297,6 +297,27 @@ def _known_bracket(
     return places[low], places[high]
 
 
+# A dip of a test within a step falls to this share of its values at the ends, by a parabola, or
+# beyond zero: a choice.
+_DIPS = 0.1
+
+
+def dip_of(places: list[float], values: list[float]) -> float | None:
+    """Return the place of the extremum of the parabola through three points, if their values have
+    one sign and the parabola comes near zero, or beyond, between the last two; else `None`."""
+    steps, heights = np.diff(places), np.sign(values[1]) * np.array(values)
+    if not (np.isfinite(heights).all() and heights.min() > 0 and steps.min() > 0):
+        return None
+    before, after = np.diff(heights) / steps
+    curvature = (after - before) / steps.sum()
+    slope = before + curvature * steps[0]
+    if not curvature > 0:
+        return None
+    shift = -0.5 * slope / curvature
+    is_low = heights[1] + 0.5 * slope * shift < _DIPS * heights[1:].min()
+    return float(places[1] + shift) if 0 < shift < steps[1] and is_low else None
+
+
 def find_zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
     """Return the solution near one at which a test is zero, by the secant method, or `None`."""
     found: list[Step] = []
