@@ -237,8 +237,9 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     if distance > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
-            "of its state is neutral, such as a free position or a counter. Leave such a "
-            "component out of the state to follow the orbit."
+            "of its state is neutral, such as a free position, a counter, or the place at which "
+            "dry friction holds a body. Leave such a component out of the state to follow the "
+            "orbit."
         )
     if distance > _SAME:
         raise ValueError(
