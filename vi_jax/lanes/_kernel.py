@@ -165,7 +165,8 @@ class _Writer:
         t = self.t
         t.open("step")
         active, n = group.active, len(self.inputs)
-        carry, going, complete, row = self._run(self.program.step, group.arrays, active)
+        own = group.arrays[n:]
+        carry, going, complete, row = self._run(self.program.step, group.arrays, active, own)
         going = t.both(active, going)
         complete = t.both(active, complete)
         self._store_row(group.lane, complete, group.rows, row)
@@ -275,10 +276,11 @@ class _Writer:
         return _Group(arrays, old.lane, rows, active)
 
     def _run(
-        self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value
+        self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value, owned: list[Any] | None = None
     ) -> tuple[list[Any], Value, Value, list[Any]]:
-        """Return results of `begin` or `step`: carry, flags (lane continues, has a row), row."""
-        out: list[Any] = write(self.t, jaxpr, args, mask)
+        """Return results of `begin` or `step`: carry, flags (lane continues, has a row), row. Large
+        arrays that are `owned` may be changed in place."""
+        out: list[Any] = write(self.t, jaxpr, args, mask, owned or ())
         n = len(self.program.carry_avals)
         return out[:n], out[n].item(), out[n + 1].item(), out[n + 2 :]
 

@@ -1,7 +1,7 @@
 """Writing a jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts
+from ._array_rules import IN_PLACE, PLACED, STRUCTURAL, any_in, select_parts
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
@@ -29,6 +29,7 @@ from ._arrays import (
     reserve,
     same,
     selected,
+    separate,
     stored,
     table,
     times,
@@ -92,11 +93,15 @@ def constants(t: Text, array: object) -> Array:
     return Registers.of(array.shape, kind, lambda i: t.constant(array[i], kind))
 
 
-def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
+def write(
+    t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value, owned: Sequence[Any] = ()
+) -> list[Any]:
     """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes; return its
     results as `Array`s. `mask` holds in the lanes that need them. Code that none of them needs may
-    be skipped. Results of other lanes are arbitrary."""
+    be skipped. Results of other lanes are arbitrary. Arguments that are `owned` may be changed in
+    place, in the lanes of the mask: a block of one that is not used any more."""
     jaxpr, env = inner(closed), {}
+    own = {v for v, x in zip(jaxpr.invars, args, strict=True) if any(x is y for y in owned)}
     needed = _needed_equations(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
@@ -114,7 +119,16 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
-        put(eqn.outvars, _write_equation(t, eqn, [read(a) for a in eqn.invars], mask))
+        given, first = [read(a) for a in eqn.invars], next(iter(eqn.invars), None)
+        in_place = eqn.primitive.name in IN_PLACE and isinstance(given[0], Strided)
+        if in_place and first in last.get(number, ()) and first in own:
+            for var, x in env.items():  # what may read the old numbers later
+                if var is not first and not isinstance(x, Registers):
+                    env[var] = separate(t, x, [given[0]])
+            put(eqn.outvars, _write_equation(t, eqn, given, mask, in_place=True))
+            own.add(eqn.outvars[0])
+        else:
+            put(eqn.outvars, _write_equation(t, eqn, given, mask))
         for var in last.get(number, ()):  # so that its memory is reused
             env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
@@ -144,7 +158,9 @@ def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
+def _write_equation(
+    t: Text, eqn: Any, args: list[Any], mask: Value, in_place: bool = False
+) -> list[Any]:
     name, params = eqn.primitive.name, eqn.params
     if (body := called(eqn)) is not None:
         return write(t, body, args, mask)
@@ -163,7 +179,7 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
         return _elementwise(t, name, params, dtypes, args, avals)
     if name in PLACED:
         dtypes = [a.aval.dtype for a in eqn.invars]
-        out = PLACED[name](t, params, avals, dtypes, *args)
+        out = PLACED[name](t, params, avals, dtypes, *args, **({"mask": mask} if in_place else {}))
     else:
         out = STRUCTURAL[name](t, params, avals, *args)
     return [to_registers(t, x) for x in (out if eqn.primitive.multiple_results else [out])]

@@ -400,6 +400,7 @@ def find_orbit(
             f"{root_finder.arcs}."
         )
     orbit = _find(the_map, state, root_finder, impact_log, multipliers)
+    orbit = dataclasses.replace(orbit, multipliers=multipliers_of(orbit.monodromy))
     if throw:
         orbit = raised(orbit, ~orbit.successful, "The search failed", orbit.result)
     return trimmed(orbit)
@@ -509,7 +510,7 @@ def _find_one(
         y_max=y_max,
         clearance=clearance,
         monodromy=monodromy,
-        multipliers=multipliers_of(monodromy),
+        multipliers=jnp.full(len(monodromy), jnp.nan, jnp.result_type(x.dtype, jnp.complex64)),
         residual=root.residual,
         error=error,
         iterations=root.steps.astype(jnp.int32),

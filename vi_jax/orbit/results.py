@@ -5,14 +5,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._checks import given_number, short
+from .._checks import array_module, by_numpy_if_known, concrete, given_number, on_host, short
 from .._messages import count_of
 from .._types import State, xr
 from ..flow import (
@@ -68,35 +67,57 @@ class STABILITY(NamedEnumeration):
 NEUTRAL = 1e-9
 
 
-def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
-    """Return the eigenvalues of a monodromy matrix, the largest modulus first, or NaN."""
+def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
+    """Return the eigenvalues of monodromy matrices, the largest modulus first, or NaN. They are
+    computed by NumPy if the matrices are known."""
+    known = concrete(monodromy)
+    if known is None:
+        return jnp.vectorize(_multipliers, signature="(n,n)->(n)")(monodromy)
+    finite = np.asarray(np.isfinite(known).all(axis=(-2, -1), keepdims=True))
+    safe = np.where(finite, known, np.eye(known.shape[-1], dtype=known.dtype))
+    if known.shape[-1] == 2:
+        values = eigenvalues(*_half_trace_and_determinant(safe))
+    else:
+        values = np.linalg.eigvals(safe).astype(np.result_type(known.dtype, np.complex64))
+    values = np.take_along_axis(values, np.argsort(-abs(values), axis=-1, kind="stable"), axis=-1)
+    return jnp.asarray(np.where(finite[..., 0], values, np.nan))
+
+
+def _multipliers(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
     finite = jnp.all(jnp.isfinite(monodromy))
     safe = jnp.where(finite, monodromy, jnp.eye(monodromy.shape[0], dtype=monodromy.dtype))
     if monodromy.shape == (2, 2):
-        half = 0.5 * (safe[0, 0] + safe[1, 1])
-        values = eigenvalues(half, safe[0, 0] * safe[1, 1] - safe[0, 1] * safe[1, 0])
+        values = eigenvalues(*_half_trace_and_determinant(safe))
     else:
         values = jnp.linalg.eigvals(safe)
     order = jnp.argsort(-jnp.abs(values))
     return jnp.where(finite, values[order], jnp.nan)
 
 
-def eigenvalues(
-    half: Float[Array, "..."], determinant: Float[Array, "..."]
-) -> Complex[Array, "... 2"]:
+def _half_trace_and_determinant(matrix: Any) -> tuple[Any, Any]:
+    a, b, c, d = (matrix[..., i, j] for i in range(2) for j in range(2))
+    return 0.5 * (a + d), a * d - b * c
+
+
+def eigenvalues(half: Any, determinant: Any) -> Any:
     """Return the eigenvalues of 2x2 matrices from half their trace and their determinant."""
+    array = array_module(half)
+    square = half * half - determinant
     # Pinned: computed again with other rounding, it might be zero in one use and not in another
     # (seen with JAX 0.12: 1 ± 0.7 for 1 and 1).
-    square = pin(half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
+    square = square if array is np else pin(square)
+    square = square.astype(array.result_type(half, array.complex64))
     double = square == 0  # the derivative of the root is infinite there
-    root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
-    return jnp.stack([half + root, half - root], axis=-1)
+    root = array.where(double, 0.0, array.sqrt(array.where(double, 1.0, square)))
+    return array.stack([half + root, half - root], axis=-1)
 
 
-def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
-    largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
-    size = jnp.abs(largest)
-    real = jnp.abs(largest.imag) <= NEUTRAL * size
+def stability_of(multipliers: Complex[Array, "*batch n"]) -> STABILITY:
+    array = array_module(multipliers)
+    place = array.argmax(abs(multipliers), axis=-1, keepdims=True)
+    largest = array.take_along_axis(multipliers, place, axis=-1)[..., 0]
+    size = abs(largest)
+    real = abs(largest.imag) <= NEUTRAL * size
     unstable_kind = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
@@ -104,8 +125,8 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
     )
     verdict = STABILITY.where(size < 1, STABILITY.stable, unstable_kind)
     rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
-    verdict = STABILITY.where(jnp.abs(size - 1) <= rounding, STABILITY.neutral, verdict)
-    return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)
+    verdict = STABILITY.where(abs(size - 1) <= rounding, STABILITY.neutral, verdict)
+    return STABILITY.where(array.isnan(size), STABILITY.unknown, verdict)
 
 
 def compound(matrix: Float[Array, "n n"]) -> Float[Array, "pairs pairs"]:
@@ -211,6 +232,7 @@ class Orbit(Summarized):
     """The machine's own modes on the sections (see `AbstractMachine.modes`)."""
 
     @property
+    @by_numpy_if_known
     def successful(self) -> Bool[Array, "..."]:
         """True if an orbit was found, of the given period or a smaller one."""
         return (self.result == ORBIT_RESULTS.successful) | (
@@ -218,21 +240,18 @@ class Orbit(Summarized):
         )
 
     @property
+    @by_numpy_if_known
     def stable(self) -> Bool[Array, "..."]:
         """True if all multipliers lie inside the unit circle, by more than rounding; false also if
         they are not known (see `stability`)."""
         return self.stability == STABILITY.stable
 
     @property
+    @by_numpy_if_known
     def stability(self) -> STABILITY:
         """Stable, neutral, or how stability was lost: fold, period doubling or Neimark–Sacker."""
-
-        def verdict(successful, multipliers):
-            return STABILITY.where(successful, stability_of(multipliers), STABILITY.unknown)
-
-        for _ in range(self.multipliers.ndim - 1):
-            verdict = jax.vmap(verdict)
-        return verdict(self.successful, self.multipliers)
+        verdict = stability_of(self.multipliers)
+        return STABILITY.where(self.successful, verdict, STABILITY.unknown)
 
     @property
     def quantities(self) -> dict[str, Float[Array, "... cycles"]]:
@@ -241,17 +260,20 @@ class Orbit(Summarized):
         return quantities_on(self.machine, self.sections, self.residual.ndim)
 
     @property
+    @by_numpy_if_known
     def slowest_impact(self) -> Float[Array, "..."]:
         """Smallest V⁻, the distance to a grazing at which an impact is lost; infinite without
         impacts. The distance to other grazings is `clearance`."""
-        speed = jnp.where(jnp.isnan(self.impact_speed), jnp.inf, self.impact_speed)
-        return jnp.min(speed, axis=-1, initial=jnp.inf)
+        array = array_module(self.impact_speed)
+        speed = array.where(array.isnan(self.impact_speed), jnp.inf, self.impact_speed)
+        return array.min(speed, axis=-1, initial=jnp.inf)
 
     @property
+    @by_numpy_if_known
     def admissible(self) -> Bool[Array, "..."]:
         """True if the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
-        size = jnp.maximum(jnp.abs(self.y_min), jnp.abs(self.y_max))
+        size = array_module(self.y_max).maximum(abs(self.y_min), abs(self.y_max))
         inside = self.clearance >= 0
         for stop in stops_of(self.machine):
             if stop.coordinate:
@@ -324,11 +346,11 @@ class Orbit(Summarized):
         """Describe the motion, its impacts and its multipliers."""
         if self.residual.ndim:
             found = self.successful
-            counted = f"{int(jnp.sum(self.stable))} of them stable"
-            if jnp.any(found & (self.stability == STABILITY.unknown)):
+            counted = f"{int(np.sum(self.stable))} of them stable"
+            if np.any(found & (self.stability == STABILITY.unknown)):
                 counted = STABILITY[STABILITY.unknown]
             searches = f"{self.residual.size} searches {self.residual.shape}"
-            return f"{searches}: {int(jnp.sum(found))} orbits found, {counted}"
+            return f"{searches}: {int(np.sum(found))} orbits found, {counted}"
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_advice(self)}"
@@ -350,7 +372,7 @@ class Orbit(Summarized):
                 lines.append(f"  impact: {name} stop at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
-        listed = int(jnp.sum(self.impact_stop >= 0))
+        listed = int(np.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts: find it with `impact_log={count}`")
         if self.stability != STABILITY.unknown:
@@ -419,11 +441,15 @@ def trimmed(orbit: Orbit) -> Orbit:
     """Remove the padding of the impacts of one orbit; return traced or batched orbits unchanged."""
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
-    keep = slice(int(orbit.impacts))
     per_impact = ("impact_phase", "impact_speed", "impact_stop")
-    cut = {name: getattr(orbit, name)[keep] for name in per_impact}
-    sections, modes = jtu.tree_map(lambda x: x[: int(orbit.cycles)], (orbit.sections, orbit.modes))
+    cut = {name: _first(getattr(orbit, name), int(orbit.impacts)) for name in per_impact}
+    cycles, kept = int(orbit.cycles), (orbit.sections, orbit.modes)
+    sections, modes = jtu.tree_map(lambda x: _first(x, cycles), kept)
     return dataclasses.replace(orbit, **cut, sections=sections, modes=modes)
+
+
+def _first(x: Array, number: int) -> Array:
+    return jnp.asarray(on_host(x)[:number])
 
 
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:
