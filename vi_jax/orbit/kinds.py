@@ -3,10 +3,10 @@
 import numpy as np
 
 from ..machine import RigidStop, SoftStop, clock_in_words
-from ._flight import Event
-from ._shooting import Shooting
-from ._sliding import SLIDING
-from ._solution import Step, since_section
+from .corrector import Step, since_section
+from .equations import Shooting
+from .flight import Event
+from .sliding import SLIDING
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"

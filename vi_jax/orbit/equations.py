@@ -44,10 +44,10 @@ from ..machine import (
     with_component,
     with_leaf,
 )
-from ._chatter import Chatter, escape_margin, last_hop, remaining
-from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
-from ._turns import Nearest, Path, pull_of, turns_of
+from .flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
+from .rest import Chatter, escape_margin, last_hop, remaining
 from .results import multipliers_of
+from .turns import Nearest, Path, pull_of, turns_of
 
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9

@@ -24,12 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._messages import count_of
-from ._conditions import Special, is_defective, sum_of_minors
-from ._follow import SAME_CURVE, Ending, Event, Table, bound_rows
-from ._local_map import LocalMap, NoLocalMapError, graze_at
-from ._motion_table import bifurcation_tests
-from ._shooting import ROUNDING, Shooting
-from ._solution import (
+from .branch_events import bifurcation_tests
+from .conditions import Special, is_defective, sum_of_minors
+from .corrector import (
     MOST_SAMPLES,
     SPACING,
     Step,
@@ -42,8 +39,9 @@ from ._solution import (
     locate_zero,
     on_host,
 )
-from ._surgery import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
-from ._words import (
+from .edit_events import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
+from .equations import ROUNDING, Shooting
+from .kinds import (
     AT_CODIMENSION_TWO,
     CROSSING,
     CUSP,
@@ -63,7 +61,9 @@ from ._words import (
     TORUS,
     TOUCHING,
 )
+from .local_map import LocalMap, NoLocalMapError, graze_at
 from .special import Point, point_at
+from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
 
 # The thresholds here are choices.
 

@@ -21,7 +21,7 @@ from .._programs import compiled
 from .._types import Flag, Scalar, State
 from ..flow import simulate
 from ..machine import frequency_ratio, own_modes, phase_at, with_modes
-from ._shooting import Shooting, Unknowns
+from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
 

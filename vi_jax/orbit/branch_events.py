@@ -34,13 +34,8 @@ from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, jumps_on_section, section_in
-from ._conditions import HeldMultiplier, in_one_parameter, rates_at
-from ._flight import LANDS, LEAVES, section_of
-from ._flight import Event as MotionEvent
-from ._follow import Ending, Event, Table, bound_rows
-from ._shooting import ROUNDING, Shooting, Unknowns
-from ._sliding import SLIDING, change_at, locate_change
-from ._solution import (
+from .conditions import HeldMultiplier, in_one_parameter, rates_at
+from .corrector import (
     SPACING,
     Step,
     advance,
@@ -51,7 +46,7 @@ from ._solution import (
     on_host,
     orbit_of,
 )
-from ._surgery import (
+from .edit_events import (
     ALIKE,
     ROUNDED,
     half_difference,
@@ -60,7 +55,10 @@ from ._surgery import (
     may_repeat,
     without_events,
 )
-from ._words import (
+from .equations import ROUNDING, Shooting, Unknowns
+from .flight import LANDS, LEAVES, section_of
+from .flight import Event as MotionEvent
+from .kinds import (
     CROSSING,
     DETAILS,
     DOUBLING,
@@ -79,7 +77,9 @@ from ._words import (
     place_in_words,
 )
 from .results import NEUTRAL, Orbit
+from .sliding import SLIDING, change_at, locate_change
 from .special import Point, further_of, point_at
+from .walk import Ending, Event, Table, bound_rows
 
 # These thresholds are choices; measured ones have the figure in the comment.
 
