@@ -429,6 +429,8 @@ def _run_file(options: argparse.Namespace) -> int:
 
 
 def _serve_page(options: argparse.Namespace) -> int:
+    if options.range and options.machine is None:
+        return _error("argument --range: only with --machine, whose sliders it sets", 2)
     if not 0 <= options.port <= 65535:
         return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
     if problem := missing():

@@ -179,6 +179,7 @@ class DryFriction(Friction):
         "level": NOT_NEGATIVE, "mass": POSITIVE, "static_ratio": Range(1.0, float("inf")),
     }  # fmt: skip
 
+    word: ClassVar = "friction"
     is_dry: ClassVar = True
     roundings: ClassVar = 4
 

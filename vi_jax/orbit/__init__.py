@@ -3,8 +3,8 @@
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
-from ._continuation import boundary, continue_orbit
-from ._cycle_map import CycleMap, cycle_map, map_state
+from .continuation import boundary, continue_orbit
+from .cycle_map import CycleMap, cycle_map, map_state
 from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium

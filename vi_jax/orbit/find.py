@@ -50,7 +50,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ._cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
+from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 

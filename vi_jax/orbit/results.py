@@ -29,10 +29,12 @@ from ..flow import (
 )
 from ..lanes import pin
 from ..machine import (
+    PLAIN,
     AbstractMachine,
     Summarized,
     angles_in,
     clock_word,
+    components,
     cycles_in_words,
     first_few,
     in_rows,
@@ -40,6 +42,7 @@ from ..machine import (
     is_autonomous,
     name_in,
     nearest_images,
+    overridden,
     plain,
     state_in_words,
     stops_of,
@@ -280,9 +283,11 @@ class Orbit(Summarized):
         return self.successful & inside & (self.slowest_impact > 0)
 
     def trajectory(
-        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8
-    ) -> Run:
-        """Return the motion over one period (or `cycles` drive cycles), sampled, for plots.
+        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8,
+        event_log: int = 0,
+    ) -> Run:  # fmt: skip
+        """Return the motion over one period (or `cycles` drive cycles), sampled, for plots. The
+        arguments are those of `simulate`.
 
         **Raises:** `ValueError` for a batch of orbits, or a guess that led to none.
         """
@@ -303,10 +308,11 @@ class Orbit(Summarized):
             period = int(self.cycles)
             each = period if cycles % period == 0 else cycles
             machine = machine.observed_every(self.duration * (each / period))
-            samples, impact_log, cycles = samples * each, impact_log * each, cycles // each
+            samples, impact_log, event_log = (each * n for n in (samples, impact_log, event_log))
+            cycles //= each
         return simulate(
             machine, self.state, cycles, method=self.method, samples=samples,
-            impact_log=impact_log,
+            impact_log=impact_log, event_log=event_log,
         )  # fmt: skip
 
     def to_xarray(
@@ -376,8 +382,8 @@ class Orbit(Summarized):
             room = in_unit(f"{float(self.clearance):.4g}", units, "position")
             lines.append(f"  clearance: {room}")
         lines.append(
-            f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
-            f"error of the search {float(self.error):.2g}"
+            f"  search: residual {float(self.residual):.2g} after {int(self.iterations)} steps, "
+            f"{float(self.error):.2g} from its solution; the method's error comes on top"
         )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
@@ -416,10 +422,12 @@ def hits_in_words(orbit: Orbit) -> str:
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
-    """Return the interval of the first coordinate, with its name in pictures."""
-    low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span = in_unit(f"[{low}, {high}]", units_of(orbit.machine), "position")
-    return f"{name_in(orbit.machine.labels[0])} in {span}"
+    """Return the interval of the first coordinate, with its name in pictures or in the state."""
+    machine, (low, high) = orbit.machine, (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
+    span, name = in_unit(f"[{low}, {high}]", units_of(machine), "position"), machine.labels[0]
+    if name == PLAIN[0] and overridden(machine, AbstractMachine, "position") is None:
+        name = next(iter(components(without_modes(orbit.state))))
+    return f"{name_in(name)} in {span}"
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:

@@ -62,9 +62,9 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
-from ._shooting import Shooting, Unknowns
-from ._solution import on_host, step_error
+from .corrector import on_host, step_error
+from .equations import Shooting, Unknowns
+from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
 
 

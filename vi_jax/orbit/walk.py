@@ -20,10 +20,10 @@ from .._checks import count, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from ._problem import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
-from ._shooting import Shooting
-from ._solution import Step, advance, distance_along, locate_zero, on_host, step_error
-from ._surgery import half_difference, repeats_from
+from .corrector import Step, advance, distance_along, locate_zero, on_host, step_error
+from .edit_events import half_difference, repeats_from
+from .equations import Shooting
+from .from_orbit import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
 from .special import Point
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.

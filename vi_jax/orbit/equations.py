@@ -44,10 +44,10 @@ from ..machine import (
     with_component,
     with_leaf,
 )
-from ._chatter import Chatter, escape_margin, last_hop, remaining
-from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
-from ._turns import Nearest, Path, pull_of, turns_of
+from .flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
+from .rest import Chatter, escape_margin, last_hop, remaining
 from .results import multipliers_of
+from .turns import Nearest, Path, pull_of, turns_of
 
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
@@ -126,8 +126,7 @@ class Observed(NamedTuple):
     @property
     def least_hold_force(self) -> float:
         """The least force on a body within its rest, relative to the motion's; within ±1."""
-        unit = self.length * (2 * np.pi / float(self.duration)) ** 2
-        return float(np.clip(self.pull.margin / unit, -1.0, 1.0))
+        return float(np.clip(self.pull.margin / self.pull.unit, -1.0, 1.0))
 
     @property
     def fastest(self) -> float:
@@ -248,6 +247,16 @@ class Shooting(eqx.Module):
     @property
     def rests(self) -> bool:
         return bool(self.landings or self.held)
+
+    @property
+    def stuck(self) -> tuple[int, ...]:
+        """Numbers of the events of dry frictions that hold their bodies all the time."""
+        return tuple(
+            number
+            for number, event in enumerate(events_of(self.machine))
+            if event.holds_mode and event.is_dry
+            and all(modes[mode_number(self.machine, number)] == 0 for modes in self.modes)
+        )  # fmt: skip
 
     @property
     def is_double(self) -> bool:
@@ -464,6 +473,9 @@ class Shooting(eqx.Module):
         for number, lands in self._landing(leg):
             state_on_stop = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
             u = jnp.where(lands, state_on_stop, u)
+        for number in self.stuck:  # else any slip would stay as it is
+            state = events_of(machine)[number].stopped(machine, begin.s, self.unravel(u))
+            u = ravel_pytree(state)[0]
         end, integrals, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
             integrals = {name: x + begin.integrals[name] for name, x in integrals.items()}
@@ -574,7 +586,7 @@ class Shooting(eqx.Module):
         Y = jnp.concatenate(positions)
         low, high, nearest, pull = turns
         i, j = jnp.argmin(nearest.margin), jnp.argmin(pull.margin)
-        nearest = jax.tree.map(lambda x: x[i], nearest)
+        nearest, pull = (jax.tree.map(lambda x, k=k: x[k], a) for a, k in ((nearest, i), (pull, j)))
         order_of_events = self._order_margin(machine, clock, ends - clock, states, sizes)
         totals = jax.tree.map(jnp.sum, integrals)
         time = totals.pop(TIME)
@@ -587,7 +599,7 @@ class Shooting(eqx.Module):
             y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
             nearest=nearest._replace(unit=sizes[i, nearest.event.astype(int)]),
-            pull=jax.tree.map(lambda x: x[j], pull),
+            pull=pull._replace(unit=sizes[j, pull.event.astype(int)] / self.sizes[0] ** 2),
             modes_agree=jnp.min(agree),
             order_margin=reduce(jnp.minimum, times_left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,
