@@ -416,7 +416,8 @@ def on_host(tree: Any) -> Any:
 def from_host(tree: Any) -> Any:
     """Return a tree of NumPy arrays and numbers as JAX arrays. `jnp.asarray` compiles a program for
     each shape."""
-    return jtu.tree_map(lambda x: jax.device_put(np.array(x)), tree)
+    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
+    return jtu.tree_map(put, tree)
 
 
 def by_numpy_if_known(method: Callable[[Any], Any]) -> Callable[[Any], Any]:

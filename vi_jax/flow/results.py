@@ -140,7 +140,8 @@ def member_of(kind: Any, number: Any) -> Any:
 
 def _at(x: Any, place: tuple) -> Any:
     """Return x[place], by NumPy if `x` is known and in this computer's memory."""
-    if isinstance(x, Tracer) or any(device.platform != "cpu" for device in x.devices()):
+    in_memory = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+    if not in_memory or any(device.platform != "cpu" for device in x.devices()):
         return x[place]
     return from_host(np.asarray(x)[place])
 
