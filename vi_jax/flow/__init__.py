@@ -13,7 +13,7 @@ from .arguments import (
     RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
 from .events import Rates, force_rate, guard_rates
-from .loop import row_sizes, sizes_on_host
+from .sizes import rounding_bounds, row_sizes, sizes_on_host
 from .methods import (
     AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,
     chosen, preset,
@@ -25,7 +25,7 @@ from .results import (
     Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
 )
 from .smooth import (
-    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means, rounding_bounds,
+    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means,
 )
 from .suggest import Suggestion, suggest_method
 

@@ -259,6 +259,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         labels=machine.labels,
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
+        history=lane.history,
         outcomes=outcomes_of(machine),
         **_outcome(machine, lane),
     )

@@ -326,6 +326,14 @@ class RESULTS(NamedEnumeration):
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
     )
+    jammed = (
+        "No motion with a closed contact or a sticking body fulfils Coulomb's law of friction, as "
+        "for a rod that is pushed into rough ground (Painlevé's paradox)."
+    )
+    full_history = (
+        "The steps within the longest delay are more than the history holds. Write a larger "
+        "`history_size` in the machine's class, such as `history_size = 1024`."
+    )
     ended = "An event of the machine ended the motion, with the outcome `Run.outcome`."
 
 
@@ -535,6 +543,8 @@ class Run(Summarized):
     """The state after the event, a pytree like the start; NaN without."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the outcomes with which events and stops of the machine end a motion."""
+    history: Any = None
+    """The history at the end, of a machine with delays, from which `last` continues."""
 
     @property
     def successful(self) -> jax.Array:
@@ -549,11 +559,13 @@ class Run(Summarized):
     @property
     def last(self) -> State:
         """The state on the last section: a start to continue from, or a guess for `find_orbit`. For
-        a machine with discrete modes it is a `HybridState`, which contains them."""
+        a machine with discrete modes or delays it is a `HybridState`, which contains them and the
+        history."""
         # Batch axes come before the axis of the sections, those of an array in the state after it.
         # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        return jtu.tree_map(lambda x: _at(x, place), with_modes(self.sections, self.modes))
+        last, modes = jtu.tree_map(lambda x: _at(x, place), (self.sections, self.modes))
+        return with_modes(last, modes, self.history)
 
     def mean_averages(self) -> dict[str, Scalar]:
         """Return the machine's own averages over the time of all cycles, of one lane."""

@@ -22,9 +22,9 @@ from .._types import Scalar, State
 from ..machine import AbstractMachine, convert_start, in_rows, longest_step, size_of, without_modes
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
-from .loop import row_sizes
 from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
 from .methods.verner import Verner9
+from .sizes import row_sizes
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -233,6 +233,8 @@ class Orbit(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
     `AbstractMachine.averages`)."""
+    modes: tuple[Float[Array, "... cycles"], ...] = ()
+    """The machine's own modes on the sections (see `AbstractMachine.modes`)."""
 
     @property
     @by_numpy_if_known
@@ -331,6 +333,8 @@ class Orbit(Summarized):
         per_impact = ("impact_phase", "impact_speed", "impact_stop")
         variables = states("section", self.sections, (*batch, "section"))
         variables |= states("section", self.quantities, (*batch, "section"))
+        modes = {f"mode_{i}": x for i, x in enumerate(self.modes)}
+        variables |= states("section", modes, (*batch, "section"))
         variables |= present({name: getattr(self, name) for name in scalars} | self.averages, batch)
         variables |= present({name: getattr(self, name) for name in per_impact}, (*batch, "impact"))
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
@@ -440,8 +444,9 @@ def trimmed(orbit: Orbit) -> Orbit:
         return orbit
     per_impact = ("impact_phase", "impact_speed", "impact_stop")
     cut = {name: _first(getattr(orbit, name), int(orbit.impacts)) for name in per_impact}
-    sections = jtu.tree_map(lambda x: _first(x, int(orbit.cycles)), orbit.sections)
-    return dataclasses.replace(orbit, **cut, sections=sections)
+    cycles, kept = int(orbit.cycles), (orbit.sections, orbit.modes)
+    sections, modes = jtu.tree_map(lambda x: _first(x, cycles), kept)
+    return dataclasses.replace(orbit, **cut, sections=sections, modes=modes)
 
 
 def _first(x: Array, number: int) -> Array:
@@ -455,6 +460,23 @@ def distance(here: Any, there: Any, unit: Any = 1) -> Any:
     whether two states, or two motions, are the same; `unit` are their `row_sizes`.
     """
     return (abs(here - there) / (unit + abs(there))).max(axis=-1)
+
+
+class MotionSections(NamedTuple):
+    """The sections of periodic motions: of one, or of several with equal periods."""
+
+    states: Float[np.ndarray, "... cycles states"]
+    modes: Float[np.ndarray, "... cycles modes"]
+    """The machine's own modes there."""
+
+    def passes(
+        self, state: np.ndarray, modes: np.ndarray, sizes: Any, angles: np.ndarray | None,
+        tolerance: float,
+    ) -> Bool[np.ndarray, "..."]:  # fmt: skip
+        """Return whether each motion passes through a state in these modes, on any section: then
+        the motion from there is the same one. `sizes` and `tolerance` as in `distance`."""
+        near = distance(nearest_images(angles, self.states, state), state, sizes) <= tolerance
+        return (near & (self.modes == modes).all(axis=-1)).any(axis=-1)
 
 
 class Orbits(list[Orbit]):
@@ -483,7 +505,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     Host-side: not to be traced.
 
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
-    their sections agree to `tolerance`, relative to the size of each component of the state.
+    their sections agree to `tolerance`, relative to the size of each component of the state, and
+    the machine's modes there are equal.
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
     each on the section on which it was first found; and the number of searches that found each.
@@ -499,7 +522,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     """Return the different motions in several batches of searches, possibly for different periods,
     and the number of searches of each batch that found each, (motions, batches)."""
     chosen: list[Orbit] = []
-    paths: list[tuple[np.ndarray, np.ndarray]] = []
+    paths: list[tuple[MotionSections, np.ndarray]] = []
     counts: list[np.ndarray] = []
     for batch, orbits in enumerate(batches):
         shape = orbits.residual.shape
@@ -511,29 +534,33 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
         found = in_one_row(orbits.successful)
         flat = jtu.tree_map(in_one_row, orbits)
         sections, cycles = np.asarray(in_rows(flat.sections, 2)), flat.cycles
+        modes = np.zeros((*sections.shape[:2], 0))
+        modes = np.stack(flat.modes, axis=-1) if flat.modes else modes
         angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))
         for i in np.flatnonzero(found):
-            path = sections[i, : cycles[i]]
+            path = MotionSections(sections[i, : cycles[i]], modes[i, : cycles[i]])
             j = _index_of(paths, path, tolerance, angles)
             if j == len(paths):
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
-                paths.append((path, sizes_on_host(chosen[j].machine, chosen[j].state, path)))
+                sizes = sizes_on_host(chosen[j].machine, chosen[j].state, path.states)
+                paths.append((path, sizes))
                 counts.append(np.zeros(len(batches), int))
             counts[j][batch] += 1
-    order = sorted(range(len(chosen)), key=lambda j: (len(paths[j][0]), float(chosen[j].y_min)))
+    order = sorted(
+        range(len(chosen)), key=lambda j: (int(chosen[j].cycles), float(chosen[j].y_min))
+    )
     table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
     return Orbits(chosen[j] for j in order), table
 
 
 def _index_of(
-    paths: list[tuple[np.ndarray, np.ndarray]], path: np.ndarray, tolerance: float,
+    paths: list[tuple[MotionSections, np.ndarray]], path: MotionSections, tolerance: float,
     angles: np.ndarray | None,
 ) -> int:  # fmt: skip
     """Return the index of a motion among the known ones, from any of its sections on, or their
     number. `paths` holds the sections of each, and the sizes of their components."""
     for j, (other, sizes) in enumerate(paths):
-        if len(other) == len(path):
-            here = nearest_images(angles, path[0], other)
-            if distance(here, other, sizes).min() <= tolerance:
+        if len(other.states) == len(path.states):
+            if other.passes(path.states[0], path.modes[0], sizes, angles, tolerance):
                 return j
     return len(paths)

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 from ..._checks import count, require
 from ..._types import Scalar, State
 from ...lanes import pin
-from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals, unit_of
+from ..sizes import unit_of
+from ..smooth import TIME, Integrals, SmoothMachine, rate_of_integrals
 from .base import AbstractMethod, Stage, has_relaxation
 from .verner import Verner9
 
@@ -345,7 +346,7 @@ class Adaptive(_RungeKutta):
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, its error norm (root mean square over the
         components of the state and the integrals of averages), and its stages."""
-        rtol, atol, floor = self._tolerances(s0)
+        rtol, atol, floor = self.tolerances(s0)
         solver = self.solver
         if solver.implicit:
             solver = _implicit_solver(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
@@ -363,7 +364,7 @@ class Adaptive(_RungeKutta):
         norm = jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
         return new, integrals, norm, stages
 
-    def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
+    def tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
         """Return rtol, atol and the floor of both, below which rounding would reject all steps."""
         floor = 8 * float(jnp.finfo(like.dtype).eps)
         rtol = jnp.maximum(jnp.asarray(self.rtol, like.dtype), floor)
@@ -373,12 +374,12 @@ class Adaptive(_RungeKutta):
     def guard_error(self, stages, values, h, longest, *, acts, size):
         """Return the error of a component whose rate is the guard, such as the impulse of a force
         that holds a body. A guard that is not such a force has the tolerance 1e-6."""
-        rtol, atol, _ = self._tolerances(h)
+        rtol, atol, _ = self.tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
         error = jnp.sum(np.asarray([x.weight for x in stages]) * values)
-        atol = atol if isinstance(size, float) else atol * size
+        atol = atol if isinstance(size, float) and size == 1.0 else atol * size
         if self.sizes is not None:
             atol = atol * functools.reduce(jnp.maximum, map(jnp.max, jtu.tree_leaves(self.sizes)))
         return jnp.abs(h * error) / (atol + rtol * longest * jnp.max(jnp.abs(values)))
@@ -449,7 +450,8 @@ class FixedStep(_RungeKutta):
         # For bodies at rest in zero only rounding is left.
         rounding = float(jnp.finfo(h.dtype).eps) ** 0.5
         before, after = (jnp.maximum(_size(x), rounding) for x in ends)
-        if not isinstance(unit, float):  # in other units of time rates are much larger, or smaller
+        # In other units of time rates are much larger, or smaller.
+        if not (isinstance(unit, float) and unit == 1.0):
             after = jnp.maximum(after, jnp.where(unit == 1, 0.0, unit * _size(slopes[0])))
 
         def unstable(size, h, slopes):
