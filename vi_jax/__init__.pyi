@@ -4,6 +4,7 @@ and type checkers take their types from here."""
 from . import machines as machines
 from . import plot as plot
 from ._messages import Interrupted as Interrupted
+from ._programs import keep_programs as keep_programs
 from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod

@@ -29,6 +29,7 @@ from matplotlib.figure import Figure
 from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted, installed_version
+from .._programs import keep_programs
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
 from ..flow import Run, RunOptions, make_plan, simulate
@@ -378,6 +379,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         options = _parser().parse_args(argv)
         jax.config.update("jax_enable_x64", True)
+        if argv is None:  # a process of its own
+            keep_programs()
         code = options.run(options)
         sys.stdout.flush()
         return code

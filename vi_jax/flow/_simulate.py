@@ -144,6 +144,15 @@ def simulate(
     return raised(run, run.failed, "The simulation failed", run.result) if throw else run
 
 
+def simulate_states(machine: AbstractMachine, start: State, cycles: int, **options: Any) -> Run:
+    """Simulate as `simulate`, within a program. Only the states of the run have derivatives, which
+    keeps a program of values and derivatives small. `options` are those of `RunOptions`."""
+    plan, start = make_plan(machine, start, cycles, RunOptions(**options))
+    plan = dataclasses.replace(plan, constant_records=True)
+    run = collect(plan, options.get("samples", 0) > 0, *run_lane(plan, start))
+    return failed_derivatives(run)
+
+
 @compiled
 def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
     return failed_derivatives(collect(plan, sampled, *run_lane(plan, start)))

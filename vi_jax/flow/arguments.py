@@ -18,6 +18,7 @@ from .._checks import (
     count,
     fits_records,
     flag,
+    from_host,
     instance_of,
     named_leaves,
     narrow,
@@ -241,7 +242,7 @@ def _checked_settle(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Arr
                 f"Arguments `settle` and `cycles` must add up to at most {most} cycles (of {parts} "
                 f"interval(s) each), the most that {dtype} can count, but got {settle} + {cycles}."
             )
-        return jnp.asarray(settle, dtype)
+        return from_host(np.asarray(settle, dtype))
     settle = jnp.asarray(settle)
     is_valid = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
     return jnp.where(is_valid, settle.astype(dtype), jnp.nan)

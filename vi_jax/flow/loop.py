@@ -249,6 +249,8 @@ def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
     plan = eqx.combine(inputs[0], rest)
     lane, completed, record = iterate(plan, lane)
+    if plan.constant_records:
+        lane, record = lane._replace(record=stop_gradient(lane.record)), stop_gradient(record)
     is_recorded = completed & (lane.done >= plan.settle)
     active = _is_active(plan, lane)
     if plan.stop is not None:

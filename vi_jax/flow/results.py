@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .._checks import array_module, concrete, one_of
+from .._checks import array_module, concrete, from_host, one_of
 from .._messages import count_of
 from .._types import Scalar, State, xr
 from ..machine import (
@@ -53,7 +53,7 @@ else:
             if known[0] is None or known[1] is None:
                 return jnp.equal(self.number, other.number)
             same = np.asarray(np.equal(*known))
-            return jnp.asarray(same) if isinstance(self.number, jax.Array) else same
+            return from_host(same) if isinstance(self.number, jax.Array) else same
 
         def __ne__(self, other):
             return ~(self == other)
@@ -136,6 +136,14 @@ def number_of(member: Any) -> Int[Array, "..."]:
 def member_of(kind: Any, number: Any) -> Any:
     """Return the member of an enumeration with this index; one for each lane."""
     return _Member(jnp.asarray(number, jnp.int32), kind)
+
+
+def _at(x: Any, place: tuple) -> Any:
+    """Return x[place], by NumPy if `x` is known and in this computer's memory."""
+    in_memory = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+    if not in_memory or any(device.platform != "cpu" for device in x.devices()):
+        return x[place]
+    return from_host(np.asarray(x)[place])
 
 
 class EventKind(enum.IntEnum):
@@ -556,7 +564,7 @@ class Run(Summarized):
         # Batch axes come before the axis of the sections, those of an array in the state after it.
         # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        last, modes = jtu.tree_map(lambda x: x[place], (self.sections, self.modes))
+        last, modes = jtu.tree_map(lambda x: _at(x, place), (self.sections, self.modes))
         return with_modes(last, modes, self.history)
 
     def mean_averages(self) -> dict[str, Scalar]:

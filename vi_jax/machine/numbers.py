@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._checks import on_host
+from .._checks import from_host, on_host
 from .._types import Machine, Scalar, State
 from .declared import warn_of_unread
 
@@ -101,7 +101,9 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
             f"{jnp.shape(old)}; name one of its numbers, as {name + str([0] * jnp.ndim(old))!r}."
         )
     else:
-        leaves[arrays[number]] = jnp.asarray(value, kind)
+        is_array = isinstance(value, jax.Array)
+        new = jnp.asarray(value, kind) if is_array else from_host(np.asarray(value, kind))
+        leaves[arrays[number]] = new
     return jtu.tree_unflatten(treedef, leaves)
 
 

@@ -8,7 +8,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import flag, given_number, instance_of, interval, one_of, short, tuple_of_names
+from .._checks import (
+    flag,
+    from_host,
+    given_number,
+    instance_of,
+    interval,
+    one_of,
+    short,
+    tuple_of_names,
+)  # fmt: skip
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf, may_rest
 from .boundary_events import Intervals, SpecialTable
@@ -104,7 +113,7 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if bool(orbit.rests > 0) or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
+    if int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
         problem, x = resting_problem_of(orbit, parameter, bounds, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
@@ -216,7 +225,7 @@ def _check_watched(
 
 def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
     """Set the sizes of the parameters, half the widths of their intervals."""
-    widths = jnp.asarray([0.5 * (high - low) for low, high in ranges])
+    widths = from_host(np.array([0.5 * (high - low) for low, high in ranges]))
     return dataclasses.replace(problem, widths=widths)
 
 

@@ -277,7 +277,7 @@ class Shooting(eqx.Module):
         return tuple(found[self.legs :])
 
     def at(self, x: Unknowns) -> AbstractMachine:
-        x = jnp.asarray(x)
+        x = x if isinstance(x, np.ndarray) else jnp.asarray(x)
         n = x.shape[0]
         return self._with_parameters([x[i] for i in range(n - len(self.parameters), n)])
 
@@ -301,19 +301,23 @@ class Shooting(eqx.Module):
 
     def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Return clock and state at the start of each leg (before its event)."""
-        legs, x = self.legs, jnp.asarray(x)
+        return self._parts(jnp, jnp.asarray(x))
+
+    def _parts(self, array: Any, x: Any) -> tuple[Any, Any]:
+        legs = self.legs
         if not self.events:
-            return jnp.zeros((1,), x.dtype), x[: self.states][None]
+            return array.zeros((1,), x.dtype), x[: self.states][None]
         end = legs * (1 + self.states)
         clock = x[:legs]
         if self.autonomous:
-            clock = jnp.concatenate([jnp.zeros((1,), x.dtype), clock[1:]])
+            clock = array.concatenate([array.zeros((1,), x.dtype), clock[1:]])
         return clock, x[legs:end].reshape(legs, self.states)
 
     def values(self, x: Unknowns) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the `parts` and the period of a solution; host-side."""
-        clock, states = self.parts(x)
-        return np.asarray(clock), np.asarray(states), float(self.period(x))
+        x = np.asarray(x)
+        period = x[0] if self.autonomous else float(self.at(x).cycle) * self.cycles
+        return *self._parts(np, x), float(period)
 
     def lengths(self, x: Unknowns) -> np.ndarray:
         """Return the duration of each leg by the clock; host-side."""
@@ -343,7 +347,7 @@ class Shooting(eqx.Module):
     @property
     def radian(self) -> float:
         """The size of the clock, a cycle through 2π; host-side."""
-        return float(self.sizes[0])
+        return float(np.asarray(self.sizes)[0])
 
     def half_scale(self) -> np.ndarray:
         """Return the sizes of the clocks and states of half a period; host-side."""

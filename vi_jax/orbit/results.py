@@ -11,7 +11,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._checks import array_module, by_numpy_if_known, concrete, given_number, on_host, short
+from .._checks import (
+    array_module,
+    by_numpy_if_known,
+    concrete,
+    from_host,
+    given_number,
+    on_host,
+    short,
+)
 from .._messages import count_of
 from .._types import State, xr
 from ..flow import (
@@ -80,7 +88,7 @@ def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*ba
     else:
         values = np.linalg.eigvals(safe).astype(np.result_type(known.dtype, np.complex64))
     values = np.take_along_axis(values, np.argsort(-abs(values), axis=-1, kind="stable"), axis=-1)
-    return jnp.asarray(np.where(finite[..., 0], values, np.nan))
+    return from_host(np.where(finite[..., 0], values, np.nan))
 
 
 def _multipliers(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
@@ -410,7 +418,8 @@ def _advice(orbit: Orbit) -> str:
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
     x, machine = without_modes(orbit.state), orbit.machine
-    bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
+    stops = map(on_host, stops_of(machine))
+    bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops)
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 
@@ -449,7 +458,7 @@ def trimmed(orbit: Orbit) -> Orbit:
 
 
 def _first(x: Array, number: int) -> Array:
-    return jnp.asarray(on_host(x)[:number])
+    return from_host(on_host(x)[:number])
 
 
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:
