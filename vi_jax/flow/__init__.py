@@ -10,6 +10,7 @@ from ._simulate import compiling, jit, simulate, simulate_pool
 from .arguments import (
     RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
+from .history import history_of_function
 from .events import Rates, force_rate, guard_rates
 from .loop import row_sizes, sizes_on_host
 from .methods import (
@@ -23,6 +24,6 @@ from .results import (
     Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
 )
 from .smooth import (
-    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means, rounding_bounds,
+    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means, rounding_bounds, unit_of,
 )
 from .suggest import Suggestion, suggest_method

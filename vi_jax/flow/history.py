@@ -11,6 +11,7 @@ Pieces have the clock's derivatives at their ends; the image of a jump has those
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,7 +36,7 @@ from ..machine import (
     size_of,
     without_past,
 )
-from .smooth import SmoothMachine, unit_of
+from .smooth import SmoothMachine
 
 # The numbers of a piece besides its coefficients: its start since that of the piece before; and the
 # level of a jump at its start, or -1, with the derivative of the jump's time relative to the start.
@@ -197,16 +198,17 @@ def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
     return int(min(_FEWEST + _PER_CYCLE * max(lengths) / cycle, 1e5)) | 1
 
 
-def _from_before(
-    machine: AbstractMachine, form: Recorded, before: Any, lags: list[Any], most: int
-) -> History:
-    """Return a history of one constant piece, or of `most` of equal length if it is a function."""
-    longest, unit = functools.reduce(jnp.maximum, lags), unit_of(machine)
-    number = most if callable(machine.before) else 1
-    length = longest * (1 + 1e-6) / number
+def _longest(lags: list[Scalar]) -> Scalar:
+    return functools.reduce(jnp.maximum, lags)
 
-    def record(t: Scalar) -> Vector:
-        return form.pack(before(t))
+
+def history_of_function(
+    record: Callable[[Scalar], Vector], longest: Scalar, unit: Any, number: int, delays: int,
+    room: int,
+) -> History:  # fmt: skip
+    """Return the history of the recorded numbers as a function of t ≤ 0, in `number` pieces of
+    equal length over the `longest` of some delays, with room for so many pieces."""
+    length = longest * (1 + 1e-6) / number
 
     def piece(n: Scalar) -> Array:
         ends = [_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0)]
@@ -214,8 +216,9 @@ def _from_before(
         return jnp.concatenate([head, _in_time(hermite(*ends, length), length, unit)])
 
     rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
+    rows = jnp.concatenate([rows, jnp.zeros((room - number, rows.shape[1]), rows.dtype)])
     zero = jnp.zeros_like(longest)
-    nothing = (zero,) * len(lags)
+    nothing = (zero,) * delays
     return History(rows, zero + number, -length, zero, zero, nothing, nothing, zero + unit)
 
 
@@ -249,10 +252,15 @@ def begun(plan: Any, start: State, s: Scalar) -> History:
     if given is None:
         before, lags = history_before(machine, start), delays_in(machine).values()
         lags, most = [jnp.asarray(x, s.dtype) for x in lags], min(_BEFORE, memory.pieces // 2)
-        given = _from_before(machine, memory.form, before, lags, most)
-    missing = memory.pieces - given.rows.shape[0]
-    rows = jnp.concatenate([given.rows, jnp.zeros((missing, given.rows.shape[1]), s.dtype)])
-    given = given._replace(rows=rows)
+        number, longest = most if callable(machine.before) else 1, _longest(lags)
+        given = history_of_function(
+            lambda t: memory.form.pack(before(t)),
+            longest,
+            plan.unit,
+            number,
+            len(lags),
+            memory.pieces,
+        )
     order, begins, exists = given.in_order()
     places, starts = [], []
     for delay in delays_in(machine).values():

@@ -14,15 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
 
 from .._checks import concrete
 from .._types import Machine, Scalar, Scalars, State, Vector
 from ..lanes import dependent_results
 from .base import cached_in_trace
 from .contacts import call_checked, check_takes, field_in, shown_modes
-from .declared import others_of, overridden, switches_of, with_static
-from .events import Reset, Switch, after_event, begin_modes, events_of, guard_of, section_number
+from .declared import overridden, switches_of, with_static
+from .events import Reset, Switch, after_event, begin_modes, guard_of, section_number
 from .state import State as Named
 from .state import like
 

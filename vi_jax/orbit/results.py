@@ -204,6 +204,9 @@ class Orbit(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
     `AbstractMachine.averages`)."""
+    delay_error: Float[Array, ""] | None = None
+    """Of a machine with delays: the difference of the state from that of a run with the whole
+    history, which a stable motion settles on, relative to the size of each component."""
 
     @property
     def successful(self) -> Bool[Array, "..."]:
@@ -353,6 +356,12 @@ class Orbit(Summarized):
             f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
             f"error of the search {float(self.error):.2g}"
         )
+        if self.delay_error is not None:
+            lines.append(
+                f"  history at nodes: a run with the whole history differs by "
+                f"{float(self.delay_error):.2g}"
+                f"{'' if bool(self.stable) else ', since it departs from an unstable motion'}"
+            )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
 
