@@ -53,7 +53,7 @@ from ._machine_checks import (
 )
 from ._step.hybrid import iterate
 from .events import Rates, force_rate, rates
-from .history import begun, is_covered, with_sizes, with_view
+from .history import begun, is_covered, with_sizes, with_some_past, with_view
 from .noise import in_modes_of
 from .results import code
 from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
@@ -86,6 +86,7 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     is zero to rounding, and for a machine whose numbers are about 1 by definition. States are
     compared relative to these sizes."""
     state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(start))  # integers too
+    machine = with_some_past(machine, state)
     row, unravel = ravel_pytree(stop_gradient(state))
     if scales_known(machine):
         return jnp.ones_like(row)

@@ -5,6 +5,7 @@
 # fmt: off
 from ._continuation import boundary, continue_orbit
 from ._cycle_map import CycleMap, cycle_map, map_state
+from ._delay import as_chain
 from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
