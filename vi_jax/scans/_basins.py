@@ -34,6 +34,7 @@ from ..machine import (
     check_leaf,
     components,
     cycles_in_words,
+    has_delays,
     in_rows,
     in_words,
     is_angle,
@@ -327,7 +328,8 @@ def basins(
     )  # fmt: skip
     kept = partial(interrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
-        return _find_basins(data, machine, begin, apart=apart, longest=longest, method=method)
+        more: Any = {"apart": apart, "longest": longest, "method": method, "settle": settle}
+        return _find_basins(data, machine, begin, **more)
 
 
 def _find_basins(
@@ -338,9 +340,10 @@ def _find_basins(
     apart: float,
     longest: int,
     method: AbstractMethod,
+    settle: int,
 ) -> Basins:
     """Return the basins in the result of `_scan_starts`; `begin` has all other components."""
-    label, motions = _label_lanes(data, machine, begin, apart, longest, method)
+    label, motions = _label_lanes(data, machine, begin, apart, longest, method, settle)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
     for number, motion in enumerate(motions):
@@ -460,7 +463,7 @@ def starts_in(
 
 def _label_lanes(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
-    method: AbstractMethod,
+    method: AbstractMethod, settle: int,
 ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
     """Return labels, and each motion's section states (period, components), most lanes first."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
@@ -491,13 +494,26 @@ def _label_lanes(
         motion_of_cell[i] = len(motions)
         section_state = with_leaves(begin, dict(zip(names, state, strict=True)))
         # The same number of cycles for all periods, for one compiled program.
-        run = simulate(machine, section_state, longest, method=method)
+        again = 0
+        if has_delays(machine):  # the state alone is not a point of the motion
+            section_state, again = _start_of_lane(data, begin, axis_names, lane), settle
+        run = simulate(machine, section_state, longest, settle=again, method=method)
         motions.append(np.asarray(in_rows(run.sections))[1 : p + 1])
         known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, motion_of_cell[i]]
     found = motion_of_cell[inverse.ravel()]
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
     return label, [motions[i] for i in order]
+
+
+def _start_of_lane(data: "xr.Dataset", begin: State, names: list[str], lane: int) -> State:
+    """Return the start of a lane of a scan over starts."""
+    period, found = data["period"], {}
+    for name in names:
+        if name in data.coords:
+            row = data[name].broadcast_like(period).transpose(*period.dims)
+            found[name] = float(row.values.ravel()[lane])
+    return start_with(begin, found)
 
 
 # Sections of a motion move less than this share of the region between two values. A choice.
@@ -645,7 +661,8 @@ def integrity_profile(
             current = with_leaf(machine, parameter, value)
             begin = current.start() if start is None else start
             part = data.isel({parameter: i}).load()
-            result = _find_basins(part, current, begin, apart=apart, longest=longest, method=method)
+            more = {"apart": apart, "longest": longest, "method": method, "settle": settle}
+            result = _find_basins(part, current, begin, **more)
             found.append(result)
             integrity.append(result.integrity(scales=scales))
             report(1)
