@@ -12,6 +12,7 @@ from ._simulate import compiling, jit, simulate, simulate_pool, simulate_states
 from .arguments import (
     RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
+from .history import history_of_function, with_first_history
 from .events import Rates, force_rate, guard_rates
 from .sizes import rounding_bounds, row_sizes, sizes_on_host
 from .methods import (

@@ -66,7 +66,7 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._quantities import average_names, check_units, quantity_names
-from .history import with_history
+from .history import check_delays, with_history, with_some_past
 from .methods import AbstractMethod, MethodLike, chosen
 from .sizes import rounding_bounds
 
@@ -153,9 +153,10 @@ def make_plan(
     start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)
-    method.check(machine)
     if has_delays(machine):
+        check_delays(machine, method)
         machine, memory = with_history(machine, as_floats(machine, start), history)
+    method.check(machine)
     if samples and is_autonomous(machine, start):
         raise ValueError(
             "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
@@ -396,6 +397,7 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     start."""
     check_reals("start", start)
     start = as_floats(machine, start)  # derivatives of a coordinate need them
+    machine = with_some_past(machine, start)
     shape = shape_of("start", machine, start)
     if shape:
         raise ValueError(

@@ -11,6 +11,7 @@ Pieces have the clock's derivatives at their ends; the image of a jump has those
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,16 +26,23 @@ from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
     FixedPast,
+    HybridState,
     Recorded,
     delays_in,
     delays_valid,
     form_of,
+    has_delays,
     history_before,
+    history_of,
+    modes_of,
     reading,
     recorded_numbers,
+    renews,
     size_of,
+    without_modes,
     without_past,
 )
+from .methods import AbstractMethod, ExactFlight, Taylor
 from .sizes import unit_of
 from .smooth import SmoothMachine
 
@@ -180,6 +188,39 @@ def with_history(
     return bound, Memory(form, pieces, jnp.ones(form.size, dtype))
 
 
+def check_delays(machine: AbstractMachine, method: AbstractMethod) -> None:
+    """**Raises:** `ValueError` for a machine with delays and what they do not work with."""
+    kind = type(machine).__name__
+    if isinstance(method, Taylor | ExactFlight):
+        raise ValueError(
+            f"Argument `method` must be `Adaptive` or `FixedStep` for a {kind}, which has delays, "
+            f"but is {method!r}."
+        )
+    if renews(machine):
+        raise ValueError(
+            f"A {kind} must not have both `delays` and `renewed`, since its history would jump. "
+            "Leave `renewed` out, and use differences of the drifting component."
+        )
+
+
+def with_some_past(machine: AbstractMachine, start: State) -> AbstractMachine:
+    """Return a machine with its history at the start as its past, for checks; unchanged without
+    delays."""
+    return with_history(machine, start, None)[0] if has_delays(machine) else machine
+
+
+def with_first_history(machine: AbstractMachine, start: State) -> State:
+    """Return a start with its history; unchanged without delays."""
+    if not has_delays(machine) or history_of(start) is not None:
+        return start
+    state = without_modes(start)
+    bound, memory = with_history(machine, state, None)
+    dtype = jnp.result_type(float, *jax.tree.leaves(state))
+    history = _first_history(machine, memory, state, dtype, unit_of(bound))
+    history = jax.tree.map(lambda x: jnp.asarray(x, dtype), history)
+    return HybridState(state, modes_of(start) or (), history)
+
+
 def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
     """Return the size of a ring: the machine's `history_size`, or from its longest delay."""
     size = getattr(machine, "history_size", None)
@@ -198,16 +239,24 @@ def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
     return int(min(_FEWEST + _PER_CYCLE * max(lengths) / cycle, 1e5)) | 1
 
 
-def _from_before(
-    machine: AbstractMachine, form: Recorded, before: Any, lags: list[Any], most: int
+def _first_history(
+    machine: AbstractMachine, memory: Memory, start: State, dtype: Any, unit: Any
 ) -> History:
-    """Return a history of one constant piece, or of `most` of equal length if it is a function."""
-    longest, unit = functools.reduce(jnp.maximum, lags), unit_of(machine)
-    number = most if callable(machine.before) else 1
-    length = longest * (1 + 1e-6) / number
+    """Return the history before a start: one constant piece, or many if it is a function."""
+    before, lags = history_before(machine, start), delays_in(machine).values()
+    longest = functools.reduce(jnp.maximum, [jnp.asarray(x, dtype) for x in lags])
+    number = min(_BEFORE, memory.pieces // 2) if callable(machine.before) else 1
+    record = lambda t: memory.form.pack(before(t))
+    return history_of_function(record, longest, unit, number, len(lags), memory.pieces)
 
-    def record(t: Scalar) -> Vector:
-        return form.pack(before(t))
+
+def history_of_function(
+    record: Callable[[Scalar], Vector], longest: Scalar, unit: Any, number: int, delays: int,
+    room: int,
+) -> History:  # fmt: skip
+    """Return the history of the recorded numbers as a function of t ≤ 0, in `number` pieces of
+    equal length over the `longest` of some delays, with room for so many pieces."""
+    length = longest * (1 + 1e-6) / number
 
     def piece(n: Scalar) -> Array:
         ends = [_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0)]
@@ -215,8 +264,9 @@ def _from_before(
         return jnp.concatenate([head, _in_time(hermite(*ends, length), length, unit)])
 
     rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
+    rows = jnp.concatenate([rows, jnp.zeros((room - number, rows.shape[1]), rows.dtype)])
     zero = jnp.zeros_like(longest)
-    nothing = (zero,) * len(lags)
+    nothing = (zero,) * delays
     return History(rows, zero + number, -length, zero, zero, nothing, nothing, zero + unit)
 
 
@@ -248,12 +298,7 @@ def begun(plan: Any, start: State, s: Scalar) -> History:
     """Return the history of a lane at its start, with the places of its delays."""
     memory, given, machine = plan.memory, plan.history, without_past(plan.machine)
     if given is None:
-        before, lags = history_before(machine, start), delays_in(machine).values()
-        lags, most = [jnp.asarray(x, s.dtype) for x in lags], min(_BEFORE, memory.pieces // 2)
-        given = _from_before(machine, memory.form, before, lags, most)
-    missing = memory.pieces - given.rows.shape[0]
-    rows = jnp.concatenate([given.rows, jnp.zeros((missing, given.rows.shape[1]), s.dtype)])
-    given = given._replace(rows=rows)
+        given = _first_history(machine, memory, start, s.dtype, plan.unit)
     order, begins, exists = given.in_order()
     places, starts = [], []
     for delay in delays_in(machine).values():

@@ -158,6 +158,11 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
     in the state `start`."""
     if not isinstance(noise, WhiteNoise):
         raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
+    if machine.delays:
+        raise ValueError(
+            f"Argument `noise` must be left out for a {type(machine).__name__}, which has delays: "
+            "impulses would leave a jump in its history at each instant."
+        )
     _check_machine(machine, start)
     amplitudes, functions = _by_leaf(start, noise)
     _check_velocities(machine, start, amplitudes)

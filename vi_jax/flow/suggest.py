@@ -135,7 +135,8 @@ def suggest_method(
         tried = [] if stiff else _fixed(bench, error)
         tried += _until(bench, error, _adaptive(Verner9()))
         tried += _until(bench, error, _adaptive(_stiff_solver())) if stiff else []
-        with contextlib.suppress(NotImplementedError):  # a primitive has no recursion
+        series = contextlib.suppress(NotImplementedError)  # a primitive has no recursion
+        with series if not machine.delays else contextlib.suppress(ValueError):
             tried += _until(bench, error, _series(error))
     accurate = [t for t in tried if t.error <= error]
     timed = bench.measure_times(accurate)

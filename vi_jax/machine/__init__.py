@@ -30,7 +30,7 @@ from .delay import (
     FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
     recorded_numbers, without_past,
 )
-from .delay_chain import delay_chain
+from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
     SliderCrank,

@@ -16,6 +16,7 @@ from .base import AbstractMachine, cached_in_trace
 from .contacts import check_takes
 from .declared import overridden, with_static
 from .delay import (
+    FixedPast,
     Recorded,
     WithPast,
     as_state,
@@ -28,7 +29,7 @@ from .delay import (
     recorded_numbers,
     values_of,
 )
-from .events import history_of, modes_of, with_modes, without_modes
+from .events import begin_modes, history_of, modes_of, with_modes, without_modes
 from .state import State as Named
 
 _NAME = "history"
@@ -40,15 +41,6 @@ class ChainForm(eqx.Module):
     form: Recorded
     nodes: int = eqx.field(static=True)
     elements: int = eqx.field(static=True)
-
-
-class _Held(eqx.Module):
-    """The past of one instant, as a function of `s`."""
-
-    past: Any
-
-    def __call__(self, s: Scalar) -> Any:
-        return self.past
 
 
 def delay_chain(
@@ -144,17 +136,19 @@ def _events(machine: Any, name: str) -> tuple[Any, ...]:
     return tuple(given_past(x, _WithChain) for x in getattr(original(machine), name))
 
 
+def machine_of_chain(machine: Any) -> Any:
+    """Return the machine with delays of a chain, or `None` for another machine."""
+    return original(machine) if hasattr(machine, "_chain") else None
+
+
 def without_history(state: Any) -> Any:
     """Return the machine's own part of a state of a chain."""
     return Named(**{name: x for name, x in vars(state).items() if name != _NAME})
 
 
 def _with_rates(machine: Any, flow: Any, s: Scalar, state: Any, modes: Any) -> Any:
-    """Return the rate of a state of a chain: `flow`, and that of its history by the transport
-    equation."""
-    chain, h = machine._chain, state.history
-    held = with_static(machine, _past=_Held(past_in(machine, state)))
-    now = recorded_numbers(held, chain.form, s, without_history(state), modes)
+    """Return the rate of a state of a chain: `flow`, and that of its history by transport."""
+    chain, h, now = machine._chain, state.history, _now(machine, s, state, modes)
     p, length = chain.nodes, _longest(machine) / chain.elements
     ends = [now, *(h[p * (e + 1) - 1] for e in range(chain.elements - 1))]
     rates = []
@@ -163,6 +157,12 @@ def _with_rates(machine: Any, flow: Any, s: Scalar, state: Any, modes: Any) -> A
         rates.append(_differences(p)[1:] @ nodes * (2 / length))
     flow = dict(flow) if isinstance(flow, Mapping) else vars(flow)
     return flow | {_NAME: jnp.concatenate(rates)}
+
+
+def _now(machine: Any, s: Scalar, state: Any, modes: Any) -> Vector:
+    """Return what a chain's machine records in a state."""
+    held = with_static(machine, _past=FixedPast(past_in(machine, state)))
+    return recorded_numbers(held, machine._chain.form, s, without_history(state), modes)
 
 
 def _longest(machine: Any) -> Any:
@@ -198,14 +198,23 @@ def past_in(machine: Any, state: Any) -> Any:
     return chain.form.by_name([_between(chain, h, lag / longest) for lag in lags])
 
 
-def _between(chain: ChainForm, h: Array, share: Scalar) -> Vector:
+def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:
+    """Return the history in a state of a chain, as a function of t ≤ 0."""
+    zero, own = jnp.zeros_like(machine.position(state)), without_modes(state)
+    modes = begin_modes(machine, zero, own, modes_of(state))
+    now, longest = _now(machine, zero, own, modes), _longest(machine)
+    return lambda t: _between(machine._chain, own.history, -t / longest, now)
+
+
+def _between(chain: ChainForm, h: Array, share: Scalar, now: Vector | None = None) -> Vector:
     """Return the history at a share of the longest delay."""
     p, number = chain.nodes, chain.elements
     place, found = share * number, h[-1]
     for e in reversed(range(number)):
         values, x = h[p * e : p * (e + 1)], _nodes(p)[1:]
-        if e:
-            values, x = jnp.concatenate([h[p * e - 1][None], values]), _nodes(p)
+        first = h[p * e - 1] if e else now
+        if first is not None:
+            values, x = jnp.concatenate([first[None], values]), _nodes(p)
         value = _lagrange(x, 1 - 2 * (place - e)) @ values
         found = value if e == number - 1 else jnp.where(place < e + 1, value, found)
     return found

@@ -3,6 +3,7 @@
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
+from ._delay import as_chain
 from .continuation import boundary, continue_orbit
 from .cycle_map import CycleMap, cycle_map, map_state
 from .closed_form import ClosedFormOrbits, closed_form_orbits

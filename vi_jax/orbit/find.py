@@ -52,6 +52,7 @@ from ..machine import (
     with_modes,
     without_modes,
 )
+from ._delay import as_chain, with_delay_error
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
@@ -413,7 +414,8 @@ def find_orbit(
     **Arguments:**
 
     - `machine`: a `Scene` (ideal drive or motor, any crank, any stops), or another machine whose
-      independent variable counts its cycles.
+      independent variable counts its cycles. One with delays is replaced by `delay_chain(machine)`,
+      and a run with the whole history gives `Orbit.delay_error`.
     - `guess`: a state on the section, by default the machine's own start, or another `Orbit`. If
       its arrays have one leading axis, one compiled call searches from every guess.
     - `cycles`: period in drive cycles; static.
@@ -447,6 +449,7 @@ def find_orbit(
         )
     impact_log, throw = count("impact_log", impact_log, least=1), flag("throw", throw)
     multipliers = flag("multipliers", multipliers)
+    machine, guess = as_chain(machine, guess)
     the_map = cycle_map(machine, cycles, method=method, section=section)
     if the_map.cycles % root_finder.arcs:
         raise ValueError(
@@ -466,7 +469,7 @@ def find_orbit(
     orbit = dataclasses.replace(orbit, multipliers=multipliers_of(orbit.monodromy))
     if throw:
         orbit = raised(orbit, ~orbit.successful, "The search failed", orbit.result)
-    return trimmed(orbit)
+    return with_delay_error(trimmed(orbit))
 
 
 def _check_guess(machine: AbstractMachine, state: State) -> None:

@@ -238,6 +238,9 @@ class Orbit(Summarized):
     `AbstractMachine.averages`)."""
     modes: tuple[Float[Array, "... cycles"], ...] = ()
     """The machine's own modes on the sections (see `AbstractMachine.modes`)."""
+    delay_error: Float[Array, ""] | None = None
+    """Of a machine with delays: the difference of the state from that of a run with the whole
+    history, which a stable motion settles on, relative to the size of each component."""
 
     @property
     @by_numpy_if_known
@@ -393,6 +396,12 @@ class Orbit(Summarized):
             f"  search: residual {float(self.residual):.2g} after {int(self.iterations)} steps, "
             f"{float(self.error):.2g} from its solution; the method's error comes on top"
         )
+        if self.delay_error is not None:
+            lines.append(
+                f"  history at nodes: a run with the whole history differs by "
+                f"{float(self.delay_error):.2g}"
+                f"{'' if bool(self.stable) else ', since it departs from an unstable motion'}"
+            )
         reason = ORBIT_RESULTS[self.result]
         return "\n".join([*lines, f"  note: {reason}"] if reason else lines)
 

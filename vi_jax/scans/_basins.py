@@ -35,6 +35,7 @@ from ..machine import (
     check_leaf,
     components,
     cycles_in_words,
+    has_delays,
     in_rows,
     in_words,
     is_angle,
@@ -335,7 +336,8 @@ def basins(
     )  # fmt: skip
     kept = partial(interrupted, data, options.get("store"))
     with at_work("sorting", kept, progress=False):
-        return _find_basins(data, machine, begin, apart=apart, longest=longest, method=method)
+        more: Any = {"apart": apart, "longest": longest, "method": method, "settle": settle}
+        return _find_basins(data, machine, begin, **more)
 
 
 def _find_basins(
@@ -346,9 +348,10 @@ def _find_basins(
     apart: float,
     longest: int,
     method: AbstractMethod,
+    settle: int,
 ) -> Basins:
     """Return the basins in the result of `_scan_starts`; `begin` has all other components."""
-    label, motions = _label_lanes(data, machine, begin, apart, longest, method)
+    label, motions = _label_lanes(data, machine, begin, apart, longest, method, settle)
     impacts = np.asarray(data["impacts"]).ravel()
     attractors = []
     for number, motion in enumerate(motions):
@@ -469,7 +472,7 @@ def starts_in(
 
 def _label_lanes(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
-    method: AbstractMethod,
+    method: AbstractMethod, settle: int,
 ) -> tuple[np.ndarray, list[MotionSections]]:  # fmt: skip
     """Return labels, and each motion's sections, most lanes first."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
@@ -504,7 +507,10 @@ def _label_lanes(
         section_state = with_leaves(without_modes(begin), dict(zip(names, state, strict=True)))
         section_state = with_modes(section_state, tuple(modes[lane]))
         # The same number of cycles for all periods, for one compiled program.
-        run = simulate(machine, section_state, longest, method=method)
+        again = 0
+        if has_delays(machine):  # the state alone is not a point of the motion
+            section_state, again = _start_of_lane(data, begin, axis_names, lane), settle
+        run = simulate(machine, section_state, longest, settle=again, method=method)
         rows = np.asarray(in_rows(run.sections))[1 : p + 1]
         motions.append(MotionSections(rows, np.reshape(run.modes, (-1, longest + 1)).T[1 : p + 1]))
         paths = [motions[n] for n in numbers] + motions[-1:]
@@ -516,6 +522,16 @@ def _label_lanes(
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
     return label, [motions[i] for i in order]
+
+
+def _start_of_lane(data: "xr.Dataset", begin: State, names: list[str], lane: int) -> State:
+    """Return the start of a lane of a scan over starts."""
+    period, found = data["period"], {}
+    for name in names:
+        if name in data.coords:
+            row = data[name].broadcast_like(period).transpose(*period.dims)
+            found[name] = float(row.values.ravel()[lane])
+    return start_with(begin, found)
 
 
 # Sections of a motion move less than this share of the region between two values. A choice.
@@ -663,7 +679,8 @@ def integrity_profile(
             current = with_leaf(machine, parameter, value)
             begin = current.start() if start is None else start
             part = data.isel({parameter: i}).load()
-            result = _find_basins(part, current, begin, apart=apart, longest=longest, method=method)
+            more = {"apart": apart, "longest": longest, "method": method, "settle": settle}
+            result = _find_basins(part, current, begin, **more)
             found.append(result)
             integrity.append(result.integrity(scales=scales))
             report(1)

@@ -40,6 +40,7 @@ from ..machine import (
     attributes,
     components,
     cycle_time,
+    has_delays,
     in_rows,
     in_unit,
     is_autonomous,
@@ -55,7 +56,7 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from ..orbit import CycleMap, cycle_map, map_state
+from ..orbit import CycleMap, as_chain, cycle_map, map_state
 
 
 class Lyapunov(Summarized):
@@ -158,7 +159,8 @@ def lyapunov(
     - `cycles`: the number of observed drive cycles, at least 8; static.
     - `settle`: the number of drive cycles before that.
     - `number`: the number of exponents, greatest first; all by default, but none of coordinates
-      with given motion (`prescribed`). Each costs about as much as the simulation itself.
+      with given motion (`prescribed`), and as many as the machine's own states for one with delays,
+      which is replaced by its `delay_chain`. Each costs about as much as the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
     - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
@@ -171,6 +173,8 @@ def lyapunov(
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
     machine = machine_of(machine)
     start = machine.start() if start is None else start
+    own = len(components(without_modes(start))) if has_delays(machine) else None
+    machine, start = as_chain(machine, start)
     if is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(
@@ -186,7 +190,7 @@ def lyapunov(
         the_map = dataclasses.replace(the_map, rests=flag("rests", rests))
     start = map_state(the_map.machine, start, "start")
     states = int(_is_free(machine, start).sum())
-    number = states if number is None else count("number", number, least=1)
+    number = (own or states) if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
             f"Argument `number` must be at most {states}, the free states of the machine, but got "

@@ -29,6 +29,7 @@ from ..flow import (
     simulate,
     states,
     tidy,
+    with_first_history,
 )
 from ..machine import (
     AbstractMachine,
@@ -256,7 +257,8 @@ def sweep(
         machine = in_clock(machine, clock)
     start = replaced(start, convert_start(machine, without_modes(start)))
     check_reals("start", start)
-    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
+    start = with_first_history(with_leaf(machine, parameter, values[0]), begun(machine, start))
+    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
         check_start(with_leaf(machine, parameter, numbers[0]), without_modes(start))
     lane_noise = lane_noise_of(noise, key)
