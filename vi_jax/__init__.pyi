@@ -68,12 +68,16 @@ from .orbit import Grazing as Grazing
 from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
 from .orbit import Point as Point
+from .orbit import Torus as Torus
+from .orbit import TorusBranch as TorusBranch
 from .orbit import boundary as boundary
 from .orbit import closed_form_orbits as closed_form_orbits
 from .orbit import continue_orbit as continue_orbit
+from .orbit import continue_torus as continue_torus
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
+from .orbit import find_torus as find_torus
 from .orbit import grazing as grazing
 from .plot import animate as animate
 from .plot import plot_basins as plot_basins
