@@ -111,6 +111,7 @@ from .scans import Integrity as Integrity
 from .scans import IntegrityProfile as IntegrityProfile
 from .scans import Lyapunov as Lyapunov
 from .scans import Regime as Regime
+from .scans import Rotation as Rotation
 from .scans import Sections as Sections
 from .scans import Statistics as Statistics
 from .scans import Sweep as Sweep

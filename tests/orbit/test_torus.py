@@ -20,7 +20,8 @@ class Ring(Kicked):
 
     locking: Any = eqx.field(default=0.0, kw_only=True, converter=jnp.asarray)
 
-    def kick(self, x, y):
+    def kick(self, *state):
+        x, y = state
         y = y - SHEAR * x**2
         square, cubic = x**2 + y**2, 3 * x**2 * y - y**3
         turn = 2 * jnp.pi * self.a + TWIST * square + self.locking * cubic

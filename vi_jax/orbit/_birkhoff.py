@@ -37,11 +37,16 @@ def agreement(rows: Float[Array, "sections states"]) -> Scalar:
     of each component and of its square, relative to their spread."""
     values = jnp.concatenate([rows, rows**2], axis=1)
     half = len(rows) // 2
-    weight, size = jnp.asarray(weights(half)), jnp.std(values, axis=0)
-    rounding = jnp.finfo(rows.dtype).eps * jnp.max(jnp.abs(values), axis=0)
-    differences = jnp.abs(weight @ (values[:half] - values[half : 2 * half]))
-    share = differences / jnp.where(size > 0, size + rounding, 1.0)
-    return jnp.minimum(-jnp.log10(jnp.max(share) + 10.0**-_MOST), _MOST)
+    difference = jnp.asarray(weights(half)) @ (values[:half] - values[half : 2 * half])
+    return digits_of(difference, jnp.std(values, axis=0), jnp.mean(values, axis=0))
+
+
+def digits_of(difference: Array, spread: Array, mean: Array) -> Scalar:
+    """Return the number of digits to which averages agree that differ by this, relative to their
+    spread; a spread that is rounding of the mean counts as that."""
+    size = spread + _STILL * jnp.abs(mean)
+    share = jnp.max(jnp.abs(difference) / jnp.where(size > 0, size, 1.0))
+    return jnp.minimum(-jnp.log10(share + 10.0**-_MOST), _MOST)
 
 
 def rotation_number(rows: Float[Array, "sections states"]) -> Scalar:

@@ -29,9 +29,9 @@ from ._solution import on_host
 # Rows that a compiled program takes at once, a choice: fewer are filled up.
 _LANES = 64
 
-# The largest scaled component of the last correction: usually, and if it is rounding; the most
-# corrections; the largest one that is made at once. Choices.
-_TOLERANCE, _ROUNDED, _MOST, _LONGEST = 1e-11, 1e-8, 14, 0.3
+# The largest scaled component of the last correction: usually (the next would be its square), and
+# if it is rounding; the most corrections; the largest one that is made at once. Choices.
+_TOLERANCE, _ROUNDED, _MOST, _LONGEST = 1e-9, 1e-8, 14, 0.3
 
 # The tail of a spectrum are the modes above this share of the highest: a choice.
 _TAIL = 0.8
@@ -264,7 +264,7 @@ class Equations:
 
         With `is_cycle` the rows are the periods of a periodic motion, and ρ is not an unknown.
         """
-        curve, before, done, tangent = guess, 1.0, False, None
+        curve, before = guess, 1.0
         for count in range(1, _MOST + 1):
             move, tangent = self._correction(curve, conditions, is_cycle)
             if move is None or tangent is None:
@@ -275,10 +275,9 @@ class Equations:
                 curve.x + share * move[0] * self.scale, curve.rotation + share * float(move[1]),
                 curve.p + share * move[2] * self.widths,
             )  # fmt: skip
-            # One correction more than needed, so that the tangent is that of the solution.
-            if done or (before <= _ROUNDED and size >= before):
+            if size <= _TOLERANCE or (before <= _ROUNDED and size >= before):
                 return Solved(curve, size, count, tangent)
-            before, done = size, size <= _TOLERANCE
+            before = size
         return None
 
     def _correction(
