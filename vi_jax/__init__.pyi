@@ -92,6 +92,7 @@ from .plot import plot_phase_portrait as plot_phase_portrait
 from .plot import plot_regimes as plot_regimes
 from .plot import plot_sketch as plot_sketch
 from .plot import plot_sweep as plot_sweep
+from .plot import plot_torus as plot_torus
 from .robust import EdgeState as EdgeState
 from .robust import Manifold as Manifold
 from .robust import MinimalKick as MinimalKick

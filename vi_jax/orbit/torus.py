@@ -385,7 +385,7 @@ def _start_equations(
     period = float(begins[0, -1])
     problem, _ = equations_along(machine, method, first, order, period, cycles, [machine])
     if not placed:
-        return problem, rows
+        return with_sizes(problem, rows[0], np.abs(rows).max(axis=0)), rows
     clocks = np.stack([clock for clock, _ in placed], axis=1)
     states, last = in_lanes(_fly_to_events, problem, clocks, begins[:, -1], rows)
     if problem.events[0].cycle == 0:  # its state is that before it
@@ -395,7 +395,8 @@ def _start_equations(
     if autonomous:
         clocks[:, 0] = begins[:, -1]
     x = np.concatenate([clocks, states.reshape(len(rows), -1)], axis=1)
-    return with_sizes(problem, x[0], np.abs(states).max(axis=(0, 1))), x
+    largest = Equations(problem).observe(Curve(x, rotation, np.zeros(0))).largest
+    return with_sizes(problem, x[0], largest.max(axis=0)), x
 
 
 def _check_events(found: Followed) -> None:

@@ -175,7 +175,7 @@ def _with_nodes(curve: Curve, nodes: int) -> Curve:
 
 def continue_torus(
     torus: Torus, *, parameter: str, bounds: tuple[float, float], step: float = 0.02,
-    max_step: float = 0.1, max_points: int = 100, max_nodes: int = MOST, progress: bool = True,
+    max_step: float = 0.2, max_points: int = 200, max_nodes: int = MOST, progress: bool = True,
 ) -> TorusBranch:  # fmt: skip
     """Follow a quasi-periodic motion in one parameter of its machine, both ways.
 
