@@ -16,3 +16,6 @@ from .results import (
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point
+from ._birkhoff import agreement, digits_of, rotation_number, without_angles
+from .torus import Torus, find_torus
+from .torus_branch import TorusBranch, Window, continue_torus

@@ -334,7 +334,7 @@ class Shooting(eqx.Module):
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = (clock - clock[0]).at[0].set(period)
-        parameters = jnp.asarray(x)[-len(self.parameters) :]
+        parameters = jnp.asarray(x)[len(x) - len(self.parameters) :]
         return jnp.concatenate([clock, jnp.ravel(states), parameters])
 
     @property
@@ -392,8 +392,13 @@ class Shooting(eqx.Module):
 
         return self._for_event(leg, value, s, u)
 
-    def ends(self, clock: Float[Array, " legs"], period: Scalar) -> Float[Array, " legs"]:
-        return jnp.concatenate([clock[1:], clock[:1] + period])
+    def ends(
+        self, clock: Float[Array, " legs"], period: Scalar, next_clock: Array | None = None
+    ) -> Float[Array, " legs"]:
+        """Return the clock at the end of each leg. The last one ends at the first event a period
+        later, whose clock is `next_clock` if the motion does not repeat."""
+        following = clock if next_clock is None else next_clock
+        return jnp.concatenate([clock[1:], following[:1] + period])
 
     def leg_at(self, x: Unknowns, s: Any) -> tuple[Array, Array]:
         """Return the leg that contains a clock, modulo the period, and the clock there."""
@@ -519,16 +524,22 @@ class Shooting(eqx.Module):
         added = [condition.residual(self, x, observed, chatters) for condition in self.conditions]
         return jnp.concatenate([residual, jnp.stack(added)])
 
-    def motion_residual(self, x: Vector, steps: Scalar | None = None) -> Vector:
+    def motion_residual(
+        self, x: Vector, steps: Scalar | None = None, following: Vector | None = None
+    ) -> Vector:
         """Return the left sides of the motion's own equations, zero for a periodic motion: end of
         each leg minus begin of the next, then the guards. `steps` is the number of steps of a
-        flight, by default `self.steps`."""
-        return self._shoot(x, steps)[0]
+        flight, by default `self.steps`. The last leg leads to the first event of `following`, the
+        unknowns a period later, by default `x`."""
+        return self._shoot(x, steps, following)[0]
 
-    def _shoot(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Chatter]:
+    def _shoot(
+        self, x: Vector, steps: Scalar | None = None, following: Vector | None = None
+    ) -> tuple[Vector, Chatter]:
         """Return the `motion_residual`, and the end of the chatter that begins each leg."""
         machine = self.at(x)
         clock, states = self.parts(x)
+        next_clock, next_states = self.parts(x if following is None else following)
 
         def end_of_leg(leg, s0, s1, u):
             after = self.after(machine, leg, s0, u)
@@ -539,14 +550,15 @@ class Shooting(eqx.Module):
             return end, self.guard(machine, leg, s0, u)[None], begin
 
         legs = jnp.arange(len(states))
-        ends = self.ends(clock, self.period(x))
+        ends = self.ends(clock, self.period(x), next_clock)
         ends_of_legs, guards, chatters = jax.vmap(end_of_leg)(legs, clock, ends, states)
-        next_states = jnp.roll(states, -1, axis=0)
+        next_states = jnp.concatenate([states[1:], next_states[:1]])
         ends_of_legs = nearest_images(self.angles, ends_of_legs, next_states)
         return jnp.concatenate([(ends_of_legs - next_states).ravel(), guards.ravel()]), chatters
 
-    def observe(self, x: Vector) -> Observed:
-        """Compute multipliers, extremes and the distances to grazing of a solution `x`.
+    def observe(self, x: Vector, following: Vector | None = None) -> Observed:
+        """Compute multipliers, extremes and the distances to grazing of a solution `x` (for
+        `following` see `motion_residual`).
 
         The monodromy matrix is the product over the legs of the flight's derivative times the
         saltation matrix of the event that begins the leg.
@@ -577,7 +589,8 @@ class Shooting(eqx.Module):
             return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
 
         legs = jnp.arange(len(states))
-        ends = self.ends(clock, self.period(x))
+        next_clock, _ = self.parts(x if following is None else following)
+        ends = self.ends(clock, self.period(x), next_clock)
         found = jax.vmap(follow)(legs, clock, ends, states)
         matrix, integrals, approach, agree, turns, positions, largest, begin, sizes = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)

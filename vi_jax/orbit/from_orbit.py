@@ -202,24 +202,35 @@ def problem_of(
             "`ends_cycle` if it happens at `t - cycle`, or make the clock a component of the state."
         )
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
+    return equations_along(
+        machine, stepper, orbit.state, found, period, cycles, corners, (parameter,)
+    )
+
+
+def equations_along(
+    machine: AbstractMachine, method: AbstractMethod, state: State, found: list[Placed],
+    period: float, cycles: int, corners: list[AbstractMachine], parameters: tuple[str, ...] = (),
+) -> tuple[Shooting, np.ndarray]:  # fmt: skip
+    """Return the equations from event to event of a motion that begins in `state` on the section,
+    and its values of the unknowns. The steps of a flight are enough for all `corners`."""
     clocks, events = [place for place, _ in found], tuple(event for _, event in found)
     cycles_needed = longest_leg(clocks, events, period, cycles)
-    steps = steps_of(stepper, corners, without_modes(orbit.state), cycles_needed)
-    blank = Shooting(
-        machine, stepper, without_modes(orbit.state), cycles, (), (), steps, (parameter,)
-    )
-    states, modes = _follow_events(blank, orbit.state, found, period)
+    like = without_modes(state)
+    steps = steps_of(method, corners, like, cycles_needed)
+    blank = Shooting(machine, method, like, cycles, (), (), steps, parameters)
+    states, modes = _follow_events(blank, state, found, period)
     _check_instants(blank, found, states, modes)
     while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
         before = states
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
-        states, modes = _follow_events(blank, orbit.state, found, period)
+        states, modes = _follow_events(blank, state, found, period)
         if np.max(np.abs(states - before) / _sizes(blank, states)) < _SETTLED:
             break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
-    x = problem.pack(np.asarray(clocks), states, [leaf(machine, parameter)], period)
+    values = np.array([leaf(machine, name) for name in parameters])
+    x = problem.pack(np.asarray(clocks), states, values, period)
     return with_sizes(problem, x), np.asarray(x)
 
 
@@ -415,11 +426,16 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
     kind, number, clock = (
         np.asarray(a) for a in (run.event_log.kind, run.event_log.number, run.event_log.phase)
     )
-    stops, switches = len(stops_of(machine)), len(switches_of(machine))
-    others = [kind == EventKind.mode, kind == EventKind.reset]
-    number = number + np.select(others, [stops, stops + switches], 0)
+    number = event_numbers(machine, kind, number)
     places = zip(*np.nonzero(kind >= 0), strict=True)
     return [(int(n), float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
+
+
+def event_numbers(machine: AbstractMachine, kind: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return the numbers among all events of the machine of those in an `EventLog`."""
+    stops, switches = len(stops_of(machine)), len(switches_of(machine))
+    others = [kind == EventKind.mode, kind == EventKind.reset]
+    return number + np.select(others, [stops, stops + switches], 0)
 
 
 @on_host

@@ -51,6 +51,7 @@ from .local_map import graze_at
 from .results import Orbit
 from .sliding import SLIDING, change_at, without_part
 from .special import Point, point_at
+from .torus import Torus, torus_near
 
 _ORBIT = "orbit"
 
@@ -145,6 +146,11 @@ def _swapped(point: Point) -> Iterator[State]:
         for each in (after, event) if event.cycle == 0 else (after,):
             state, modes = after_event(machine, each.number, clock[i], state, modes)
         yield state
+
+
+def _torus(point: Point, distance: float) -> Torus:
+    name, width = point.problem.parameters[-1], float(point.scale[-1])
+    return torus_near(point.orbit, name, width, distance)
 
 
 def _search(
@@ -331,6 +337,7 @@ STARTS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] =
     (None, GRAZING): {_ORBIT: _orbit_beyond_grazing},
     (None, CROSSING): {_ORBIT: _crossing_orbit},
     (None, SYMMETRY): {_ORBIT: _crossing_orbit},
+    (None, TORUS): {"torus": _torus},
     (None, REST): {_ORBIT: _orbit_beyond_rest},
     **{(None, kind): {_ORBIT: _orbit_beyond_sliding} for kind in SLIDING},
     **{

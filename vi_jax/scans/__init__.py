@@ -10,7 +10,7 @@ from ._lyapunov import Lyapunov, lyapunov
 from ._scan import scan
 from ._sweep import Sweep, moved_by_stops, sweep
 from .measures import (
-    REGIMES, AbstractMeasure, Density, Escape, Exponent, Regime, Sections, Statistics,
+    REGIMES, AbstractMeasure, Density, Escape, Exponent, Regime, Rotation, Sections, Statistics,
     escape_rate,
 )
 from .program import make_program

@@ -24,10 +24,12 @@ from ..machine import (
     components,
     frequency_ratio,
     in_rows,
+    is_autonomous,
     nearest_images,
     without_modes,
 )
-from ._lyapunov import lyapunov
+from ..orbit import agreement, rotation_number, without_angles
+from ._lyapunov import lyapunov, observe_growth
 
 # The largest difference of sections a period apart; its factor for the least period, if some period
 # fits; and the largest ratio of differences of two periods that fit. Choices.
@@ -35,6 +37,11 @@ _TOLERANCE, _SLACK, _WORSE = 1e-6, 100.0, 1e4
 
 # The least tolerance of sections: multiples of their error by the method, and of rounding: choices.
 _WANDERS, _ROUNDINGS = 10.0, 64.0
+
+
+# A motion is quasi-periodic if averages agree to more digits than this, and the logarithm of the
+# growth of a perturbation over the observed time is below the second number. Fitted; see the test.
+_DIGITS, _NEUTRAL = 4.4, 0.1
 
 
 class REGIMES(IntEnum):
@@ -45,6 +52,7 @@ class REGIMES(IntEnum):
     unsettled = -2, "unsettled"
     failed = -3, "failed"
     transient = -4, "transiently chaotic"
+    quasiperiodic = -5, "quasi-periodic"
 
     meaning: str
 
@@ -318,6 +326,37 @@ class Exponent(AbstractMeasure):
         return {"exponent": spectrum.exponents[0]}
 
 
+class Rotation(AbstractMeasure):
+    """`rotation`, the rotation number of a quasi-periodic motion, in turns per cycle; and `digits`,
+    to which averages over both halves of the observed cycles agree.
+
+    The averages are of each component on the section and its square, with weights that vanish at
+    both ends. Over 1,024 cycles they agree to five digits and more on most quasi-periodic motions
+    and to less than four on chaotic ones; the error of the rotation number is then some 1e-9. The
+    number is that of turns around the mean of the sections, from 0 to 1/2, as ρ and 1 - ρ are the
+    same curve. It is NaN for a fixed point and has no meaning on chaotic motions. A motion that
+    slowly settles on a periodic one has many digits: `Regime` examines its exponent too.
+
+    **Arguments:** `cycles`, the number of observed cycles; static.
+    """
+
+    cycles: int = eqx.field(static=True, default=1024)  # pyright: ignore
+    record = "sections"
+    attributes: ClassVar[About] = {
+        "rotation": {"units": "turn/cycle", "long_name": "rotation number"},
+        "digits": {"units": "1", "long_name": "digits to which averages of both halves agree"},
+    }
+
+    def __check_init__(self):
+        count("cycles", self.cycles, least=16)
+
+    def __call__(self, machine, run):
+        first = jtu.tree_map(lambda x: x[0], run.sections)
+        rows = in_rows(run.sections)[-self.cycles :]
+        rows = without_angles(rows, angles_in(machine, first))
+        return {"rotation": rotation_number(rows), "digits": agreement(rows)}
+
+
 class Regime(AbstractMeasure):
     """`period` in drive cycles and `impacts` in a period; motions without a period by kind.
 
@@ -325,14 +364,20 @@ class Regime(AbstractMeasure):
     with as many impacts in each cycle. The tolerance is relative to the size of each component,
     which is 1 for the paper's scenes; by default it is 1e-6, or ten tolerances of a method with
     adaptive steps. See `least_period` for a motion that still spirals in. Other motions are
-    observed for another `observed` cycles. Unless its greatest Lyapunov exponent exceeds
-    `threshold` there (in the machine's unit of rates), a motion is unsettled or quasi-periodic. If
-    it does, the motion is continued for `lasting` cycles and observed once more. It is chaotic if
-    its exponent exceeds `threshold` again. Otherwise it is transiently chaotic: it has settled
-    meanwhile, or is about to. `REGIMES` has the numbers for these kinds in `period`.
+    observed for another `observed` cycles. If the greatest Lyapunov exponent exceeds `threshold`
+    there (in the machine's unit of rates), the motion goes on for `lasting` cycles and is observed
+    once more. It is chaotic if its exponent exceeds `threshold` again. Otherwise it is transiently
+    chaotic: it has settled meanwhile, or is about to. `REGIMES` has the numbers for these kinds in
+    `period`.
+
+    The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
+    both halves agree to many digits (see `Rotation`) and the exponent is zero to the accuracy of
+    that time, else unsettled. Quasi-periodic motions close to a resonance, or with more than two
+    frequencies, and those of machines without losses are mostly called unsettled.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
-    later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass.
+    later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass,
+    and an `averaged` of 0 the last.
     """
 
     longest: int = eqx.field(static=True, default=64)
@@ -340,6 +385,7 @@ class Regime(AbstractMeasure):
     tolerance: float | None = eqx.field(default=None)
     threshold: Any = eqx.field(default=2e-3)
     lasting: int = eqx.field(static=True, default=4000)
+    averaged: int = eqx.field(static=True, default=2048)
     wander: Any = eqx.field(default=0.0, kw_only=True)
     """The error of sections under the method; set by a scan."""
     start: Any = eqx.field(default=(), kw_only=True)
@@ -360,6 +406,8 @@ class Regime(AbstractMeasure):
             require("tolerance", self.tolerance, low=0.0, open_low=True)
         require("threshold", self.threshold)
         count("lasting", self.lasting)
+        if self.averaged:
+            count("averaged", self.averaged, least=256)
 
     def under(self, method):
         """Return this measure with the error of sections under this method."""
@@ -375,8 +423,11 @@ class Regime(AbstractMeasure):
 
     @property
     def passes(self):
-        """A pass for motions that do not repeat, and one for chaotic ones."""
-        return 2 if self.lasting else 1
+        """A pass for motions that do not repeat, one for chaotic ones and one for others."""
+        return 1 + bool(self.lasting) + bool(self.averaged)
+
+    def _is_last(self, pass_number) -> Flag:
+        return jnp.asarray(pass_number) == (self.passes - 1 if self.averaged else -1)
 
     def __call__(self, machine, run):
         """Return period and impacts of one lane, without a check of chaos."""
@@ -399,21 +450,26 @@ class Regime(AbstractMeasure):
 
     def needs_refinement(self, found, pass_number=0):
         """Return whether it does not repeat; at the second pass, whether it is chaotic."""
-        return found["period"] == jnp.where(
-            jnp.asarray(pass_number) == 0, REGIMES.unsettled, REGIMES.chaotic
-        )
+        is_outer = (jnp.asarray(pass_number) == 0) | self._is_last(pass_number)
+        return found["period"] == jnp.where(is_outer, REGIMES.unsettled, REGIMES.chaotic)
 
     def refine(self, machine, state, method, found, pass_number=0, rests=None):
-        """Return whether it is chaotic, or at the second pass still chaotic."""
-        settle = pass_number * (self.observed + self.lasting)
-        spectrum = lyapunov(
-            machine, state, self.observed, settle=settle, number=1, method=method, rests=rests
-        )
-        chaotic = spectrum.exponents[0] > self.threshold
+        """Return whether it is chaotic, at the second pass still chaotic; at the last one whether
+        it is quasi-periodic."""
+        before = jnp.asarray(found["period"])
+        is_last, again = self._is_last(pass_number), jnp.asarray(pass_number) > 0
+        # The exponent of an autonomous machine is 0 on any motion that does not rest.
+        averaged = 0 if is_autonomous(machine, without_modes(state)) else self.averaged
+        observed = jnp.where(is_last, averaged // 4 * 4, self.observed)
+        settle = jnp.where(again & ~is_last, self.observed + self.lasting, 0)
+        seen = observe_growth(machine, state, observed, settle=settle, method=method, rests=rests)
         # A lane that cannot be continued is unchanged.
-        continued, before = spectrum.successful & (pass_number > 0), found["period"]
-        otherwise = jnp.where(continued, REGIMES.transient, before)
-        return {"period": jnp.where(chaotic, REGIMES.chaotic, otherwise).astype(before.dtype)}
+        otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
+        chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
+        neutral = jnp.abs(seen.per_cycle) * averaged < _NEUTRAL
+        is_torus = seen.successful & (seen.digits > _DIGITS) & neutral
+        torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
+        return {"period": jnp.where(is_last, torus, chaos).astype(before.dtype)}
 
 
 # Results of a run for each cycle, not for an instant.
@@ -760,6 +816,7 @@ def escape_rate(
 MEASURES: Mapping[str, Callable[[], AbstractMeasure]] = {
     "extremes": functools.partial(Usual, "extremes"),  # the most common first
     "regime": Regime,
+    "rotation": Rotation,
     "sections": Sections,
     "exponent": Exponent,
     **{name: functools.partial(Usual, name) for name in _KINDS if name != "extremes"},
