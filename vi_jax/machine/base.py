@@ -353,7 +353,8 @@ class AbstractMachine(Shown):
         time. The means over a cycle are in `Run.averages`, those over the period in
         `Orbit.averages` and in columns of a `Branch`. Impulses of impacts are not included.
         Discrete modes are further arguments, as of the field. `units` may have the unit under the
-        same name. `record="sections"` omits averages.
+        same name. `record="sections"` omits averages. A function that jumps is refused: its jump
+        must be that of the mode of a `Switch`.
         """
         return {}
 
