@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.extend.core import Jaxpr
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
@@ -247,8 +248,7 @@ def _decides(jaxpr: Any, marks: list[bool]) -> bool:
     def mark(eqn: Any, depends: list[bool]) -> list[bool]:
         body = called(eqn)
         if body is not None:
-            inner = getattr(body, "jaxpr", body)
-            return propagate_marks(inner, depends, mark)
+            return propagate_marks(body if isinstance(body, Jaxpr) else body.jaxpr, depends, mark)
         found.append(eqn.primitive.name in _DECIDES)
         return [True] * len(eqn.outvars)
 

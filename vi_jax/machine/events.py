@@ -273,7 +273,9 @@ class Switch(AbstractSwitch):
     function: Callable[..., Any] = eqx.field(static=True)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    is_plain: ClassVar = True
+    @property
+    def is_plain(self) -> bool:
+        return True
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
