@@ -46,6 +46,7 @@ from ..machine import (
     like,
     listed,
     others_of,
+    outcomes_of,
     section_in,
     shown_modes,
     stops_of,
@@ -63,6 +64,10 @@ _TRACER_ERRORS = (
 # period of five digits they differ by less. They are compared at the start and at this share of a
 # cycle, where few inputs are zero.
 _PERIODIC, INNER_INSTANT = 1e-4, 0.29
+
+
+# The number of an outcome is a part of the number of a reason: it must be smaller than 4096.
+_MOST_OUTCOMES = 4095
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
@@ -527,6 +532,11 @@ def check_parts(machine: AbstractMachine) -> None:
     if isinstance(machine, LinearMachine | Scene):
         _check_ignored("Stop", stops_of(machine), name)
         _check_ignored("Soft stop", switches_of(machine), name)
+    if len(outcomes_of(machine)) > _MOST_OUTCOMES:
+        raise ValueError(
+            f"The events of a {name} must have at most {_MOST_OUTCOMES} outcomes (`ends`), but "
+            f"have {len(outcomes_of(machine))}."
+        )
     count = len(machine.coordinates)
     for i, stop in enumerate(stops_of(machine)):
         for part in ("gap", "restitution"):
@@ -580,6 +590,12 @@ def _check_names(machine: AbstractMachine) -> None:
                 f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
                 "method of every machine."
             )
+    if any("section" in vars(x) for x in kind.__mro__ if not is_builtin(x)):
+        _warn_once(
+            kind,
+            f"The `section` of a {kind.__name__} has no effect. Cycles end by `cycle`: a number, "
+            '`vi.rising("u", usual=6.3)` or `vi.turn_of("phi")`.',
+        )
     pairs = [x.on for x in contacts_in(machine) if isinstance(getattr(x, "on", None), tuple)]
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)

@@ -40,6 +40,7 @@ from ..machine import (
     check_takes,
     component,
     components,
+    contacts_in,
     convert_start,
     counter_of,
     field_in,
@@ -358,9 +359,9 @@ def _check_turn(machine: AbstractMachine, start: State) -> None:
         return
     angle, begin = concrete(component(counter.name, start)), concrete(counter.start)
     beyond = None if angle is None or begin is None else angle - begin - 2 * np.pi
-    if beyond is not None and np.any(beyond > 1e-9):  # rounding
+    if beyond is not None and np.any(beyond > -1e-9):  # rounding
         raise ValueError(
-            f"Argument `start` must not have {counter.name} beyond the end of a turn, but it is "
+            f"Argument `start` must have {counter.name} before the end of a turn, but it is "
             f"{np.max(beyond):.6g} beyond. Subtract whole turns."
         )
 
@@ -388,6 +389,13 @@ def check_start(machine: AbstractMachine, start: State) -> None:
     check_reals("start", start)
     start = as_floats(machine, start)  # derivatives of a coordinate need them
     shape = shape_of("start", machine, start)
+    if shape and not contacts_in(machine):
+        raise ValueError(
+            "Argument `start` must be one state (use `jax.vmap` for a batch), but its first "
+            f"component has shape {shape}. If it is one, name the number whose extremes are "
+            f"recorded: `def position(self, z): return z.x[0]` in a {type(machine).__name__}, and "
+            "`velocity` in the same way."
+        )
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
@@ -414,6 +422,6 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
-                f"({stop.side}, gap {gap})."
+                f"({stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on the left."
             )
     check_values(machine, start)

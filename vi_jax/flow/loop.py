@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes
@@ -40,7 +39,7 @@ from .events import Rates, force_rate, rates
 from .noise import in_modes_of
 from .results import code
 from .sizes import at_most_one, extents_of, sizes_of
-from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
+from .smooth import constant, hold_contacts, in_modes, limited_of, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -127,7 +126,7 @@ def _pressed_together(
     bodies = plan.machine.coordinates
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
-        held = stop_gradient(hold_contacts(plan.machine, modes, contact))
+        held = constant(hold_contacts(plan.machine, modes, contact))
         current = [rates(held.field, x.position, s, start) for x in bodies]
         jerks = [force_rate(held, x.position, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)

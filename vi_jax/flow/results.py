@@ -26,6 +26,7 @@ from ..machine import (
     name_in,
     plain,
     state_in_words,
+    unit_of,
     with_modes,
     with_units,
     without_modes,
@@ -326,7 +327,7 @@ def code(name: str) -> float:
 
 
 # The number of an outcome is added as a fraction to the common reason, `ended`.
-_OUTCOMES = 64
+_OUTCOMES = 4096
 
 
 def code_of_outcome(number: int) -> float:
@@ -342,6 +343,16 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 def reason_of(reason: Scalar) -> RESULTS:
     return member_of(RESULTS, jnp.floor(reason))
+
+
+def span_of_position(
+    labels: tuple[str, str], units: Mapping[str, str], ends: tuple[Any, Any], digits: int
+) -> str:
+    """Return the interval of the position, with its name and unit."""
+    name, size = name_in(labels[0]), max(abs(float(x)) for x in ends)
+    low, high = (plain(x, digits, size) for x in ends)
+    quantity = "position" if unit_of(units, "position") else name
+    return f"{name} in {in_unit(f'[{low}, {high}]', units, quantity)}"
 
 
 class Samples(Shown):
@@ -596,9 +607,8 @@ class Run(Summarized):
         where = "section" if outcome is None else "state"
         lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
         if outcome is None and self.y_min is not None and self.y_max is not None:
-            span = f"[{plain(self.y_min[-1], 6)}, {plain(self.y_max[-1], 6)}]"
-            span = in_unit(span, units, "position")
-            lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
+            ends = self.y_min[-1], self.y_max[-1]
+            lines.append(f"  last cycle: {span_of_position(self.labels, units, ends, 6)}")
         for average, x in self.averages.items() if outcome is None else ():
             lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:

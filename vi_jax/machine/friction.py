@@ -36,7 +36,7 @@ from .contacts import (
     rate_of,
     velocity_change,
 )
-from .declared import stops_of, switches_of
+from .declared import hashable, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
 from .state import with_components
@@ -176,7 +176,7 @@ class DryFriction(Friction):
     """
 
     level: Any = eqx.field(converter=real_or_law("level"))
-    on: Any = eqx.field(static=True, kw_only=True, default=None)
+    on: Any = eqx.field(static=True, kw_only=True, default=None, converter=hashable)
     mass: Float[Array, "..."] | None = eqx.field(
         kw_only=True, default=None, converter=optional_real("mass")
     )

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._checks import (
@@ -30,6 +31,7 @@ from .._checks import (
 )
 from .._types import Machine, Number, Scalar, State
 from .contacts import push_of, shown_modes
+from .declared import hashable, stops_of, switches_of
 from .event import AbstractEvent, AbstractSwitch, Modes
 from .events import modes_after, struck_modes
 from .numbers import Shown
@@ -103,7 +105,7 @@ class RigidStop(Wall, AbstractEvent):
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
-    on: Any = eqx.field(static=True, default=None, kw_only=True)
+    on: Any = eqx.field(static=True, default=None, kw_only=True, converter=hashable)
     """The names of position and velocity, or the coordinate or function of a `Mechanical`."""
     mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
     """The effective mass of an impact, for `Run.impact_energy`: 1, or that of a `Mechanical`."""
@@ -111,7 +113,7 @@ class RigidStop(Wall, AbstractEvent):
         default=None, kw_only=True, converter=optional_real("friction")
     )
     """μ, Coulomb's coefficient of friction (dimensionless); without friction by default."""
-    along: Any = eqx.field(static=True, default=None, kw_only=True)
+    along: Any = eqx.field(static=True, default=None, kw_only=True, converter=hashable)
     """The coordinate that the body slips along, given as in `on`."""
     tangential_restitution: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("tangential_restitution")
@@ -193,6 +195,15 @@ class RigidStop(Wall, AbstractEvent):
         return 0.5 * (1 - coefficient**2) * approach**2
 
 
+def _exponent(x: Any) -> float:
+    if isinstance(x, Tracer):
+        raise TypeError(
+            "Argument `exponent` of a contact law must be a compile-time constant, but is traced. "
+            "A parameter of the machine is one with `eqx.field(static=True)`."
+        )
+    return float(x)
+
+
 class AbstractContactLaw(Shown):
     """The force away from a `SoftStop` as a function of the depth δ > 0 and its rate δ'.
 
@@ -200,7 +211,7 @@ class AbstractContactLaw(Shown):
     parameters of the law.
     """
 
-    exponent: float = eqx.field(static=True, default=1.0, converter=float)
+    exponent: float = eqx.field(static=True, default=1.0, converter=_exponent)
     """p ≥ 1, the power of the depth in the spring's force, for the length of steps. Static."""
 
     def __check_init__(self):
@@ -444,7 +455,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.mass = optional_real("mass")(mass)
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
-        self.on, self.acts = on, acts
+        self.on, self.acts = hashable(on), acts
         self.coordinate = count("coordinate", coordinate)
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
@@ -547,3 +558,18 @@ def _damping_of(
             f"`PowerLaw`, whose restitution is one number, but got {given}."
         )
     return found
+
+
+def stop_in_words(machine: Machine, wall: Wall) -> str:
+    """Return the name of one of a machine's stops: its `name`, else its side, with the coordinate
+    or the number if several stops are on that side."""
+    walls = [x for x in (*stops_of(machine), *switches_of(machine)) if isinstance(x, Wall)]
+    soft = "soft " if isinstance(wall, SoftStop) else ""
+    alike = [x for x in walls if type(x) is type(wall) and x.side == wall.side and not x.name]  # pyright: ignore
+    words = f"{wall.side} {soft}stop"  # pyright: ignore
+    if wall.name or len(alike) < 2:  # pyright: ignore
+        return wall.name or words  # pyright: ignore
+    names = [x.on[0] if isinstance(x.on, tuple) else x.on for x in alike]  # pyright: ignore
+    number = next(i for i, x in enumerate(alike) if x is wall)
+    by_name = all(isinstance(x, str) for x in names) and len(set(names)) == len(names)
+    return f"{words} of {names[number]}" if by_name else f"{words} {number}"

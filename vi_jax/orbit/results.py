@@ -25,6 +25,7 @@ from ..flow import (
     quantities_on,
     simulate,
     sizes_on_host,
+    span_of_position,
     states,
     tidy,
 )
@@ -39,10 +40,10 @@ from ..machine import (
     in_rows,
     in_unit,
     is_autonomous,
-    name_in,
+    labels_in,
     nearest_images,
-    plain,
     state_in_words,
+    stop_in_words,
     stops_of,
     units_of,
     with_units,
@@ -334,10 +335,10 @@ class Orbit(Summarized):
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
-                name = stops_of(self.machine)[int(stop)].side
+                name = stop_in_words(self.machine, stops_of(self.machine)[int(stop)])
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 clock = in_unit(f"{clock_word(self.machine)} {float(phase):.6f}", units, "phase")
-                lines.append(f"  impact: {name} stop at {clock}, V⁻ = {fast}")
+                lines.append(f"  impact: {name} at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(jnp.sum(self.impact_stop >= 0))
@@ -391,9 +392,9 @@ def hits_in_words(orbit: Orbit) -> str:
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """Return the interval of the first coordinate, with its name in pictures."""
-    low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span = in_unit(f"[{low}, {high}]", units_of(orbit.machine), "position")
-    return f"{name_in(orbit.machine.labels[0])} in {span}"
+    machine, ends = orbit.machine, (orbit.y_min, orbit.y_max)
+    labels = labels_in(machine, without_modes(orbit.state))
+    return span_of_position(labels, units_of(machine), ends, digits)
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:

@@ -540,7 +540,7 @@ def _landed(
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.attempts < _PATIENCE)
-    jumped = None if sudden is None else sudden & jumped
+    jumped = None if sudden is None or jumped is None else sudden & jumped
     return guard._replace(
         offset=offset, landed=landed, again=again, near=near, sudden=sudden, jumped=jumped
     )
