@@ -1,5 +1,7 @@
 """Parts of machines that a user may write in several ways, and what messages say about them."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -181,3 +183,60 @@ def test_prints():
         "right stop of a", "right stop of b", "buffer", "left stop", "right soft stop 0",
         "right soft stop 1",
     ]  # fmt: skip
+
+
+class Rocking(vi.AbstractMachine):
+    """A block that loses energy as it passes the upright, which its torque depends on."""
+
+    first: str = eqx.field(static=True)
+
+    cycle = 10.0
+
+    @property
+    def events(self):
+        switch = vi.Switch(lambda m, t, z: z.th)
+        slows = lambda m, t, z, s: dict(w=0.9 * z.w)
+        loss = vi.Reset(lambda m, t, z, s: z.th, slows, direction="both")
+        return (switch, loss) if self.first == "switch" else (loss, switch)
+
+    def field(self, t, z, s):
+        return dict(th=z.w, w=-jnp.sin(0.25 * s - z.th))
+
+
+@pytest.mark.parametrize("first", ["switch", "reset"])
+def test_a_switch_and_a_reset_on_one_surface_are_logged_once(first):
+    run = vi.simulate(Rocking(first), vi.State(th=0.2, w=0.0), 1, event_log=20, method="reference")
+    log = run.event_log
+    kinds = np.asarray(log.kind[0])
+    modes, resets = (vi.EVENTS.index(x) for x in ("mode", "reset"))
+    assert np.count_nonzero(kinds == modes) == np.count_nonzero(kinds == resets) == 4
+    np.testing.assert_allclose(
+        log.phase[0][kinds == modes], log.phase[0][kinds == resets], atol=1e-12
+    )
+    # From the same motion with a rigid stop at |th| = 0, with the modes of both sides.
+    np.testing.assert_allclose(run.last.th, 0.0552197656, atol=1e-9)
+    full = vi.simulate(Rocking(first), vi.State(th=0.2, w=0.0), 1, event_log=3).event_log
+    assert "events after the first 3 are not listed; 1 cycle may have more" in str(full)
+    assert "mode (switch 0 becomes" in str(full) and "may have more" not in str(log)
+
+
+class Loaded(vi.AbstractMachine):
+    cycle = 1.0
+    contacts = vi.DryFriction(0.5, on="u", load=lambda t, z: 1.0 + t)
+
+    def field(self, t, z):
+        return dict(x=z.u, u=0.0 * z.u)
+
+
+def test_a_load_with_another_period_is_named_if_cycles_repeat():
+    start = vi.State(x=0.0, u=2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = vi.simulate(Loaded(), start, 1, event_log=2)
+    with pytest.warns(
+        UserWarning, match=r"`contacts` of a Loaded are not the same.*force on its u"
+    ):
+        vi.simulate(Loaded(), start, 2)
+    assert "switch" not in str(run.event_log)
+    with pytest.raises(TypeError, match=r"Compare it with `vi.RESULTS.successful`"):
+        int(run.result)

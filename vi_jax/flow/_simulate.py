@@ -27,6 +27,7 @@ from ..machine import (
     others_of,
     outcomes_of,
     stated,
+    switches_of,
     without_modes,
 )
 from ._lane import Plan, Record
@@ -291,8 +292,12 @@ def _impact_log(plan: Plan, entries: Any) -> ImpactLog:
 def _event_log(plan: Plan, entries: Any) -> EventLog:
     phase, code, number, value = _by_cycle(plan, entries, used=1)
     names = tuple(event.name for event in others_of(plan.machine))
+    switches, modes = switches_of(plan.machine), []
+    for i, switch in enumerate(switches):
+        index = sum(other.word == switch.word for other in switches[:i])
+        modes.append(switch.name or f"{switch.word} {index}")
     clock = as_logged(plan.machine, phase)
-    return EventLog(clock, _as_integers(code), _as_integers(number), value, names)
+    return EventLog(clock, _as_integers(code), _as_integers(number), value, names, tuple(modes))
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:

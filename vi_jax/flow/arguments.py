@@ -159,7 +159,7 @@ def make_plan(
     if isinstance(machine, Scene):
         _check_scalars(machine=machine, start=start)
     _check_numbers(machine)
-    check_start(machine, start)
+    check_start(machine, start, repeats=cycles > 1 or concrete(options.settle) != 0)
     if options.begin is None:
         check_prescribed(machine, start)
     machine, start = of_one_type(machine, start)
@@ -383,7 +383,7 @@ def check_prescribed(machine: AbstractMachine, start: State) -> None:
             )
 
 
-def check_start(machine: AbstractMachine, start: State) -> None:
+def check_start(machine: AbstractMachine, start: State, repeats: bool = True) -> None:
     """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` for an invalid concrete
     start."""
     check_reals("start", start)
@@ -424,4 +424,4 @@ def check_start(machine: AbstractMachine, start: State) -> None:
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
                 f"({stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on the left."
             )
-    check_values(machine, start)
+    check_values(machine, start, repeats)

@@ -55,6 +55,14 @@ else:
         def __ne__(self, other):
             return ~(self == other)
 
+        def __int__(self) -> int:
+            name = self.kind.__name__
+            first = next(iter(self.kind._texts))
+            raise TypeError(
+                f"A {name} is no integer. Compare it with `vi.{name}.{first}` or another member; "
+                f"`vi.{name}[...]` is its text."
+            )
+
         def __repr__(self) -> str:
             name, number = self.kind.__name__, self.number
             if isinstance(number, Tracer):
@@ -390,6 +398,10 @@ def _listing(what: str, used: object, text: Callable[[int, int], str]) -> str:
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:
         lines.append(f"  and {len(some) - _CYCLES} more cycles")
+    full = int(used.all(axis=1).sum()) if used.shape[1] else 0
+    if full:
+        cycles, size = count_of(full, "cycle"), used.shape[1]
+        lines.append(f"  {what}s after the first {size} are not listed; {cycles} may have more")
     return "\n".join(lines)
 
 
@@ -435,6 +447,8 @@ class EventLog(Summarized):
     `value` of a reset; NaN for a release."""
     names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the machine's resets, by number; "" for one without a name."""
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the parts with a mode, by number: a friction, a soft stop, a switch."""
 
     def summary(self) -> str:
         """Return the events of the first cycles: kind; stop, switch or event; clock."""
@@ -443,8 +457,9 @@ class EventLog(Summarized):
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            name = self.names[number] if kind == "reset" and self.names else None
-            return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
+            names = {"mode": self.mode_names, "reset": self.names}.get(kind)
+            name = names[number] if names else ""
+            return f"{kind} ({name or f'{of} {number}'}{after}) at {self.phase[i, j]:.6g}"
 
         return _listing("event", self.number >= 0, word)
 

@@ -53,6 +53,7 @@ class Friction(AbstractSwitch):
     roundings: ClassVar[int]
     """A slip below this number of roundings of its size counts as zero."""
 
+    word: ClassVar = "friction"
     needs_all_modes: ClassVar = True  # a holding force depends on all other forces
     may_slide: ClassVar = False  # there the body sticks
 

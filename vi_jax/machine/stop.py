@@ -163,7 +163,7 @@ class RigidStop(Wall, AbstractEvent):
             found = self.modes(machine, s, before, *shown_modes(machine, modes))
             whose = f"`modes` of a stop of a {type(machine).__name__}"
             machine_modes = modes_after(machine, found, modes, whose)
-        return struck_modes(machine, s, after, modes, machine_modes)
+        return struck_modes(machine, s, after, modes, machine_modes, before=before)
 
     def jump(self, machine, s, state, *modes):
         body = machine.coordinates[self.coordinate]
@@ -400,6 +400,7 @@ class SoftStop(Wall, AbstractSwitch):
     mass: Float[Array, "..."] | None
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
+    word: ClassVar = "soft stop"
     checked_within_step: ClassVar = (
         False  # steps are short compared with a contact (`longest_step`)
     )

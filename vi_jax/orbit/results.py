@@ -122,7 +122,8 @@ class ORBIT_RESULTS(NamedEnumeration):
     inadmissible = "The motion found would pass through a stop."
     no_orbit = (
         "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
-        "nearer to one."
+        "nearer to one, such as the end of a long simulation. Events that a reset sets off at the "
+        "same instant change the number of cycles (see the event log)."
     )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
@@ -257,8 +258,9 @@ class Orbit(Summarized):
         return self.successful & inside & (self.slowest_impact > 0)
 
     def trajectory(
-        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8
-    ) -> Run:
+        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8,
+        event_log: int = 0,
+    ) -> Run:  # fmt: skip
         """Return the motion over one period (or `cycles` drive cycles), sampled, for plots.
 
         **Raises:** `ValueError` for a batch of orbits, or a guess that led to none.
@@ -281,9 +283,10 @@ class Orbit(Summarized):
             each = period if cycles % period == 0 else cycles
             machine = machine.observed_every(self.duration * (each / period))
             samples, impact_log, cycles = samples * each, impact_log * each, cycles // each
+            event_log = event_log * each
         return simulate(
             machine, self.state, cycles, method=self.method, samples=samples,
-            impact_log=impact_log,
+            impact_log=impact_log, event_log=event_log,
         )  # fmt: skip
 
     def to_xarray(
