@@ -23,7 +23,7 @@ from .methods.exact import lack_of_closed_form
 from .noise import WhiteNoise, check_noise, lane_key, words_of
 from .results import (
     EVENTS, REASON_NAMES, RESULTS, Errors, EventKind, EventLog, ImpactLog, NamedEnumeration,
-    Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
+    Run, Samples, batch_names, in_names, number_of, present, raised, span_of_position, states, tidy,
 )
 from .smooth import (
     TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means,

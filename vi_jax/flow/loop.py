@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes
@@ -45,7 +44,7 @@ from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code
 from .sizes import at_most_one, extents_of, sizes_of
-from .smooth import hold_contacts, in_modes, stops_are_exact
+from .smooth import constant, hold_contacts, in_modes, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -137,7 +136,7 @@ def _pressed_together(
     bodies = plan.machine.coordinates
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
-        held = stop_gradient(hold_contacts(plan.machine, modes, contact))
+        held = constant(hold_contacts(plan.machine, modes, contact))
         current = [rates(held.field, x, s, start) for x in bodies]
         jerks = [force_rate(held, x, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)

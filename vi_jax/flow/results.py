@@ -26,6 +26,7 @@ from ..machine import (
     name_in,
     plain,
     state_in_words,
+    unit_of,
     with_modes,
     with_units,
     without_modes,
@@ -57,6 +58,14 @@ else:
 
         def __ne__(self, other):
             return ~(self == other)
+
+        def __int__(self) -> int:
+            name = self.kind.__name__
+            first = next(iter(self.kind._texts))
+            raise TypeError(
+                f"A {name} is no integer. Compare it with `vi.{name}.{first}` or another member; "
+                f"`vi.{name}[...]` is its text."
+            )
 
         def __repr__(self) -> str:
             name, number = self.kind.__name__, self.number
@@ -347,7 +356,7 @@ def code(name: str) -> float:
 
 
 # The number of an outcome is added as a fraction to the common reason, `ended`.
-_OUTCOMES = 64
+_OUTCOMES = 4096
 
 
 def code_of_outcome(number: int) -> float:
@@ -363,6 +372,16 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 def reason_of(reason: Scalar) -> RESULTS:
     return member_of(RESULTS, jnp.floor(reason))
+
+
+def span_of_position(
+    labels: tuple[str, str], units: Mapping[str, str], ends: tuple[Any, Any], digits: int
+) -> str:
+    """Return the interval of the position, with its name and unit."""
+    name, size = name_in(labels[0]), max(abs(float(x)) for x in ends)
+    low, high = (plain(x, digits, size) for x in ends)
+    quantity = "position" if unit_of(units, "position") else name
+    return f"{name} in {in_unit(f'[{low}, {high}]', units, quantity)}"
 
 
 class Samples(Shown):
@@ -400,6 +419,10 @@ def _listing(what: str, used: object, text: Callable[[int, int], str]) -> str:
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:
         lines.append(f"  and {len(some) - _CYCLES} more cycles")
+    full = int(used.all(axis=1).sum()) if used.shape[1] else 0
+    if full:
+        cycles, size = count_of(full, "cycle"), used.shape[1]
+        lines.append(f"  {what}s after the first {size} are not listed; {cycles} may have more")
     return "\n".join(lines)
 
 
@@ -445,6 +468,8 @@ class EventLog(Summarized):
     `value` of a reset; NaN for a release."""
     names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the machine's resets, by number; "" for one without a name."""
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the parts with a mode, by number: a friction, a soft stop, a switch."""
 
     def summary(self) -> str:
         """Return the events of the first cycles: kind; stop, switch or event; clock."""
@@ -453,8 +478,9 @@ class EventLog(Summarized):
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            name = self.names[number] if kind == "reset" and self.names else None
-            return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
+            names = {"mode": self.mode_names, "reset": self.names}.get(kind)
+            name = names[number] if names else ""
+            return f"{kind} ({name or f'{of} {number}'}{after}) at {self.phase[i, j]:.6g}"
 
         return _listing("event", self.number >= 0, word)
 
@@ -621,9 +647,8 @@ class Run(Summarized):
         where = "section" if outcome is None else "state"
         lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
         if outcome is None and self.y_min is not None and self.y_max is not None:
-            span = f"[{plain(self.y_min[-1], 6)}, {plain(self.y_max[-1], 6)}]"
-            span = in_unit(span, units, "position")
-            lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
+            ends = self.y_min[-1], self.y_max[-1]
+            lines.append(f"  last cycle: {span_of_position(self.labels, units, ends, 6)}")
         for average, x in self.averages.items() if outcome is None else ():
             lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:

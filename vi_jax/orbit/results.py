@@ -32,27 +32,25 @@ from ..flow import (
     quantities_on,
     simulate,
     sizes_on_host,
+    span_of_position,
     states,
     tidy,
 )
 from ..lanes import pin
 from ..machine import (
-    PLAIN,
     AbstractMachine,
     Summarized,
     angles_in,
     clock_word,
-    components,
     cycles_in_words,
     first_few,
     in_rows,
     in_unit,
     is_autonomous,
-    name_in,
+    labels_in,
     nearest_images,
-    overridden,
-    plain,
     state_in_words,
+    stop_in_words,
     stops_of,
     units_of,
     with_units,
@@ -153,7 +151,8 @@ class ORBIT_RESULTS(NamedEnumeration):
     inadmissible = "The motion found would pass through a stop."
     no_orbit = (
         "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
-        "nearer to one."
+        "nearer to one, such as the end of a long simulation. Events that a reset sets off at the "
+        "same instant change the number of cycles (see the event log)."
     )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
@@ -377,10 +376,10 @@ class Orbit(Summarized):
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
-                name = stops_of(self.machine)[int(stop)].side
+                name = stop_in_words(self.machine, stops_of(self.machine)[int(stop)])
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 clock = in_unit(f"{clock_word(self.machine)} {float(phase):.6f}", units, "phase")
-                lines.append(f"  impact: {name} stop at {clock}, V⁻ = {fast}")
+                lines.append(f"  impact: {name} at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(np.sum(self.impact_stop >= 0))
@@ -440,12 +439,10 @@ def hits_in_words(orbit: Orbit) -> str:
 
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
-    """Return the interval of the first coordinate, with its name in pictures or in the state."""
-    machine, (low, high) = orbit.machine, (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span, name = in_unit(f"[{low}, {high}]", units_of(machine), "position"), machine.labels[0]
-    if name == PLAIN[0] and overridden(machine, AbstractMachine, "position") is None:
-        name = next(iter(components(without_modes(orbit.state))))
-    return f"{name_in(name)} in {span}"
+    """Return the interval of the first coordinate, with its name in pictures."""
+    machine, ends = orbit.machine, (orbit.y_min, orbit.y_max)
+    labels = labels_in(machine, without_modes(orbit.state))
+    return span_of_position(labels, units_of(machine), ends, digits)
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:
