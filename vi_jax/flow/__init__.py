@@ -14,7 +14,7 @@ from .arguments import (
 )
 from .history import history_of_function, with_first_history
 from .events import Rates, force_rate, guard_rates
-from .sizes import rounding_bounds, row_sizes, sizes_on_host
+from .sizes import rounding_bounds, row_sizes, sizes_on_host, unit_of
 from .methods import (
     AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,
     chosen, preset,

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes

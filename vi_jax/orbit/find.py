@@ -52,8 +52,8 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ._delay import as_chain, with_delay_error
 from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
+from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 
