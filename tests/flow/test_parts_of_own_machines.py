@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow._machine_checks import check_parts
+from vi_jax.flow.machine_checks import check_parts
 from vi_jax.flow.results import code_of_outcome, outcome_of
 from vi_jax.machine import events_of, stop_in_words
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.flow.events import rising_root, slope
+from vi_jax.flow._step.roots import rising_root, slope
 from vi_jax.flow.methods.taylor import Along, expand
 
 from differences import quick

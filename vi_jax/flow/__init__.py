@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 # ruff: noqa: F401, I001
 # fmt: off
 from ._lane import has_fixed_cycle
-from ._machine_checks import check_parts, check_values, depends_on_time
+from .machine_checks import check_parts, check_values, depends_on_time
 from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
 from ._simulate import compiling, jit, simulate, simulate_pool, simulate_states
 from .arguments import (
     RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
 from .history import history_of_function, with_first_history
-from .events import Rates, force_rate, guard_rates
+from ._step.roots import Rates, force_rate, guard_rates
 from .sizes import rounding_bounds, row_sizes, sizes_on_host, unit_of
 from .methods import (
     AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,

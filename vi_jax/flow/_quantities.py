@@ -30,7 +30,7 @@ from ..machine import (
     overridden,
     shown_modes,
 )
-from ._machine_checks import explain_errors
+from .machine_checks import explain_errors
 
 # Names that results use already: columns of runs, orbits, branches and scans, and axes.
 _RESERVED = frozenset(

@@ -59,7 +59,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._lane import Plan
-from ._machine_checks import (
+from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,
     check_parts,

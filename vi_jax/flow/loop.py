@@ -31,7 +31,7 @@ from ..machine import (
     without_modes,
 )
 from ._lane import Lane, Plan, Record, to_event, total
-from ._machine_checks import (
+from .machine_checks import (
     check_before_modes,
     check_events,
     check_field,
@@ -40,7 +40,7 @@ from ._machine_checks import (
 )
 from ._step.hybrid import iterate
 from ._step.impact import is_compound
-from .events import Rates, force_rate, rates
+from ._step.roots import Rates, force_rate, rates
 from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code

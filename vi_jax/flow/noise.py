@@ -26,7 +26,7 @@ from ..machine import (
     prepared,
 )
 from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
-from ._machine_checks import explain_errors
+from .machine_checks import explain_errors
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))

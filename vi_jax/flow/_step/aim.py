@@ -16,7 +16,7 @@ from ..._types import Flag, Scalar, Scalars
 from ...lanes import pin
 from ...machine import RigidStop, clock_of, events_of, horner, section_number, stops_of, switches_of
 from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
-from ..events import Rates, highest, offset_to_turn, quintic, rising_root, slope
+from .roots import Rates, highest, offset_to_turn, quintic, rising_root, slope
 from ..methods import Foreseen
 from ..smooth import stops_are_exact
 from .guards import Crossing, Side, at_stops, beyond, for_each, may_be_above

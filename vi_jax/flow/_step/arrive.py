@@ -29,8 +29,8 @@ from ...machine import (
     switches_of,
 )
 from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
-from ..drift import FlowToEvent
-from ..events import Rates, guard_rates, offset_to_turn, rates
+from .event_derivatives import FlowToEvent
+from .roots import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
 from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact

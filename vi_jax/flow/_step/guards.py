@@ -33,7 +33,7 @@ from ...machine import (
     stops_of,
 )
 from .._lane import Lane, Plan, any_of, select, to_event
-from ..events import Rates, guard_rates, landing, rates
+from .roots import Rates, guard_rates, landing, rates
 from ..methods import Stage
 from ..sizes import guard_rounding
 from ..smooth import SmoothMachine, is_affine, stops_are_exact
@@ -554,7 +554,7 @@ def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
 
 def landing_tolerance(x: Scalar) -> float:
     """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. The
-    state is extrapolated over it to first order (`drift.extrapolate`): errors are of order δ²."""
+    state is extrapolated over it to first order (`event_derivatives.extrapolate`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 

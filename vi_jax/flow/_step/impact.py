@@ -36,8 +36,8 @@ from ...machine import (
     struck_modes,
 )
 from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
-from ..drift import FlowToEvent
-from ..events import force_rate, rates
+from .event_derivatives import FlowToEvent
+from .roots import force_rate, rates
 from ..results import EventKind
 from ..smooth import SmoothMachine, hold_contacts, in_modes
 from .trial import AppliedStep

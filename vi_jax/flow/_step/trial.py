@@ -11,8 +11,8 @@ from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import is_alive, stops_of, switches_of
 from .._lane import FREE, Lane, Plan, any_of, to_event, to_release, to_turn_of, total
-from ..drift import FlowToEvent
-from ..events import Rates, force_rate, rates, turns_within
+from .event_derivatives import FlowToEvent
+from .roots import Rates, force_rate, rates, turns_within
 from ..history import end_of_step, new_piece, piece_error
 from ..methods import Foreseen, stages_to_step_to
 from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, stops_are_exact

@@ -24,7 +24,7 @@ from ..._checks import count, require
 from ..._types import Scalar, Scalars, State
 from ...lanes import called
 from ...machine import SoftStop, switches_of
-from ..events import Rates
+from .._step.roots import Rates
 from ..smooth import Integrals, SmoothMachine, rate_of_integrals
 from .base import AbstractMethod, has_relaxation
 

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from .._types import Flag, Scalar, Scalars, State
-from ..machine import Coordinate, horner
-from .smooth import SmoothMachine
+from ..._types import Flag, Scalar, Scalars, State
+from ...machine import Coordinate, horner
+from ..smooth import SmoothMachine
 
 # d(state)/ds as a function of s and the state.
 Field = Callable[[Scalar, State], State]
