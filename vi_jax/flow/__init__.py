@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
-from ._lane import has_fixed_cycle
+from .plan import has_fixed_cycle
 from .machine_checks import check_parts, check_values, depends_on_time
 from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
 from ._simulate import compiling, jit, simulate, simulate_pool, simulate_states

@@ -30,12 +30,13 @@ from ..machine import (
     switches_of,
     without_modes,
 )
-from ._lane import Plan, Record
 from ._quantities import has_quantities
 from .arguments import RunOptions, make_plan
+from .lane import Record
 from .loop import Ends, run_lane
 from .methods import MethodLike
 from .noise import with_noise
+from .plan import Plan
 from .results import Errors, EventLog, ImpactLog, Run, Samples, outcome_of, raised, reason_of
 from .smooth import TIME, means
 

@@ -58,7 +58,8 @@ from ..machine import (
     without_modes,
 )
 from ..machine import State as NamedState
-from ._lane import Plan
+from ._quantities import average_names, check_units, quantity_names
+from .history import check_delays, with_history, with_some_past
 from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,
@@ -66,9 +67,8 @@ from .machine_checks import (
     check_values,
     explain_errors,
 )
-from ._quantities import average_names, check_units, quantity_names
-from .history import check_delays, with_history, with_some_past
 from .methods import AbstractMethod, MethodLike, chosen
+from .plan import Plan
 from .sizes import rounding_bounds
 
 _TRACED = ["settle", "method", "begin", "until", "stop"]

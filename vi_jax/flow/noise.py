@@ -25,8 +25,8 @@ from ..machine import (
     others_of,
     prepared,
 )
-from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
 from .machine_checks import explain_errors
+from .plan import Impulses, Plan, has_fixed_cycle, s_counts_cycles
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))

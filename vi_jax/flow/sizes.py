@@ -38,7 +38,7 @@ from ..machine import (
 from .smooth import in_modes, stops_are_exact
 
 if TYPE_CHECKING:
-    from ._lane import Plan
+    from .plan import Plan
 
 # Thresholds in `s` are for cycles of about 2π, and hold for cycles up to this factor shorter or
 # longer: a choice.

@@ -39,11 +39,11 @@ from ..machine import (
     without_modes,
     without_turns,
 )
-from .flight import Event, section_of
 from .birkhoff import agreement, rotation_number, weights, without_angles
 from .corrector import on_host
 from .cycle_map import cycle_map, map_state
 from .equations import ROUNDING, Observed, Shooting
+from .flight import Event, section_of
 from .from_orbit import equations_along, event_numbers, fixed_step_method, steps_of, with_sizes
 from .results import Orbit
 from .special import Point

@@ -15,11 +15,12 @@ from jaxtyping import Array
 from ..._types import Flag, Scalar, Scalars
 from ...lanes import pin
 from ...machine import RigidStop, clock_of, events_of, horner, section_number, stops_of, switches_of
-from .._lane import FREE, Lane, Plan, any_of, select, to_event, to_release, to_turn_of
-from .roots import Rates, highest, offset_to_turn, quintic, rising_root, slope
+from ..lane import FREE, Lane, any_of, select, to_event, to_release, to_turn_of
 from ..methods import Foreseen
+from ..plan import Plan
 from ..smooth import stops_are_exact
 from .guards import Crossing, Side, at_stops, beyond, for_each, may_be_above
+from .roots import Rates, highest, offset_to_turn, quintic, rising_root, slope
 from .trial import Path, Trial
 
 # A hump of a guard this close to an end of a step (as a share of it) is visible there: a choice.

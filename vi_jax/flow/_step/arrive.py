@@ -28,14 +28,15 @@ from ...machine import (
     struck_modes,
     switches_of,
 )
-from .._lane import Lane, Plan, any_of, select, to_event, to_turn_of, with_item
-from .event_derivatives import FlowToEvent
-from .roots import Rates, guard_rates, offset_to_turn, rates
+from ..lane import Lane, any_of, select, to_event, to_turn_of, with_item
+from ..plan import Plan
 from ..results import EventKind, code_of_outcome
 from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
+from .event_derivatives import FlowToEvent
 from .guards import JUMPED, Crossing, furthest_landing
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
+from .roots import Rates, guard_rates, offset_to_turn, rates
 from .trial import AppliedStep, Release, Trial
 
 # Each event of one instant may happen this often, by choice, before the lane ends: some trigger

@@ -21,9 +21,9 @@ from jax.custom_derivatives import SymbolicZero
 
 from ..._types import Flag, Scalar
 from ...machine import clock_of, guard_of, section_number
-from .._lane import Plan
-from .roots import rates
+from ..plan import Plan
 from ..smooth import SmoothMachine, hold_contacts, rate_of_integrals
+from .roots import rates
 
 
 def _nonzero_tangents(tangents: Any) -> tuple[tuple[bool, ...], list[Any]]:
@@ -207,7 +207,7 @@ class FlowToEvent:
         return event_offset(self._pure_rate, guard, offset, *self._arguments(), flags)
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
-        """Return the `height` of coordinate number k with derivatives (`event_derivatives.height_of_turn`)."""
+        """Return the `height` of coordinate number k with derivatives (`height_of_turn`)."""
         position = self._pure(self._position_of(k))
         return height_of_turn(self._pure_rate, position, height, turns, offset, *self._arguments())
 

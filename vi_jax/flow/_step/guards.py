@@ -32,11 +32,12 @@ from ...machine import (
     size_of,
     stops_of,
 )
-from .._lane import Lane, Plan, any_of, select, to_event
-from .roots import Rates, guard_rates, landing, rates
+from ..lane import Lane, any_of, select, to_event
 from ..methods import Stage
+from ..plan import Plan
 from ..sizes import guard_rounding
 from ..smooth import SmoothMachine, is_affine, stops_are_exact
+from .roots import Rates, guard_rates, landing, rates
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -554,7 +555,7 @@ def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:
 
 def landing_tolerance(x: Scalar) -> float:
     """Return the largest accepted |δ|, the distance in `s` from the step's end to the event. The
-    state is extrapolated over it to first order (`event_derivatives.extrapolate`): errors are of order δ²."""
+    state is extrapolated over it to first order (`extrapolate`): errors are of order δ²."""
     return 1e-9 if x.dtype == jnp.float64 else 1e-4
 
 

@@ -38,9 +38,10 @@ from ...machine import (
     switches_of,
     with_earlier_clock,
 )
-from .._lane import FREE, Lane, Plan, Record, any_of, select, to_event, total
 from ..history import extended, is_full, opened
+from ..lane import FREE, Lane, Record, any_of, select, to_event, total
 from ..noise import with_impulse
+from ..plan import Plan
 from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
 from .aim import aim_ahead, aim_at

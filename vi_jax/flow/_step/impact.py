@@ -35,11 +35,12 @@ from ...machine import (
     strike,
     struck_modes,
 )
-from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
-from .event_derivatives import FlowToEvent
-from .roots import force_rate, rates
+from ..lane import Lane, add_entry, any_of, select, to_event, with_item
+from ..plan import Plan
 from ..results import EventKind
 from ..smooth import SmoothMachine, hold_contacts, in_modes
+from .event_derivatives import FlowToEvent
+from .roots import force_rate, rates
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than

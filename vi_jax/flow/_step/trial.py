@@ -10,12 +10,12 @@ from jaxtyping import Array
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import is_alive, stops_of, switches_of
-from .._lane import FREE, Lane, Plan, any_of, to_event, to_release, to_turn_of, total
-from .event_derivatives import FlowToEvent
-from .roots import Rates, force_rate, rates, turns_within
 from ..history import end_of_step, new_piece, piece_error
+from ..lane import FREE, Lane, any_of, to_event, to_release, to_turn_of, total
 from ..methods import Foreseen, stages_to_step_to
+from ..plan import Plan
 from ..smooth import Integrals, SmoothMachine, carried, elapsed, hold_contacts, stops_are_exact
+from .event_derivatives import FlowToEvent
 from .guards import (
     SHARES,
     Crossing,
@@ -30,6 +30,7 @@ from .guards import (
     tolerance_factor,
     turn_tolerance,
 )
+from .roots import Rates, force_rate, rates, turns_within
 
 # Attempts in a row at a release until its distance is halved: a choice, three or four are usual.
 _PATIENCE = 8.0

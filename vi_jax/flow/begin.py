@@ -1,0 +1,141 @@
+"""The first lane of a simulation: which bodies rest, stick or slip at the start."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._types import Flag, Scalar, Scalars, State
+from ..machine import (
+    begin_modes,
+    frictions_in,
+    has_contact_friction,
+    holds_anywhere,
+    is_in_range,
+    limited_in,
+    on_held_surfaces,
+    pressed_contacts,
+    stops_of,
+    struck_modes,
+    switches_of,
+)
+from ._step.impact import is_compound
+from ._step.roots import Rates, force_rate, rates
+from .lane import Lane, to_event, total
+from .plan import Plan
+from .results import code
+from .smooth import constant, hold_contacts, in_modes, stops_are_exact
+
+
+def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
+    """Return the lane at the first step of its loop, in the state `start`. A lane that cannot be
+    simulated, or is not `wanted`, has ended already."""
+    machine = plan.machine
+    Y = machine.position(start)
+    bad = ~jnp.isfinite(total((start, machine.cycle), plan.settle)) | ~jnp.asarray(wanted)
+    bad = bad | ~is_in_range(machine, start)
+    for number in jtu.tree_leaves(eqx.filter(machine, eqx.is_inexact_array)):
+        bad = bad | jnp.any(jnp.isnan(number))  # infinite is allowed: no limit
+    bad = bad | plan.beyond_a_stop(start)
+    bad = jax.lax.stop_gradient(bad)
+    zero = jnp.zeros_like(Y)
+    s = zero if plan.begin is None else zero + plan.begin
+    modes = begin_modes(machine, s, start, plan.start_modes)
+    free = in_modes(machine, modes)
+    current = [rates(free.field, x, s, start) for x in machine.coordinates]
+    # At rest the sign of the acceleration is the direction of motion.
+    direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in current)
+    contact = None
+    if plan.rests:
+        jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
+        contact = _contacts_at(plan, start, current, jerks)
+        if len(limited_in(machine)) > 1:
+            contact = _pressed_together(plan, s, start, modes, contact)
+        direction = tuple(
+            jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
+            for x, j, sign in zip(current, jerks, direction, strict=True)
+        )
+        for i, stop in enumerate(stops_of(machine)):
+            # From slightly off the stop it would come to rest there too: no derivatives.
+            on_stop = machine.coordinates[stop.coordinate].placed(start, stop.place, zero)
+            rests = contact[stop.coordinate] == to_event(i)
+            start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
+        if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
+            modes = struck_modes(machine, s, start, modes, contact=contact)
+        if is_compound(machine):
+            contact = pressed_contacts(machine, s, start, modes, contact)
+    slides = any(x.blends for x in switches_of(machine))
+    if slides or holds_anywhere(machine) or has_contact_friction(machine):
+        start = on_held_surfaces(machine, s, start, modes, contact or ())
+    fault = jnp.where(bad, code("bad_start"), zero)
+    for i in frictions_in(machine):
+        fault = jnp.where(jnp.isnan(modes[i]) & ~bad, code("jammed"), fault)
+    length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
+    if plan.method.adaptive:
+        length = length / 8
+    return Lane(
+        s=s,
+        state=start,
+        record=plan.empty_record(start),
+        direction=jax.lax.stop_gradient(direction),
+        contact=contact,
+        modes=modes,
+        below=tuple(zero - 1 for _ in plan.from_below(start)),
+        length=length,
+        attempt=length,
+        target=zero,
+        attempts=zero,
+        part=plan.first_part(zero) if plan.instants > 1 else zero,
+        done=zero,
+        fault=fault,
+        steps=zero,
+        spent=zero,
+        rejected=zero,
+        last_impulse=zero if plan.noise is not None and plan.noise.measures_time else None,
+    )
+
+
+def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Scalar]) -> Scalars:
+    """Return the stops on which the coordinates rest, by their rates and those of the forces."""
+    found = []
+    for k, (body, rate) in enumerate(zip(current, jerks, strict=True)):
+        slack, slow = plan.rounding_bounds(k, start)
+        if not stops_are_exact(plan.machine, start):
+            # A resting body gathers the rounding of the force on it: a woodpecker 0.03 of this.
+            share = 4 * float(jnp.finfo(body.x.dtype).eps)
+            slow = jnp.maximum(slow, share * plan.machine.cycle * jnp.abs(body.a))
+        found.append(_rests_on(plan, k, body, rate, slack, slow))
+    return tuple(found)
+
+
+def _pressed_together(
+    plan: Plan, s: Scalar, start: State, modes: Scalars, contact: Scalars
+) -> Scalars:
+    """Return the contacts with those that press on only since others hold: a body lies on another
+    that would fall faster than it."""
+    bodies = plan.machine.coordinates
+
+    def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
+        held = constant(hold_contacts(plan.machine, modes, contact))
+        current = [rates(held.field, x, s, start) for x in bodies]
+        jerks = [force_rate(held, x, held, s, start) for x in bodies]
+        more = _contacts_at(plan, start, current, jerks)
+        return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
+
+    return jax.lax.scan(add_contacts, contact, None, length=len(limited_in(plan.machine)) - 1)[0]
+
+
+def _rests_on(
+    plan: Plan, k: int, current: Rates, jerk: Scalar, slack: Scalar | float, slow: Scalar | float
+) -> Scalar:
+    """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
+    about to be by a force that grows. Its position is known to within `slack`, its velocity to
+    `slow`, and both to the rounding of a search that ends there."""
+    contact, least = jnp.zeros_like(current.x), 4 * jnp.finfo(current.x.dtype).eps * plan.extent(k)
+    slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
+    for i, stop in enumerate(stops_of(plan.machine)):
+        if stop.coordinate == k:
+            pressed = (stop.sign * current.a > 0) | (current.a == 0) & (stop.sign * jerk > 0)
+            rests = (stop.beyond(current.x) >= -slack) & (jnp.abs(current.v) <= slow) & pressed
+            contact = jnp.where(rests, to_event(i), contact)
+    return contact
