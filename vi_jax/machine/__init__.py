@@ -13,6 +13,7 @@ from .clocks import (
     frequency_ratio, in_clock, in_cycle_clock, in_cycle_state, is_alive, is_in_range,
     logged_turn, may_rest, phase_at, prepared, scales_known,
 )
+from .contact_forces import contact_forces
 from .contacts import (
     added, check_takes, constrained_rate, contact_constraints, field_in, forces, on_held_surfaces,
     push_gains, push_of, row_of, shown_modes, velocity_change, with_friction_impulse,

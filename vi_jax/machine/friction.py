@@ -40,7 +40,7 @@ from .coordinates import Row
 from .declared import hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
-from .settle import Contacts, settle
+from .settle import Contacts, Settled, settle
 from .state import with_components
 
 
@@ -365,15 +365,31 @@ def _settled(
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
     """Return the modes of frictions by their slips, and the contacts that stay closed; jitted like
     `_solve_forces`."""
+    slip_of = dict(zip(frictions_in(machine), slips, strict=True))
+    if not contact and not any(x.is_dry for x in switches_of(machine)):
+        return slips, contact
+    order, touches, answer = settled_forces(machine, s, state, modes, contact, slips, holds)
+    for n, i in enumerate(order):
+        mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
+        slip_of[i] = jnp.where(touches[n], mode, slip_of[i])
+    kept = list(contact)
+    for row, k in enumerate(limited_in(machine) if contact else ()):
+        kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
+    return tuple(slip_of.values()), tuple(kept)
+
+
+def settled_forces(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    slips: Scalars, holds: Scalars,
+) -> tuple[list[int], list[Flag], Settled]:  # fmt: skip
+    """Return the frictions that act, by their indices, those on stops first; whether each touches
+    its surface; and the forces and modes. **Arguments:** `contact`, as in `EventContext`; `slips`
+    and `holds`, a number for each friction, as in `machine.settle`."""
     indices, switches = frictions_in(machine), switches_of(machine)
     order = [i for i in indices if switches[i].is_dry or contact]
     order.sort(key=lambda i: switches[i].is_dry)
-    slip_of, hold_of = (
-        dict(zip(indices, slips, strict=True)),
-        dict(zip(indices, holds, strict=True)),
-    )
-    if not order and not contact:
-        return slips, contact
+    slip_of = dict(zip(indices, slips, strict=True))
+    hold_of = dict(zip(indices, holds, strict=True))
     free = tuple(0.0 * x if i in indices else x for i, x in enumerate(modes))
     held = contact_constraints(machine, s, state, free, contact)
     touches = [switches[i].touches(machine, contact) for i in order]
@@ -387,14 +403,7 @@ def _settled(
         hold=jnp.stack([hold_of[i] for i in order]) if order else none,
         touches=jnp.stack(touches[: len(of)]) if of else None,
     )
-    answer = settle(question, of, has_ratios=bool(held.dry))
-    for n, i in enumerate(order):
-        mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
-        slip_of[i] = jnp.where(touches[n], mode, slip_of[i])
-    kept = list(contact)
-    for row, k in enumerate(limited_in(machine) if contact else ()):
-        kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
-    return tuple(slip_of.values()), tuple(kept)
+    return order, touches, settle(question, of, has_ratios=bool(held.dry))
 
 
 def _question(
