@@ -222,7 +222,7 @@ def _are_supported(*options: tuple[str, object]) -> bool:
 
 
 def keep_programs(folder: str | Path | None = None) -> Path | None:
-    """Keep compiled programs in a folder, so that the next process need not compile them again.
+    """Store compiled programs in a folder, so that the next process need not compile them again.
 
     Call it once, before the first simulation. A program's name is computed from its content, so a
     changed class, function or number of a program is compiled anew. Only the user must be able to

@@ -24,7 +24,7 @@ from tools.study import QUICK, say
 from tools.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
-ROUNDS = 1 if QUICK else 5
+ROUNDS = 1 if QUICK else int(os.environ.get("ROUNDS", "5"))
 
 BEGIN = """
 import jax
@@ -120,12 +120,13 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for name, program in PROGRAMS.items():
             found: dict[tuple[Path, str], list[float]] = {}
-            for number in range(ROUNDS + 1):  # the first fills the caches
+            for place, root in enumerate(roots):
+                seconds(program, root, f"{folder}/{place}")  # fills the cache
+            for _ in range(ROUNDS):
                 for place, root in enumerate(roots):
                     for cache in ("", f"{folder}/{place}"):
                         taken = seconds(program, root, cache)
-                        if number:
-                            found.setdefault((root, cache), []).append(taken)
+                        found.setdefault((root, cache), []).append(taken)
             medians = [f"{statistics.median(x):.1f}" for x in found.values()]
             say(f"{name}: {', '.join(medians)}")
             rows.append([name, *medians])
@@ -135,9 +136,9 @@ def main() -> None:
 
     text = f"""# First calls
 
-Processor seconds of a fresh process, imports included; medians of {ROUNDS} runs with Python
-{platform.python_version()} and JAX {jax.__version__}. The second column is with the programs of an
-earlier process (`vi.keep_programs()`).
+Processor seconds of a fresh process, imports included; number of runs of which the median is
+taken: {ROUNDS}. Python {platform.python_version()}, JAX {jax.__version__}. The second column is
+with the programs of an earlier process (`vi.keep_programs()`).
 
 {table(["program", "without a cache", "with a warm cache"], rows)}
 

@@ -43,7 +43,7 @@ def test_plain_english(page):
 
 
 VERBS = """Animate Compile Compute Count Draw End Estimate Find Follow Label Predict Return Run
-Simulate Sweep Trace""".split()
+Simulate Store Sweep Trace""".split()
 CLAUSES = "What Where When Which How Why".split()
 
 
