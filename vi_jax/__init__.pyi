@@ -4,6 +4,7 @@ and type checkers take their types from here."""
 from . import machines as machines
 from . import plot as plot
 from ._messages import Interrupted as Interrupted
+from ._programs import keep_programs as keep_programs
 from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
@@ -51,6 +52,7 @@ from .machine import SliderCrank as SliderCrank
 from .machine import SoftStop as SoftStop
 from .machine import State as State
 from .machine import Switch as Switch
+from .machine import delay_chain as delay_chain
 from .machine import falling as falling
 from .machine import rising as rising
 from .machine import turn_of as turn_of

@@ -188,3 +188,33 @@ def test_results_agree_with_xla(name):
     for a, b in zip(*map(jax.tree_util.tree_leaves, (ours, truth)), strict=True):
         assert a.dtype == b.dtype and a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol)
+
+
+def test_blocks_of_the_carry_are_written_in_place():
+    """A row is replaced in each iteration; what was read before keeps its old numbers."""
+    size, width = 40, 5
+
+    def begin(x):
+        carry = jnp.zeros((size, width)) + x, x * 0, x
+        return carry, lanes.Emitted(True, False, (x * jnp.ones(width), x * jnp.ones(3 * width)))
+
+    def step(x, carry):
+        table, n, y = carry
+        at = jnp.mod(3 * n + jnp.floor(x), size).astype(jnp.int32)
+        zero = jnp.zeros_like(at)
+        before = jax.lax.dynamic_slice(table, (at, zero), (1, width))[0]
+        many = 2 * table[3:7].ravel()  # computed when it is used, after the row is replaced
+        row = y * jnp.arange(1.0, width + 1)
+        table = jax.lax.dynamic_update_slice(table, row[None], (at, zero))
+        y = 0.9 * y + 0.1 * jnp.sum(before) + 0.01 * jnp.sum(many)
+        return (table, n + 1, jnp.sin(y)), lanes.Emitted(n < 30 + x, False, (before, many[:15]))
+
+    def run(x, backend):
+        out, _ = lanes.run(begin, step, lambda x, c: c[:1] + c[2:], x, rows=0, backend=backend)
+        return out
+
+    xs = jnp.linspace(0.3, 9.7, 20)
+    for function in (run, lambda x, b: jax.jvp(lambda x: run(x, b), (x,), (1.0,))[1]):
+        fast, plain = (jax.vmap(lambda x, b=b, f=function: f(x, b))(xs) for b in ("auto", "xla"))
+        for a, b in zip(fast, plain, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)

@@ -21,12 +21,12 @@ from ..machine import (
     cycle_time,
     is_autonomous,
     leaf_names,
+    limited_in,
     others_of,
     prepared,
 )
 from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
 from ._machine_checks import explain_errors
-from .smooth import limited_of
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -158,6 +158,11 @@ def check_noise(machine: AbstractMachine, start: State, noise: Any) -> None:
     in the state `start`."""
     if not isinstance(noise, WhiteNoise):
         raise TypeError(f"Argument `noise` must be a `WhiteNoise`, but got {noise!r}.")
+    if machine.delays:
+        raise ValueError(
+            f"Argument `noise` must be left out for a {type(machine).__name__}, which has delays: "
+            "impulses would leave a jump in its history at each instant."
+        )
     _check_machine(machine, start)
     amplitudes, functions = _by_leaf(start, noise)
     _check_velocities(machine, start, amplitudes)
@@ -244,7 +249,7 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
         for x, a in zip(leaves, amplitudes, strict=True)
     ]
-    for k in limited_of(machine):
+    for k in limited_in(machine):
         place = machine.coordinates[k].position
         velocity = concrete(jax.jvp(place, (start,), (tree.unflatten(direction),))[1])
         if velocity is not None and np.any(velocity):

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .._checks import one_of
+from .._checks import array_module, concrete, from_host, one_of
 from .._messages import count_of
 from .._types import Scalar, State, xr
 from ..machine import (
@@ -26,6 +26,7 @@ from ..machine import (
     name_in,
     plain,
     state_in_words,
+    unit_of,
     with_modes,
     with_units,
     without_modes,
@@ -49,10 +50,22 @@ else:
         def __eq__(self, other):
             if not isinstance(other, self.kind):
                 raise ValueError(f"A {self.kind.__name__} has no order with {other!r}.")
-            return jnp.equal(self.number, other.number)
+            known = concrete(self.number), concrete(other.number)
+            if known[0] is None or known[1] is None:
+                return jnp.equal(self.number, other.number)
+            same = np.asarray(np.equal(*known))
+            return from_host(same) if isinstance(self.number, jax.Array) else same
 
         def __ne__(self, other):
             return ~(self == other)
+
+        def __int__(self) -> int:
+            name = self.kind.__name__
+            first = next(iter(self.kind._texts))
+            raise TypeError(
+                f"A {name} is no integer. Compare it with `vi.{name}.{first}` or another member; "
+                f"`vi.{name}[...]` is its text."
+            )
 
         def __repr__(self) -> str:
             name, number = self.kind.__name__, self.number
@@ -98,7 +111,8 @@ else:
         @classmethod
         def where(cls, condition, a, b):
             """Apply `jnp.where` to two members."""
-            return _Member(jnp.where(condition, a.number, b.number), cls)
+            array = array_module(condition, a.number, b.number)
+            return _Member(array.where(condition, a.number, b.number), cls)
 
 
 def names_of(kind: Any) -> np.ndarray:
@@ -131,6 +145,14 @@ def number_of(member: Any) -> Int[Array, "..."]:
 def member_of(kind: Any, number: Any) -> Any:
     """Return the member of an enumeration with this index; one for each lane."""
     return _Member(jnp.asarray(number, jnp.int32), kind)
+
+
+def _at(x: Any, place: tuple) -> Any:
+    """Return x[place], by NumPy if `x` is known and in this computer's memory."""
+    in_memory = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+    if not in_memory or any(device.platform != "cpu" for device in x.devices()):
+        return x[place]
+    return from_host(np.asarray(x)[place])
 
 
 class EventKind(enum.IntEnum):
@@ -313,6 +335,14 @@ class RESULTS(NamedEnumeration):
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
     )
+    jammed = (
+        "No motion with a closed contact or a sticking body fulfils Coulomb's law of friction, as "
+        "for a rod that is pushed into rough ground (Painlevé's paradox)."
+    )
+    full_history = (
+        "The steps within the longest delay are more than the history holds. Write a larger "
+        "`history_size` in the machine's class, such as `history_size = 1024`."
+    )
     ended = "An event of the machine ended the motion, with the outcome `Run.outcome`."
 
 
@@ -326,7 +356,7 @@ def code(name: str) -> float:
 
 
 # The number of an outcome is added as a fraction to the common reason, `ended`.
-_OUTCOMES = 64
+_OUTCOMES = 4096
 
 
 def code_of_outcome(number: int) -> float:
@@ -342,6 +372,16 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 def reason_of(reason: Scalar) -> RESULTS:
     return member_of(RESULTS, jnp.floor(reason))
+
+
+def span_of_position(
+    labels: tuple[str, str], units: Mapping[str, str], ends: tuple[Any, Any], digits: int
+) -> str:
+    """Return the interval of the position, with its name and unit."""
+    name, size = name_in(labels[0]), max(abs(float(x)) for x in ends)
+    low, high = (plain(x, digits, size) for x in ends)
+    quantity = "position" if unit_of(units, "position") else name
+    return f"{name} in {in_unit(f'[{low}, {high}]', units, quantity)}"
 
 
 class Samples(Shown):
@@ -379,6 +419,10 @@ def _listing(what: str, used: object, text: Callable[[int, int], str]) -> str:
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:
         lines.append(f"  and {len(some) - _CYCLES} more cycles")
+    full = int(used.all(axis=1).sum()) if used.shape[1] else 0
+    if full:
+        cycles, size = count_of(full, "cycle"), used.shape[1]
+        lines.append(f"  {what}s after the first {size} are not listed; {cycles} may have more")
     return "\n".join(lines)
 
 
@@ -424,6 +468,8 @@ class EventLog(Summarized):
     `value` of a reset; NaN for a release."""
     names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the machine's resets, by number; "" for one without a name."""
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the parts with a mode, by number: a friction, a soft stop, a switch."""
 
     def summary(self) -> str:
         """Return the events of the first cycles: kind; stop, switch or event; clock."""
@@ -432,8 +478,9 @@ class EventLog(Summarized):
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            name = self.names[number] if kind == "reset" and self.names else None
-            return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
+            names = {"mode": self.mode_names, "reset": self.names}.get(kind)
+            name = names[number] if names else ""
+            return f"{kind} ({name or f'{of} {number}'}{after}) at {self.phase[i, j]:.6g}"
 
         return _listing("event", self.number >= 0, word)
 
@@ -522,6 +569,8 @@ class Run(Summarized):
     """The state after the event, a pytree like the start; NaN without."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the outcomes with which events and stops of the machine end a motion."""
+    history: Any = None
+    """The history at the end, of a machine with delays, from which `last` continues."""
 
     @property
     def successful(self) -> jax.Array:
@@ -536,11 +585,13 @@ class Run(Summarized):
     @property
     def last(self) -> State:
         """The state on the last section: a start to continue from, or a guess for `find_orbit`. For
-        a machine with discrete modes it is a `HybridState`, which contains them."""
+        a machine with discrete modes or delays it is a `HybridState`, which contains them and the
+        history."""
         # Batch axes come before the axis of the sections, those of an array in the state after it.
         # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        return jtu.tree_map(lambda x: x[place], with_modes(self.sections, self.modes))
+        last, modes = jtu.tree_map(lambda x: _at(x, place), (self.sections, self.modes))
+        return with_modes(last, modes, self.history)
 
     def mean_averages(self) -> dict[str, Scalar]:
         """Return the machine's own averages over the time of all cycles, of one lane."""
@@ -584,25 +635,24 @@ class Run(Summarized):
     def summary(self) -> str:
         """Return the last section and cycle, and the reason why the run ended, as text."""
         if self.steps.ndim:
-            good = int(jnp.sum(self.successful))
-            ended = "" if self.outcome is None else f", {int(jnp.sum(self.outcome >= 0))} ended"
+            good = int(np.sum(self.successful))
+            ended = "" if self.outcome is None else f", {int(np.sum(self.outcome >= 0))} ended"
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful{ended}"
         cycles = self.impacts.shape[-1]
         lines = [
-            f"Run of {count_of(cycles, 'cycle')}, {count_of(int(jnp.sum(self.impacts)), 'impact')}"
+            f"Run of {count_of(cycles, 'cycle')}, {count_of(int(np.sum(self.impacts)), 'impact')}"
         ]
         units, outcome = dict(self.units), self._outcome_in_words()
         last = without_modes(self.last) if outcome is None else self.outcome_state
         where = "section" if outcome is None else "state"
         lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
         if outcome is None and self.y_min is not None and self.y_max is not None:
-            span = f"[{plain(self.y_min[-1], 6)}, {plain(self.y_max[-1], 6)}]"
-            span = in_unit(span, units, "position")
-            lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
+            ends = self.y_min[-1], self.y_max[-1]
+            lines.append(f"  last cycle: {span_of_position(self.labels, units, ends, 6)}")
         for average, x in self.averages.items() if outcome is None else ():
             lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:
-            worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
+            worst = max(float(np.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")
         lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
         ended = outcome or ("completed" if bool(self.successful) else RESULTS[self.result])

@@ -36,7 +36,7 @@ from .declared import (
 from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction
-from .numbers import PLAIN, Shown, unit_in
+from .numbers import PLAIN, Shown, components, unit_in
 from .stop import RigidStop, SoftStop, Wall
 
 # Required members, each with advice for an error message.
@@ -235,6 +235,8 @@ class AbstractMachine(Shown):
     | `modes` | discrete modes by name, which events change |
     | `position`, `velocity`, `placed` | the coordinate of contacts that name none |
     | `coordinates` | several coordinates by index |
+    | `delays` | delays by name; then the past follows the state in functions |
+    | `recorded`, `before` | what is delayed, by default the state; its history before the start |
     | `averages` | means over a cycle: a power, a mean force |
     | `quantities` | functions of the state, by name, included in results |
     | `renewed` | a drifting component, set back in each cycle |
@@ -281,6 +283,8 @@ class AbstractMachine(Shown):
         events: Any = eqx.field(init=False)
         modes: Any = eqx.field(init=False)
         coordinates: Any = eqx.field(init=False)
+        delays: Any = eqx.field(init=False)
+        before: Any = eqx.field(init=False)
     else:
 
         @property
@@ -314,6 +318,24 @@ class AbstractMachine(Shown):
             `on`; a contact without `on` acts on the machine's `position`, `velocity` and
             `placed`."""
             return _coordinates_in(self)
+
+        @derived
+        def delays(self) -> Mapping[str, Any]:
+            """The delays by name, lengths in `s` that may depend on parameters. The field, guards
+            and resets then receive the past after the state: `past.turn.x` is x one delay `turn`
+            ago."""
+            return {}
+
+        @derived
+        def before(self) -> Any:
+            """The history before the start: a state like `recorded`, or a function of t ≤ 0; by
+            default the start."""
+            return None
+
+    def recorded(self, *args: Any, **kwargs: Any) -> Any:
+        """Return what is delayed, numbers by name: `recorded(s, state, past, *modes)`, by default
+        the state."""
+        return args[1]
 
     def start(self) -> State:
         """Return the default start. **Raises:** `ValueError` if the machine defines none."""
@@ -353,7 +375,8 @@ class AbstractMachine(Shown):
         time. The means over a cycle are in `Run.averages`, those over the period in
         `Orbit.averages` and in columns of a `Branch`. Impulses of impacts are not included.
         Discrete modes are further arguments, as of the field. `units` may have the unit under the
-        same name. `record="sections"` omits averages.
+        same name. `record="sections"` omits averages. A function that jumps is refused: its jump
+        must be that of the mode of a `Switch`.
         """
         return {}
 
@@ -463,6 +486,17 @@ def names_coordinates(machine: AbstractMachine) -> bool:
         return True
     ons = (x.on for x in contacts_in(machine) if isinstance(x, Wall))  # pyright: ignore[reportAttributeAccessIssue]
     return any(on is not None for on in ons) or machine._names_on(None) is not None
+
+
+def labels_in(machine: AbstractMachine, state: State) -> tuple[str, str]:
+    """Return the labels of position and velocity, which are the first components of a state by name
+    if nothing else names them."""
+    names, labels = list(components(state)), machine.labels
+    own = overridden(machine, AbstractMachine, "position") is not None
+    if labels != PLAIN or own or stops_of(machine) or hasattr(state, "Y"):
+        return labels
+    named = [x for x in names if x[:1].isalpha()]
+    return (named[0], named[:2][-1]) if named else labels
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -5,6 +5,7 @@ An argument `number` is that of an event. `modes` are all of the machine, before
 `contact` is as in `EventContext`.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
 from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import choose_modes, frictions_in
+from .friction import frictions_in, settled_modes
 from .numbers import Shown, size_of
 from .state import changed
 
@@ -73,9 +74,6 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[part], **keywords)
     if event.holds_mode:
         changed = (*modes[: part.start], changed, *modes[part.stop :])
-        if event.is_dry and len(frictions_in(machine)) > 1:
-            changed, was_sticking = constant_modes(changed, s), modes[part.start] == 0
-            changed = choose_modes(machine, s, new, changed, contact, (part.start, was_sticking))
     return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
 
 
@@ -137,21 +135,24 @@ def begin_modes(
 
 def struck_modes(
     machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
-    contact: Scalars = (),
+    contact: Scalars = (), before: State | None = None,
 ) -> Modes:  # fmt: skip
-    """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
+    """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
+    are unchanged, or `own`."""
     event_modes = []
-    solve_together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
-        if solve_together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
-            event_modes.append(event.slip_sign(machine, s, state))  # pyright: ignore
-        elif event.holds_mode:
+        if event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
-            event_modes.append(event.struck(machine, s, state, *modes[part], **keywords))
+            mode = event.struck(machine, s, state, *modes[part], **keywords)
+            if before is not None and isinstance(event, Switch) and not event.slides:
+                # On its surface, where the sign is rounding, only its own event changes the mode.
+                was, now = (event.function(machine, s, x) for x in (before, state))
+                mode = jnp.where(stop_gradient(was == now), modes[part][0], mode)
+            event_modes.append(mode)
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
-    if solve_together:
-        modes = constant_modes(choose_modes(machine, s, state, modes, contact), s)
+    if frictions_in(machine):
+        modes = constant_modes(settled_modes(machine, s, state, modes, contact), s)
     return modes
 
 
@@ -204,13 +205,16 @@ class HybridState(Shown):
 
     - `state`: the state, as the machine's field receives it.
     - `modes`: the machine's discrete modes, a tuple in the order of its `modes`.
+    - `history`: the history of a machine with delays, as a run returns it; by default `None`, the
+      machine's `before`.
     """
 
     state: Any
     modes: tuple[Any, ...]
+    history: Any = None
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("state", "modes") or name.startswith("__"):
+        if name in ("state", "modes", "history") or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.state, name)
 
@@ -228,14 +232,20 @@ def modes_of(state: State) -> tuple[Any, ...] | None:
     return state.modes if isinstance(state, HybridState) else None
 
 
-def with_modes(state: State, modes: tuple[Any, ...] | None) -> State:
-    """Return the state with these own modes of the machine; unchanged without modes."""
-    return HybridState(state, modes) if modes else state
+def history_of(state: State) -> Any:
+    """Return the history of a machine with delays in a state, or `None`."""
+    return state.history if isinstance(state, HybridState) else None
+
+
+def with_modes(state: State, modes: tuple[Any, ...] | None, history: Any = None) -> State:
+    """Return the state with these own modes of the machine, and this history; unchanged without
+    both."""
+    return HybridState(state, modes or (), history) if modes or history is not None else state
 
 
 def replaced(state: State, new: State) -> State:
-    """Return another state in the same modes."""
-    return HybridState(new, state.modes) if isinstance(state, HybridState) else new
+    """Return another state in the same modes, with the same history."""
+    return dataclasses.replace(state, state=new) if isinstance(state, HybridState) else new
 
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:
@@ -270,6 +280,10 @@ class Switch(AbstractSwitch):
 
     function: Callable[..., Any] = eqx.field(static=True)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    @property
+    def is_plain(self) -> bool:
+        return True
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
@@ -347,17 +361,20 @@ class Reset(AbstractEvent):
     ends a cycle belongs to the next cycle.
 
     A guard may jump, such as `where(x > 1, 1.0, -1.0)`. Its zero is found by bisection, to 1e-12 in
-    `s`, in many steps; the time of such an event has no derivative.
+    `s`, in many steps. The time of such an event has no derivative, so that derivatives are NaN. A
+    guard without a slope at its zero, such as `(x - 1)**3`, takes many steps too; its derivatives
+    are right, or NaN where JAX's derivative of the guard is 0.
 
     **Arguments:**
 
     - `guard`: the function that rises through zero: negative before the event, positive after it.
     - `reset`: the state after the event, or a dictionary of the components that change; by default
       the state is unchanged.
-    - `when`: a flag, evaluated only at the instant at which the guard rises through zero. If it is
-      false, the reset does not happen, and the guard must become negative before it can rise again.
-      For a reset as soon as two conditions hold, use the smaller of two guards, or of a mode and a
-      guard: `jnp.where(on == 1, z.T - 296, -1.0)`.
+    - `when`: a flag, evaluated only at the instant at which the guard rises through zero, such as
+      that of a mode: `lambda m, t, z, on: on == 1`. If it is false, the reset does not happen, and
+      the guard must become negative before it can rise again. For a reset as soon as two conditions
+      hold, use the smaller of two guards. With a mode in the guard, the event happens at the
+      instant at which the mode makes it positive.
     - `modes`: the machine's discrete modes after the event: one number, a tuple, or a dictionary of
       those that change; by default unchanged. Switches then have their modes after an impact.
     - `value`: a number for the event log, a function of the state before.
@@ -410,7 +427,7 @@ class Reset(AbstractEvent):
             found = self._call("modes", self._modes, machine, s, state, modes)
             machine_modes = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
-        return new, struck_modes(machine, s, new, modes, machine_modes)
+        return new, struck_modes(machine, s, new, modes, machine_modes, before=state)
 
     def jump(self, machine, s, state, *modes):
         if self._reset is None:

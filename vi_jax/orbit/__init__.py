@@ -3,18 +3,19 @@
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
-from ._continuation import boundary, continue_orbit
-from ._cycle_map import CycleMap, cycle_map, map_state
+from .delay import as_chain
+from .continuation import boundary, continue_orbit
+from .cycle_map import CycleMap, cycle_map, map_state
 from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
 from .grazing import SCENARIOS, Grazing, Motions, grazing
 from .results import (
-    ORBIT_RESULTS, STABILITY, Orbit, Orbits, check_multipliers, complex_in_words,
+    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, complex_in_words,
     distance, distinct_among, distinct_orbits, in_one_line, multipliers_of, stability_of,
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point
-from ._birkhoff import agreement, digits_of, rotation_number, without_angles
+from .birkhoff import agreement, digits_of, rotation_number, without_angles
 from .torus import Torus, find_torus
 from .torus_branch import TorusBranch, Window, continue_torus

@@ -9,12 +9,12 @@ import numpy as np
 
 from .._checks import given_number, one_of
 from ..machine import in_unit, units_of
-from ._conditions import in_one_parameter
-from ._shooting import Shooting
-from ._sliding import SLIDING
-from ._solution import Step, orbit_of
-from ._words import DETAILS, GRAZING, REST, grazing_in_words, with_article
+from .conditions import in_one_parameter
+from .corrector import Step, orbit_of
+from .equations import Shooting
+from .kinds import DETAILS, GRAZING, REST, grazing_in_words, with_article
 from .results import Orbit
+from .sliding import SLIDING
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -127,7 +127,7 @@ class Point:
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
-        from ._switch import STARTS  # imported here: it needs this class
+        from .switch import STARTS  # imported here: it needs this class
 
         distance = given_number("distance", distance, low=0.0, open_low=True)
         starts = STARTS.get((self.curve, self.kind), {})

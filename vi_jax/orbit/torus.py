@@ -39,13 +39,15 @@ from ..machine import (
     without_modes,
     without_turns,
 )
-from ._birkhoff import agreement, rotation_number, weights, without_angles
-from ._cycle_map import cycle_map, map_state
-from ._flight import Event, section_of
-from ._problem import equations_along, event_numbers, fixed_step_method, steps_of, with_sizes
-from ._shooting import ROUNDING, Observed, Shooting
-from ._solution import on_host
-from ._torus_equations import (
+from .birkhoff import agreement, rotation_number, weights, without_angles
+from .corrector import on_host
+from .cycle_map import cycle_map, map_state
+from .equations import ROUNDING, Observed, Shooting
+from .flight import Event, section_of
+from .from_orbit import equations_along, event_numbers, fixed_step_method, steps_of, with_sizes
+from .results import Orbit
+from .special import Point
+from .torus_equations import (
     Condition,
     Curve,
     Equations,
@@ -54,8 +56,6 @@ from ._torus_equations import (
     interpolated,
     modes,
 )
-from .results import Orbit
-from .special import Point
 
 # A torus is resolved if tail and residual are below the first number; nodes are doubled until the
 # tail is below the second. The tail falls by some digits with each doubling. Choices.

@@ -13,21 +13,9 @@ import numpy as np
 from .._checks import count, flag, interval
 from .._messages import Interrupted, ReportProgress, at_work
 from ..machine import check_leaf, in_unit, leaf, units_of
-from ._follow import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
-from ._problem import check_parameter
-from ._torus_equations import (
-    Condition,
-    Curve,
-    Equations,
-    Solved,
-    cosine,
-    derivative,
-    interpolated,
-    resampled,
-    unit,
-)
-from ._words import GRAZING, TORUS
 from .find import find_orbit
+from .from_orbit import check_parameter
+from .kinds import GRAZING, TORUS
 from .results import Orbit
 from .torus import (
     MOST,
@@ -40,6 +28,18 @@ from .torus import (
     torus_of,
     with_parameter,
 )
+from .torus_equations import (
+    Condition,
+    Curve,
+    Equations,
+    Solved,
+    cosine,
+    derivative,
+    interpolated,
+    resampled,
+    unit,
+)
+from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
 
 # Reasons to end: at a ratio p:q, where the motion locks; the nodes do not suffice; events change
 # their order.

@@ -41,6 +41,7 @@ from ..machine import (
     attributes,
     components,
     cycle_time,
+    has_delays,
     in_rows,
     in_unit,
     is_autonomous,
@@ -56,7 +57,7 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from ..orbit import CycleMap, cycle_map, digits_of, map_state, without_angles
+from ..orbit import CycleMap, as_chain, cycle_map, digits_of, map_state, without_angles
 
 
 class Lyapunov(Summarized):
@@ -162,7 +163,8 @@ def lyapunov(
     - `cycles`: the number of observed drive cycles, at least 8; static.
     - `settle`: the number of drive cycles before that.
     - `number`: the number of exponents, greatest first; all by default, but none of coordinates
-      with given motion (`prescribed`). Each costs about as much as the simulation itself.
+      with given motion (`prescribed`), and as many as the machine's own states for one with delays,
+      which is replaced by its `delay_chain`. Each costs about as much as the simulation itself.
     - `method`: by default the `"standard"` preset.
     - `rests`: as for `simulate`.
     - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
@@ -173,10 +175,13 @@ def lyapunov(
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.
     """
     cycles, progress = count("cycles", cycles, least=8), flag("progress", progress)
-    the_map, start = _observed_map(machine, start, method, rests)
+    machine = machine_of(machine)
+    start = machine.start() if start is None else start
+    own = len(components(without_modes(start))) if has_delays(machine) else None
+    the_map, start = _observed_map(*as_chain(machine, start), method, rests)
     machine = the_map.machine
     states = int(_is_free(machine, start).sum())
-    number = states if number is None else count("number", number, least=1)
+    number = (own or states) if number is None else count("number", number, least=1)
     if number > states:
         raise ValueError(
             f"Argument `number` must be at most {states}, the free states of the machine, but got "

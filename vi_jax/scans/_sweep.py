@@ -29,6 +29,7 @@ from ..flow import (
     simulate,
     states,
     tidy,
+    with_first_history,
 )
 from ..machine import (
     AbstractMachine,
@@ -211,8 +212,9 @@ def sweep(
     """Sweep one parameter slowly: run-up with rising values, close-down with falling ones.
 
     At each value the motion continues from its state at the previous one (the paper's continuation
-    method). It stays on its branch until that ends, so sweeps up and down show hysteresis. Works
-    under `jit` and `vmap` (over other parameters, starts, or values).
+    method). It stays on its branch until that ends, so sweeps up and down show hysteresis. A body
+    that a moved stop has overtaken begins on that stop, with its velocity. Works under `jit` and
+    `vmap` (over other parameters, starts, or values).
 
     **Arguments:**
 
@@ -255,7 +257,8 @@ def sweep(
         machine = in_clock(machine, clock)
     start = replaced(start, convert_start(machine, without_modes(start)))
     check_reals("start", start)
-    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), begun(machine, start))
+    start = with_first_history(with_leaf(machine, parameter, values[0]), begun(machine, start))
+    start = jtu.tree_map(lambda x: jnp.asarray(x, values.dtype), start)
     if numbers is not None:
         check_start(with_leaf(machine, parameter, numbers[0]), without_modes(start))
     lane_noise = lane_noise_of(noise, key)
@@ -298,13 +301,14 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 
 
 def moved_by_stops(machine: AbstractMachine, state: State) -> State:
-    """Return the state with the body moved to a stop that is beyond it, at rest."""
+    """Return the state with each body that a stop has overtaken moved onto that stop. It keeps its
+    velocity, with which it flies on, hits the stop at once, or rests on it."""
     new = without_modes(state)
     for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
         Y = body.position(new)
         beyond = stop.beyond(Y) > 0
-        moved = body.placed(new, stop.place, jnp.zeros_like(Y))
+        moved = body.placed(new, stop.place, body.velocity(new))
         new = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, new)
     return replaced(state, new)
 

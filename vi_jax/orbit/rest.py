@@ -20,7 +20,7 @@ from jax.lax import stop_gradient
 from .._types import Flag, Scalar, State, Vector
 from ..flow import TIME, Integrals, Rates, force_rate, guard_rates, rounding_bounds
 from ..machine import RigidStop, push_of, stops_of
-from ._flight import Flight, force_on
+from .flight import Flight, force_on
 
 # Most hops of a chatter, and most corrections of the landing of each: choices. With restitution
 # 0.95 a rebound has 1e-4 of the first speed after 180 hops.
@@ -119,7 +119,7 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
     """Estimate the duration of a hop, with a force that grows linearly."""
     s, u = stop_gradient((s, u))
     here, body = _rates(free, stop, s, u), free.machine.coordinates[stop.coordinate]
-    rise = stop.sign * force_rate(free.smooth, body.position, free.smooth, s, free.unravel(u))
+    rise = stop.sign * force_rate(free.smooth, body, free.smooth, s, free.unravel(u))
     root = jnp.sqrt(jnp.maximum(0.25 * here.a**2 - 2 * rise * here.v / 3, 0.0))
     minus, plus = root - 0.5 * here.a, root + 0.5 * here.a
     if_pressed = -2 * here.v / jnp.where(plus > 0, plus, 1.0)

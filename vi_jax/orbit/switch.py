@@ -13,14 +13,10 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
-from ._conditions import AbstractCondition, FixedComponent, Special
-from ._flight import Event
-from ._local_map import graze_at
-from ._motion_table import bifurcation_tests
-from ._problem import events_in
-from ._shooting import Shooting
-from ._sliding import SLIDING, change_at, without_part
-from ._solution import (
+from .boundary_events import PERIODS
+from .branch_events import bifurcation_tests
+from .conditions import AbstractCondition, FixedComponent, Special
+from .corrector import (
     Step,
     advance,
     jacobian_at,
@@ -30,9 +26,12 @@ from ._solution import (
     state_at,
     tangent_at,
 )
-from ._special_table import PERIODS
-from ._surgery import admissible_near, over_periods, repeated, without_events
-from ._words import (
+from .edit_events import admissible_near, over_periods, repeated, without_events
+from .equations import Shooting
+from .find import find_orbit
+from .flight import Event
+from .from_orbit import events_in
+from .kinds import (
     CROSSING,
     DOUBLING,
     FLIP,
@@ -48,8 +47,9 @@ from ._words import (
     TOGETHER,
     TORUS,
 )
-from .find import find_orbit
+from .local_map import graze_at
 from .results import Orbit
+from .sliding import SLIDING, change_at, without_part
 from .special import Point, point_at
 from .torus import Torus, torus_near
 
@@ -283,12 +283,11 @@ def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
     graze, sign = graze_at(dataclasses.replace(point, kind=GRAZING)), -1 if kind == DOUBLING else 1
     problem, local, touch = graze.problem, graze.map, graze.touches[0]
     _check_plain(problem)
-    sizes = np.asarray(problem.sizes)[1:]
 
     def depth(n: int) -> float:
         """Return the depth of an impact that equals its kick's remainder n periods later."""
-        remainder = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
-        return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(remainder / sizes))
+        remainder = np.linalg.matrix_power(local.matrix, n) @ local.kicks[0]
+        return float(np.linalg.norm(local.gradients[0]) * np.linalg.norm(remainder))
 
     periods = range(1, PERIODS + 1)
     n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * depth(n)), 1)

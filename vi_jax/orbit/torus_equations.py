@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ._shooting import Shooting
-from ._solution import on_host
+from .corrector import on_host
+from .equations import Shooting
 
 # Rows that a compiled program takes at once, a choice: fewer are filled up.
 _LANES = 64

@@ -21,7 +21,7 @@ from .._programs import compiled
 from .._types import Flag, Scalar, State
 from ..flow import simulate
 from ..machine import frequency_ratio, own_modes, phase_at, with_modes
-from ._shooting import Shooting, Unknowns
+from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
 
@@ -297,6 +297,27 @@ def _known_bracket(
     return places[low], places[high]
 
 
+# A dip of a test within a step falls to this share of its values at the ends, by a parabola, or
+# beyond zero: a choice.
+_DIPS = 0.1
+
+
+def dip_of(places: list[float], values: list[float]) -> float | None:
+    """Return the place of the extremum of the parabola through three points, if their values have
+    one sign and the parabola comes near zero, or beyond, between the last two; else `None`."""
+    steps, heights = np.diff(places), np.sign(values[1]) * np.array(values)
+    if not (np.isfinite(heights).all() and heights.min() > 0 and steps.min() > 0):
+        return None
+    before, after = np.diff(heights) / steps
+    curvature = (after - before) / steps.sum()
+    slope = before + curvature * steps[0]
+    if not curvature > 0:
+        return None
+    shift = -0.5 * slope / curvature
+    is_low = heights[1] + 0.5 * slope * shift < _DIPS * heights[1:].min()
+    return float(places[1] + shift) if 0 < shift < steps[1] and is_low else None
+
+
 def find_zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:
     """Return the solution near one at which a test is zero, by the secant method, or `None`."""
     found: list[Step] = []
@@ -410,10 +431,10 @@ def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     return np.mod(clock - begin, float(problem.period(x)))
 
 
-def _first_state(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
+def _first_state(problem: Shooting, x: Unknowns) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
-    sections = sections_at(problem, x)[0] if sections is None else sections
-    modes = problem.modes_in(int(sections_at(problem, x)[1][0][0])) if problem.modes[0] else ()
+    sections, (legs, _), _ = sections_at(problem, x)
+    modes = problem.modes_in(int(legs[0])) if problem.modes[0] else ()
     state = jax.tree.map(lambda x: x[0], sections)
     return with_modes(state, own_modes(problem.machine, modes))
 
@@ -466,8 +487,10 @@ def _impact_energies(problem: Shooting, xs: Array, states: State) -> Array:
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     observed, machine = step.observed, problem.at(step.x)
-    sections, _, residual = sections_at(problem, step.x)
-    state = _first_state(problem, step.x, sections)
+    sections, (legs, _), residual = sections_at(problem, step.x)
+    modes = [own_modes(machine, problem.modes_in(int(leg))) for leg in legs if problem.modes[0]]
+    modes = tuple(map(jnp.asarray, zip(*modes, strict=True)))
+    state = with_modes(jax.tree.map(lambda x: x[0], sections), tuple(x[0] for x in modes))
     admissible = observed.admissible(range(len(problem.events)))
     hits = hits_of(problem, step, state)
     order = np.argsort(hits.clock)
@@ -477,6 +500,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         method=problem.method,
         state=state,
         sections=sections,
+        modes=modes,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,
         frequency_ratio=frequency_ratio(machine, duration / problem.cycles),

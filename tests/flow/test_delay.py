@@ -1,0 +1,327 @@
+"""Machines with delays beside exact values, and beside SciPy by the method of steps."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from delayed import by_steps
+
+
+class Linear(vi.AbstractMachine):
+    """x' = -x(t - 1) after x = 1: a polynomial in each unit of time."""
+
+    cycle = 5.0
+    delays = property(lambda self: dict(lag=1.0))
+
+    def field(self, t, z, past):
+        return dict(x=-past.lag.x)
+
+    def start(self):
+        return vi.State(x=1.0)
+
+
+class Fed(vi.AbstractMachine):
+    """An oscillator that hits a stop, with delayed feedback of its position."""
+
+    omega: float = 0.8
+    damping: float = 0.05
+    gain: float = 0.3
+    delay: float = 4.0
+    gap: float = 0.6
+    restitution: float = 0.7
+    first: float = 0.0
+
+    cycle = property(lambda self: 2 * jnp.pi / self.omega)
+    delays = property(lambda self: dict(sensor=self.delay))
+    before = property(lambda self: vi.State(x=self.first, u=0.0))
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(self.gap, self.restitution, on=("x", "u"))
+
+    def field(self, t, z, past):
+        pull = self.gain * (past.sensor.x - z.x)
+        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Turning(vi.AbstractMachine):
+    """A tool that cuts the surface which it left one turn ago, and may leave the cut."""
+
+    stiffness: float = 0.3
+    turn: float = 8.0
+    feed: float = 1.0
+    damping: float = 0.03
+    before = vi.State(surface=0.0)
+    cycle = property(lambda self: self.turn)
+    delays = property(lambda self: dict(turn=self.turn))
+    events = vi.Switch(lambda m, t, z, past: m.feed + past.turn.surface - z.x)
+
+    def recorded(self, t, z, past, cuts):
+        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + self.feed))
+
+    def field(self, t, z, past, cuts):
+        chip = self.feed + past.turn.surface - z.x
+        force = jnp.where(cuts > 0, self.stiffness * chip, 0.0)
+        return dict(x=z.u, u=force - z.x - 2 * self.damping * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Two(Fed):
+    """Two delays, one of a velocity, and a history that is a function."""
+
+    slow: float = 0.1
+    near: float = 1.0
+    delays = property(lambda self: dict(far=self.delay, near=self.near))
+
+    def before(self, t):
+        return dict(x=0.2 * jnp.cos(1.3 * t), u=-0.26 * jnp.sin(1.3 * t))
+
+    def field(self, t, z, past):
+        pull = self.gain * (past.far.x - z.x) + self.slow * (past.near.u - z.u)
+        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
+
+    def start(self):
+        return vi.State(x=0.2, u=0.0)
+
+
+CYCLES = 6
+
+
+def two_by_steps(m):
+    """Return the same motion by SciPy, for parameters in a dictionary."""
+
+    def rate(t, y, past):
+        pull = m["gain"] * (past[0][0] - y[0]) + m["slow"] * (past[1][1] - y[1])
+        return [y[1], np.cos(m["omega"] * t) - y[0] - 2 * m["damping"] * y[1] + pull]
+
+    return by_steps(
+        rate, [0.2, 0.0], lambda t: [0.2 * np.cos(1.3 * t), -0.26 * np.sin(1.3 * t)],
+        [m["delay"], m["near"]], CYCLES * 2 * np.pi / m["omega"],
+        guard=lambda t, y, past: y[0] - m["gap"],
+        jump=lambda y, past: [m["gap"], -m["restitution"] * y[1]],
+    )  # fmt: skip
+
+
+def random_machines(number, seed):
+    rng = np.random.default_rng(seed)
+    ranges = dict(
+        omega=(0.6, 1.6), damping=(0.02, 0.1), gain=(-0.3, 0.4), slow=(-0.15, 0.15),
+        delay=(2, 14), near=(0.3, 3), gap=(0.4, 1.0), restitution=(0.4, 0.9),
+    )  # fmt: skip
+    return {name: rng.uniform(*ends, number) for name, ends in ranges.items()}
+
+
+def test_linear_equation_is_exact():
+    run = vi.simulate(Linear(), cycles=4, method="reference")
+    exact = [1.0, 0.1583333333333333, 0.02024112654320987]
+    np.testing.assert_allclose(run.sections.x[:3], exact, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(run.sections.x[4], -4.606955991e-4, rtol=0, atol=1e-12)
+
+
+def test_impacts_with_feedback():
+    run = vi.simulate(Fed(), cycles=50, impact_log=3)
+    end = [run.sections.x[jnp.array([5, 50])], run.sections.u[jnp.array([5, 50])]]
+    wanted = [[-0.3721662410390, -0.3631911832734], [-0.7218104265337, -0.7155667014084]]
+    np.testing.assert_allclose(end, wanted, rtol=0, atol=1e-9)
+    assert int(run.impacts.sum()) == 51
+    times = np.asarray(run.impact_log.phase)
+    times = [times[0, 0], times[0, 1], times[1, 0] + 2 * np.pi / 0.8]
+    np.testing.assert_allclose(times, [1.2897849071, 6.6933253587, 14.8037714534], atol=1e-9)
+
+
+def test_derivative_with_respect_to_a_delay():
+    class Lagged(Linear):
+        lag: float = 1.0
+        delays = property(lambda self: dict(lag=self.lag))
+
+    @jax.jit
+    def slope(lag):
+        end = lambda lag: vi.simulate(Lagged(lag=lag), method="reference").last.x
+        return jax.jvp(end, (lag,), (1.0,))[1]
+
+    # x(5) = Σ (-1)^k (5 - (k - 1) T)^k / k!, of which T is the delay.
+    terms = [(-1) ** k * (1 - k) * (6 - k) ** (k - 1) / math.factorial(k - 1) for k in range(1, 6)]
+    np.testing.assert_allclose(slope(1.0), sum(terms), rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_pass_through_history_and_images():
+    names = ("gain", "delay", "restitution", "damping", "gap", "first")
+    values = jnp.array([0.3, 4.0, 0.7, 0.05, 0.6, 0.0])
+
+    def end(values):
+        machine = Fed(**dict(zip(names, values, strict=True)))
+        last = vi.simulate(machine, cycles=5, method="reference").last
+        return jnp.array([last.x, last.u])
+
+    forward = jax.jit(jax.jacfwd(end))(values)
+    wanted = [
+        [-0.430489847, 2.116946376], [-0.070574524, 0.502590888], [-2.128487819, -2.569314730],
+        [7.660579518, 5.831451311], [2.886460679, -2.012359144], [-0.000886436, 0.011725705],
+    ]  # fmt: skip
+    np.testing.assert_allclose(forward.T, wanted, rtol=0, atol=1e-8)
+    backward = jax.jit(jax.jacrev(end))(values)
+    np.testing.assert_allclose(backward, forward, rtol=0, atol=1e-10)
+
+
+def test_turning_tool_leaves_the_cut():
+    run = vi.simulate(Turning(), cycles=25, event_log=4, method="reference")
+    wanted = [0.5088833895, 0.9952359308, -0.3342284987]
+    np.testing.assert_allclose(run.sections.x[jnp.array([10, 15, 25])], wanted, atol=1e-9)
+    np.testing.assert_allclose(run.sections.u[25], 0.3354090455, atol=1e-9)
+    instants = run.event_log.phase[10, :2] + 80
+    np.testing.assert_allclose(instants, [84.0632905055, 84.5797966961], atol=1e-9)
+
+
+def test_random_machines_with_two_delays():
+    p, one = random_machines(3, 1), ["x", "u"]
+
+    def end(p):
+        run = vi.simulate(Two(**p), cycles=CYCLES)
+        return jnp.array([getattr(run.last, name) for name in one]), run.impacts.sum()
+
+    ends, impacts = jax.jit(jax.vmap(end))({name: jnp.asarray(x) for name, x in p.items()})
+    for i in range(3):
+        state, events = two_by_steps({name: x[i] for name, x in p.items()})
+        assert len(events) == int(impacts[i])
+        np.testing.assert_allclose(ends[i], state, rtol=0, atol=2e-9)
+
+
+@pytest.mark.slow
+def test_more_random_machines_and_a_delay_of_one_cycle():
+    p = random_machines(10, 2)
+    p["delay"][0] = 2 * np.pi / p["omega"][0]  # images of impacts coincide with impacts
+
+    def end(p):
+        last = vi.simulate(Two(**p), cycles=CYCLES, method="reference").last
+        return jnp.array([last.x, last.u])
+
+    ends = jax.jit(jax.vmap(end))({name: jnp.asarray(x) for name, x in p.items()})
+    for i in range(10):
+        state, _ = two_by_steps({name: x[i] for name, x in p.items()})
+        np.testing.assert_allclose(ends[i], state, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_with_delayed_velocity():
+    names, values = ("gain", "slow", "delay", "near"), jnp.array([0.3, 0.1, 4.0, 1.0])
+
+    @jax.jit
+    def end(values):
+        machine = Two(**dict(zip(names, values, strict=True)))
+        last = vi.simulate(machine, cycles=3, method="reference").last
+        return jnp.array([last.x, last.u])
+
+    found, step = jax.jit(jax.jacfwd(end))(values), 1e-5
+    for i in range(4):
+        change = end(values.at[i].add(step)) - end(values.at[i].add(-step))
+        np.testing.assert_allclose(found[:, i], change / (2 * step), atol=1e-7)
+
+
+def test_run_continues_with_its_history():
+    first = vi.simulate(Fed(), cycles=1, settle=2)
+    second = vi.simulate(Fed(), first.last, cycles=1, settle=1)
+    np.testing.assert_allclose(second.last.x, -0.3721662410390, rtol=0, atol=1e-9)
+    again = vi.simulate(Fed(), first.last.state, cycles=1, settle=1)  # without its history
+    assert abs(float(again.last.x - second.last.x)) > 1e-3
+
+
+class Masses(vi.Mechanical):
+    """`Fed` as a machine of masses."""
+
+    q = ("x",)
+    mass = (1.0,)
+    cycle = 2 * np.pi / 0.8
+    delays = property(lambda self: dict(sensor=4.0))
+    contacts = vi.RigidStop(0.6, 0.7, on="x")
+
+    def force(self, t, q, v, past):
+        pull = 0.3 * (past.sensor.x - q.x)
+        return dict(x=jnp.cos(0.8 * t) - q.x - 0.1 * v.x + pull)
+
+
+def test_machine_of_masses():
+    run = vi.simulate(Masses(), cycles=5)
+    np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=1e-9)
+
+
+class Kicked(Linear):
+    """A reset whose guard and jump read the past."""
+
+    events = vi.Reset(
+        lambda m, t, z, past: past.lag.x - z.x - 0.5,
+        lambda m, t, z, past: dict(y=z.y + past.lag.x),
+    )
+
+    def field(self, t, z, past):
+        return dict(x=-past.lag.x, y=-z.y)
+
+    def start(self):
+        return vi.State(x=1.0, y=0.0)
+
+
+def test_reset_reads_the_past():
+    run = vi.simulate(Kicked(), cycles=1, event_log=6, method="reference")
+    y, events = by_steps(
+        lambda t, y, past: [-past[0][0], -y[1]], [1.0, 0.0], lambda t: [1.0, 0.0], [1.0], 5.0,
+        guard=lambda t, y, past: past[0][0] - y[0] - 0.5,
+        jump=lambda y, past: [y[0], y[1] + past[0][0]],
+    )  # fmt: skip
+    found = run.event_log.phase[0]
+    assert len(events) > 0
+    np.testing.assert_allclose(found[~jnp.isnan(found)], events, rtol=0, atol=1e-9)
+    np.testing.assert_allclose([run.last.x, run.last.y], y, rtol=0, atol=1e-9)
+
+
+def test_full_history_ends_a_lane_with_its_reason():
+    class Short(Fed):
+        history_size = 9
+
+    run = vi.simulate(Short(), cycles=5)
+    assert run.result == vi.RESULTS.full_history
+    assert "history_size" in vi.RESULTS[run.result]
+
+
+def test_traced_delays_out_of_range_end_their_lanes():
+    lane = lambda delay: vi.simulate(Fed(delay=delay), cycles=2).result.number
+    found = jax.jit(jax.vmap(lane))(jnp.array([4.0, -1.0, 1e-3]))
+    assert found.tolist() == [0, 1, 1]
+
+
+class Renewed(Fed):
+    def renewed(self, state):
+        return state.replace(x=0.0)
+
+
+class Blind(Linear):
+    def field(self, t, z, past):
+        return dict(x=-z.x)
+
+
+class NoBefore(Turning):
+    before = None
+
+
+def test_refusals_name_what_is_wrong():
+    noise = dict(noise=vi.WhiteNoise(dict(u=0.1)), key=jax.random.key(0))
+    for machine, options, words in (
+        (Fed(delay=1e-3), {}, "a thousandth of a cycle"),
+        (Fed(delay=-1.0), {}, "sensor is -1"),
+        (Fed(), noise, "must be left out for a Fed"),
+        (Fed(), dict(method=vi.Taylor()), "must be `Adaptive` or `FixedStep`"),
+        (Fed(), dict(method=vi.ExactFlight()), "must be `Adaptive` or `FixedStep`"),
+        (Renewed(), {}, "must not have both `delays` and `renewed`"),
+        (Blind(), {}, "nothing reads its past"),
+        (NoBefore(), {}, "`before` of a NoBefore must be given"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            vi.simulate(machine, **options)

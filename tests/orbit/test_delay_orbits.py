@@ -1,0 +1,103 @@
+"""Periodic motions of machines with delays, beside closed forms and values by collocation."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Fed(vi.AbstractMachine):
+    """A driven oscillator with delayed feedback."""
+
+    omega: float = 0.8
+    damping: float = 0.05
+    gain: float = 0.3
+    delay: float = 4.0
+
+    cycle = property(lambda self: 2 * jnp.pi / self.omega)
+    delays = property(lambda self: dict(sensor=self.delay))
+
+    def field(self, t, z, past):
+        pull = self.gain * (past.sensor.x - z.x)
+        return dict(x=z.u, u=jnp.cos(self.omega * t) - z.x - 2 * self.damping * z.u + pull)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Struck(Fed):
+    contacts = vi.RigidStop(0.6, 0.7, on=("x", "u"))
+
+
+@pytest.mark.slow
+def test_boundary_of_stability_is_that_of_the_closed_form():
+    """On the boundary λ = iΩ: g = (a² + 4ζ²Ω²)/2a with a = Ω² - 1, and tan ΩT follows."""
+    a, damped = 1.2**2 - 1, 2 * 0.05 * 1.2
+    gain = (a**2 + damped**2) / (2 * a)
+    delay = (np.arctan2(-damped, 1 + gain - 1.2**2) + 2 * np.pi) / 1.2
+    np.testing.assert_allclose([gain, delay], [0.2363636364, 3.0617472932], atol=1e-9)
+    errors = []
+    for nodes in (6, 12):
+        chain = vi.delay_chain(Fed(gain=gain, delay=delay), nodes)
+        orbit = vi.find_orbit(chain)
+        largest = orbit.multipliers[jnp.argmin(jnp.abs(jnp.abs(orbit.multipliers) - 1))]
+        errors.append(abs(float(jnp.abs(largest)) - 1))
+    assert errors[1] < 1e-9 < errors[0]
+
+
+@pytest.mark.slow
+def test_orbit_with_an_impact_is_checked_by_the_whole_history():
+    orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
+    assert orbit.successful
+    np.testing.assert_allclose(orbit.state.x, -0.3631911886, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(orbit.impact_phase, [7.0342180392], rtol=0, atol=1e-4)
+    found = orbit.multipliers[:2]
+    np.testing.assert_allclose(found, [0.332155 + 0.205150j, 0.332155 - 0.205150j], atol=3e-4)
+    assert 1e-6 < float(orbit.delay_error) < 3e-4
+    assert "whole history" in str(orbit)
+
+
+@pytest.mark.slow
+def test_fold_of_a_branch():
+    orbit = vi.find_orbit(Struck(), vi.simulate(Struck(), settle=30).last)
+    branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.25, 0.9), progress=False)
+    fold = next(x for x in branch.special if "fold" in str(x))
+    np.testing.assert_allclose(float(fold.parameter), 0.7514467176, rtol=0, atol=5e-5)
+
+
+@pytest.mark.slow
+def test_more_nodes_are_more_accurate():
+    errors = []
+    for nodes, elements in ((8, 1), (16, 1), (8, 8)):
+        chain = vi.delay_chain(Struck(), nodes, elements=elements)
+        run = vi.simulate(chain, cycles=5)
+        errors.append(abs(float(run.last.x) + 0.3721662410390))
+    assert errors[2] < 1e-6 < errors[1] < 2e-5 < errors[0]
+
+
+def test_chain_of_nodes():
+    run = vi.simulate(vi.delay_chain(Struck(), 16), cycles=5)
+    np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_exponents():
+    found = vi.lyapunov(Fed(delay=3.0), cycles=64, settle=64).exponents
+    chain = vi.find_orbit(Fed(delay=3.0))
+    largest = np.log(np.abs(chain.multipliers[0])) / float(chain.duration)
+    np.testing.assert_allclose(found[0], largest, rtol=0, atol=2e-3)
+
+
+class Undelayed(vi.AbstractMachine):
+    cycle = 1.0
+
+    def field(self, t, z):
+        return dict(x=-z.x)
+
+    def start(self):
+        return vi.State(x=1.0)
+
+
+def test_machines_without_delays_are_refused():
+    with pytest.raises(ValueError, match="must have `delays`"):
+        vi.delay_chain(Undelayed())

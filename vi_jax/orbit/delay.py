@@ -1,0 +1,70 @@
+"""Periodic motions of machines with delays: by a chain, checked by a run with the whole history."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..flow import history_of_function, row_sizes, simulate, unit_of
+from ..machine import (
+    AbstractMachine,
+    HybridState,
+    delay_chain,
+    delays_in,
+    has_delays,
+    history_in,
+    in_rows,
+    machine_of_chain,
+    modes_of,
+    without_history,
+    without_modes,
+)
+from .results import Orbit, distance
+
+# The pieces of polynomials of degree 7 for a chain's history: a choice, far more accurate than it.
+_PIECES, _ROOM = 64, 1025
+
+# A run of a stable motion ends when differences at its start are this share of themselves, after
+# at most so many periods more. Choices.
+_FORGOTTEN, _MOST_PERIODS = 1e-7, 400
+
+
+def as_chain(machine: AbstractMachine, guess: Any) -> tuple[AbstractMachine, Any]:
+    """Return a machine with delays as a chain with the default number of nodes, and a guess of its
+    orbits as a state of the chain; another machine and its guess unchanged."""
+    if not has_delays(machine):
+        return machine, guess
+    chain: Any = delay_chain(machine)
+    if guess is None or isinstance(guess, Orbit):
+        return chain, guess
+    is_batch = jnp.ndim(machine.position(without_modes(guess))) > 0
+    return chain, (jax.vmap(chain.chained) if is_batch else chain.chained)(guess)
+
+
+def with_delay_error(orbit: Orbit) -> Orbit:
+    """Return a single orbit of a chain with its difference from a run with the whole history."""
+    chain, machine = orbit.machine, machine_of_chain(orbit.machine)
+    if machine is None or isinstance(orbit.residual, Tracer):
+        return orbit
+    if orbit.residual.ndim or not bool(orbit.successful):
+        return orbit
+    state, lags = without_modes(orbit.state), delays_in(machine).values()
+    longest = jnp.asarray(max(float(x) for x in lags))
+    history = history_of_function(
+        history_in(chain, orbit.state), longest, unit_of(machine), _PIECES, len(lags), _ROOM
+    )
+    own, cycles = without_history(state), int(orbit.cycles)
+    # The run begins with the polynomial of the nodes, in which kinks are smooth. A stable motion
+    # forgets them; from an unstable one the run departs, and one longest delay must do.
+    largest = float(jnp.max(jnp.abs(orbit.multipliers)))
+    periods = 1 + int(np.ceil(float(longest) / float(orbit.duration)))
+    if largest < 1:
+        periods += int(min(np.log(_FORGOTTEN) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
+    start = HybridState(own, modes_of(orbit.state) or (), history)
+    run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")
+    rows, row = in_rows(run.sections)[cycles::cycles], in_rows(own, 0)
+    error = distance(rows[-1], row, row_sizes(chain, state)[: row.size])
+    return dataclasses.replace(orbit, delay_error=error)
