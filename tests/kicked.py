@@ -70,3 +70,27 @@ def polynomial(a, b, *rows, decay=0.0):
     shares = [[row.get(power, 0.0) for power in POWERS] for row in rows]
     assert all(power in POWERS for row in rows for power in row)
     return Polynomial(a, b, shares=jnp.asarray(shares), decay=decay)
+
+
+TWIST, SHEAR = 0.3, 0.7
+
+
+class Ring(Kicked):
+    """In polar coordinates r ← r (1 + b - r²), φ ← φ + 2πa + 0.3 r² + locking r³ sin 3φ, seen as
+    (x, y + 0.7 x²). The curve r = √b has the exponent ln(1 - 2b), and without locking the rotation
+    number a + 0.3 b/2π."""
+
+    locking: jax.Array = eqx.field(default=0.0, kw_only=True, converter=jnp.asarray)
+
+    def kick(self, *state):
+        x, y = state
+        y = y - SHEAR * x**2
+        square, cubic = x**2 + y**2, 3 * x**2 * y - y**3
+        turn = 2 * jnp.pi * self.a + TWIST * square + self.locking * cubic
+        growth, c, s = 1 + self.b - square, jnp.cos(turn), jnp.sin(turn)
+        x, y = growth * (c * x - s * y), growth * (s * x + c * y)
+        return x, y + SHEAR * x**2
+
+
+def rotation_of(a, b):
+    return a + TWIST * b / (2 * jnp.pi)

@@ -1,22 +1,22 @@
-"""From a Neimark–Sacker point along quasi-periodic motions to a grazing, past a window of locking.
+# %% [markdown]
+"""# From a Neimark–Sacker point along quasi-periodic motions to a grazing
 
-Two bodies in a row, the first driven against a stop. Below ω = 1.0106 the motion of one cycle is
-unstable and a torus attracts. It locks to 1:7 in a narrow window and ends where it grazes the stop.
+Two bodies in a row; a stop limits the driven one. Below ω = 1.0106 a torus attracts. It locks to
+1:7 in a narrow window (orange) and ends where it grazes the stop. Left: its curve on the section.
 """
 
+# %%
 import jax
 
 jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import vi_jax as vi
 
 
-class Two(vi.Mechanical):
-    q = ("a", "b")
+class Row(vi.Mechanical):
+    q, mass = ("a", "b"), (1.0, 0.5)
     omega: float = 1.015
-    mass = (1.0, 0.5)
     cycle = property(lambda self: 2 * jnp.pi / self.omega)
     contacts = vi.RigidStop(1.1, 0.8, on="a")
 
@@ -25,15 +25,16 @@ class Two(vi.Mechanical):
         return dict(a=jnp.cos(self.omega * t - 2) - q.a - 0.1 * v.a - link, b=link)
 
 
-machine = Two()
-settled = vi.simulate(machine, machine.at(a=0.1, b=0.2), 1, settle=300).last
-branch = vi.continue_orbit(vi.find_orbit(machine, settled), parameter="omega", bounds=(1.0, 1.02))
-torus = branch.special[0].switch(distance=0.3)  # the Neimark–Sacker point
-family = vi.continue_torus(torus, parameter="omega", bounds=(0.97, 1.02))
+row, span = Row(), {"parameter": "omega", "bounds": (0.97, 1.02)}
+settled = vi.simulate(row, row.at(a=0.1, b=0.2), 1, settle=300).last
+branch = vi.continue_orbit(vi.find_orbit(row, settled), **span)
+family = vi.continue_torus(branch.special[0].switch(distance=0.3), **span)
 print(family)
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
-for omega in (1.005, 0.995, 0.98):
-    vi.plot_torus(family.at(omega), ax=left, color=plt.cm.viridis((1.01 - omega) * 30))
+
+# %%
+figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.5), layout="constrained")
+for omega, color in ((1.005, "C0"), (0.995, "C2"), (0.98, "C3")):
+    vi.plot_torus(family.at(omega), ax=left, color=color)
 vi.plot_torus(family, ax=middle)
 vi.plot_torus(family, ax=right, y="exponents")
 figure.savefig("torus.png")

@@ -10,6 +10,8 @@ import vi_jax as vi
 from vi_jax.scans import _basins
 from vi_jax.scans.measures import least_period
 
+from kicked import Ring, at, rotation_of
+
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
 
@@ -144,3 +146,30 @@ def test_the_comparison_of_motions_scales_with_their_size(monkeypatch):
         assert len(compared) < 16
         compared.clear()
     assert len(shares[0]) == 2 and sum(shares[0]) == 32 and shares == shares[:1] * 4
+
+
+def test_quasi_periodic_motions_of_rings():
+    """Their rotation number is a + 0.3 b/2π. With b < 0 the motion rests."""
+    a = np.array([0.1234, 0.21, 0.3819])
+    data = vi.scan(
+        Ring(0.2, 0.1), {"a": a, "b": [-0.1, 0.1]}, start=at(0.3, 0.1), settle=500,
+        measure=("regime", "rotation"), progress=False,
+    )  # fmt: skip
+    assert (data.period.values == [1, int(vi.REGIMES.quasiperiodic)]).all()
+    turns = data.rotation.values[:, 1]
+    np.testing.assert_allclose(turns, rotation_of(a, 0.1), atol=1e-9)
+    assert (data.digits.values[:, 1] > 5).all()
+
+
+def test_a_motion_that_slowly_locks_is_not_quasi_periodic():
+    """At the middle of the window 1:3 the distance decays by 1 - 3 locking b³ᐟ² in a cycle."""
+    options = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
+    middle = 1 / 3 - rotation_of(0.0, 0.1)
+    data = vi.scan(
+        Ring(middle, 0.1), {"locking": [1e-3, 0.0]}, measure=("regime", "rotation"), **options
+    )
+    assert (data.period.values == [int(vi.REGIMES.unsettled), 3]).all()
+    slow = vi.lyapunov(
+        Ring(middle, 0.1, locking=1e-3), at(0.3, 0.1), 2048, settle=500, number=1, progress=False
+    )
+    assert -0.5 < float(slow.per_cycle[0]) * 2048 < -0.1

@@ -165,7 +165,7 @@ def plot_basins(found: Basins, *, ax: Axes | None = None) -> Axes:
         further = (f"{len(entries) - _NAMED} further: {100 * rest:.1f} %", "none")
         entries = [*entries[:_NAMED], further]
     for regime in REGIMES:
-        part = found.irregular[regime.name]
+        part = found.irregular.get(regime.name, 0.0)  # absent in older files
         if part:
             entries.append((f"{regime.meaning}: {100 * part:.1f} %", IRREGULAR[regime]))
     points = {"ls": "none", "marker": "o", "mfc": "w", "mec": "k", "ms": 6}
