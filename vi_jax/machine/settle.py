@@ -294,7 +294,7 @@ def _settle_one(x: Contacts) -> Settled:
     needed = -x.rates / x.gains[0]
     slip = jnp.where(jnp.abs(needed) <= x.hold * x.level, 0.0, -jnp.sign(needed))
     mode = jnp.where(x.slip != 0, x.slip, slip)
-    force = jnp.where(mode == 0, needed, jnp.where(x.slip != 0, 0.0, -mode * x.level))
+    force = jnp.where(mode == 0, needed, -mode * x.level)
     return Settled(force, x.rates + x.gains[0] * force, x.closed, mode, jnp.zeros((), bool))
 
 

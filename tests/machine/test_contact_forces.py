@@ -1,0 +1,80 @@
+"""Forces of contacts in given states, beside closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+HALF_WIDTH, HALF_HEIGHT, G = 0.2, 0.5, 9.81
+
+
+class Pushed(vi.Mechanical):
+    """A block on two corners, pushed by a force at its centre."""
+
+    friction: float = 0.2
+    push: float = 3.0
+    q = ("x", "y", "tilt")
+    mass = (1.0, 1.0, (HALF_WIDTH**2 + HALF_HEIGHT**2) / 3)
+    cycle = 0.1
+
+    @property
+    def contacts(self):
+        def corner(side, name):
+            high = lambda q: q.y + side * jnp.sin(q.tilt) - HALF_HEIGHT * jnp.cos(q.tilt)
+            along = lambda q: q.x + side * jnp.cos(q.tilt) + HALF_HEIGHT * jnp.sin(q.tilt)
+            grip = dict(friction=self.friction, along=along)
+            return vi.RigidStop(0.0, 0.0, "left", on=high, name=name, **grip)
+
+        return corner(-HALF_WIDTH, "left"), corner(HALF_WIDTH, "right")
+
+    def force(self, t, q, v):
+        return dict(x=self.push, y=-G, tilt=0.0)
+
+
+def test_a_pushed_block_slides_or_tips():
+    """The balances of force and moment. It slides if the push exceeds μ m g. It tips about the
+    right corner, and sticks there, if that corner has all the weight and friction holds it."""
+    friction, push = jnp.array([0.2, 0.35, 0.45]), jnp.array([3.0, 4.5, 4.5])
+
+    def forces(mu, push):
+        block = Pushed(mu, push)
+        return vi.contact_forces(block, block.at(y=HALF_HEIGHT))
+
+    found = jax.vmap(forces)(friction, push)
+    for i, mu in enumerate((0.2, 0.35)):
+        right = G / 2 * (1 + mu * HALF_HEIGHT / HALF_WIDTH)
+        assert float(found["right"].normal[i]) == pytest.approx(right, abs=1e-12)
+        assert float(found["left"].normal[i]) == pytest.approx(G - right, abs=1e-12)
+        assert float(found["right"].tangential[i]) == pytest.approx(-mu * right, abs=1e-12)
+    # About the corner: (J + m r²) θ'' = m g a - F h; its forces follow from the centre's motion.
+    square = HALF_WIDTH**2 + HALF_HEIGHT**2
+    turn = (4.5 * HALF_HEIGHT - G * HALF_WIDTH) / (4 / 3 * square)
+    assert float(found["left"].normal[2]) == 0.0
+    assert float(found["right"].normal[2]) == pytest.approx(G + turn * HALF_WIDTH, abs=1e-12)
+    drag = turn * HALF_HEIGHT - 4.5
+    assert float(found["right"].tangential[2]) == pytest.approx(drag, abs=1e-12)
+
+
+class Several(vi.AbstractMachine):
+    """A body on a soft stop, with dry friction."""
+
+    cycle = 2 * np.pi
+    contacts = (
+        vi.SoftStop(0.1, 50.0, on=("x", "u"), mass=2.0),
+        vi.DryFriction(0.5, on="u", mass=2.0, name="guide"),
+    )
+
+    def field(self, t, z):
+        return dict(x=z.u, u=0.15 - 0 * z.x)
+
+
+def test_soft_stops_and_dry_friction():
+    """A spring's force at its depth; friction that slides, and that holds the applied force."""
+    machine = Several()
+    sliding = vi.contact_forces(machine, vi.State(x=0.14, u=0.3))
+    assert float(sliding["right soft stop"].normal) == pytest.approx(-50.0 * -0.04, rel=1e-12)
+    assert float(sliding["guide"].tangential) == -0.5
+    held = vi.contact_forces(machine, vi.State(x=0.0, u=0.0))
+    assert float(held["right soft stop"].normal) == 0.0
+    assert float(held["guide"].tangential) == pytest.approx(-0.3, abs=1e-15)
