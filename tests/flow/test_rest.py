@@ -52,6 +52,78 @@ def test_a_bouncing_ball_rests_after_the_time_of_the_series():
         assert len(times) <= 2 + np.log(1e-6) / np.log(max(k, 1e-6))
 
 
+class Lifted(vi.AbstractMachine):
+    """A ball on a floor that accelerates: x'' = -1 + 0.4 t between impacts."""
+
+    k: float
+
+    cycle = 2.0
+
+    @property
+    def contacts(self):
+        return vi.RigidStop(0.0, self.k, "left", on=("x", "u"))
+
+    def field(self, t, z):
+        return dict(x=z.u, u=0.4 * t - 1.0)
+
+    def hop_by_hop(self, x=0.3):
+        """Return the instant of rest: the sum of the hops (cubics) and of the last series."""
+        time, u = 0.0, 0.0
+        roots = np.roots([0.4 / 6, -0.5, u, x])
+        hop = min(r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
+        while True:
+            approach = -(u + (0.4 * time - 1) * hop + 0.2 * hop**2)
+            time, u = time + hop, self.k * approach
+            force = 1 - 0.4 * time
+            if u < 1e-13:
+                return time + 2 * u / force / (1 - self.k)
+            hop = 2 * u / (force / 2 + np.sqrt(force**2 / 4 - 4 * u * 0.4 / 6))
+
+
+def rest_of(k):
+    run = vi.simulate(Lifted(k), vi.State(x=0.3, u=0.0), 1, event_log=40, method="reference")
+    rests = jnp.argmax(run.event_log.kind[0] == vi.EVENTS.index("rest"))
+    return run.event_log.phase[0, rests]
+
+
+@pytest.mark.parametrize("k", [0.2, 0.25, 0.3])
+def test_the_instant_of_rest_has_derivatives(k):
+    at = lambda k: Lifted(k).hop_by_hop()
+    np.testing.assert_allclose(rest_of(k), at(k), atol=1e-9)
+    coarse, fine = ((at(k + h) - at(k - h)) / (2 * h) for h in (2e-4, 1e-4))
+    # The number of hops before the last series may be another in the difference: 1e-6.
+    derivative = (4 * fine - coarse) / 3
+    found = jax.jvp(rest_of, (k,), (1.0,))[1]
+    np.testing.assert_allclose([found, jax.grad(rest_of)(k)], derivative, rtol=1e-5)
+
+
+class Tied(vi.AbstractMachine):
+    """A ball on a stiff spring, which has the length of the floor's height."""
+
+    cycle = 1.0
+    contacts = vi.RigidStop(0.0, 0.9, "left", on=("x", "v"))
+
+    def field(self, t, z):
+        return dict(x=z.v, v=-9.81 - 1e5 * z.x)
+
+
+@pytest.mark.parametrize(("rtol", "error"), [(1e-10, 2e-9), (1e-12, 1e-11), (1e-13, 3e-12)])
+def test_the_instant_of_rest_gets_better_with_the_tolerance(rtol, error):
+    # Each hop is an arc of an oscillation about -g/k: from its speed follows its duration.
+    w, drop = np.sqrt(1e5), 9.81e-5
+    u = w * np.sqrt((1 + drop) ** 2 - drop**2)
+    time = np.arccos(drop / (1 + drop)) / w
+    while u > 1e-9:
+        u *= 0.9
+        time += 2 * np.arctan2(u / w, drop) / w
+    time += 2 * 0.9 * u / 9.81 / 0.1
+    method = vi.Adaptive(rtol=rtol)
+    run = vi.simulate(Tied(), vi.State(x=1.0, v=0.0), 1, event_log=256, method=method)
+    log = run.event_log
+    rest = log.phase[log.kind == vi.EVENTS.index("rest")]
+    np.testing.assert_allclose(rest, time, rtol=0, atol=error)
+
+
 @pytest.mark.parametrize("method", METHODS, ids=IDS)
 def test_release_when_the_crank_no_longer_presses(method):
     # U = cos φ > d presses the body on the stop. It leaves at φ = arccos d and then moves as the

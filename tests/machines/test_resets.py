@@ -2,6 +2,8 @@
 
 import warnings
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -145,3 +147,49 @@ def test_reset_beyond_a_stop_fails_the_lane():
     run = vi.simulate(Thrown(), start, 2)
     assert bool(run.result == vi.RESULTS.bad_reset)
     assert np.isfinite(run.sections.Y[0]) and not np.isfinite(run.last.Y)
+
+
+FLAT = {
+    "cube": lambda m, t, z: (z.x - m.p) ** 3,
+    "square": lambda m, t, z: (z.x - m.p) * jnp.abs(z.x - m.p),
+    "sign": lambda m, t, z: jnp.sign(z.x - m.p) * jnp.abs(z.x - m.p),
+    "jump": lambda m, t, z: jnp.where(z.x > m.p, 1.0, -1.0),
+}
+
+
+class Sawtooth(vi.AbstractMachine):
+    """x' = 1, and x = 0 whenever it gets to p, by a guard that may have no slope there."""
+
+    p: float
+    guard: str = eqx.field(static=True)
+
+    cycle = 5.0
+
+    @property
+    def events(self):
+        return vi.Reset(FLAT[self.guard], lambda m, t, z: dict(x=0.0 * z.x))
+
+    def field(self, t, z):
+        return dict(x=1.0 + 0.0 * z.x)
+
+
+@pytest.mark.parametrize("guard", FLAT)
+def test_guards_without_a_slope(guard):
+    def run(p):
+        found = vi.simulate(Sawtooth(p, guard), vi.State(x=0.0), 1, event_log=7)
+        return found.event_log.phase[0], found.last.x, found.successful
+
+    # The event lies at x = p, so the k-th comes at the time k p.
+    (phase, last, successful), (rates, slope, _) = jax.jvp(run, (0.7,), (1.0,))
+    assert bool(successful)
+    np.testing.assert_allclose(
+        phase, 0.7 * np.arange(1, 8), rtol=0, atol=1e-12 + 1e-11 * (guard == "jump")
+    )
+    np.testing.assert_allclose(last, 0.1, atol=1e-11)
+    for found, expected in ((rates, np.arange(1, 8)), (slope, -7.0)):
+        right = np.isclose(found, expected, rtol=1e-9)
+        assert np.all(right | np.isnan(found))
+    if guard == "jump":
+        assert np.all(np.isnan(rates))
+    if guard == "cube":
+        np.testing.assert_allclose(rates, np.arange(1, 8))

@@ -1,5 +1,7 @@
 """Simulation: methods of integration, the hybrid step, closed forms, `simulate` and its results."""
 
+from typing import TYPE_CHECKING, Any
+
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
@@ -12,10 +14,10 @@ from .arguments import (
 )
 from .history import history_of_function, with_first_history
 from .events import Rates, force_rate, guard_rates
-from .loop import row_sizes, sizes_on_host
+from .sizes import rounding_bounds, row_sizes, sizes_on_host, unit_of
 from .methods import (
     AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,
-    Unrolled, Verner9, chosen, preset,
+    chosen, preset,
 )
 from .methods.exact import lack_of_closed_form
 from .noise import WhiteNoise, check_noise, lane_key, words_of
@@ -24,6 +26,17 @@ from .results import (
     Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
 )
 from .smooth import (
-    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means, rounding_bounds, unit_of,
+    TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means,
 )
 from .suggest import Suggestion, suggest_method
+
+if TYPE_CHECKING:
+    from .methods.solvers import Unrolled, Verner9
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("Unrolled", "Verner9"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from .methods import solvers  # loads diffrax
+
+    return getattr(solvers, name)

@@ -29,7 +29,8 @@ from ..machine import (
 )
 from .methods import AbstractMethod
 from .results import EventKind, code
-from .smooth import TIME, Integrals, rounding_bounds, unit_of
+from .sizes import rounding_bounds, unit_of
+from .smooth import TIME, Integrals
 
 # Targets of the next step, as numbers, which the loop carries: none, or one of the following.
 FREE = 0.0
@@ -243,7 +244,7 @@ class Plan(eqx.Module):
     """The part of the history that the current step reads."""
 
     sizes: State | None = None
-    """The size of each number of the state (see `loop.sizes_of`), at most 1."""
+    """The size of each number of the state (see `sizes.sizes_of`), at most 1."""
     extents: tuple[Any, ...] | None = None
     """The size, at most 1, of each coordinate, then that of the guard of each of `others`; `None`
     for a machine whose numbers are about 1. An event that holds a mode has a pair of sizes, out of
@@ -262,6 +263,15 @@ class Plan(eqx.Module):
             return extent
         in_mode_zero = lane.modes[mode_number(self.machine, number)] == 0
         return jnp.where(in_mode_zero, extent[1], extent[0])
+
+    def slip_rounding(self, switch: int, lane: "Lane") -> Scalar | float:
+        """Return a bound of the rounding error of a slip; `switch` is the friction's index."""
+        rounding = 256 * float(jnp.finfo(lane.s.dtype).eps)
+        if self.extents is None:
+            return rounding
+        number = len(stops_of(self.machine)) + switch
+        place = len(self.machine.coordinates) + self.others(lane.state).index(number)
+        return rounding * self.extents[place][0]
 
     def rounding_bounds(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""
@@ -299,7 +309,7 @@ class Plan(eqx.Module):
     def in_units(self, threshold: Any) -> Any:
         """Return a threshold in `s`, given for a cycle of about 2π, in the unit of `s`."""
         unit = self.unit
-        return threshold if isinstance(unit, float) else threshold * unit
+        return threshold if isinstance(unit, float) and unit == 1.0 else threshold * unit
 
     def cycle_of(self, done: Scalar) -> Scalar:
         """Return the number of the current cycle, from the start, after `done` intervals."""

@@ -53,6 +53,7 @@ from ..machine import (
     modes_of,
     shown_modes,
     stops_of,
+    with_some_past,
     without_modes,
 )
 from ..machine import State as NamedState
@@ -65,9 +66,9 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._quantities import average_names, check_units, quantity_names
-from .history import check_delays, with_history, with_some_past
+from .history import check_delays, with_history
 from .methods import AbstractMethod, MethodLike, chosen
-from .smooth import rounding_bounds
+from .sizes import rounding_bounds
 
 _TRACED = ["settle", "method", "begin", "until", "stop"]
 _STATIC = [

@@ -96,15 +96,17 @@ with_flow_derivatives.defjvp(partial(_flow_jvp, with_flow_derivatives), symbolic
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def event_offset(
-    rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any
-) -> Scalar:
+    rate: Callable, guard: Callable, offset: Scalar, moving: Any, fixed: Any, rest: Any,
+    lost: tuple[Flag, Flag],
+) -> Scalar:  # fmt: skip
     """Return the offset in s to the zero of a guard: `offset` itself, which must be accurate to
-    rounding, with the derivatives of the implicit function."""
+    rounding, with the derivatives of the implicit function. They are NaN if the first flag in
+    `lost` is true and the guard has no slope, or if the second is true."""
     return offset
 
 
 def _event_offset_jvp(rate, guard, primals, tangents):
-    _, moving, fixed, rest = primals
+    _, moving, fixed, rest, (sloped, lost) = primals
     offset = event_offset(rate, guard, *primals)
     moves, slopes = _nonzero_tangents(tangents[1:3])
     if not any(moves):
@@ -117,7 +119,8 @@ def _event_offset_jvp(rate, guard, primals, tangents):
     end = extrapolate(rate, offset, moving, fixed, rest)
     rate_at_end = rate(end, fixed, rest)
     speed = jax.jvp(lambda x: guard(x, fixed, rest), (end,), (rate_at_end,))[1]
-    return offset, -change / jnp.where(speed == 0, 1.0, speed)
+    speed = jnp.where(speed == 0, jnp.where(sloped, jnp.nan, 1.0), speed)
+    return offset, -change / jnp.where(lost, jnp.nan, speed)
 
 
 event_offset.defjvp(_event_offset_jvp, symbolic_zeros=True)
@@ -152,7 +155,8 @@ def _height_of_turn_jvp(rate, position, primals, tangents):
         return jax.jvp(lambda x: position(x, fixed, rest), (moving,), (flow,))[1]
 
     def height_at_turn(moving, fixed):
-        to_turn = event_offset(rate, speed, offset, moving, fixed, rest)
+        no = jnp.zeros((), bool)
+        to_turn = event_offset(rate, speed, offset, moving, fixed, rest, (no, no))
         return position(extrapolate(rate, to_turn, moving, fixed, rest), fixed, rest)
 
     def slope_of(function: Callable) -> Scalar:
@@ -193,10 +197,14 @@ class FlowToEvent:
         """Return the same for an offset that is zero in value, but has derivatives."""
         return with_flow_derivatives(self._pure_rate, offset, *self._arguments())
 
-    def event_offset(self, guard: Callable, offset: Scalar) -> Scalar:
-        """Return `offset`, to the zero of a guard or a force, with its derivatives."""
-        guard = self._pure(guard)
-        return event_offset(self._pure_rate, guard, offset, *self._arguments())
+    def event_offset(
+        self, guard: Callable, offset: Scalar, met: Flag | None = None, lost: Flag | None = None
+    ) -> Scalar:
+        """Return `offset`, to the zero of a guard or a force, with its derivatives. They are NaN if
+        a guard that was `met` has no slope there, or if they are `lost`."""
+        guard, no = self._pure(guard), jnp.zeros((), bool)
+        flags = no if met is None else met, no if lost is None else lost
+        return event_offset(self._pure_rate, guard, offset, *self._arguments(), flags)
 
     def height_of_turn(self, k: int, height: Scalar, turns: Flag, offset: Scalar) -> Scalar:
         """Return the `height` of coordinate number k with derivatives (`drift.height_of_turn`)."""
@@ -230,7 +238,7 @@ class FlowToEvent:
         def acceleration(moving, fixed, rest):
             (smooth, _), (s, state, _) = self._combined(fixed, rest), moving
             free = hold_contacts(smooth.machine, smooth.modes, smooth.contact, but=k)
-            return rates(free.field, smooth.machine.coordinates[k].position, s, state).a
+            return rates(free.field, smooth.machine.coordinates[k], s, state).a
 
         return acceleration
 

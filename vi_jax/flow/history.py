@@ -25,7 +25,6 @@ from .._checks import concrete
 from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
-    FixedPast,
     HybridState,
     Recorded,
     delays_in,
@@ -39,11 +38,13 @@ from ..machine import (
     recorded_numbers,
     renews,
     size_of,
+    with_fixed_past,
     without_modes,
     without_past,
 )
 from .methods import AbstractMethod, ExactFlight, Taylor
-from .smooth import SmoothMachine, unit_of
+from .sizes import unit_of
+from .smooth import SmoothMachine
 
 # The numbers of a piece besides its coefficients: its start since that of the piece before; and the
 # level of a jump at its start, or -1, with the derivative of the jump's time relative to the start.
@@ -182,8 +183,7 @@ def with_history(
             f"Argument `start` must have the history of a {type(machine).__name__}, but has that "
             "of another machine."
         )
-    past = [form.pack(before(-lag)) for lag in lags]
-    bound = reading(machine, FixedPast(form.by_name(past)))
+    bound = with_fixed_past(machine, form, before)
     return bound, Memory(form, pieces, jnp.ones(form.size, dtype))
 
 
@@ -200,12 +200,6 @@ def check_delays(machine: AbstractMachine, method: AbstractMethod) -> None:
             f"A {kind} must not have both `delays` and `renewed`, since its history would jump. "
             "Leave `renewed` out, and use differences of the drifting component."
         )
-
-
-def with_some_past(machine: AbstractMachine, start: State) -> AbstractMachine:
-    """Return a machine with its history at the start as its past, for checks; unchanged without
-    delays."""
-    return with_history(machine, start, None)[0] if has_delays(machine) else machine
 
 
 def with_first_history(machine: AbstractMachine, start: State) -> State:

@@ -1,43 +1,30 @@
-"""The loop around the hybrid step, and the sizes of the state's numbers, relative to which errors
-of steps are judged."""
+"""The loop around the hybrid step, and its first lane."""
 
 import dataclasses
 from functools import partial
-from math import pi
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes
-from .._programs import compiled
-from .._types import Flag, Scalar, Scalars, State, Vector
+from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
-    AbstractMachine,
-    ContactFriction,
-    angles_in,
     begin_modes,
-    events_of,
-    guard_of,
+    frictions_in,
     has_contact_friction,
     holds_anywhere,
-    in_rows,
     is_in_range,
-    longest_step,
-    mode_number,
-    modes_of,
+    limited_in,
     on_held_surfaces,
     outcomes_of,
     prepared,
+    pressed_contacts,
     replaced,
-    scales_known,
-    size_of,
     stops_of,
     struck_modes,
     switches_of,
@@ -52,136 +39,13 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._step.hybrid import iterate
+from ._step.impact import is_compound
 from .events import Rates, force_rate, rates
-from .history import begun, is_covered, with_sizes, with_some_past, with_view
+from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code
-from .smooth import hold_contacts, in_modes, limited_of, stops_are_exact
-
-# A number of the state below this share of the change that the other numbers cause has still to
-# grow. Rates are evaluated at this many instants of a cycle. Choices.
-_GROWS, _INSTANTS = 1e-3, 7
-
-# A number of this size or smaller counts as zero: it is rounding of numbers about 1. A choice.
-_ZERO = 1e-15
-
-
-def sizes_of(machine: AbstractMachine, s: Scalar, start: State, modes: Scalars) -> State | None:
-    """Return the expected size of each number of the state. `None` for a machine whose numbers are
-    about 1 by definition.
-
-    The size is the greater of the value at the start and its change at the rates there, in 1/2π of
-    a cycle or of a shorter natural period. If both are tiny, it is the change that the sizes of the
-    other numbers cause. The size of a zero that nothing moves yet is unknown, and returned as 1.
-    """
-    if scales_known(machine):
-        return None
-    known = _known_sizes(machine, s, start, modes, jtu.tree_map(jnp.abs, start))
-    return stop_gradient(jtu.tree_map(_known_or_one, known))
-
-
-def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None) -> Vector:
-    """Return the size of each number of a state, in the order of `in_rows`: its expected magnitude
-    along a motion, from `start` and `rows` (..., states). It is 1 for an angle, for a number that
-    is zero to rounding, and for a machine whose numbers are about 1 by definition. States are
-    compared relative to these sizes."""
-    state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(start))  # integers too
-    machine = with_some_past(machine, state)
-    row, unravel = ravel_pytree(stop_gradient(state))
-    if scales_known(machine):
-        return jnp.ones_like(row)
-    zero, angles = jnp.zeros((), row.dtype), angles_in(machine, state)
-    angles = jnp.zeros(row.shape, bool) if angles is None else angles
-    modes = begin_modes(machine, zero, state, modes_of(start))
-    values = unravel(jnp.where(angles, 1.0, jnp.abs(row)))
-    sizes = in_rows(_known_sizes(machine, zero, state, modes, values), 0)
-    if rows is not None:
-        rows = stop_gradient(jnp.nan_to_num(jnp.abs(rows.reshape(-1, row.size)), posinf=0.0))
-        sizes = jnp.maximum(sizes, jnp.max(rows, axis=0))
-    return stop_gradient(jnp.where(angles | ~(sizes > _ZERO), 1.0, sizes))
-
-
-_compiled_sizes = compiled(row_sizes)
-
-
-def sizes_on_host(machine: AbstractMachine, start: State, rows: np.ndarray) -> np.ndarray:
-    """Return `row_sizes` as a NumPy array, compiled once for any number of `rows`."""
-    largest = np.abs(rows.reshape(-1, rows.shape[-1])).max(axis=0)
-    return np.asarray(_compiled_sizes(machine, start, jnp.asarray(largest)))
-
-
-def _known_sizes(
-    machine: AbstractMachine, s: Scalar, start: State, modes: Scalars, values: State
-) -> State:
-    """Return `sizes_of`, but 0 if unknown; `values`: moduli in `start`."""
-    holding = [x for x in events_of(machine) if x.holds_mode]
-    # While something sticks or slides along a surface, its rate does not show its size.
-    sticks = [getattr(x, "blends", False) or x.is_dry for x in holding] + [False] * len(modes)
-    slips = (jnp.where(x == 0, 1.0, x) if y else x for x, y in zip(modes, sticks, strict=False))
-    smooth = in_modes(machine, tuple(slips))
-    s, start = stop_gradient((s, start))
-    longest = 5 * jnp.asarray(longest_step(machine, s, start)) / (2 * pi)
-    unit = stop_gradient(jnp.minimum(jnp.asarray(machine.cycle) / (2 * pi), longest))
-    instants = s + jnp.asarray(machine.cycle) * np.arange(_INSTANTS) / _INSTANTS
-    rates = jax.vmap(smooth.field, (0, None))(instants, start)
-    sizes = jtu.tree_map(
-        lambda x, v: jnp.maximum(x, unit * jnp.max(jnp.abs(v), axis=0)), values, rates
-    )
-    # Different factors prevent a force that acts on a difference from cancelling.
-    leaves, tree = jtu.tree_flatten(sizes)
-    rng = np.random.default_rng(0)
-    signs = [rng.choice([-1, 1], x.shape) * rng.uniform(0.7, 1.0, x.shape) for x in leaves]
-    direction = tree.unflatten([x * sign for x, sign in zip(leaves, signs, strict=True)])
-    change_of_rate = jax.jvp(lambda x: smooth.field(s, x), (start,), (direction,))[1]
-
-    def size(x: Scalar, change: Scalar) -> Scalar:
-        change = unit * jnp.abs(change)
-        return jnp.where(x > _GROWS * change, x, change)
-
-    return jtu.tree_map(size, sizes, change_of_rate)
-
-
-def extents_of(
-    plan: Plan, s: Scalar, start: State, modes: Scalars, sizes: State
-) -> tuple[Any, ...]:
-    """Return `Plan.extents`: the size, at most 1, of each coordinate, then the size of the guard of
-    each event other than a stop. `sizes` are from `sizes_of`."""
-    machine, unit = plan.machine, plan.unit
-    contact = tuple(jnp.zeros_like(s) for _ in machine.coordinates) if plan.rests else ()
-    s, start = stop_gradient((s, start))
-
-    def of_guard(number: int, modes: Scalars, contact: Scalars) -> Scalar:
-        def guard(s: Scalar, x: State) -> Scalar:
-            return jnp.asarray(guard_of(machine, number, s, x, modes, contact), s.dtype)
-
-        value, rate = jax.jvp(lambda s: guard(s, start), (s,), (jnp.ones_like(s),))
-        size = jnp.maximum(jnp.abs(value), unit * jnp.abs(rate))
-        return _known_or_one(jnp.maximum(size, size_of(lambda x: guard(s, x), start, sizes)))
-
-    of_coordinates = (size_of(x.position, start, sizes) for x in machine.coordinates)
-    extents: list[Any] = [_at_most_one(_known_or_one(size)) for size in of_coordinates]
-    for number in plan.others(start):
-        event, rest = events_of(machine)[number], contact
-        if not event.holds_mode:
-            extents.append(of_guard(number, modes, rest))
-            continue
-        if contact and isinstance(event, ContactFriction):  # it holds a resting body
-            k = stops_of(machine)[event.stop].coordinate
-            rest = (*contact[:k], jnp.full_like(s, to_event(event.stop)), *contact[k + 1 :])
-        mode = mode_number(machine, number)
-        both_modes = ((*modes[:mode], jnp.full_like(s, x), *modes[mode + 1 :]) for x in (1.0, 0.0))
-        extents.append(tuple(of_guard(number, x, rest) for x in both_modes))
-    return stop_gradient(tuple(extents))
-
-
-def _known_or_one(size: Array) -> Array:
-    """Return a size; 1 if it is 0 or NaN, which is unknown."""
-    return jnp.where(size > 0, size, 1.0)
-
-
-def _at_most_one(size: Array) -> Array:
-    """Return a size; 1 if it is larger, since the motion may become smaller."""
-    return jnp.minimum(size, 1.0)
+from .sizes import at_most_one, extents_of, sizes_of
+from .smooth import hold_contacts, in_modes, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -199,14 +63,14 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
-    current = [rates(free.field, x.position, s, start) for x in machine.coordinates]
+    current = [rates(free.field, x, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.
     direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in current)
     contact = None
     if plan.rests:
-        jerks = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
+        jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
         contact = _contacts_at(plan, start, current, jerks)
-        if len(limited_of(machine)) > 1:
+        if len(limited_in(machine)) > 1:
             contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
@@ -219,9 +83,14 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
+        if is_compound(machine):
+            contact = pressed_contacts(machine, s, start, modes, contact)
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
+    fault = jnp.where(bad, code("bad_start"), zero)
+    for i in frictions_in(machine):
+        fault = jnp.where(jnp.isnan(modes[i]) & ~bad, code("jammed"), fault)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8
@@ -239,7 +108,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         attempts=zero,
         part=plan.first_part(zero) if plan.instants > 1 else zero,
         done=zero,
-        fault=jnp.where(bad, code("bad_start"), zero),
+        fault=fault,
         steps=zero,
         spent=zero,
         rejected=zero,
@@ -269,12 +138,12 @@ def _pressed_together(
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
         held = stop_gradient(hold_contacts(plan.machine, modes, contact))
-        current = [rates(held.field, x.position, s, start) for x in bodies]
-        jerks = [force_rate(held, x.position, held, s, start) for x in bodies]
+        current = [rates(held.field, x, s, start) for x in bodies]
+        jerks = [force_rate(held, x, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)
         return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
 
-    return jax.lax.scan(add_contacts, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
+    return jax.lax.scan(add_contacts, contact, None, length=len(limited_in(plan.machine)) - 1)[0]
 
 
 def _rests_on(
@@ -338,7 +207,7 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
     sizes = sizes_of(plan.machine, s, start, modes)
     if sizes is not None:
         extents = extents_of(plan, s, start, modes, sizes)
-        sizes = jtu.tree_map(_at_most_one, sizes)
+        sizes = jtu.tree_map(at_most_one, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
         if plan.memory is not None:

@@ -2,7 +2,6 @@
 on which the motion does not depend."""
 
 from collections.abc import Callable
-from math import pi
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import Tracer
 from jax.extend.core import Jaxpr
-from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called, propagate_marks
@@ -23,31 +21,11 @@ from ..machine import (
     field_in,
     has_contact_friction,
     holds_anywhere,
+    limited_in,
     push_of,
-    scales_known,
     shown_modes,
-    stops_of,
     velocity_change,
 )
-
-# Thresholds in `s` are for cycles of about 2π, and hold for cycles up to this factor shorter or
-# longer: a choice.
-_USUAL = 100.0
-
-
-def unit_of(machine: AbstractMachine) -> Scalar | float:
-    """Return the unit of `s` for thresholds: 1, or cycle/2π of a cycle that is much shorter or
-    longer than 2π."""
-    cycle = machine.cycle
-    if scales_known(machine) or (isinstance(cycle, float | int) and 1 / _USUAL < cycle < _USUAL):
-        return 1.0
-    unit = stop_gradient(jnp.asarray(cycle)) / (2 * pi)
-    return jnp.where((unit > 1 / _USUAL) & (unit < _USUAL), 1.0, unit)
-
-
-def limited_of(machine: AbstractMachine) -> list[int]:
-    """Return the numbers of the coordinates that stops limit."""
-    return sorted({stop.coordinate for stop in stops_of(machine)})
 
 
 class SmoothMachine(eqx.Module):
@@ -70,7 +48,7 @@ class SmoothMachine(eqx.Module):
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
             return flow
-        limited = limited_of(machine) if self.contact else []
+        limited = limited_in(machine) if self.contact else []
         several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
             flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]
@@ -147,27 +125,6 @@ def is_affine(function: Callable[[State], Scalar], state: State) -> bool:
     jaxpr = jax.make_jaxpr(function)(state).jaxpr
     propagate_marks(jaxpr, [True] * len(jaxpr.invars), mark)
     return not nonlinear
-
-
-def rounding_bounds(
-    machine: AbstractMachine, k: int, state: State, least: Scalar | float = 1.0,
-    unit: Scalar | float = 1.0,
-) -> tuple[Scalar | float, Scalar | float]:  # fmt: skip
-    """Return bounds of the rounding errors of position and velocity of coordinate number k at its
-    stop: 0 if the position is itself a number of the state. A position counts as at least `least`
-    large, a velocity as `least / unit`."""
-    if stops_are_exact(machine, state):
-        return 0.0, 0.0
-    body = machine.coordinates[k]
-    return _bound(body.position, state, least), _bound(body.velocity, state, least / unit)
-
-
-def _bound(part: Callable[[State], Scalar], state: State, least: Scalar | float) -> Scalar:
-    state = stop_gradient(state)
-    slopes = jax.grad(lambda x: jnp.sum(part(x)))(state)
-    terms = jtu.tree_map(lambda slope, x: jnp.sum(jnp.abs(slope * x)), slopes, state)
-    size = sum(jtu.tree_leaves(terms), start=jnp.asarray(least))
-    return stop_gradient(16 * jnp.finfo(size.dtype).eps * size)
 
 
 Integrals = dict[str, Scalar]

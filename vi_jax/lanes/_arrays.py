@@ -302,7 +302,7 @@ class Memory:
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
         if isinstance(place, Value):
-            return gathered(t, self._base(t), self._of_slots(t, place), kind)
+            return gathered(t, self.pointer(t), self._of_slots(t, place), kind)
         stored = stored_kind(kind)
         aligned = f"align {self._alignment(t, stored)}"
         where = self._address(t, place, stored)
@@ -312,7 +312,7 @@ class Memory:
     def store(self, t: Text, place: Index, value: Value, mask: Value | None = None) -> None:
         """Store a number where the mask, if one is given, holds."""
         if isinstance(place, Value):
-            return scattered(t, self._base(t), self._of_slots(t, place), value, mask)
+            return scattered(t, self.pointer(t), self._of_slots(t, place), value, mask)
         if mask is not None:
             value = t.select(mask, value, self.load(t, place, value.kind))
         value = _as_stored(t, value)
@@ -320,7 +320,7 @@ class Memory:
         where, aligned = self._address(t, place, kind), f"align {self._alignment(t, kind)}"
         t.store(f"store {t.vector(kind)} {value.text}, ptr {where}, {aligned}")
 
-    def _base(self, t: Text) -> str:
+    def pointer(self, t: Text) -> str:
         if isinstance(self.block, Block):
             return t.once(f"getelementptr i8, ptr %arena, i64 {self.block.start * t.width * 8}")
         pointer, begin = self.block
@@ -331,7 +331,7 @@ class Memory:
             pointer, begin = self.block
             place = begin + t.width * _BYTES[kind] * place
             return t.once(f"getelementptr i8, ptr {pointer}, i64 {place}")
-        return t.once(f"getelementptr {t.vector(kind)}, ptr {self._base(t)}, i64 {place}")
+        return t.once(f"getelementptr {t.vector(kind)}, ptr {self.pointer(t)}, i64 {place}")
 
     def _alignment(self, t: Text, kind: str) -> int:
         return min(64, t.width * _BYTES[kind]) if isinstance(self.block, Block) else 8

@@ -62,6 +62,13 @@ class AbstractEvent(Shown):
     from_below: ClassVar[bool] = True
     """True if the guard must have been negative since the last jump before the event can happen.
     False if the guard is another function after the event."""
+
+    @property
+    def is_plain(self) -> bool:
+        """True if the guard is a function of the user's that may have no slope at its zero, or may
+        jump; static."""
+        return self.from_below
+
     checked_within_step: ClassVar[bool] = True
     """True if the guard may be positive for a part of a step only, and must be evaluated within
     each step. False if the length of steps depends on it already."""

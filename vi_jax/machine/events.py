@@ -22,7 +22,7 @@ from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
 from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import choose_modes, frictions_in
+from .friction import frictions_in, settled_modes
 from .numbers import Shown, size_of
 from .state import changed
 
@@ -74,9 +74,6 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[part], **keywords)
     if event.holds_mode:
         changed = (*modes[: part.start], changed, *modes[part.stop :])
-        if event.is_dry and len(frictions_in(machine)) > 1:
-            changed, was_sticking = constant_modes(changed, s), modes[part.start] == 0
-            changed = choose_modes(machine, s, new, changed, contact, (part.start, was_sticking))
     return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
 
 
@@ -142,17 +139,14 @@ def struck_modes(
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
     event_modes = []
-    solve_together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
     for number, event in enumerate(events_of(machine)):
-        if solve_together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
-            event_modes.append(event.slip_sign(machine, s, state))  # pyright: ignore
-        elif event.holds_mode:
+        if event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
             event_modes.append(event.struck(machine, s, state, *modes[part], **keywords))
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
-    if solve_together:
-        modes = constant_modes(choose_modes(machine, s, state, modes, contact), s)
+    if frictions_in(machine):
+        modes = constant_modes(settled_modes(machine, s, state, modes, contact), s)
     return modes
 
 
@@ -281,6 +275,8 @@ class Switch(AbstractSwitch):
     function: Callable[..., Any] = eqx.field(static=True)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
 
+    is_plain: ClassVar = True
+
     @property
     def may_slide(self) -> bool:  # pyright: ignore
         return not self.slides
@@ -357,7 +353,9 @@ class Reset(AbstractEvent):
     ends a cycle belongs to the next cycle.
 
     A guard may jump, such as `where(x > 1, 1.0, -1.0)`. Its zero is found by bisection, to 1e-12 in
-    `s`, in many steps; the time of such an event has no derivative.
+    `s`, in many steps. The time of such an event has no derivative, so that derivatives are NaN. A
+    guard without a slope at its zero, such as `(x - 1)**3`, takes many steps too; its derivatives
+    are right, or NaN where JAX's derivative of the guard is 0.
 
     **Arguments:**
 

@@ -290,8 +290,8 @@ def power(x: Any, n: float) -> Any:
 # Modes: the body touches; it is released, but not yet out; it is apart.
 TOUCHING, RELEASED, APART = 1.0, 0.0, -1.0
 
-# Within this distance (unit: that of the coordinate) the contact's time scale matters: a choice,
-# since a step that ends on first touch may end a little short of it.
+# Within this time to the stop, as a share of 1/2π of a cycle, the contact's time scale matters: a
+# choice, since a step that ends on first touch may end a little short of it.
 _NEAR = 1e-6
 
 
@@ -455,7 +455,8 @@ class SoftStop(Wall, AbstractSwitch):
         mass = self._mass(machine, s, state)
         stiffness = self.stiffness if _is_one(mass) else self.stiffness / mass
         frequency = self.law.frequency(stiffness, depth, rate)
-        return jnp.where(depth > -_NEAR, 0.4 * pi / frequency, jnp.inf)
+        near = -_NEAR * jnp.asarray(machine.cycle) / (2 * pi) * jnp.abs(rate)
+        return jnp.where(depth >= near, 0.4 * pi / frequency, jnp.inf)
 
     def _mass(self, machine: Machine, s: Scalar, state: State) -> Any:
         return machine.coordinates[self.coordinate].mass_at(s, state)

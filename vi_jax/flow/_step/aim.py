@@ -227,6 +227,10 @@ _MARGIN = 0.02
 # Factor that widens a bound to cover rounding.
 _WIDER = 1.001
 
+# After this many attempts at an event a step is this much shorter, so that the event comes within a
+# thousandth of it: choices.
+_PATIENCE, _SHORT = 8.0, 0.999
+
 # A turn's place is uncertain if the velocity there is above this share of that at the ends.
 _UNCERTAIN = 1e-3
 
@@ -571,4 +575,10 @@ def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
             length=jnp.where(again, h + stop_gradient(c.offset), goal.length),
             target=jnp.where(again, to_event(c.number), goal.target),
         )
+    for c in trial.crossings:
+        if c.event.is_plain and c.above is not None:
+            # Attempts may all lie beyond a guard without a slope: then one falls short.
+            stuck = goal.event & ~c.again & (lane.attempts >= _PATIENCE)
+            stuck = stuck & (goal.target == to_event(c.number)) & (lane.target == goal.target)
+            goal = goal._replace(length=jnp.where(stuck, _SHORT * goal.length, goal.length))
     return goal

@@ -26,14 +26,17 @@ from ...machine import (
     clock_of,
     events_of,
     guard_of,
+    limited_in,
     section_number,
     sides_of,
+    size_of,
     stops_of,
 )
 from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
-from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
+from ..sizes import guard_rounding
+from ..smooth import SmoothMachine, is_affine, stops_are_exact
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -113,12 +116,12 @@ def inner_guards(
     if not stages:
         return InnerGuards({}, {}, {}, {})
     machine, arguments = plan.machine, (lane.modes, lane.contact or ())
-    limited = limited_of(machine) if plan.rests else []
+    limited = limited_in(machine) if plan.rests else []
     contacts: Any = lane.contact
     checked = events_within_step(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
-        return rates(free_machines[k].field, machine.coordinates[k].position, s, state)
+        return rates(free_machines[k].field, machine.coordinates[k], s, state)
 
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):
@@ -153,7 +156,7 @@ def inner_guards(
     if not limited:
         return InnerGuards({}, events, slow, {})
     # The integral of a force is a velocity.
-    size = 1.0 if isinstance(plan.unit, float) else 1 / plan.unit
+    size = 1 / plan.unit
 
     def of_forces(places: tuple) -> tuple[dict[int, Array], Scalar, dict[int, Scalar]]:
         forces, error, slack = at_places(pulls)(places), jnp.zeros_like(h), {}
@@ -262,6 +265,9 @@ class Crossing(NamedTuple):
     """The coordinate that a stop limits."""
     slack: Scalar | None = None
     """A step may be beyond the event by this rounding; `None` if positions on it are exact."""
+    zero: Scalar | None = None
+    """Values up to this count as zero at the start of the step, if the guard falls; `None` for an
+    event that need not come from below."""
     above: Flag | None = None
     """True if the guard has jumped above zero at the start of the step, for example with the clock
     of a new cycle; `None` for a stop."""
@@ -273,7 +279,10 @@ class Crossing(NamedTuple):
     again: Any = None
     """The step was aimed at the event and has to be corrected by δ."""
     sudden: Any = None
-    """True if the guard jumped above zero there, so that δ has no meaning; `None` if none can."""
+    """True if the event was located by its sign alone, so that δ has no meaning; `None` if none
+    can."""
+    jumped: Any = None
+    """True if the guard jumped above zero there, so that the event's time has no derivative."""
     sides: tuple[Side, ...] = ()
     """The smooth functions whose maximum is g, if they were evaluated at stages."""
 
@@ -303,20 +312,53 @@ def crossings(
     if plan.others(lane.state) or not stops_are_exact(machine, lane.state):
         eps = float(jnp.finfo(h.dtype).eps)
         guards = [guard._replace(slack=4 * eps * guard.scale) for guard in guards]
+        guards = _with_own_rounding(plan, lane, (s1, new), guards)
         guards = [guard if guard.coordinate is not None else _mark_jump(guard) for guard in guards]
     return tuple(_landed(plan, lane, good & last, good, h, each, guards) for each in guards), below
+
+
+def _with_own_rounding(
+    plan: Plan, lane: Lane, at_end: tuple[Scalar, State], guards: list[Crossing]
+) -> list[Crossing]:
+    """Return the guards with a smaller slack where one ends the step at zero to rounding, but is
+    known better: a guard without a slope, such as (x - p)³, whose sign is that of x - p."""
+    own = [guard for guard in guards if guard.event.is_plain]
+    if not own:
+        return guards
+    s, state = stop_gradient(at_end)
+    sizes = jtu.tree_map(lambda x: jnp.maximum(1.0, jnp.abs(x)), state)
+    if plan.sizes is not None:
+        sizes = jtu.tree_map(lambda size, x: jnp.maximum(size, jnp.abs(x)), plan.sizes, state)
+    arguments, eps = (lane.modes, lane.contact or ()), float(jnp.finfo(s.dtype).eps)
+
+    def of_each(_: None) -> Scalars:
+        found = []
+        for guard in own:
+            value = lambda s, x, i=guard.number: guard_of(plan.machine, i, s, x, *arguments)
+            rate = jax.jvp(lambda s, f=value: f(s, state), (s,), (jnp.ones_like(s),))[1]
+            size = size_of(lambda x, f=value: f(s, x), state, sizes)
+            size = size + jnp.maximum(plan.unit, jnp.abs(s)) * jnp.abs(rate)
+            found.append(jnp.where(jnp.isfinite(size), 4 * eps * size, jnp.inf))
+        return tuple(found)
+
+    near = any_of(lane.s > 0, (jnp.abs(x.end.x) <= x.slack for x in own))
+    far = tuple(jnp.full_like(s, jnp.inf) for _ in own)
+    slack = jax.lax.cond(stop_gradient(near), of_each, lambda _: far, None)
+    by_number = {guard.number: x for guard, x in zip(own, slack, strict=True)}
+    return [
+        guard._replace(slack=jnp.minimum(guard.slack, by_number[guard.number]))
+        if guard.number in by_number
+        else guard
+        for guard in guards
+    ]
 
 
 def _mark_jump(guard: Crossing) -> Crossing:
     """Set `above` of an event: its guard is above zero at the start of the step, by more than
     `_from_below` takes for zero in a guard that falls."""
-    x = stop_gradient(guard.begin.x)
-    return guard._replace(above=x > JUMPED * jnp.abs(x) + guard_rounding(guard.scale))
-
-
-def guard_rounding(scale: Scalar) -> Scalar:
-    """Return the rounding error of a guard of this size at its zero after a search."""
-    return float(jnp.finfo(scale.dtype).eps) ** 0.5 * scale
+    x, eps = stop_gradient(guard.begin.x), float(jnp.finfo(guard.scale.dtype).eps)
+    zero = eps**0.5 * guard.scale if guard.zero is None else guard.zero
+    return guard._replace(above=x > JUMPED * jnp.abs(x) + zero)
 
 
 def at_stops(plan: Plan, ends: list[tuple[Rates, Rates]]) -> list[Crossing]:
@@ -375,9 +417,12 @@ def _other_events(
         scale = plan.guard_extent(number, lane) + plan.in_units(
             stop_gradient(functools.reduce(jnp.maximum, [abs(x.end.v) for x in sides]))
         )
+        zero = None
         if event.from_below:
             (side,) = sides
-            armed, risen = _from_below(lane.below[len(below)], side.begin, side.end, scale)
+            was_below = lane.below[len(below)]
+            zero = _zero_of(plan, was_below, plan.guard_extent(number, lane), side)
+            armed, risen = _from_below(was_below, side.begin, side.end, zero)
             begin, end = _rates_if_armed(armed, side.begin), _rates_if_armed(armed, side.end)
             sides = [Side(begin, end, jnp.where(armed, side.within, -1.0))]
             below.append(risen)
@@ -387,7 +432,7 @@ def _other_events(
         for side in sides[1:]:  # the side that is the guard at the step's end
             greater = stop_gradient(side.end.x > end.x)
             begin, end = select(greater, (side.begin, side.end), (begin, end))
-        crossing = Crossing(event, number, begin, end, scale)
+        crossing = Crossing(event, number, begin, end, scale, zero=zero)
         found.append(crossing._replace(sides=tuple(sides)) if number in inner.events else crossing)
     if clocked:
         number, (begin,), (end,) = section_number(machine), begin_rates[-1], end_rates[-1]
@@ -406,11 +451,21 @@ def _falling(plan: Plan, begin: Rates, scale: Scalar) -> Rates:
     return begin._replace(v=jnp.where(risen, 0.0, begin.v))
 
 
-def _from_below(below: Scalar, begin: Rates, end: Rates, scale: Scalar) -> tuple[Flag, Scalar]:
+def _zero_of(plan: Plan, below: Scalar, extent: Scalar | float, side: Side) -> Scalar:
+    """Return the distance from zero up to which a guard of this extent counts as zero: the rounding
+    of its evaluation, and what the location of an event leaves. At the start of a motion it is what
+    a search for an orbit leaves, in units of the guard's change: no cycle is this short."""
+    begin, end = stop_gradient((side.begin, side.end))
+    near, left = landing_tolerance(begin.x), furthest_landing(begin.x)
+    rate = plan.in_units(jnp.maximum(jnp.abs(begin.v), jnp.abs(end.v)))
+    bend = plan.in_units(plan.in_units(jnp.maximum(jnp.abs(begin.a), jnp.abs(end.a))))
+    change = jnp.where(below < 0, near * (rate + bend), left * left * bend)
+    return guard_rounding(extent + jnp.abs(begin.x)) + change
+
+
+def _from_below(below: Scalar, begin: Rates, end: Rates, rounding: Scalar) -> tuple[Flag, Scalar]:
     """Return whether a guard that must have been negative counts now, and `Lane.below` at the
     step's end. A guard that begins at zero and falls counts."""
-    # A point that a search left this close to the surface is on it too: no cycle is this short.
-    rounding = guard_rounding(scale)
     here = stop_gradient(begin)
     falls = (here.x <= rounding) & (here.v < 0)
     # If the motion began on the surface, a falling guard may be rounding alone.
@@ -463,7 +518,8 @@ def _landed(
     size = stop_gradient(jnp.abs(offset))
     # Two tests of being on the event to rounding: along the path, or, near grazing, in position.
     close = size <= landing_tolerance(h) * tolerance_factor(plan, lane)
-    on_event = (jnp.abs(end.x) <= 4 * eps * guard.scale) & (end.v >= 0)
+    slack = 4 * eps * guard.scale if guard.slack is None else guard.slack
+    on_event = (jnp.abs(end.x) <= slack) & (end.v >= 0)
     real = stop_gradient(square) > 0
     # On the event a parabola may have no root: a body that is at rest on a surface.
     near = close & real | on_event
@@ -472,16 +528,20 @@ def _landed(
     # When bodies touch at rest, their remaining speed is rounding.
     rises = end.v > 0 if guard.slack is None else end.v * lane.length > guard.slack
     again = again | ends & on_event & close & rises
-    sudden = None
+    sudden, jumped = None, None
     if guard.above is not None:
-        shortest = jnp.maximum(
-            plan.in_units(_SUDDEN), 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
-        )
+        # A guard without a slope is followed further, to the clock's rounding.
+        jumped = stop_gradient(end.x) > JUMPED * guard.scale
+        shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
+        shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
         sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.attempts < _PATIENCE)
-    return guard._replace(offset=offset, landed=landed, again=again, near=near, sudden=sudden)
+    jumped = None if sudden is None else sudden & jumped
+    return guard._replace(
+        offset=offset, landed=landed, again=again, near=near, sudden=sudden, jumped=jumped
+    )
 
 
 def tolerance_factor(plan: Plan, lane: Lane) -> Scalar:

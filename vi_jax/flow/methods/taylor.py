@@ -5,6 +5,7 @@ of every variable, each equation gives the next one of its result: by a sum, a c
 recurrence such as e' = a' e.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import factorial, pi
@@ -520,6 +521,8 @@ class Expansion(NamedTuple):
     """The tolerance that determines its reach; `None` without a limit."""
     rarely: bool = False
     """True if it shortens few steps; static."""
+    sizes: State | None = None
+    """The sizes of the state's numbers, relative to which its error is judged; `None`: all 1."""
 
     def at(self, h: Scalar) -> tuple[State, Integrals]:
         """Return the state and the integrals after a length h."""
@@ -537,14 +540,23 @@ class Expansion(NamedTuple):
         if self.tolerance is None:
             return limit
         floor = 8 * jnp.finfo(limit.dtype).eps
-        size = jnp.asarray(sum(jnp.sum(jnp.abs(stop_gradient(x[0]))) for x in self.series))
-        allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor) * (1 + size)
+        values = [jnp.abs(stop_gradient(x[0])) for x in self.series]
+        allowed = jnp.maximum(jnp.asarray(self.tolerance, limit.dtype), floor)
+        if self.sizes is None:
+            allowed, weights = allowed * (1 + sum(jnp.sum(x) for x in values)), None
+        else:  # each number by its own size, since they have different units
+            sizes = [*jtu.tree_leaves(self.sizes), *(1.0 for _ in values)]
+            weights = [1 / (size + x) for size, x in zip(sizes, values, strict=False)]
+            allowed = allowed * sum(x.size for x in values)
         for n in (len(self.series[0]) - 2, len(self.series[0]) - 1):
-            coefficients = [stop_gradient(x[n]) for x in self.series if x[n] is not None]
-            terms = [jnp.sum(jnp.abs(x)) for x in coefficients]
+            terms = [
+                jnp.sum(jnp.abs(stop_gradient(x[n])) * (1.0 if weights is None else weights[i]))
+                for i, x in enumerate(self.series)
+                if x[n] is not None
+            ]
             if not terms:
                 continue
-            term = jnp.maximum(sum(terms), jnp.finfo(size.dtype).tiny)
+            term = jnp.maximum(sum(terms), jnp.finfo(limit.dtype).tiny)
 
             def shorten(limit: Scalar, ratio: Scalar, n: int = n) -> Scalar:
                 return jnp.minimum(limit, jnp.exp(jnp.log(ratio) * (1.0 / n)))
@@ -576,14 +588,21 @@ class Taylor(AbstractMethod):
     order: int = eqx.field(static=True, default=16)
     steps_per_cycle: int = eqx.field(static=True, default=8)  # pyright: ignore
     rtol: np.ndarray | float | None = eqx.field(
-        kw_only=True, default=None, converter=lambda x: x if x is None else np.asarray(x)
+        kw_only=True,
+        default=None,
+        converter=lambda x: x if x is None or isinstance(x, Tracer) else np.asarray(x),
     )
+    sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
+    """The sizes of the state's numbers, set by `with_sizes`."""
 
     def __check_init__(self):
         count("order", self.order, least=4)
         count("steps_per_cycle", self.steps_per_cycle, least=5)
         if self.rtol is not None:
             require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
+
+    def with_sizes(self, sizes):
+        return dataclasses.replace(self, sizes=sizes)
 
     @property
     def wander(self):
@@ -622,9 +641,10 @@ class Taylor(AbstractMethod):
         with _explain_errors():
             treedef, series = expand(field, s, (state, beside), self.order)
         if self.rtol is not None:
-            return Expansion(treedef, series, self.rtol)
+            return Expansion(treedef, series, self.rtol, sizes=self.sizes)
         known = has_relaxation(smooth.machine, s, state)
-        return Expansion(treedef, series, None if known else self._coarsest, rarely=True)
+        tolerance = None if known else self._coarsest
+        return Expansion(treedef, series, tolerance, rarely=True, sizes=self.sizes)
 
     @property
     def _coarsest(self) -> float:
