@@ -31,4 +31,4 @@ data = vi.scan(Controlled(), {"gain": gains}, measure="sections", start=start, s
 figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
 ax.plot(data.gain, data.u, "k,")
 ax.set(xlabel="gain g of the feedback", ylabel="velocity once in each cycle")
-figure.savefig("delayed_control.png", dpi=100)
+figure.savefig("delayed_control.png")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+
 from delayed import by_steps
 
 
@@ -14,7 +15,7 @@ class Linear(vi.AbstractMachine):
     """x' = -x(t - 1) after x = 1: a polynomial in each unit of time."""
 
     cycle = 5.0
-    delays = dict(lag=1.0)
+    delays = property(lambda self: dict(lag=1.0))
 
     def field(self, t, z, past):
         return dict(x=-past.lag.x)
@@ -240,7 +241,7 @@ class Masses(vi.Mechanical):
     q = ("x",)
     mass = (1.0,)
     cycle = 2 * np.pi / 0.8
-    delays = dict(sensor=4.0)
+    delays = property(lambda self: dict(sensor=4.0))
     contacts = vi.RigidStop(0.6, 0.7, on="x")
 
     def force(self, t, q, v, past):

@@ -269,7 +269,7 @@ def recorded_numbers(
 
 
 def _recorded(
-    machine: Machine, structure: Any, shapes: Any, s: Scalar, state: State, modes: Scalars
+    machine: Any, structure: Any, shapes: Any, s: Scalar, state: State, modes: Scalars
 ) -> Any:
     original = without_past(machine)
     whose = f"`recorded` of a {type(machine).__name__}"
