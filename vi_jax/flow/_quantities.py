@@ -23,6 +23,7 @@ from ..machine import (
     near_names,
     overridden,
     shown_modes,
+    with_some_past,
 )
 from ._machine_checks import explain_errors
 
@@ -52,6 +53,7 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     averages are not a mapping to numbers; `ValueError` if a name is in use already."""
     if not has_averages(machine):
         return ()
+    machine = with_some_past(machine, start)
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
     modes = shown_modes(machine, begin_modes(machine, zero, start))
     names = _checked_names(machine, "averages", machine.averages, start, (zero, start, *modes))
