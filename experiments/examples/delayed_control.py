@@ -1,8 +1,8 @@
 # %% [markdown]
 """# Delayed feedback ends the chaos of an impact oscillator
 
-A driven oscillator strikes a stop at its rest position and moves chaotically. A force g times
-(velocity one drive cycle ago - velocity) vanishes on a motion of one cycle, and stabilises it.
+A driven oscillator strikes a stop at its rest position and moves chaotically. A force that is g
+times (velocity one cycle ago - velocity) makes it repeat: from g = 0.12 after four cycles.
 """
 
 # %%
@@ -29,6 +29,6 @@ gains = jnp.linspace(0.0, 0.3, 301)
 start = vi.State(x=-0.1, u=0.0)
 data = vi.scan(Controlled(), {"gain": gains}, measure="sections", start=start, settle=300)
 figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
-ax.plot(data.gain, data.u, "k,")
+ax.plot(data.gain, data.u, "k.", markersize=1)
 ax.set(xlabel="gain g of the feedback", ylabel="velocity once in each cycle")
 figure.savefig("delayed_control.png")

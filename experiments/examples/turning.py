@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import vi_jax as vi
 
 jax.config.update("jax_enable_x64", True)
-Z, K = 0.03, 0.15  # damping, stiffness of the cut
+Z, K, W = 0.03, 0.15, 1 + jnp.geomspace(0.002, 0.35, 400)  # damping, stiffness, frequencies
 
 
 class Tool(vi.Mechanical):
@@ -34,7 +34,6 @@ speeds, (figure, ax) = jnp.linspace(0.45, 1.15, 36), plt.subplots(figsize=(8, 4)
 data = vi.scan(Tool(), {"slot": [1e3, 0.5], "turn": 2 * jnp.pi / speeds}, measure="square")
 ax.plot(speeds, data.square.T**0.5, ".-")
 ax.set(xlabel="turns in a natural period", ylabel="rms velocity (orange: ball)", xlim=(0.45, 1.15))
-W = 1 + jnp.geomspace(0.002, 0.35, 400)  # the frequency of chatter on a lobe
 limit = (W**2 - 1) / 2 + (2 * Z * W) ** 2 / (2 * (W**2 - 1))
 turns = jnp.arctan2(-2 * Z * W, 1 + limit - W**2) / (2 * jnp.pi) + jnp.arange(1, 4)[:, None]
 ax.twinx().plot((W / turns).T, limit, "k--", [0.45, 1.15], [K, K], "C3:")
