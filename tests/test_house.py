@@ -79,7 +79,7 @@ def test_each_name_is_listed_once_and_belongs_to_its_package():
 
 def test_members_of_a_machine_are_few_and_documented():
     members = [name for name in dir(vi_jax.AbstractMachine) if not name.startswith("_")]
-    assert len(members) <= 23
+    assert len(members) <= 24  # four of them for delays
     text = " ".join(vi_jax.AbstractMachine.__doc__.split())
     assert not [name for name in members if f"`{name}`" not in text and f".{name}(" not in text]
 

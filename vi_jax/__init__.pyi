@@ -4,6 +4,7 @@ and type checkers take their types from here."""
 from . import machines as machines
 from . import plot as plot
 from ._messages import Interrupted as Interrupted
+from ._programs import keep_programs as keep_programs
 from .flow import EVENTS as EVENTS
 from .flow import RESULTS as RESULTS
 from .flow import AbstractMethod as AbstractMethod
@@ -69,12 +70,16 @@ from .orbit import Grazing as Grazing
 from .orbit import Newton as Newton
 from .orbit import Orbit as Orbit
 from .orbit import Point as Point
+from .orbit import Torus as Torus
+from .orbit import TorusBranch as TorusBranch
 from .orbit import boundary as boundary
 from .orbit import closed_form_orbits as closed_form_orbits
 from .orbit import continue_orbit as continue_orbit
+from .orbit import continue_torus as continue_torus
 from .orbit import cycle_map as cycle_map
 from .orbit import distinct_orbits as distinct_orbits
 from .orbit import find_orbit as find_orbit
+from .orbit import find_torus as find_torus
 from .orbit import grazing as grazing
 from .plot import animate as animate
 from .plot import plot_basins as plot_basins
@@ -89,6 +94,7 @@ from .plot import plot_phase_portrait as plot_phase_portrait
 from .plot import plot_regimes as plot_regimes
 from .plot import plot_sketch as plot_sketch
 from .plot import plot_sweep as plot_sweep
+from .plot import plot_torus as plot_torus
 from .robust import EdgeState as EdgeState
 from .robust import Manifold as Manifold
 from .robust import MinimalKick as MinimalKick
@@ -108,6 +114,7 @@ from .scans import Integrity as Integrity
 from .scans import IntegrityProfile as IntegrityProfile
 from .scans import Lyapunov as Lyapunov
 from .scans import Regime as Regime
+from .scans import Rotation as Rotation
 from .scans import Sections as Sections
 from .scans import Statistics as Statistics
 from .scans import Sweep as Sweep

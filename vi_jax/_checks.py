@@ -300,7 +300,8 @@ def number(name: str, value: object) -> jax.Array:
     try:
         if isinstance(value, int | float | np.generic | np.ndarray):
             with jax.ensure_compile_time_eval():
-                return _floating(name, jnp.asarray(value, *_type_of(value)))
+                # By NumPy, since JAX compiles a program to convert a number.
+                return _floating(name, from_host(np.asarray(value, *_type_of(value))))
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"Argument `{name}` must be a real number, but got {value!r}.") from None
@@ -323,7 +324,7 @@ def strongly_typed(value: object) -> Any:
         isinstance(value, np.ndarray) and not value.ndim and value.dtype.kind == "f"
     ):
         with jax.ensure_compile_time_eval():
-            return jnp.asarray(value, *_type_of(value))
+            return from_host(np.asarray(value, *_type_of(value)))
     return value
 
 
@@ -402,9 +403,21 @@ def array_module(*values: object) -> Any:
 
 
 def on_host(tree: Any) -> Any:
-    """Return a tree whose JAX arrays are NumPy arrays. JAX compiles each operation on arrays
-    outside of a program, which takes about 20 ms."""
-    return jtu.tree_map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
+    """Return a tree whose JAX arrays are NumPy arrays, if they are known. JAX compiles each
+    operation on arrays outside of a program, which takes about 20 ms."""
+
+    def leaf_on_host(x: Any) -> Any:
+        is_known = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+        return np.asarray(x) if is_known else x
+
+    return jtu.tree_map(leaf_on_host, tree)
+
+
+def from_host(tree: Any) -> Any:
+    """Return a tree of NumPy arrays and numbers as JAX arrays. `jnp.asarray` compiles a program for
+    each shape."""
+    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
+    return jtu.tree_map(put, tree)
 
 
 def by_numpy_if_known(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -417,6 +430,6 @@ def by_numpy_if_known(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return method(self)
         if not any(isinstance(x, jax.Array) for x in leaves):
             return method(self)
-        return jtu.tree_map(jnp.asarray, method(on_host(self)))
+        return from_host(method(on_host(self)))
 
     return applied

@@ -10,7 +10,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -65,6 +64,8 @@ def at_work(
 
     **Raises:** on Ctrl-C the result of `kept`, or the `KeyboardInterrupt` itself.
     """
+    from tqdm import tqdm  # slow to load
+
     from .lanes import raise_dropped, raise_interrupts_within  # here, since it loads JAX
 
     def report(done: int) -> None:

@@ -7,6 +7,7 @@ with a segmentation fault. JAX keeps every program, so a long script reaches tha
 import contextlib
 import functools
 import gc
+import os
 import threading
 import time
 import warnings
@@ -17,15 +18,24 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.tree_util as jtu
+import numpy as np
 from jax.core import Tracer
 
+from ._checks import unwritable
 from .lanes import Unsupported, current_backend, raise_interrupts_within, vector_only
 
 # With these options XLA compiles two to three times faster. Most of the run time is spent in the
 # lanes, whose code XLA does not compile. `PLAIN` alone saves half of the compile time and costs no
 # run time. It is meant for programs that compute much outside the lanes.
 PLAIN = {"xla_cpu_use_fusion_emitters": False}
-_QUICK = {**PLAIN, "xla_backend_optimization_level": 0}
+_QUICK = {
+    **PLAIN,
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
+
+# An argument for an operation that is no program.
+_NOTHING = np.zeros(())
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 
@@ -192,21 +202,53 @@ def is_outermost(*arguments: Any) -> bool:
     """Return whether a call is outside any other program. Only then JAX takes compiler options."""
     if any(isinstance(x, Tracer) for x in jtu.tree_leaves(arguments)):
         return False
-    return not isinstance(jax.lax.full((1,), 0.0), Tracer)
+    return not isinstance(jax.device_put(_NOTHING), Tracer)
 
 
 def _supported(options: Mapping[str, Any]) -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in options.items() if _is_supported(name, value)}
+    if _are_supported(*options.items()):
+        return dict(options)
+    return {name: value for name, value in options.items() if _are_supported((name, value))}
 
 
 @functools.cache
-def _is_supported(name: str, value: object) -> bool:
+def _are_supported(*options: tuple[str, object]) -> bool:
     with contextlib.suppress(jax.errors.JaxRuntimeError):
-        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+        jax.jit(lambda: 0, compiler_options=dict(options)).lower().compile()
         return True
     return False
+
+
+def keep_programs(folder: str | Path | None = None) -> Path | None:
+    """Keep compiled programs in a folder, so that the next process need not compile them again.
+
+    Call it once, before the first simulation. A program's name is computed from its content, so a
+    changed class, function or number of a program is compiled anew. Only the user must be able to
+    write to the folder, since its files are machine code. It may be deleted at any time.
+
+    **Arguments:** `folder`, by default `vi_jax` in `$XDG_CACHE_HOME` or `~/.cache`. A folder that
+    JAX has already, such as `$JAX_COMPILATION_CACHE_DIR`, is used instead of the default.
+
+    **Returns:** the folder; `None` if it cannot be written to, or if JAX's cache is switched off.
+    """
+    config: Any = jax.config
+    if not config.jax_enable_compilation_cache:
+        return None
+    if folder is None and config.jax_compilation_cache_dir:
+        return Path(config.jax_compilation_cache_dir)
+    if folder is None:
+        try:
+            folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vi_jax"
+        except RuntimeError:  # no home
+            return None
+    folder = Path(folder).expanduser().absolute()
+    if unwritable(folder) is not None:
+        return None
+    config.update("jax_compilation_cache_dir", str(folder))
+    config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    return folder
 
 
 def compiled(function: Callable[..., Any]) -> CompiledFunction:

@@ -17,6 +17,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
+from tools.kept import keep_programs
 from tools.pictures import shrink
 
 FIGURES = HERE.parent / "figures" / "examples"
@@ -120,6 +121,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="examples; all of them if left out")
     parser.add_argument("--notebooks", action="store_true", help="only write the notebooks")
     options = parser.parse_args()
+    keep_programs()
     FIGURES.mkdir(parents=True, exist_ok=True)
     for path in EXAMPLES:
         if options.names and path.stem not in options.names:

@@ -10,6 +10,8 @@ from pathlib import Path
 os.environ["JAX_ENABLE_X64"], os.environ["JAX_PLATFORMS"] = "1", "cpu"
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tools.kept import keep_programs
+
 from reproduction.report import KEPT, STEPS, differences, read, reproduce, summary
 
 BEGIN = time.perf_counter()
@@ -30,6 +32,7 @@ def main() -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("reproduction"), help="folder to write to")
     out = parser.parse_args().out
+    keep_programs()
     try:
         found = reproduce(out, tell)
     except KeyboardInterrupt:

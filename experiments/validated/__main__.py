@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+from tools.kept import keep_programs
+
 PAGE = HERE.parents[1] / "docs" / "validated.md"
 SCRIPTS = sorted(path for path in HERE.glob("*.py") if not path.name.startswith("_"))
 # The order of the page: the best known examples first.
@@ -63,6 +65,7 @@ def section(path: Path, comparison: Any, seconds: float) -> str:
 def main() -> None:
     """Run all scripts and write the page, or only run the named scripts."""
     names = sys.argv[1:]
+    keep_programs()
     assert sorted(ORDER) == [path.stem for path in SCRIPTS]
     sections = []
     for name in names or ORDER:

@@ -55,6 +55,8 @@ def test_invalid_machines_and_ranges_are_errors_before_serving(
     assert cli.main(["explore", "--no-browser", "--machine", name, *more]) == 2
     printed = capsys.readouterr().err
     assert message in printed and printed.count("\n") == 1 and not called
+    assert cli.main(["explore", "--range", "gap", "0.5", "3"]) == 2 and not called
+    assert "--range: only with --machine" in capsys.readouterr().err
     more = ["--machine", "shown.py:make", "--range", "gap", "0.5", "3"]
     assert cli.main(["explore", *more]) == 0
     shown, subject = called[0][2]

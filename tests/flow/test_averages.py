@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow import average_names
 
 from shaken_oscillator import Shaken
 
@@ -159,3 +160,71 @@ def test_invalid_averages_raise_before_any_work(said, kind, match):
 
     with pytest.raises(kind, match=match):
         vi.simulate(Named(), begin(), 1)
+
+
+class Observed(vi.AbstractMachine):
+    """A driven body with a stop; the function of an average is given."""
+
+    amplitude: float = 1.0
+    level: float = 0.3
+
+    cycle = 2 * np.pi
+    contacts = vi.RigidStop(0.6, 0.5, on=("x", "u"))
+
+    def field(self, t, z, *modes):
+        push = self.amplitude * jnp.cos(t) + 0.5 * jnp.sin(2 * t)
+        return dict(x=z.u, u=push - 1.3 * z.x - 0.2 * z.u)
+
+
+JUMPS = {
+    "sign": lambda m, t, z: jnp.sign(z.u),
+    "share of time": lambda m, t, z: jnp.where(z.x > 1e-7, 1.0, 0.0),
+    "a power above a level": lambda m, t, z: jnp.where(z.x > m.level, z.u**2, 0.0),
+    "floor": lambda m, t, z: jnp.floor(3 * z.x),
+    "a jump in time": lambda m, t, z: jnp.where(t < 1.0, z.x, 0.0),
+}
+CONTINUOUS = {
+    "|u|": lambda m, t, z: jnp.abs(z.u) + jnp.maximum(z.x, 0.0),
+    "two branches": lambda m, t, z: jnp.where(z.x > m.level, (z.x - m.level) ** 2, 0.0),
+    "a root": lambda m, t, z: jnp.where(z.x > 0, jnp.sqrt(jnp.where(z.x > 0, z.x, 1.0)), 0.0),
+    "a parameter": lambda m, t, z: jnp.where(m.amplitude > 0, z.x, -z.x),
+    "an angle": lambda m, t, z: jnp.sin(jnp.mod(z.x, 2 * np.pi)),
+}
+
+
+def names_of(function, machine):
+    kind = type("Given", (Observed,), {"averages": lambda m, t, z: {"mean": function(m, t, z)}})
+    return average_names(kind(*machine), vi.State(x=0.0, u=0.0))
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_averages_that_jump_are_refused(traced):
+    call = lambda function: (
+        jax.eval_shape(lambda a: [names_of(function, (a, a))] and a, 1.0)
+        if traced
+        else names_of(function, (1.0, 0.3))
+    )
+    for function in JUMPS.values():
+        with pytest.raises(ValueError, match=r"continuous, but 'mean' jumps.*`Switch`"):
+            call(function)
+    for function in CONTINUOUS.values():
+        call(function)
+
+
+class ByMode(Observed):
+    events = vi.Switch(lambda m, t, z: z.x - m.level)
+
+    def averages(self, t, z, side):
+        return {"above": 0.5 * (1 + side), "power": 0.5 * (1 + side) * z.u**2}
+
+
+def test_the_mode_of_a_switch_gives_averages_with_a_jump():
+    def means(amplitude):
+        run = vi.simulate(ByMode(amplitude), vi.State(x=0.0, u=0.0), 2, method="reference")
+        return jnp.stack([run.averages["above"][1], run.averages["power"][1]])
+
+    value, slope = jax.jvp(means, (1.0,), (1.0,))
+    np.testing.assert_allclose(slope, (means(1.0001) - means(0.9999)) / 2e-4, rtol=1e-6)
+    # The share of samples above the level.
+    x = vi.simulate(ByMode(), vi.State(x=0.0, u=0.0), 2, samples=20000).samples.state.x
+    np.testing.assert_allclose(value[0], np.mean(np.asarray(x)[20001:] > 0.3), atol=1e-4)

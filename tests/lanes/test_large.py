@@ -215,6 +215,6 @@ def test_blocks_of_the_carry_are_written_in_place():
 
     xs = jnp.linspace(0.3, 9.7, 20)
     for function in (run, lambda x, b: jax.jvp(lambda x: run(x, b), (x,), (1.0,))[1]):
-        fast, plain = (jax.vmap(lambda x, f=function, b=b: f(x, b))(xs) for b in ("auto", "xla"))
+        fast, plain = (jax.vmap(lambda x, b=b, f=function: f(x, b))(xs) for b in ("auto", "xla"))
         for a, b in zip(fast, plain, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from scipy.integrate import solve_ivp
 
 from differences import check_derivatives, quick
 from event_by_event import followed
@@ -24,6 +25,41 @@ def test_restitution_does_not_depend_on_the_speed(exponent, restitution):
     found, good = vi.jit(jax.vmap(left))(jnp.asarray(speed))
     assert bool(good.all())
     np.testing.assert_allclose(found, restitution, atol=1e-9)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0])
+def test_restitution_without_pull(exponent):
+    """SciPy integrates the contact until the force vanishes; then the body flies freely."""
+    law = vi.PowerLaw(exponent)
+    for wanted in (0.05, 0.1353, 0.3, 0.7, 1.0):
+        stop = vi.SoftStop(0.0, 9.0, restitution=wanted, law=law, adhesive=False)
+        damping = float(stop.damping)
+
+        def rate(t, y, damping=damping):
+            return [y[1], -force(y[0], y[1], 9.0, damping=damping, law=law)]
+
+        def pulls(t, y, damping=damping):
+            return force(y[0], y[1], 9.0, damping=damping, law=law)
+
+        pulls.terminal, pulls.direction = True, -1
+        end = solve_ivp(rate, (0, 50), [1e-9, 2.0], events=pulls, rtol=1e-11, atol=1e-13).y[:, -1]
+        np.testing.assert_allclose(-end[1] / 2.0, wanted, rtol=2e-5)
+        # A traced restitution gives the same damping and its derivative.
+        of = lambda e: vi.SoftStop(0.0, 9.0, restitution=e, law=law, adhesive=False).damping
+        np.testing.assert_allclose(jax.jit(of)(wanted), damping, rtol=1e-12, atol=1e-15)
+        if wanted < 1:
+            h = 1e-5 * wanted
+            difference = (of(wanted + h) - of(wanted - h)) / (2 * h)
+            np.testing.assert_allclose(jax.grad(of)(wanted), difference, rtol=1e-6)
+
+
+def test_a_body_leaves_a_stop_without_pull_with_its_restitution():
+    found = jax.vmap(lambda e: thrown(
+        vi.SoftStop(0.5, 100.0, restitution=e, adhesive=False), jnp.asarray(1.0), jnp.asarray(3.0)
+    ).last.V)(jnp.array([0.3, 0.7]))  # fmt: skip
+    np.testing.assert_allclose(found, [-0.3, -0.7], atol=1e-9)
+    with pytest.raises(ValueError, match="`restitution` must be left out with `prestress`"):
+        vi.SoftStop(0.5, 100.0, restitution=0.5, prestress=1.0)
 
 
 def test_start_on_the_stop_touches_only_inwards():

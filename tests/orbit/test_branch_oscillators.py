@@ -5,7 +5,7 @@ import pytest
 import vi_jax as vi
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
-from vi_jax.orbit import _problem
+from vi_jax.orbit import from_orbit
 
 ZETA = "drive.frequency_ratio"
 
@@ -95,7 +95,7 @@ def test_a_weak_motor_whose_crank_slows_down_within_a_turn(monkeypatch):
                 y[1] *= -0.8
         np.testing.assert_allclose(y[:3], [state.Y, state.V, state.W], atol=1e-8)
     assert slowest < 0.2
-    monkeypatch.setattr(_problem, "_MOST", 0)
+    monkeypatch.setattr(from_orbit, "_MOST", 0)
     with pytest.warns(UserWarning, match="twice as many change its states by"):
         vi.continue_orbit(orbit, parameter="drive.control", bounds=(0.5, 1.2), max_points=3)
 

@@ -84,6 +84,17 @@ def test_meets_the_boundary_conditions_and_passes_the_section(n):
     assert np.nanmax(np.abs(V - orbits.V) / scale) < 1e-12
 
 
+def test_its_states_are_starts():
+    """A batch of two motions; the search of the unstable one converges at once."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, damping_ratio=0.0)
+    found = vi.closed_form_orbits(scene)
+    first = jax.tree.map(lambda x: x[0], found.state)
+    orbit = vi.find_orbit(scene, first, throw=True)
+    np.testing.assert_allclose(orbit.state.Y, found.Y[0], atol=1e-12)
+    log = orbit.trajectory(cycles=2, event_log=4).event_log
+    assert log.phase.shape == (2, 4) and int((log.number >= 0).sum()) == 2
+
+
 def test_admissible_motions_come_first_then_faster_ones():
     orbits = solve_many(*samples(0), 1)
     admissible, exists = np.asarray(orbits.admissible), np.asarray(orbits.exists)

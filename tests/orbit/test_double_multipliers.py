@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from vi_jax.orbit._conditions import is_defective
+from vi_jax.orbit.conditions import is_defective
 
 PAIR = [[1.0, 0.0], [0.0, 1.0]]
 BLOCK = [[1.0, 0.3], [0.0, 1.0]]

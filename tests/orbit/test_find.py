@@ -47,9 +47,10 @@ def test_an_orbit_agrees_with_a_simulation():
     orbit = vi.find_orbit(machine, settled.last)
     run = vi.simulate(machine, orbit.state, 1)
     # Both locate the section to 1e-9 in the clock, with a second-order effect on the period.
-    # Adaptive steps depend on how the code is compiled: 3e-11 was observed.
+    # Adaptive steps depend on how the code is compiled, and the orbit's program has derivatives:
+    # 3e-11 was observed, and 2e-12 in the extremes.
     assert float(orbit.duration) == pytest.approx(float(run.duration[0]), abs=1e-10)
-    assert float(orbit.y_max) == pytest.approx(float(run.y_max[0]), abs=1e-12)
+    assert float(orbit.y_max) == pytest.approx(float(run.y_max[0]), abs=1e-11)
 
     def field(_, x):
         return [x[1], 5 * (1 - x[0] ** 2) * x[1] - x[0]]

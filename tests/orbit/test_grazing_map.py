@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from vi_jax.orbit._local_map import LocalMap
 from vi_jax.orbit.grazing import find_attractors, scenario_of, windows
+from vi_jax.orbit.local_map import LocalMap
 
 
 def root_map(share):

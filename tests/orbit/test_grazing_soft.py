@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.orbit._local_map import graze_at
+from vi_jax.orbit.local_map import graze_at
 
 from grazings import grazing_of
 

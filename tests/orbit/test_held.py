@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from scipy.optimize import brentq
-from vi_jax.orbit import Orbits, _conditions
-from vi_jax.orbit._shooting import Observed
+from vi_jax.orbit import Orbits, conditions
+from vi_jax.orbit.equations import Observed
 from vi_jax.orbit.results import compound
 
 ZETA, XI, GAP = "drive.frequency_ratio", "damping_ratio", "stops.0.gap"
@@ -72,8 +72,8 @@ def test_an_amplitude_is_held_by_the_damping(linear, monkeypatch):
     np.testing.assert_array_equal(data[XI], xi)
     assert vi.plot_branch(branch, x=XI, y="multiplier").get_xlabel() == "damping ratio ξ"
     # Another value compiles no other program.
-    traced, plain = [], _conditions.quantity_at
-    monkeypatch.setattr(_conditions, "quantity_at", lambda *a: (traced.append(a[-1]), plain(*a))[1])
+    traced, plain = [], conditions.quantity_at
+    monkeypatch.setattr(conditions, "quantity_at", lambda *a: (traced.append(a[-1]), plain(*a))[1])
     branch = branch_of_amplitude(linear, 2.9)
     assert not traced and branch.y_max == pytest.approx(2.9, abs=1e-12)
     assert f"held: y_max = 2.9 a; by {XI} in [0.001, " in str(branch)
@@ -199,7 +199,7 @@ def test_a_pair_of_multipliers_is_held_until_it_turns_real():
     expected = [0.49, 0.21 * np.exp(1j), 0.21 * np.exp(-1j)]
     np.testing.assert_allclose(np.sort_complex(products), np.sort_complex(expected), atol=1e-12)
     pair = [0.7 * np.exp(1j), 0.7 * np.exp(-1j)]
-    (pair_held,) = _conditions.hold_values({"multiplier": 0.7}, np.array([*pair, 0.3]))
+    (pair_held,) = conditions.hold_values({"multiplier": 0.7}, np.array([*pair, 0.3]))
     assert pair_held.pair
 
     def dominance_margin(*values):

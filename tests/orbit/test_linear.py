@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vi_jax.orbit._linear import solve, svd
+from vi_jax.orbit.linear import solve, svd
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

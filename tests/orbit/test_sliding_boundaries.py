@@ -173,3 +173,43 @@ def excess_velocity(speed, damping):
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
     x = solve_ivp(field, (0, 2), [1 - damping * speed, speed], **options).y[:, -1]
     return solve_ivp(field, (2, 12), x, events=fastest, **options).y[1, -1] - speed
+
+
+class Held(vi.AbstractMachine):
+    """Dry friction holds the second body while the first one pulls by less than its limit."""
+
+    amplitude: float = 0.3
+    cycle = 2 * np.pi / 0.8
+    contacts = vi.DryFriction(1.0, on="w", mass=1.0)
+
+    def field(self, t, z):
+        u = self.amplitude * jnp.cos(0.8 * t) - z.x - 0.2 * z.u
+        return {"x": z.u, "u": u, "w": 0.1 * z.x}
+
+
+def test_friction_that_holds_a_body_for_the_whole_cycle():
+    """The body slips once 0.1 x passes 1; the motion of x is linear up to there."""
+    orbit = vi.find_orbit(Held(), vi.State(x=0.1, u=0.0, w=0.0), throw=True)
+    branch = vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.2, 8.0), progress=False)
+    assert branch.ends == ("bounds", "adding-sliding")
+    slips = 10 * np.hypot(1 - 0.8**2, 0.2 * 0.8)
+    assert branch.special[0].parameter == pytest.approx(slips, rel=1e-12)
+    assert "friction 0 is just held" in branch.special[0].detail
+    np.testing.assert_allclose(np.abs(branch.multipliers[:, 2]), 0, atol=1e-12)
+
+
+class Carried(vi.Mechanical):
+    """The same bodies with the position of the second, which may be anywhere."""
+
+    q, mass, cycle = ("x", "p"), (1.0, 1.0), 2 * np.pi / 0.8
+    amplitude: float = 0.3
+    contacts = vi.DryFriction(1.0, on="p")
+
+    def force(self, t, q, v):
+        return {"x": self.amplitude * jnp.cos(0.8 * t) - q.x - 0.2 * v.x, "p": 0.1 * q.x}
+
+
+def test_a_body_held_anywhere_is_refused():
+    orbit = vi.find_orbit(Carried(), Carried().at(x=0.1), throw=True)
+    with pytest.raises(ValueError, match="the place at which dry friction holds a body"):
+        vi.continue_orbit(orbit, parameter="amplitude", bounds=(0.2, 0.4))

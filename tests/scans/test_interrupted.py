@@ -59,7 +59,7 @@ def test_an_interrupted_branch_is_a_branch(monkeypatch):
     scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.0)
     orbit = vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2)
 
-    interrupt_at(monkeypatch, "orbit._follow.advance", after=5)
+    interrupt_at(monkeypatch, "orbit.walk.advance", after=5)
     options = {"parameter": "stops.0.gap", "bounds": (1.5, 2.5)}
     part = interrupted_by(vi.Interrupted, lambda: vi.continue_orbit(orbit, **options)).partial
     assert isinstance(part, vi.Branch) and part.ends == ("interrupted", "interrupted")

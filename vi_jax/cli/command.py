@@ -29,6 +29,7 @@ from matplotlib.figure import Figure
 from .. import plot
 from .._checks import unwritable
 from .._messages import Interrupted, installed_version
+from .._programs import keep_programs
 from ..explore.serve import missing, serve
 from ..explore.subject import Subject, ready
 from ..flow import Run, RunOptions, make_plan, simulate
@@ -378,6 +379,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         options = _parser().parse_args(argv)
         jax.config.update("jax_enable_x64", True)
+        if argv is None:  # a process of its own
+            keep_programs()
         code = options.run(options)
         sys.stdout.flush()
         return code
@@ -429,6 +432,8 @@ def _run_file(options: argparse.Namespace) -> int:
 
 
 def _serve_page(options: argparse.Namespace) -> int:
+    if options.range and options.machine is None:
+        return _error("argument --range: only with --machine, whose sliders it sets", 2)
     if not 0 <= options.port <= 65535:
         return _error(f"argument --port: the port must be 0-65535, but is {options.port}", 2)
     if problem := missing():

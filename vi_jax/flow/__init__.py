@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ._lane import has_fixed_cycle
 from ._machine_checks import check_parts, check_values, depends_on_time
 from ._quantities import average_names, has_averages, has_quantities, quantities_on, quantity_names
-from ._simulate import compiling, jit, simulate, simulate_pool
+from ._simulate import compiling, jit, simulate, simulate_pool, simulate_states
 from .arguments import (
     RunOptions, as_floats, check_leaves, check_reals, check_start, machine_of, make_plan, shape_of,
 )
@@ -23,7 +23,7 @@ from .methods.exact import lack_of_closed_form
 from .noise import WhiteNoise, check_noise, lane_key, words_of
 from .results import (
     EVENTS, REASON_NAMES, RESULTS, Errors, EventKind, EventLog, ImpactLog, NamedEnumeration,
-    Run, Samples, batch_names, in_names, number_of, present, raised, states, tidy,
+    Run, Samples, batch_names, in_names, number_of, present, raised, span_of_position, states, tidy,
 )
 from .smooth import (
     TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means,

@@ -237,6 +237,8 @@ class Plan(eqx.Module):
     """The machine's own modes at the start, if the start contains them."""
     stop: Any = None
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
+    constant_records: bool = eqx.field(static=True, default=False)
+    """True if only the states have derivatives, and the records have none."""
     history: Any = None
     """The history of a machine with delays at the start, and in `memory` its constants."""
     memory: Any = None

@@ -46,6 +46,7 @@ from ..machine import (
     like,
     listed,
     others_of,
+    outcomes_of,
     section_in,
     shown_modes,
     stops_of,
@@ -63,6 +64,10 @@ _TRACER_ERRORS = (
 # period of five digits they differ by less. They are compared at the start and at this share of a
 # cycle, where few inputs are zero.
 _PERIODIC, INNER_INSTANT = 1e-4, 0.29
+
+
+# The number of an outcome is a part of the number of a reason: it must be smaller than 4096.
+_MOST_OUTCOMES = 4095
 
 
 def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalars) -> None:
@@ -199,10 +204,10 @@ def check_laws(machine: AbstractMachine, speed: Scalar) -> None:
 _SAMPLES, _MODES, _DISTANCES = 48, (-1.0, 0.0, 1.0), (0.1, 1.0, 10.0)
 
 
-def check_values(machine: AbstractMachine, start: State) -> None:
-    """Check numbers of a machine around its start. Warn once if the field is not periodic, or if an
-    event's guard is not negative in any of many states. Machines of this package and machines with
-    traced numbers are not checked."""
+def check_values(machine: AbstractMachine, start: State, repeats: bool = True) -> None:
+    """Check numbers of a machine around its start. Warn once if the field is not periodic and the
+    motion `repeats` its cycle, or if an event's guard is not negative in any of many states.
+    Machines of this package and machines with traced numbers are not checked."""
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     if is_builtin(kind) or any(isinstance(x, Tracer) for x in leaves):
         return
@@ -227,9 +232,9 @@ def check_values(machine: AbstractMachine, start: State) -> None:
             f"`mass` of a {kind.__name__} must be positive, or a symmetric and positive definite "
             f"matrix, but at the start it is {masses.tolist()}."
         )
-    if ticks:
+    if ticks and repeats:
         _check_period(kind, start, fields, cycle)
-    elif any(np.any(rates[0] != rates[1]) for rates in fields):
+    elif not ticks and any(np.any(rates[0] != rates[1]) for rates in fields):
         _warn_once(
             kind,
             f"The `field` of a {kind.__name__} depends on time, which restarts from 0 in each "
@@ -256,13 +261,17 @@ def _check_period(kind: type, start: State, fields: list[np.ndarray], cycle: Any
     several = any(not any(differ(x, 1, k) for x in fields) for k in (4, 5, 6))
     paths = [jtu.keystr(path).lstrip(".") for path, _ in jtu.tree_leaves_with_path(start)]
     parts = [("field", f"rate of its {path or 'state'}") for path in paths]
+    parts += [("contacts", f"force on its {path or 'state'}") for path in paths]
     parts += [("prescribed", f"value of its {path}") for path in paths]
     for (member, what), values in zip(parts, fields, strict=False):
         if differ(values, 0, 2) or (several and differ(values, 1, 3)):
-            of = "the field" if member == "field" else "prescribed motions"
+            of = {"field": "the field", "contacts": "their loads, levels and slips"}.get(
+                member, "prescribed motions"
+            )
             _warn_once(
                 kind,
-                f"The `{member}` of a {kind.__name__} is not the same a `cycle` = {cycle:.6g} "
+                f"The `{member}` of a {kind.__name__} {'are' if member == 'contacts' else 'is'} "
+                f"not the same a `cycle` = {cycle:.6g} "
                 f"later: the {what} differs. Time restarts from 0 in each cycle: `cycle` must be a "
                 f"period of {of}, unless it jumps.",
             )
@@ -415,9 +424,10 @@ def _values(machine: AbstractMachine, zero: Scalar, start: State, ticks: bool) -
     instants = zero + cycle * np.array([0.0, INNER_INSTANT, 1.0, *later])
     prescribed = getattr(machine, "with_prescribed", lambda s, state: state)
 
-    def rates(s: Scalar) -> tuple[State, State]:
+    def rates(s: Scalar) -> tuple[State, State, State]:
         state = prescribed(s, start)
-        return field_in(machine, s, state, modes), state
+        own = machine.field(s, state, *shown_modes(machine, modes))
+        return like(state, own, "`field`"), field_in(machine, s, state, modes), state
 
     fields = jax.vmap(rates)(instants) if ticks else ()
     around = _states_around(zero, cycle, start, modes)
@@ -527,6 +537,11 @@ def check_parts(machine: AbstractMachine) -> None:
     if isinstance(machine, LinearMachine | Scene):
         _check_ignored("Stop", stops_of(machine), name)
         _check_ignored("Soft stop", switches_of(machine), name)
+    if len(outcomes_of(machine)) > _MOST_OUTCOMES:
+        raise ValueError(
+            f"The events of a {name} must have at most {_MOST_OUTCOMES} outcomes (`ends`), but "
+            f"have {len(outcomes_of(machine))}."
+        )
     count = len(machine.coordinates)
     for i, stop in enumerate(stops_of(machine)):
         for part in ("gap", "restitution"):
@@ -580,6 +595,12 @@ def _check_names(machine: AbstractMachine) -> None:
                 f"Field {field.name!r} of a {kind.__name__} must have another name, since it is a "
                 "method of every machine."
             )
+    if any("section" in vars(x) for x in kind.__mro__ if not is_builtin(x)):
+        _warn_once(
+            kind,
+            f"The `section` of a {kind.__name__} has no effect. Cycles end by `cycle`: a number, "
+            '`vi.rising("u", usual=6.3)` or `vi.turn_of("phi")`.',
+        )
     pairs = [x.on for x in contacts_in(machine) if isinstance(getattr(x, "on", None), tuple)]
     for stop in contacts_in(machine):
         on = getattr(stop, "on", None)

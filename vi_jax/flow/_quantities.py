@@ -1,6 +1,8 @@
 """The quantities that a machine defines, by name: functions of its state, and averages over a
 cycle."""
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -8,10 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
+from jax.extend.core import Jaxpr
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._checks import fields_with
-from .._types import State
+from .._checks import concrete, fields_with
+from .._types import Scalar, State
+from ..lanes import called, propagate_marks
 from ..machine import (
     PLAIN,
     QUANTITIES,
@@ -50,7 +56,8 @@ def has_quantities(machine: AbstractMachine) -> bool:
 
 def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     """Return the names of a machine's averages in their order. **Raises:** `TypeError` if the
-    averages are not a mapping to numbers; `ValueError` if a name is in use already."""
+    averages are not a mapping to numbers; `ValueError` if a name is in use already, or if one of
+    them jumps."""
     if not has_averages(machine):
         return ()
     machine = with_some_past(machine, start)
@@ -62,6 +69,13 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
         raise ValueError(
             f"`averages` of a {type(machine).__name__} must have names of their own, but "
             f"{both[0]!r} is one of its `quantities` too."
+        )
+    jumping = _jumping(_Averages(machine, start, modes))
+    if jumping is not None:
+        raise ValueError(
+            f"`averages` of a {type(machine).__name__} must be continuous, but {jumping!r} jumps: "
+            "its mean would be inaccurate, with wrong derivatives. Let a `Switch` among the "
+            "`events` have the sign that decides, and use its mode: `0.5 * (1 + side)`."
         )
     return names
 
@@ -141,3 +155,104 @@ def _as_arrays(label: str, found: object) -> dict[str, Array]:
         if not hasattr(value, "dtype") and not isinstance(value, int | float):
             raise TypeError(f"{label} must be numbers, but {name!r} is {value!r}.")
     return {name: jnp.asarray(value) for name, value in found.items()}
+
+
+# Functions of these primitives may jump: a comparison chooses, the others count.
+_DECIDES = frozenset("gt lt ge le eq ne sign floor ceil round rem".split())
+
+# Lines through the state space on which jumps are looked for, points on each, and halvings of the
+# interval with the greatest change. A jump keeps this share of the change on its line. Choices.
+_LINES, _POINTS, _HALVINGS, _KEPT = 48, 129, 40, 1e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Averages:
+    """A machine and a state of it, the same as any other with these types and static values."""
+
+    machine: AbstractMachine
+    state: State
+    modes: tuple
+
+    @property
+    def key(self) -> Any:
+        return type(self.machine), jtu.tree_structure((self.machine, self.state, self.modes))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Averages) and self.key == other.key
+
+
+@functools.lru_cache(maxsize=256)
+def _jumping(averages: _Averages) -> str | None:
+    """Return the name of an average that jumps as a function of the state, or `None`. Only those
+    with comparisons are tried, with arbitrary numbers in place of those that are not known."""
+    rng = np.random.default_rng(0)
+
+    def number(x: Any) -> np.ndarray:
+        known = concrete(x)
+        return rng.uniform(0.5, 1.5, jnp.shape(x)) if known is None else np.asarray(known)
+
+    parts, rest = eqx.partition((averages.machine, averages.modes), eqx.is_array)
+    machine, modes = eqx.combine(jtu.tree_map(number, parts), rest)
+    state = jtu.tree_map(number, averages.state)
+
+    def values(s: Scalar, state: State) -> dict[str, Array]:
+        return {name: jnp.asarray(x) for name, x in machine.averages(s, state, *modes).items()}
+
+    with jax.ensure_compile_time_eval():
+        row, unravel = ravel_pytree(jtu.tree_map(jnp.asarray, (0.0, state)))
+        jaxpr = jax.make_jaxpr(lambda x: values(*unravel(x)))(row).jaxpr
+        if not _decides(jaxpr, [True]):
+            return None
+        cycle = concrete(machine.cycle)
+        sizes = np.maximum(1.0, np.abs(np.asarray(row)))
+        sizes[0] = 1.0 if cycle is None else np.max(cycle)
+        shape, scales = (2, _LINES, row.size), 10 ** rng.uniform(-3, 1, (_LINES, 1))
+        ends = np.asarray(row) + rng.uniform(-1, 1, shape) * scales * sizes
+        of_row = functools.partial(_jumps_between, lambda x: values(*unravel(x)))
+        found = jax.jit(jax.vmap(of_row))(*ends)
+    return next((name for name, jumps in found.items() if np.asarray(jumps).any()), None)
+
+
+def _jumps_between(values: Callable[[Array], Any], begin: Array, end: Array) -> Any:
+    """Return for each value whether it jumps on the line between two points: whether the greatest
+    change between points of it stays as their distance is halved again and again."""
+    at = lambda share: values(begin + share * (end - begin))
+    shares = np.linspace(0, 1, _POINTS)
+    on_line = jax.vmap(at)(shares)
+
+    def jumps(name: str) -> Array:
+        heights = on_line[name].astype(float)
+        steps = jnp.abs(jnp.diff(heights))
+        first = jnp.argmax(steps)
+
+        def halve(_: int, ends: tuple) -> tuple:
+            low, high = ends
+            middle = 0.5 * (low + high)
+            x, y, z = (at(share)[name].astype(float) for share in (low, middle, high))
+            before = jnp.abs(y - x) >= jnp.abs(z - y)
+            return jnp.where(before, low, middle), jnp.where(before, middle, high)
+
+        ends = first / (_POINTS - 1.0), (first + 1) / (_POINTS - 1.0)
+        low, high = jax.lax.fori_loop(0, _HALVINGS, halve, ends)
+        left = jnp.abs(at(high)[name].astype(float) - at(low)[name].astype(float))
+        return left > _KEPT * (jnp.max(heights) - jnp.min(heights))
+
+    return {name: jumps(name) for name in on_line}
+
+
+def _decides(jaxpr: Any, marks: list[bool]) -> bool:
+    """Return whether a jaxpr compares or counts values that depend on the marked arguments."""
+    found = []
+
+    def mark(eqn: Any, depends: list[bool]) -> list[bool]:
+        body = called(eqn)
+        if body is not None:
+            return propagate_marks(body if isinstance(body, Jaxpr) else body.jaxpr, depends, mark)
+        found.append(eqn.primitive.name in _DECIDES)
+        return [True] * len(eqn.outvars)
+
+    propagate_marks(jaxpr, marks, mark)
+    return any(found)

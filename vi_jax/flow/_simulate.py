@@ -22,10 +22,12 @@ from ..machine import (
     as_logged,
     cycle_time,
     frequency_ratio,
+    labels_in,
     modes_of,
     others_of,
     outcomes_of,
     stated,
+    switches_of,
     without_modes,
 )
 from ._lane import Plan, Record
@@ -144,6 +146,15 @@ def simulate(
     return raised(run, run.failed, "The simulation failed", run.result) if throw else run
 
 
+def simulate_states(machine: AbstractMachine, start: State, cycles: int, **options: Any) -> Run:
+    """Simulate as `simulate`, within a program. Only the states of the run have derivatives, which
+    keeps a program of values and derivatives small. `options` are those of `RunOptions`."""
+    plan, start = make_plan(machine, start, cycles, RunOptions(**options))
+    plan = dataclasses.replace(plan, constant_records=True)
+    run = collect(plan, options.get("samples", 0) > 0, *run_lane(plan, start))
+    return failed_derivatives(run)
+
+
 @compiled
 def _simulate(plan: Plan, start: State, sampled: bool) -> Run:
     return failed_derivatives(collect(plan, sampled, *run_lane(plan, start)))
@@ -247,7 +258,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         rejected=lane.rejected.astype(jnp.int32),
         averages=averages,
         quantities={name: x[::parts] for name, x in quantities.items()},
-        labels=machine.labels,
+        labels=labels_in(machine, jtu.tree_map(lambda x: x[0], points)),
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
         history=lane.history,
@@ -291,8 +302,12 @@ def _impact_log(plan: Plan, entries: Any) -> ImpactLog:
 def _event_log(plan: Plan, entries: Any) -> EventLog:
     phase, code, number, value = _by_cycle(plan, entries, used=1)
     names = tuple(event.name for event in others_of(plan.machine))
+    switches, modes = switches_of(plan.machine), []
+    for i, switch in enumerate(switches):
+        index = sum(other.word == switch.word for other in switches[:i])
+        modes.append(switch.name or f"{switch.word} {index}")
     clock = as_logged(plan.machine, phase)
-    return EventLog(clock, _as_integers(code), _as_integers(number), value, names)
+    return EventLog(clock, _as_integers(code), _as_integers(number), value, names, tuple(modes))
 
 
 def _by_cycle(plan: Plan, entries: Array, *, used: int) -> list[Array]:

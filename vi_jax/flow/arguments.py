@@ -18,6 +18,7 @@ from .._checks import (
     count,
     fits_records,
     flag,
+    from_host,
     instance_of,
     named_leaves,
     narrow,
@@ -40,6 +41,7 @@ from ..machine import (
     check_takes,
     component,
     components,
+    contacts_in,
     convert_start,
     counter_of,
     field_in,
@@ -166,7 +168,7 @@ def make_plan(
     if isinstance(machine, Scene):
         _check_scalars(machine=machine, start=start)
     _check_numbers(machine)
-    check_start(machine, start)
+    check_start(machine, start, repeats=cycles > 1 or concrete(options.settle) != 0)
     if options.begin is None:
         check_prescribed(machine, start)
     machine, start = of_one_type(machine, start)
@@ -243,7 +245,7 @@ def _checked_settle(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Arr
                 f"Arguments `settle` and `cycles` must add up to at most {most} cycles (of {parts} "
                 f"interval(s) each), the most that {dtype} can count, but got {settle} + {cycles}."
             )
-        return jnp.asarray(settle, dtype)
+        return from_host(np.asarray(settle, dtype))
     settle = jnp.asarray(settle)
     is_valid = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
     return jnp.where(is_valid, settle.astype(dtype), jnp.nan)
@@ -368,9 +370,9 @@ def _check_turn(machine: AbstractMachine, start: State) -> None:
         return
     angle, begin = concrete(component(counter.name, start)), concrete(counter.start)
     beyond = None if angle is None or begin is None else angle - begin - 2 * np.pi
-    if beyond is not None and np.any(beyond > 1e-9):  # rounding
+    if beyond is not None and np.any(beyond > -1e-9):  # rounding
         raise ValueError(
-            f"Argument `start` must not have {counter.name} beyond the end of a turn, but it is "
+            f"Argument `start` must have {counter.name} before the end of a turn, but it is "
             f"{np.max(beyond):.6g} beyond. Subtract whole turns."
         )
 
@@ -392,13 +394,20 @@ def check_prescribed(machine: AbstractMachine, start: State) -> None:
             )
 
 
-def check_start(machine: AbstractMachine, start: State) -> None:
+def check_start(machine: AbstractMachine, start: State, repeats: bool = True) -> None:
     """Warn as `check_values`. **Raises:** `ValueError` or `TypeError` for an invalid concrete
     start."""
     check_reals("start", start)
     start = as_floats(machine, start)  # derivatives of a coordinate need them
     machine = with_some_past(machine, start)
     shape = shape_of("start", machine, start)
+    if shape and not contacts_in(machine):
+        raise ValueError(
+            "Argument `start` must be one state (use `jax.vmap` for a batch), but its first "
+            f"component has shape {shape}. If it is one, name the number whose extremes are "
+            f"recorded: `def position(self, z): return z.x[0]` in a {type(machine).__name__}, and "
+            "`velocity` in the same way."
+        )
     if shape:
         raise ValueError(
             "Argument `start` must be one state (use `jax.vmap` for a batch), in which position "
@@ -425,6 +434,6 @@ def check_start(machine: AbstractMachine, start: State) -> None:
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
-                f"({stop.side}, gap {gap})."
+                f"({stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on the left."
             )
-    check_values(machine, start)
+    check_values(machine, start, repeats)

@@ -45,7 +45,7 @@ from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code
 from .sizes import at_most_one, extents_of, sizes_of
-from .smooth import hold_contacts, in_modes, stops_are_exact
+from .smooth import constant, hold_contacts, in_modes, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -137,7 +137,7 @@ def _pressed_together(
     bodies = plan.machine.coordinates
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
-        held = stop_gradient(hold_contacts(plan.machine, modes, contact))
+        held = constant(hold_contacts(plan.machine, modes, contact))
         current = [rates(held.field, x, s, start) for x in bodies]
         jerks = [force_rate(held, x, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)
@@ -249,6 +249,8 @@ def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
     plan = eqx.combine(inputs[0], rest)
     lane, completed, record = iterate(plan, lane)
+    if plan.constant_records:
+        lane, record = lane._replace(record=stop_gradient(lane.record)), stop_gradient(record)
     is_recorded = completed & (lane.done >= plan.settle)
     active = _is_active(plan, lane)
     if plan.stop is not None:

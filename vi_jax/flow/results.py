@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .._checks import array_module, concrete, one_of
+from .._checks import array_module, concrete, from_host, one_of
 from .._messages import count_of
 from .._types import Scalar, State, xr
 from ..machine import (
@@ -26,6 +26,7 @@ from ..machine import (
     name_in,
     plain,
     state_in_words,
+    unit_of,
     with_modes,
     with_units,
     without_modes,
@@ -53,10 +54,18 @@ else:
             if known[0] is None or known[1] is None:
                 return jnp.equal(self.number, other.number)
             same = np.asarray(np.equal(*known))
-            return jnp.asarray(same) if isinstance(self.number, jax.Array) else same
+            return from_host(same) if isinstance(self.number, jax.Array) else same
 
         def __ne__(self, other):
             return ~(self == other)
+
+        def __int__(self) -> int:
+            name = self.kind.__name__
+            first = next(iter(self.kind._texts))
+            raise TypeError(
+                f"A {name} is no integer. Compare it with `vi.{name}.{first}` or another member; "
+                f"`vi.{name}[...]` is its text."
+            )
 
         def __repr__(self) -> str:
             name, number = self.kind.__name__, self.number
@@ -136,6 +145,14 @@ def number_of(member: Any) -> Int[Array, "..."]:
 def member_of(kind: Any, number: Any) -> Any:
     """Return the member of an enumeration with this index; one for each lane."""
     return _Member(jnp.asarray(number, jnp.int32), kind)
+
+
+def _at(x: Any, place: tuple) -> Any:
+    """Return x[place], by NumPy if `x` is known and in this computer's memory."""
+    in_memory = isinstance(x, jax.Array) and not isinstance(x, Tracer)
+    if not in_memory or any(device.platform != "cpu" for device in x.devices()):
+        return x[place]
+    return from_host(np.asarray(x)[place])
 
 
 class EventKind(enum.IntEnum):
@@ -339,7 +356,7 @@ def code(name: str) -> float:
 
 
 # The number of an outcome is added as a fraction to the common reason, `ended`.
-_OUTCOMES = 64
+_OUTCOMES = 4096
 
 
 def code_of_outcome(number: int) -> float:
@@ -355,6 +372,16 @@ def outcome_of(reason: Scalar) -> Int[Array, ""]:
 
 def reason_of(reason: Scalar) -> RESULTS:
     return member_of(RESULTS, jnp.floor(reason))
+
+
+def span_of_position(
+    labels: tuple[str, str], units: Mapping[str, str], ends: tuple[Any, Any], digits: int
+) -> str:
+    """Return the interval of the position, with its name and unit."""
+    name, size = name_in(labels[0]), max(abs(float(x)) for x in ends)
+    low, high = (plain(x, digits, size) for x in ends)
+    quantity = "position" if unit_of(units, "position") else name
+    return f"{name} in {in_unit(f'[{low}, {high}]', units, quantity)}"
 
 
 class Samples(Shown):
@@ -392,6 +419,10 @@ def _listing(what: str, used: object, text: Callable[[int, int], str]) -> str:
         lines.append(f"  cycle {i + 1}: {', '.join([*words, *more])}")
     if len(some) > _CYCLES:
         lines.append(f"  and {len(some) - _CYCLES} more cycles")
+    full = int(used.all(axis=1).sum()) if used.shape[1] else 0
+    if full:
+        cycles, size = count_of(full, "cycle"), used.shape[1]
+        lines.append(f"  {what}s after the first {size} are not listed; {cycles} may have more")
     return "\n".join(lines)
 
 
@@ -437,6 +468,8 @@ class EventLog(Summarized):
     `value` of a reset; NaN for a release."""
     names: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the machine's resets, by number; "" for one without a name."""
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The names of the parts with a mode, by number: a friction, a soft stop, a switch."""
 
     def summary(self) -> str:
         """Return the events of the first cycles: kind; stop, switch or event; clock."""
@@ -445,8 +478,9 @@ class EventLog(Summarized):
             kind, number = EVENTS[int(self.kind[i, j])], int(self.number[i, j])
             after = f" becomes {self.value[i, j]:g}" if kind == "mode" else ""
             of = {"mode": "switch", "reset": "event"}.get(kind, "stop")
-            name = self.names[number] if kind == "reset" and self.names else None
-            return f"{kind} ({name or f'{of} {number}{after}'}) at {self.phase[i, j]:.6g}"
+            names = {"mode": self.mode_names, "reset": self.names}.get(kind)
+            name = names[number] if names else ""
+            return f"{kind} ({name or f'{of} {number}'}{after}) at {self.phase[i, j]:.6g}"
 
         return _listing("event", self.number >= 0, word)
 
@@ -556,7 +590,7 @@ class Run(Summarized):
         # Batch axes come before the axis of the sections, those of an array in the state after it.
         # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        last, modes = jtu.tree_map(lambda x: x[place], (self.sections, self.modes))
+        last, modes = jtu.tree_map(lambda x: _at(x, place), (self.sections, self.modes))
         return with_modes(last, modes, self.history)
 
     def mean_averages(self) -> dict[str, Scalar]:
@@ -613,9 +647,8 @@ class Run(Summarized):
         where = "section" if outcome is None else "state"
         lines.append(f"  last {where}: {state_in_words(last, 9, units)}")
         if outcome is None and self.y_min is not None and self.y_max is not None:
-            span = f"[{plain(self.y_min[-1], 6)}, {plain(self.y_max[-1], 6)}]"
-            span = in_unit(span, units, "position")
-            lines.append(f"  last cycle: {name_in(self.labels[0])} in {span}")
+            ends = self.y_min[-1], self.y_max[-1]
+            lines.append(f"  last cycle: {span_of_position(self.labels, units, ends, 6)}")
         for average, x in self.averages.items() if outcome is None else ():
             lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import Tracer
 from jax.extend.core import Jaxpr
+from jax.lax import stop_gradient
 
 from .._types import Flag, Scalar, Scalars, State
 from ..lanes import called, propagate_marks
@@ -26,6 +27,11 @@ from ..machine import (
     shown_modes,
     velocity_change,
 )
+
+
+def constant(tree: Any) -> Any:
+    """Return a tree without derivatives. Its booleans, integers and texts stay what they are."""
+    return jtu.tree_map(lambda x: stop_gradient(x) if eqx.is_inexact_array(x) else x, tree)
 
 
 class SmoothMachine(eqx.Module):

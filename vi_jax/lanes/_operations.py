@@ -227,9 +227,11 @@ def extreme(t: Text, how: str, a: Value, b: Value, unsigned: bool) -> Value:
         a, b = b, a
     if not is_float(a.kind):
         return t.select(compare(t, how, a, b, unsigned), a, b)
-    # NaN wins. The unordered comparison chooses a if it is NaN; b is tested unless it is constant.
+    # NaN wins. The unordered comparison chooses a if it is NaN; b is tested, unless it is a known
+    # number.
     best = t.select(t.binary(f"fcmp u{how}", a, b, "i1"), a, b)
-    return best if b.number is not None else t.select(t.binary("fcmp uno", b, b, "i1"), b, best)
+    is_number = b.number is not None and b.number == b.number
+    return best if is_number else t.select(t.binary("fcmp uno", b, b, "i1"), b, best)
 
 
 @elementwise("clamp")

@@ -1,9 +1,11 @@
 """Writing vector code as LLVM's text: values, operations on them, and blocks."""
 
+import functools
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import copysign
 from typing import Any
 
 import numpy as np
@@ -97,6 +99,11 @@ def literal(number: Any, kind: str) -> str:
     return str(bool(number)).lower() if kind == "i1" else str(int(number))
 
 
+@functools.lru_cache(maxsize=4096)
+def _constant(number: Any, kind: str, sign: float) -> Value:
+    return Value(f"splat ({kind} {literal(number, kind)})", kind, number)
+
+
 class Text:
     """The body of a function while it is written, with equal operations merged.
 
@@ -106,6 +113,7 @@ class Text:
 
     def __init__(self, width: int):
         self.width = width
+        self._vectors: dict[str, str] = {}
         self.lines: list[str] = []
         self.declared: dict[str, str] = {}
         self.block = "entry"
@@ -120,7 +128,10 @@ class Text:
         self._operations: list[dict[tuple, Value]] = [{}]
 
     def vector(self, kind: str) -> str:
-        return f"<{self.width} x {kind}>"
+        found = self._vectors.get(kind)
+        if found is None:
+            found = self._vectors[kind] = f"<{self.width} x {kind}>"
+        return found
 
     def fresh(self) -> str:
         self._names += 1
@@ -129,9 +140,8 @@ class Text:
     def constant(self, number: Any, kind: str) -> Value:
         if is_float(kind):
             number = float(np.float32(number)) if kind == "float" else float(number)
-        else:
-            number = bool(number) if kind == "i1" else int(number)
-        return Value(f"splat ({kind} {literal(number, kind)})", kind, number)
+            return _constant(number, kind, copysign(1.0, number))  # 0 and -0 are equal
+        return _constant(bool(number) if kind == "i1" else int(number), kind, 1.0)
 
     def zero(self, kind: str) -> Value:
         return self.constant(0, kind)

@@ -49,10 +49,12 @@ class Unsupported(Exception):
     """The error for a program without a vector form; its argument names the reason."""
 
 
+# Cached, as the analysis below: a step calls the jaxpr of the field some fifty times.
+@functools.lru_cache(maxsize=1024)
 def check(jaxpr: Jaxpr) -> None:
     """Raise `Unsupported` with the first primitive or type that has no vector form, or `TypeError`
     for a function without a forward derivative."""
-    needed = _needed_equations(jaxpr)
+    needed, _, _ = _analysed(jaxpr)
     for var in (*jaxpr.invars, *jaxpr.constvars, *(v for e in needed for v in e.outvars)):
         dtype = getattr(var.aval, "dtype", None)
         try:
@@ -103,8 +105,7 @@ def write(
     place, in the lanes of the mask: a block of one that is not used any more."""
     jaxpr, env = inner(closed), {}
     own = {v for v, x in zip(jaxpr.invars, args, strict=True) if any(x is y for y in owned)}
-    needed = _needed_equations(jaxpr)
-    uses, last = _uses(jaxpr, needed)
+    needed, uses, last = _analysed(jaxpr)
 
     def read(atom: object) -> Array:
         if isinstance(atom, Literal):
@@ -135,8 +136,11 @@ def write(
     return [read(a) for a in jaxpr.outvars]
 
 
-def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, list[Any]]]:
-    """Return the number of uses of each variable, and the variables last used by each equation."""
+@functools.lru_cache(maxsize=1024)
+def _analysed(jaxpr: Jaxpr) -> tuple[list[Any], dict[Any, int], dict[int, list[Any]]]:
+    """Return the needed equations, the number of uses of each variable, and the variables last used
+    by each equation."""
+    needed = _needed_equations(jaxpr)
     uses, last_use = {}, {}
     for number, atoms in enumerate([*(eqn.invars for eqn in needed), jaxpr.outvars]):
         for atom in atoms:
@@ -146,7 +150,7 @@ def _uses(jaxpr: Jaxpr, needed: list[Any]) -> tuple[dict[Any, int], dict[int, li
     last: dict[int, list[Any]] = {}
     for var, number in last_use.items():
         last.setdefault(number, []).append(var)
-    return uses, last
+    return needed, uses, last
 
 
 def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
@@ -202,11 +206,12 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
             return [Registers.one(x) for x in results(*(x[()] for x in values))]
         if any(x.shape != values[0].shape for x in values):
             values = [*np.broadcast_arrays(*values)]
-        outs = [np.empty(values[0].shape, object) for _ in avals]
-        for i in np.ndindex(values[0].shape):
-            for out, value in zip(outs, results(*(x[i] for x in values)), strict=True):
+        outs = [np.empty(values[0].size, object) for _ in avals]
+        for i, numbers in enumerate(zip(*(x.flat for x in values), strict=True)):
+            for out, value in zip(outs, results(*numbers), strict=True):
                 out[i] = value
-        return [Registers(out, kind) for out, kind in zip(outs, kinds, strict=True)]
+        shaped = (out.reshape(values[0].shape) for out in outs)
+        return [Registers(out, kind) for out, kind in zip(shaped, kinds, strict=True)]
     if name in IDENTITY_PRIMITIVES:
         return args[:1]
 

@@ -5,7 +5,7 @@
 # fmt: off
 from ..lanes import horner, sincos
 from .base import (
-    AbstractMachine, contacts_in, has_velocity, jumps_on_section, listed, longest_step,
+    AbstractMachine, contacts_in, has_velocity, jumps_on_section, labels_in, listed, longest_step,
     names_on, number_on, renews,
 )
 from .clocks import (
@@ -55,4 +55,4 @@ from .numbers import (
 from .scene import Parameters, Scene
 from .settle import Strike, strike
 from .state import State, like
-from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop
+from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop, stop_in_words

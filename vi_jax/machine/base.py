@@ -36,7 +36,7 @@ from .declared import (
 from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
 from .friction import ContactFriction
-from .numbers import PLAIN, Shown, unit_in
+from .numbers import PLAIN, Shown, components, unit_in
 from .stop import RigidStop, SoftStop, Wall
 
 # Required members, each with advice for an error message.
@@ -375,7 +375,8 @@ class AbstractMachine(Shown):
         time. The means over a cycle are in `Run.averages`, those over the period in
         `Orbit.averages` and in columns of a `Branch`. Impulses of impacts are not included.
         Discrete modes are further arguments, as of the field. `units` may have the unit under the
-        same name. `record="sections"` omits averages.
+        same name. `record="sections"` omits averages. A function that jumps is refused: its jump
+        must be that of the mode of a `Switch`.
         """
         return {}
 
@@ -485,6 +486,17 @@ def names_coordinates(machine: AbstractMachine) -> bool:
         return True
     ons = (x.on for x in contacts_in(machine) if isinstance(x, Wall))  # pyright: ignore[reportAttributeAccessIssue]
     return any(on is not None for on in ons) or machine._names_on(None) is not None
+
+
+def labels_in(machine: AbstractMachine, state: State) -> tuple[str, str]:
+    """Return the labels of position and velocity, which are the first components of a state by name
+    if nothing else names them."""
+    names, labels = list(components(state)), machine.labels
+    own = overridden(machine, AbstractMachine, "position") is not None
+    if labels != PLAIN or own or stops_of(machine) or hasattr(state, "Y"):
+        return labels
+    named = [x for x in names if x[:1].isalpha()]
+    return (named[0], named[:2][-1]) if named else labels
 
 
 def renews(machine: AbstractMachine) -> bool:

@@ -4,6 +4,7 @@ words, another form for a run."""
 from math import pi
 from typing import Any
 
+import jax
 from jaxtyping import Array, Float
 
 from .._checks import in_range
@@ -102,9 +103,9 @@ def scales_known(machine: Machine) -> bool:
     """Return whether the default number of fixed steps in a cycle is known to be enough. Contacts
     with soft stops may be much briefer than a cycle, and so may be the decay of a user's drive.
     Static."""
-    return (
-        isinstance(machine, Scene) and not machine.soft_stops and machine.drive.rate() is not None
-    )
+    if not isinstance(machine, Scene) or machine.soft_stops:
+        return False
+    return jax.eval_shape(machine.drive.rate) is not None
 
 
 def is_alive(machine: Machine, state: State) -> Flag | None:

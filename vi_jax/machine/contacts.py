@@ -289,12 +289,20 @@ def check_takes(
 ) -> None:
     """Raise `TypeError` if a user's function does not accept these arguments, modes last."""
     try:
-        inspect.signature(function).bind(*arguments)
+        signature = inspect.signature(function)
+    except ValueError:
+        return  # it has no signature
+    try:
+        signature.bind(*arguments)
     except TypeError as error:
         and_modes = f" and {modes} modes (of switches, then the machine's own)" if modes else ""
-        raise TypeError(f"{whose} must take {first}{and_modes}: {error}.") from None
-    except ValueError:
-        pass  # it has no signature
+        needed = [x.name for x in signature.parameters.values() if x.default is x.empty]
+        more = needed[len(arguments) :] if "missing" in str(error) else []
+        text = f"{whose} must take {first}{and_modes}: {error}."
+        if more:
+            modes_ = ", ".join(f"{name}=0.0" for name in more)
+            text += f" If {' and '.join(more)} are modes, declare them: `modes = dict({modes_})`."
+        raise TypeError(text) from None
 
 
 def call_checked(function: Callable[..., Any], whose: str, *arguments: Any) -> Any:

@@ -115,6 +115,29 @@ def defines(part: object, name: str) -> bool:
     return hasattr(type(part), name) or name in vars(part)
 
 
+class _Method:
+    """A method of a machine, equal to any other of the same machine and name: its machine's arrays
+    cannot be compared."""
+
+    def __init__(self, method: Any):
+        self._method = method
+        self._key = method.__func__, id(method.__self__)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._method(*arguments)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Method) and self._key == other._key
+
+
+def hashable(on: Any) -> Any:
+    """Return what a contact acts on, with a method of a machine in a form that can be hashed."""
+    return _Method(on) if hasattr(on, "__func__") and hasattr(on, "__self__") else on
+
+
 def with_static(part: Any, **values: Any) -> Any:
     """Return a copy of a part or a state with other values of fields, without its `__init__`."""
     new = copy.copy(part)

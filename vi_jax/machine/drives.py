@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, real, require_ranges
+from .._checks import NOT_NEGATIVE, POSITIVE, REAL, Range, on_host, real, require_ranges
 from .._types import State
 from ..lanes import sincos
 from .numbers import Shown
@@ -182,7 +182,8 @@ class Motor(AbstractDrive):
     @property
     def components(self):
         """The crank speed `W`, by default the no-load speed κ w0."""
-        return {"W": self.control * self.no_load_speed}
+        control, no_load_speed = on_host((self.control, self.no_load_speed))
+        return {"W": control * no_load_speed}
 
     def field(self, scene, s, state, pushes):
         """Return d(state)/ds by crank angle (Eq. 8 to 9 of the paper) or by time (Eq. 5 to 7)."""

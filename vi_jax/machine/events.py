@@ -135,14 +135,20 @@ def begin_modes(
 
 def struck_modes(
     machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
-    contact: Scalars = (),
+    contact: Scalars = (), before: State | None = None,
 ) -> Modes:  # fmt: skip
-    """Return the modes after a jump to `state`; the machine's own are unchanged, or `own`."""
+    """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
+    are unchanged, or `own`."""
     event_modes = []
     for number, event in enumerate(events_of(machine)):
         if event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
-            event_modes.append(event.struck(machine, s, state, *modes[part], **keywords))
+            mode = event.struck(machine, s, state, *modes[part], **keywords)
+            if before is not None and isinstance(event, Switch) and not event.slides:
+                # On its surface, where the sign is rounding, only its own event changes the mode.
+                was, now = (event.function(machine, s, x) for x in (before, state))
+                mode = jnp.where(stop_gradient(was == now), modes[part][0], mode)
+            event_modes.append(mode)
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
     if frictions_in(machine):
@@ -275,7 +281,9 @@ class Switch(AbstractSwitch):
     function: Callable[..., Any] = eqx.field(static=True)
     slides: bool = eqx.field(static=True, default=False, kw_only=True)
 
-    is_plain: ClassVar = True
+    @property
+    def is_plain(self) -> bool:
+        return True
 
     @property
     def may_slide(self) -> bool:  # pyright: ignore
@@ -362,10 +370,11 @@ class Reset(AbstractEvent):
     - `guard`: the function that rises through zero: negative before the event, positive after it.
     - `reset`: the state after the event, or a dictionary of the components that change; by default
       the state is unchanged.
-    - `when`: a flag, evaluated only at the instant at which the guard rises through zero. If it is
-      false, the reset does not happen, and the guard must become negative before it can rise again.
-      For a reset as soon as two conditions hold, use the smaller of two guards, or of a mode and a
-      guard: `jnp.where(on == 1, z.T - 296, -1.0)`.
+    - `when`: a flag, evaluated only at the instant at which the guard rises through zero, such as
+      that of a mode: `lambda m, t, z, on: on == 1`. If it is false, the reset does not happen, and
+      the guard must become negative before it can rise again. For a reset as soon as two conditions
+      hold, use the smaller of two guards. With a mode in the guard, the event happens at the
+      instant at which the mode makes it positive.
     - `modes`: the machine's discrete modes after the event: one number, a tuple, or a dictionary of
       those that change; by default unchanged. Switches then have their modes after an impact.
     - `value`: a number for the event log, a function of the state before.
@@ -418,7 +427,7 @@ class Reset(AbstractEvent):
             found = self._call("modes", self._modes, machine, s, state, modes)
             machine_modes = modes_after(machine, found, modes, self._whose("modes", machine))
         new = self.jump(machine, s, state, *modes)
-        return new, struck_modes(machine, s, new, modes, machine_modes)
+        return new, struck_modes(machine, s, new, modes, machine_modes, before=state)
 
     def jump(self, machine, s, state, *modes):
         if self._reset is None:

@@ -37,7 +37,7 @@ from .contacts import (
     velocity_change,
 )
 from .coordinates import Row
-from .declared import limited_in, stops_of, switches_of
+from .declared import hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
 from .settle import Contacts, settle
@@ -50,6 +50,7 @@ class Friction(AbstractSwitch):
     roundings: ClassVar[int]
     """A slip below this number of roundings of its size counts as zero."""
 
+    word: ClassVar = "friction"
     needs_all_modes: ClassVar = True  # a holding force depends on all other forces
     may_slide: ClassVar = False  # there the body sticks
 
@@ -164,7 +165,7 @@ class DryFriction(Friction):
     """
 
     level: Any = eqx.field(converter=real_or_law("level"))
-    on: Any = eqx.field(static=True, kw_only=True, default=None)
+    on: Any = eqx.field(static=True, kw_only=True, default=None, converter=hashable)
     mass: Float[Array, "..."] | None = eqx.field(
         kw_only=True, default=None, converter=optional_real("mass")
     )
@@ -179,6 +180,7 @@ class DryFriction(Friction):
         "level": NOT_NEGATIVE, "mass": POSITIVE, "static_ratio": Range(1.0, float("inf")),
     }  # fmt: skip
 
+    word: ClassVar = "friction"
     is_dry: ClassVar = True
     roundings: ClassVar = 4
 

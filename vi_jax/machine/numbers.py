@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._checks import on_host
+from .._checks import from_host, on_host
 from .._types import Machine, Scalar, State
 from .declared import warn_of_unread
 
@@ -60,7 +60,9 @@ def state_in_words(state: State, digits: int, units: Mapping[str, str]) -> str:
     """Return the numbers of a state with their units, as text; of a long state the first few."""
     # JAX sorts the names of a dictionary, but not those of an `OrderedDict`.
     parts = components(OrderedDict(state) if isinstance(state, Mapping) else state).items()
-    return ", ".join(first_few([f"{k} = {in_unit(plain(x, digits), units, k)}" for k, x in parts]))
+    size = max((abs(float(x)) for _, x in parts), default=0.0)
+    words = [f"{k} = {in_unit(plain(x, digits, size), units, k)}" for k, x in parts]
+    return ", ".join(first_few(words))
 
 
 def first_few(words: list[str]) -> list[str]:
@@ -68,13 +70,18 @@ def first_few(words: list[str]) -> list[str]:
     return words if len(words) <= _MANY else [*words[:_FEW], f"and {len(words) - _FEW} more"]
 
 
+# A number is shown as 0 below this share of the largest beside it: a choice.
+_NOTHING = 1e-28
+
 # The length of a long list, and the number of its words that are printed: choices.
 _MANY, _FEW = 16, 8
 
 
-def plain(x: Any, digits: int) -> str:
-    """Return a number as text; zero has no sign."""
-    return f"{float(x) + 0.0:.{digits}g}"
+def plain(x: Any, digits: int, size: float = 0.0) -> str:
+    """Return a number as text; zero has no sign. It is zero if it is rounding of rounding of
+    numbers of this size."""
+    x = float(x)
+    return f"{0.0 if abs(x) < _NOTHING * size else x + 0.0:.{digits}g}"
 
 
 def leaf(tree: object, name: str) -> Float[Array, "..."]:
@@ -101,7 +108,9 @@ def with_leaf(tree: Any, name: str, value: Any) -> Any:
             f"{jnp.shape(old)}; name one of its numbers, as {name + str([0] * jnp.ndim(old))!r}."
         )
     else:
-        leaves[arrays[number]] = jnp.asarray(value, kind)
+        is_array = isinstance(value, jax.Array)
+        new = jnp.asarray(value, kind) if is_array else from_host(np.asarray(value, kind))
+        leaves[arrays[number]] = new
     return jtu.tree_unflatten(treedef, leaves)
 
 

@@ -24,6 +24,7 @@ from .._checks import (
     in_range,
     instance_of,
     number,
+    on_host,
     one_of,
     optional_real,
     real,
@@ -46,7 +47,7 @@ from .drives import (
     OscillatorState,
     SliderCrank,
 )
-from .numbers import Shown
+from .numbers import Shown, known
 from .state import State as Named
 from .state import like
 from .stop import RigidStop, SoftStop
@@ -497,6 +498,8 @@ class Parameters(Shown):
         one_of("drive", drive, ("motor", "ideal"))
         one_of("crank", crank, ("cosine", "slider"))
         require_ranges(self)  # again: a number may have been replaced
+        if known(self) and isinstance(self.stiffness, jax.Array):
+            return on_host(self).scene(drive=drive, crank=crank)
         omega = self.natural_frequency
         if drive == "ideal":
             scene_drive: IdealDrive | Motor = IdealDrive(self.control)

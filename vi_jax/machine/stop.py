@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._checks import (
@@ -30,6 +31,7 @@ from .._checks import (
 )
 from .._types import Machine, Number, Scalar, State
 from .contacts import push_of, shown_modes
+from .declared import hashable, stops_of, switches_of
 from .event import AbstractEvent, AbstractSwitch, Modes
 from .events import modes_after, struck_modes
 from .numbers import Shown
@@ -103,7 +105,7 @@ class RigidStop(Wall, AbstractEvent):
     """k, coefficient of restitution (dimensionless)."""
     side: str = eqx.field(static=True, default="right")
     """"right" or "left"."""
-    on: Any = eqx.field(static=True, default=None, kw_only=True)
+    on: Any = eqx.field(static=True, default=None, kw_only=True, converter=hashable)
     """The names of position and velocity, or the coordinate or function of a `Mechanical`."""
     mass: Any = eqx.field(default=None, kw_only=True, converter=optional_real("mass"))
     """The effective mass of an impact, for `Run.impact_energy`: 1, or that of a `Mechanical`."""
@@ -111,7 +113,7 @@ class RigidStop(Wall, AbstractEvent):
         default=None, kw_only=True, converter=optional_real("friction")
     )
     """μ, Coulomb's coefficient of friction (dimensionless); without friction by default."""
-    along: Any = eqx.field(static=True, default=None, kw_only=True)
+    along: Any = eqx.field(static=True, default=None, kw_only=True, converter=hashable)
     """The coordinate that the body slips along, given as in `on`."""
     tangential_restitution: Float[Array, "..."] | None = eqx.field(
         default=None, kw_only=True, converter=optional_real("tangential_restitution")
@@ -161,7 +163,7 @@ class RigidStop(Wall, AbstractEvent):
             found = self.modes(machine, s, before, *shown_modes(machine, modes))
             whose = f"`modes` of a stop of a {type(machine).__name__}"
             machine_modes = modes_after(machine, found, modes, whose)
-        return struck_modes(machine, s, after, modes, machine_modes)
+        return struck_modes(machine, s, after, modes, machine_modes, before=before)
 
     def jump(self, machine, s, state, *modes):
         body = machine.coordinates[self.coordinate]
@@ -193,6 +195,15 @@ class RigidStop(Wall, AbstractEvent):
         return 0.5 * (1 - coefficient**2) * approach**2
 
 
+def _exponent(x: Any) -> float:
+    if isinstance(x, Tracer):
+        raise TypeError(
+            "Argument `exponent` of a contact law must be a compile-time constant, but is traced. "
+            "A parameter of the machine is one with `eqx.field(static=True)`."
+        )
+    return float(x)
+
+
 class AbstractContactLaw(Shown):
     """The force away from a `SoftStop` as a function of the depth δ > 0 and its rate δ'.
 
@@ -200,7 +211,7 @@ class AbstractContactLaw(Shown):
     parameters of the law.
     """
 
-    exponent: float = eqx.field(static=True, default=1.0, converter=float)
+    exponent: float = eqx.field(static=True, default=1.0, converter=_exponent)
     """p ≥ 1, the power of the depth in the spring's force, for the length of steps. Static."""
 
     def __check_init__(self):
@@ -224,6 +235,10 @@ class AbstractContactLaw(Shown):
         """Return α for this restitution at every speed, or `None` if it depends on speed."""
         return None
 
+    def damping_without_pull(self, restitution: Any) -> Any:
+        """Return the same for a stop that does not pull (`adhesive=False`)."""
+        return None
+
     def frequency(self, stiffness: Any, depth: Any, rate: Any) -> Any:
         """Return the frequency of oscillations on the stop, at the depth that the body will reach;
         `stiffness` is per unit of its mass."""
@@ -238,7 +253,8 @@ class PowerLaw(AbstractContactLaw):
     """K δᵖ + α √K δ^((p-1)/2) δ': p = 1 is a spring with a dashpot, p = 3/2 Hertz's contact.
 
     The coefficient of restitution does not depend on the speed: α = √(2(p+1)) (-ln e)/√(π² + ln² e)
-    (Feng, arXiv 2603.27764).
+    (Feng, arXiv 2603.27764). Without pull the contact ends earlier: α = √(2(p+1)) ζ, where
+    e = exp(-2ζ acos(ζ)/√(1 - ζ²)).
     """
 
     def force(self, stiffness, damping, depth, rate):
@@ -260,6 +276,48 @@ class PowerLaw(AbstractContactLaw):
         require("restitution", restitution, low=0.0, high=1.0, open_low=True)
         drop = -jnp.log(jnp.asarray(restitution, float))
         return sqrt(2 * (self.exponent + 1)) * drop / jnp.sqrt(pi**2 + drop**2)
+
+    def damping_without_pull(self, restitution):
+        """Return α for e in (0, 1]. In the variable δ^((p+1)/2) and the speed, the contact is a
+        damped oscillation with the damping ratio ζ, and ends where its acceleration is zero."""
+        require("restitution", restitution, low=0.0, high=1.0, open_low=True)
+        known = concrete(restitution)
+        ratio = _ratio_without_pull(
+            *((np, np.asarray(known)) if known is not None else (jnp, restitution))
+        )
+        return sqrt(2 * (self.exponent + 1)) * jnp.asarray(ratio, float)
+
+
+def _ratio_without_pull(xp: Any, restitution: Any) -> Any:
+    """Return ζ with e = exp(-2ζ acos(ζ)/√(1 - ζ²)), with arrays of NumPy or JAX (`xp`)."""
+    drop = -0.5 * xp.log(restitution)
+    is_one, safe = drop <= 0, xp.where(drop > 0, drop, 1.0)
+    ratio = 2 / pi * xp.sinh(safe)
+    for _ in range(5):  # Newton's method in ln ζ: 1e-9 after three
+        x = 1 - ratio
+        near = xp.abs(x) < _NEAR_ONE
+        angle = _angle_by_sine(xp, ratio)
+        far = xp.where(near, 1.0, x * (1 + ratio))
+        slope = xp.where(near, -1 / 3 - 4 / 15 * x, (ratio * angle - 1) / far)
+        ratio = ratio * xp.exp((safe - ratio * angle) / (ratio * angle + ratio**2 * slope))
+    return xp.where(is_one, 2 / pi * drop, ratio)
+
+
+# Within this distance of ζ = 1 a series of seven terms is exact to rounding.
+_NEAR_ONE = 0.01
+
+
+def _angle_by_sine(xp: Any, ratio: Any) -> Any:
+    """Return acos(ζ)/√(1 - ζ²), or acosh(ζ)/√(ζ² - 1)."""
+    x, series, coefficients = 1 - ratio, 0.0, [1.0]
+    for n in range(1, 7):
+        coefficients.append(coefficients[-1] * n / (2 * n + 1))
+    for c in reversed(coefficients):
+        series = series * x + c
+    near, below = xp.abs(x) < _NEAR_ONE, ratio < 1
+    low, high = xp.where(near | ~below, 0.5, ratio), xp.where(near | below, 2.0, ratio)
+    angles = xp.arccos(low) / xp.sqrt(1 - low**2), xp.arccosh(high) / xp.sqrt(high**2 - 1)
+    return xp.where(near, series, xp.where(below, *angles))
 
 
 class HuntCrossley(AbstractContactLaw):
@@ -314,8 +372,8 @@ class SoftStop(Wall, AbstractSwitch):
     - `gap`: distance of the stop from the coordinate's zero (its unit); the body touches beyond.
     - `stiffness` K, a force by depthᵖ, N/m for a spring in SI units; positive (for a `Scene`: in
       units of the body's own spring).
-    - `restitution` e in (0, 1], or `damping` α, not negative (no unit for a power law, s/m for
-      `HuntCrossley`); no damping by default.
+    - `restitution` e in (0, 1], without prestress, or `damping` α, not negative (no unit for a
+      power law, s/m for `HuntCrossley`); no damping by default.
     - `dashpot` c of a power law, not negative: a force by speed, N s/m for a spring in SI units.
       The term c δ^((p-1)/2) δ' is added to the force.
     - `law`: `PowerLaw(p)` or `HuntCrossley(p)` with an exponent p of at least 1 (`PowerLaw()` by
@@ -342,6 +400,7 @@ class SoftStop(Wall, AbstractSwitch):
     mass: Float[Array, "..."] | None
     coordinate: int = eqx.field(static=True)
     ends: str = eqx.field(static=True, init=False, default="")  # its touch ends no motion
+    word: ClassVar = "soft stop"
     checked_within_step: ClassVar = (
         False  # steps are short compared with a contact (`longest_step`)
     )
@@ -373,7 +432,12 @@ class SoftStop(Wall, AbstractSwitch):
         instance_of("law", self.law, AbstractContactLaw, "a `PowerLaw()` or another contact law")
         if restitution is not None:
             given = f"{restitution!r} with damping={damping!r} and law={law!r}"
-            damping = _damping_of(self.law, restitution, damping, given)
+            damping = _damping_of(self.law, restitution, damping, given, bool(adhesive))
+            if prestress is not None:
+                raise ValueError(
+                    "Argument `restitution` must be left out with `prestress`, with which it "
+                    f"depends on the speed, but got {restitution!r}. Give `damping`."
+                )
             if dashpot is not None:
                 raise ValueError(
                     "Argument `dashpot` must be left out with `restitution`, which determines the "
@@ -392,7 +456,7 @@ class SoftStop(Wall, AbstractSwitch):
         self.mass = optional_real("mass")(mass)
         self.adhesive = bool(adhesive)
         self.side = one_of("side", side, ("right", "left"))
-        self.on, self.acts = on, acts
+        self.on, self.acts = hashable(on), acts
         self.coordinate = count("coordinate", coordinate)
         self.ends_cycle, self.name = bool(ends_cycle), str(name)
         require_ranges(self)
@@ -480,13 +544,33 @@ def _is_one(mass: Any) -> bool:
 
 
 def _damping_of(
-    law: AbstractContactLaw, restitution: Number, damping: Number | None, given: str
+    law: AbstractContactLaw,
+    restitution: Number,
+    damping: Number | None,
+    given: str,
+    adhesive: bool,
 ) -> Any:
     """Return α for a restitution; `given` is the text of the arguments for an error."""
-    found = law.damping_of(restitution) if damping is None else None
+    of_law = law.damping_of if adhesive else law.damping_without_pull
+    found = of_law(restitution) if damping is None else None
     if found is None:
         raise ValueError(
             "Argument `restitution` must be given without `damping`, and for a law such as "
             f"`PowerLaw`, whose restitution is one number, but got {given}."
         )
     return found
+
+
+def stop_in_words(machine: Machine, wall: Wall) -> str:
+    """Return the name of one of a machine's stops: its `name`, else its side, with the coordinate
+    or the number if several stops are on that side."""
+    walls = [x for x in (*stops_of(machine), *switches_of(machine)) if isinstance(x, Wall)]
+    soft = "soft " if isinstance(wall, SoftStop) else ""
+    alike = [x for x in walls if type(x) is type(wall) and x.side == wall.side and not x.name]  # pyright: ignore
+    words = f"{wall.side} {soft}stop"  # pyright: ignore
+    if wall.name or len(alike) < 2:  # pyright: ignore
+        return wall.name or words  # pyright: ignore
+    names = [x.on[0] if isinstance(x.on, tuple) else x.on for x in alike]  # pyright: ignore
+    number = next(i for i, x in enumerate(alike) if x is wall)
+    by_name = all(isinstance(x, str) for x in names) and len(set(names)) == len(names)
+    return f"{words} of {names[number]}" if by_name else f"{words} {number}"

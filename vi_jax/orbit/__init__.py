@@ -3,9 +3,9 @@
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
-from ._continuation import boundary, continue_orbit
-from ._cycle_map import CycleMap, cycle_map, map_state
-from ._delay import as_chain
+from .delay import as_chain
+from .continuation import boundary, continue_orbit
+from .cycle_map import CycleMap, cycle_map, map_state
 from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
@@ -16,3 +16,6 @@ from .results import (
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton
 from .special import Point
+from .birkhoff import agreement, digits_of, rotation_number, without_angles
+from .torus import Torus, find_torus
+from .torus_branch import TorusBranch, Window, continue_torus

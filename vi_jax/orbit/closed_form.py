@@ -26,7 +26,7 @@ from .._checks import count
 from .._programs import compiled
 from .._types import Flag, Number, Scalar
 from ..flow import lack_of_closed_form
-from ..machine import IdealDrive, Scene, Shown
+from ..machine import IdealDrive, OscillatorState, Scene, Shown
 from .results import eigenvalues
 
 # Grid points per drive cycle that bracket turning points: a choice, for ζ well above 1/256.
@@ -58,6 +58,11 @@ class ClosedFormOrbits(Shown):
     """True if the motion exists and stays inside the gap between impacts."""
     exists: Bool[Array, "... 2"]
     """True if the equations have this real solution and the body approaches the stop (v > 0)."""
+
+    @property
+    def state(self) -> OscillatorState:
+        """The states on the section: a batch of starts, for `simulate` and `find_orbit`."""
+        return OscillatorState(self.Y, self.V)
 
 
 def closed_form_orbits(scene: Scene, *, cycles: int | Int[Array, ""] = 1) -> ClosedFormOrbits:

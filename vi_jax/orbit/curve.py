@@ -24,11 +24,11 @@ from ..machine import (
     units_of,
     with_units,
 )
-from ._conditions import Special, held_in_words
-from ._shooting import Observed, Shooting
-from ._solution import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_at
-from ._special_table import cosine_of, points_of
-from ._words import TORUS
+from .boundary_events import cosine_of, points_of
+from .conditions import Special, held_in_words
+from .corrector import Hits, Step, energies_of, hits_of, locate_zero, orbit_of, sections_at
+from .equations import Observed, Shooting
+from .kinds import TORUS
 from .results import NEUTRAL, Orbit, stability_of
 from .special import Point
 

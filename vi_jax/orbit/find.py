@@ -23,6 +23,7 @@ from .._messages import warning_once
 from .._programs import compiled
 from .._types import Flag, Number, Scalar, State, Vector
 from ..flow import (
+    ExactFlight,
     MethodLike,
     Run,
     check_leaves,
@@ -32,6 +33,7 @@ from ..flow import (
     row_sizes,
     shape_of,
     simulate,
+    simulate_states,
 )
 from ..machine import (
     AbstractMachine,
@@ -50,17 +52,19 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ._cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
-from ._delay import as_chain, with_delay_error
+from .cycle_map import CycleMap, axes_of, batch_together, cycle_map, forward_jacobian, map_state
+from .delay import as_chain, with_delay_error
 from .results import ORBIT_RESULTS, Orbit, distance, multipliers_of, trimmed
 from .root_finders import AbstractRootFinder, Found, Newton, find_root, smallest_solution
 
 
 def _residual(
-    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State]
-) -> Float[Array, "arcs states"]:
-    """Return F, each arc's end minus the next arc's begin; the first arc follows the last."""
-    ends = jax.vmap(lambda x: raveled(arc(unravel(x)))[0])(arcs)
+    arc: CycleMap, arcs: Float[Array, "arcs states"], unravel: Callable[[Vector], State],
+    end: Callable[[State], State],
+) -> Float[Array, "arcs states"]:  # fmt: skip
+    """Return F, each arc's end minus the next arc's begin; the first arc follows the last. `end` is
+    `arc` or a function of its values."""
+    ends = jax.vmap(lambda x: raveled(end(unravel(x)))[0])(arcs)
     angles, next_starts = (
         angles_in(arc.machine, without_modes(unravel(arcs[0]))),
         jnp.roll(arcs, -1, axis=0),
@@ -68,7 +72,10 @@ def _residual(
     return nearest_images(angles, ends, next_starts) - next_starts
 
 
-def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Found:
+def root_of(
+    arc: CycleMap, guess: State, root_finder: AbstractRootFinder,
+    end: Callable[[State], State] | None = None,
+) -> Found:  # fmt: skip
     """Run a root finder from a guess, the first arc's start; the other arcs begin on the motion
     from there. The result's `x` holds the starts of the arcs in rows. The residual is relative to
     the sizes of the components. All numbers are floats."""
@@ -82,7 +89,7 @@ def root_of(arc: CycleMap, guess: State, root_finder: AbstractRootFinder) -> Fou
         sections = in_rows(run.sections)[: -1 : arc.cycles]
         arcs = jnp.where(jnp.isfinite(sections), sections, x)
     found = find_root(
-        root_finder, lambda z: _residual(arc, z * sizes, unravel) / sizes, arcs / sizes
+        root_finder, lambda z: _residual(arc, z * sizes, unravel, end or arc) / sizes, arcs / sizes
     )
     found = found._replace(x=found.x * sizes)
     return jtu.tree_map(lambda a: a.astype(x.dtype), found)  # all floats, for `jvp`
@@ -121,12 +128,50 @@ def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
     )  # fmt: skip
 
 
+def _follow(the_map: CycleMap, state: State, impact_log: int) -> Run:
+    """Simulate as `_run`, with derivatives of the states alone."""
+    places = _samples_per_cycle(the_map, state)
+    return simulate_states(
+        the_map.machine, state, the_map.cycles, method=the_map.method,
+        samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
+    )  # fmt: skip
+
+
+@forward_jacobian
+def _end_of_motion(the_map: CycleMap, state: State, impact_log: int) -> State:
+    return _follow(the_map, state, impact_log).last
+
+
+def _with_jacobians(the_map: CycleMap, state: State, impact_log: int) -> tuple[Run, Array]:
+    """Return the run of `_follow` and the derivatives of its sections but the first with respect to
+    the state, by the program that also computes the derivatives of `_end_of_motion`."""
+    x, unravel = raveled(jax.lax.stop_gradient(state))
+
+    def along(direction):
+        def sections(x):
+            run = _follow(the_map, unravel(x), impact_log)
+            return in_rows(run.sections)[1:], run
+
+        _, columns, run = jax.jvp(sections, (x,), (direction,), has_aux=True)
+        return run, columns
+
+    runs, columns = jax.vmap(along, out_axes=(0, -1))(jnp.eye(x.size, dtype=x.dtype))
+    return jtu.tree_map(lambda leaf: leaf[0], runs), columns
+
+
+def _shares_a_program(the_map: CycleMap, state: State) -> bool:
+    """Return whether one program serves the search and the observation of a single guess. Its steps
+    end on samples, which changes the motion by rounding, or not at all."""
+    exact = isinstance(the_map.method, ExactFlight)
+    return exact or _samples_per_cycle(the_map, state) == 1
+
+
 def _samples_per_cycle(the_map: CycleMap, state: State) -> int:
     return 1 if is_autonomous(the_map.machine, without_modes(state)) else _SAMPLES
 
 
 def move_section(
-    the_map: CycleMap, guess: State, impact_log: int
+    the_map: CycleMap, guess: State, impact_log: int, shared: bool
 ) -> tuple[CycleMap, State, Int[Array, ""]]:
     """Return map, guess and their place (in eighths of a cycle) for the section of the search.
 
@@ -136,7 +181,13 @@ def move_section(
     machine = the_map.machine
     if not isinstance(machine, Scene):
         return the_map, guess, jnp.zeros((), jnp.int32)
-    run = _run(the_map, guess, impact_log)
+    if shared:
+        # With a section phase, also of 0, the guess and the orbit have one program.
+        phase = jnp.zeros(()) if machine.section_phase is None else machine.section_phase
+        at_phase = dataclasses.replace(the_map, machine=machine.at_section(phase))
+        run, _ = _with_jacobians(at_phase, guess, impact_log)
+    else:
+        run = _run(the_map, guess, impact_log)
     assert run.samples is not None and run.impact_log is not None
     step, half = machine.cycle / _SAMPLES, machine.cycle / 2
     phase = run.impact_log.phase.ravel() - step * jnp.arange(_SAMPLES)[:, None]
@@ -203,24 +254,10 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
 
     @forward_jacobian
     def observe(arc, state):
-        x, _ = raveled(state)
-        jacobians = jacobians_from(arc, state) if second else jnp.zeros((0,), x.dtype)
-        run = _run(arc, state, impact_log)
-        log = run.impact_log
-        assert log is not None and run.y_min is not None and run.y_max is not None
-        states_met = run.sections if run.samples is None else run.samples.state
-        modes_there = run.modes if run.samples is None else run.samples.modes
-        places, modes = in_rows(states_met)[1:], None
-        places = places.reshape(arc.cycles, _samples_per_cycle(arc, state), -1)
-        if modes_there:  # batched as all else, see `forward_jacobian`
-            modes = in_rows(modes_there)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
-        assert run.clearance is not None and run.duration is not None
-        rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(x.dtype)
-        return ObservedArc(
-            places, modes, jacobians, Impacts(log.phase, log.speed, log.stop.astype(x.dtype)),
-            run.impacts.astype(x.dtype), rests, run.y_min, run.y_max, run.clearance, run.duration,
-            {name: mean * run.duration for name, mean in run.averages.items()},
-        )  # fmt: skip
+        jacobians = (
+            jacobians_from(arc, state) if second else jnp.zeros((0,), raveled(state)[0].dtype)
+        )
+        return _observations(arc, state, _run(arc, state, impact_log), jacobians)
 
     found = observe(arc, state)
     if second:
@@ -230,24 +267,50 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
     return found._replace(jacobians=jacobians_from(*constants))
 
 
+def _observations(arc: CycleMap, state: State, run: Run, jacobians: Array) -> ObservedArc:
+    log, dtype = run.impact_log, jacobians.dtype
+    assert log is not None and run.y_min is not None and run.y_max is not None
+    states_met = run.sections if run.samples is None else run.samples.state
+    modes_there = run.modes if run.samples is None else run.samples.modes
+    places, modes = in_rows(states_met)[1:], None
+    places = places.reshape(arc.cycles, _samples_per_cycle(arc, state), -1)
+    if modes_there:  # batched as all else, see `forward_jacobian`
+        modes = in_rows(modes_there)[1:].reshape(*places.shape[:2], -1) + 0 * places[..., :1]
+    assert run.clearance is not None and run.duration is not None
+    rests = jnp.zeros_like(run.y_min) if run.rests is None else run.rests.astype(dtype)
+    return ObservedArc(
+        places, modes, jacobians, Impacts(log.phase, log.speed, log.stop.astype(dtype)),
+        run.impacts.astype(dtype), rests, run.y_min, run.y_max, run.clearance, run.duration,
+        {name: mean * run.duration for name, mean in run.averages.items()},
+    )  # fmt: skip
+
+
 @eqx.filter_custom_jvp
 def find_and_observe(
-    arc: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int, second: bool
-) -> tuple[Found, ObservedArc]:
+    arc: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int, second: bool,
+    shared: bool,
+) -> tuple[Found, ObservedArc]:  # fmt: skip
     """Return the root found from a guess (`root_of`), and the observations of its arcs, in rows.
 
     The derivative with respect to the numbers p of `arc` is that of the root x(p) of F, dx/dp =
     -(∂F/∂x)⁻¹ ∂F/∂p, by the implicit function theorem; the search is not differentiated. One
     program computes the derivatives of all observations.
     """
-    root, (_, unravel) = root_of(arc, guess, root_finder), raveled(guess)
-    observe_from = lambda x: observe_arc(arc, unravel(x), impact_log, second)
+    end = (lambda state: _end_of_motion(arc, state, impact_log)) if shared else None
+    root, (_, unravel) = root_of(arc, guess, root_finder, end), raveled(guess)
+
+    def observe_from(x):
+        state = unravel(x)
+        if shared:
+            return _observations(arc, state, *_with_jacobians(arc, state, impact_log))
+        return observe_arc(arc, state, impact_log, second)
+
     return batch_together((root, jax.vmap(observe_from)(root.x)), root.x)
 
 
 @find_and_observe.def_jvp
 def _(primals, tangents):
-    arc, guess, _, impact_log, second = primals
+    arc, guess, _, impact_log, second, _ = primals
     root, observed = find_and_observe(*primals)
     _, unravel = raveled(guess)
     zeros = jtu.tree_map(jnp.zeros_like, (root, observed))
@@ -439,24 +502,24 @@ def _find(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
     multipliers: bool,
 ) -> Orbit:  # fmt: skip
-    def find_one(guess):
-        return _find_one(the_map, guess, root_finder, impact_log, multipliers)
+    def find_one(guess, shared=False):
+        return _find_one(the_map, guess, root_finder, impact_log, multipliers, shared)
 
     first = jtu.tree_leaves(guess)[0]
     if not axes_of(the_map.machine, guess):
-        return find_one(guess)
+        return find_one(guess, _shares_a_program(the_map, guess))
     return jax.lax.map(find_one, guess, batch_size=min(_BATCH, first.shape[0]))
 
 
 def _find_one(
     the_map: CycleMap, guess: State, root_finder: AbstractRootFinder, impact_log: int,
-    multipliers: bool,
+    multipliers: bool, shared: bool,
 ) -> Orbit:  # fmt: skip
     machine, cycles = the_map.machine, the_map.cycles
     guess = _with_later_modes(the_map, jax.lax.stop_gradient(guess))
-    moved, start, place = move_section(the_map, guess, impact_log)
+    moved, start, place = move_section(the_map, guess, impact_log, shared)
     arc = dataclasses.replace(moved, cycles=cycles // root_finder.arcs)
-    root, observed = find_and_observe(arc, start, root_finder, impact_log, multipliers)
+    root, observed = find_and_observe(arc, start, root_finder, impact_log, multipliers, shared)
     x = root.x
     jacobians = chain_jacobians(observed.jacobians)
     angles = angles_in(machine, without_modes(guess))

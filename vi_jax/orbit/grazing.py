@@ -17,10 +17,10 @@ from .._checks import count, flag, instance_of
 from .._messages import Interrupted, at_work, count_of
 from ..flow import NamedEnumeration, simulate
 from ..machine import Stated, Summarized, in_rows, in_unit, stated, stops_of
-from ._flight import Event
-from ._local_map import LocalGrazing, LocalMap, graze_at
-from ._shooting import Shooting
-from ._solution import on_host
+from .corrector import on_host
+from .equations import Shooting
+from .flight import Event
+from .local_map import LocalGrazing, LocalMap, graze_at
 from .results import complex_in_words
 from .special import Point
 

@@ -11,7 +11,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._checks import array_module, by_numpy_if_known, concrete, given_number, on_host, short
+from .._checks import (
+    array_module,
+    by_numpy_if_known,
+    concrete,
+    from_host,
+    given_number,
+    on_host,
+    short,
+)
 from .._messages import count_of
 from .._types import State, xr
 from ..flow import (
@@ -24,6 +32,7 @@ from ..flow import (
     quantities_on,
     simulate,
     sizes_on_host,
+    span_of_position,
     states,
     tidy,
 )
@@ -38,10 +47,10 @@ from ..machine import (
     in_rows,
     in_unit,
     is_autonomous,
-    name_in,
+    labels_in,
     nearest_images,
-    plain,
     state_in_words,
+    stop_in_words,
     stops_of,
     units_of,
     with_units,
@@ -77,7 +86,7 @@ def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*ba
     else:
         values = np.linalg.eigvals(safe).astype(np.result_type(known.dtype, np.complex64))
     values = np.take_along_axis(values, np.argsort(-abs(values), axis=-1, kind="stable"), axis=-1)
-    return jnp.asarray(np.where(finite[..., 0], values, np.nan))
+    return from_host(np.where(finite[..., 0], values, np.nan))
 
 
 def _multipliers(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
@@ -142,7 +151,8 @@ class ORBIT_RESULTS(NamedEnumeration):
     inadmissible = "The motion found would pass through a stop."
     no_orbit = (
         "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
-        "nearer to one."
+        "nearer to one, such as the end of a long simulation. Events that a reset sets off at the "
+        "same instant change the number of cycles (see the event log)."
     )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
@@ -283,9 +293,11 @@ class Orbit(Summarized):
         return self.successful & inside & (self.slowest_impact > 0)
 
     def trajectory(
-        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8
-    ) -> Run:
-        """Return the motion over one period (or `cycles` drive cycles), sampled, for plots.
+        self, *, cycles: int | None = None, samples: int = 128, impact_log: int = 8,
+        event_log: int = 0,
+    ) -> Run:  # fmt: skip
+        """Return the motion over one period (or `cycles` drive cycles), sampled, for plots. The
+        arguments are those of `simulate`.
 
         **Raises:** `ValueError` for a batch of orbits, or a guess that led to none.
         """
@@ -306,10 +318,11 @@ class Orbit(Summarized):
             period = int(self.cycles)
             each = period if cycles % period == 0 else cycles
             machine = machine.observed_every(self.duration * (each / period))
-            samples, impact_log, cycles = samples * each, impact_log * each, cycles // each
+            samples, impact_log, event_log = (each * n for n in (samples, impact_log, event_log))
+            cycles //= each
         return simulate(
             machine, self.state, cycles, method=self.method, samples=samples,
-            impact_log=impact_log,
+            impact_log=impact_log, event_log=event_log,
         )  # fmt: skip
 
     def to_xarray(
@@ -363,10 +376,10 @@ class Orbit(Summarized):
         impacts = zip(self.impact_phase, self.impact_speed, self.impact_stop, strict=True)
         for phase, speed, stop in impacts:
             if stop >= 0:
-                name = stops_of(self.machine)[int(stop)].side
+                name = stop_in_words(self.machine, stops_of(self.machine)[int(stop)])
                 fast = in_unit(f"{float(speed):.9g}", units, "velocity")
                 clock = in_unit(f"{clock_word(self.machine)} {float(phase):.6f}", units, "phase")
-                lines.append(f"  impact: {name} stop at {clock}, V⁻ = {fast}")
+                lines.append(f"  impact: {name} at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
         listed = int(np.sum(self.impact_stop >= 0))
@@ -379,8 +392,8 @@ class Orbit(Summarized):
             room = in_unit(f"{float(self.clearance):.4g}", units, "position")
             lines.append(f"  clearance: {room}")
         lines.append(
-            f"  residual {float(self.residual):.2g} after {int(self.iterations)} steps, estimated "
-            f"error of the search {float(self.error):.2g}"
+            f"  search: residual {float(self.residual):.2g} after {int(self.iterations)} steps, "
+            f"{float(self.error):.2g} from its solution; the method's error comes on top"
         )
         if self.delay_error is not None:
             lines.append(
@@ -413,7 +426,8 @@ def _advice(orbit: Orbit) -> str:
 
 def lies_on_a_stop(orbit: Orbit) -> bool:
     x, machine = without_modes(orbit.state), orbit.machine
-    bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops_of(machine))
+    stops = map(on_host, stops_of(machine))
+    bodies = ((stop, machine.coordinates[stop.coordinate]) for stop in stops)
     return any(stop.beyond(y.position(x)) >= 0 and y.velocity(x) == 0 for stop, y in bodies)
 
 
@@ -426,9 +440,9 @@ def hits_in_words(orbit: Orbit) -> str:
 
 def span_in_words(orbit: Orbit, digits: int) -> str:
     """Return the interval of the first coordinate, with its name in pictures."""
-    low, high = (plain(x, digits) for x in (orbit.y_min, orbit.y_max))
-    span = in_unit(f"[{low}, {high}]", units_of(orbit.machine), "position")
-    return f"{name_in(orbit.machine.labels[0])} in {span}"
+    machine, ends = orbit.machine, (orbit.y_min, orbit.y_max)
+    labels = labels_in(machine, without_modes(orbit.state))
+    return span_of_position(labels, units_of(machine), ends, digits)
 
 
 def complex_in_words(z: complex, digits: int, rounding: float) -> str:
@@ -450,7 +464,7 @@ def trimmed(orbit: Orbit) -> Orbit:
 
 
 def _first(x: Array, number: int) -> Array:
-    return jnp.asarray(on_host(x)[:number])
+    return from_host(on_host(x)[:number])
 
 
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:

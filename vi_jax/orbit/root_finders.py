@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
-from ._linear import Matrix, solve, svd
+from .linear import Matrix, solve, svd
 
 # Above this singular value a motion is so unstable that rounding hides what is neutral: a choice.
 _STEEP = 1e3

@@ -9,12 +9,12 @@ import numpy as np
 
 from .._checks import given_number, one_of
 from ..machine import in_unit, units_of
-from ._conditions import in_one_parameter
-from ._shooting import Shooting
-from ._sliding import SLIDING
-from ._solution import Step, orbit_of
-from ._words import DETAILS, GRAZING, REST, grazing_in_words, with_article
+from .conditions import in_one_parameter
+from .corrector import Step, orbit_of
+from .equations import Shooting
+from .kinds import DETAILS, GRAZING, REST, grazing_in_words, with_article
 from .results import Orbit
+from .sliding import SLIDING
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -101,8 +101,9 @@ class Point:
         boundary mostly a `Point` that `boundary` follows in the same two parameters.
 
         On a branch: at a period doubling the motion of twice the period, or of half of it if the
-        branch begins at one; at a grazing the motion with one impact less or more, on the side on
-        which it is admissible; at a branch point a motion of the other branch; at a sliding
+        branch begins at one; at a Neimark–Sacker point a `Torus` (for `continue_torus`), which has
+        another value of the parameter; at a grazing the motion with one impact less or more, on the
+        side on which it is admissible; at a branch point a motion of the other branch; at a sliding
         bifurcation the motion that sticks once more or less; at a lost or divided rest the motion
         with one rest more or less, at joined rests that with one; where two events coincide, as an
         impact and the section of a machine with `renewed`, the motion with them in another order.
@@ -120,12 +121,13 @@ class Point:
 
         - `to`: the kind of the curve if several begin: "fold" (by default) or "period-doubling" at
           a resonant grazing.
-        - `distance`: distance of an orbit from the point, in the norm of the scaled unknowns; at a
-          resonant grazing about the speed of the impact, as a share of the fastest one there.
+        - `distance`: distance of an orbit from the point, in the norm of the scaled unknowns; of a
+          torus the size of its first Fourier mode; at a resonant grazing about the speed of the
+          impact, as a share of the fastest one there.
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
-        from ._switch import STARTS  # imported here: it needs this class
+        from .switch import STARTS  # imported here: it needs this class
 
         distance = given_number("distance", distance, low=0.0, open_low=True)
         starts = STARTS.get((self.curve, self.kind), {})

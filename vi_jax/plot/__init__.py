@@ -28,3 +28,4 @@ from .scan import plot_integrity as plot_integrity
 from .scan import plot_regimes as plot_regimes
 from .schematic import Pen as Pen
 from .schematic import plot_sketch as plot_sketch
+from .torus import plot_torus as plot_torus

@@ -33,6 +33,7 @@ IRREGULAR = {
     REGIMES.unsettled: "#b9b9b9",
     REGIMES.transient: "#7f7f7f",
     REGIMES.chaotic: "#1a1a1a",
+    REGIMES.quasiperiodic: "#d9c58b",
     REGIMES.failed: "#ffffff",
 }
 NOT_COMPUTED = "#e6e6e6"

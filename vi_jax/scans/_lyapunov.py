@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,6 +37,7 @@ from ..machine import (
     Mechanical,
     Stated,
     Summarized,
+    angles_in,
     attributes,
     components,
     cycle_time,
@@ -56,7 +57,7 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from ..orbit import CycleMap, as_chain, cycle_map, map_state
+from ..orbit import CycleMap, as_chain, cycle_map, digits_of, map_state, without_angles
 
 
 class Lyapunov(Summarized):
@@ -124,6 +125,9 @@ class Lyapunov(Summarized):
 # even number, as the windows of `_window` are.
 _AT_ONCE = 512
 
+# Places of a mean over the weights, whose sum over many cycles it gives to rounding: a choice.
+_NODES = 512
+
 # A direction that is this number of roundings of its previous length counts as zero: a choice, some
 # times the error of the projections.
 _ROUNDING = 16
@@ -174,21 +178,8 @@ def lyapunov(
     machine = machine_of(machine)
     start = machine.start() if start is None else start
     own = len(components(without_modes(start))) if has_delays(machine) else None
-    machine, start = as_chain(machine, start)
-    if is_autonomous(machine, without_modes(start)):
-        if renews(machine):
-            raise ValueError(
-                "Argument `machine` must not have both a section and a `renewed`, as a "
-                f"{type(machine).__name__} has: at equal intervals it would be renewed there. The "
-                "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
-            )
-        # States on a section do not show the exponent 0 along the motion.
-        machine = machine.observed_every(machine.cycle)
-    method = chosen(machine, method)
-    the_map = cycle_map(machine, method=method)
-    if rests is not None:
-        the_map = dataclasses.replace(the_map, rests=flag("rests", rests))
-    start = map_state(the_map.machine, start, "start")
+    the_map, start = _observed_map(*as_chain(machine, start), method, rests)
+    machine = the_map.machine
     states = int(_is_free(machine, start).sum())
     number = (own or states) if number is None else count("number", number, least=1)
     if number > states:
@@ -214,6 +205,84 @@ def lyapunov(
             total=cycles,
         )  # fmt: skip
     return _lyapunov(the_map, start, cycles, settle, number)
+
+
+def _observed_map(
+    machine: AbstractMachine, start: State, method: MethodLike, rests: bool | None
+) -> tuple[CycleMap, State]:
+    """Return the map whose exponents are computed, and the start in its form."""
+    machine = machine_of(machine)
+    start = machine.start() if start is None else start
+    if is_autonomous(machine, without_modes(start)):
+        if renews(machine):
+            raise ValueError(
+                "Argument `machine` must not have both a section and a `renewed`, as a "
+                f"{type(machine).__name__} has: at equal intervals it would be renewed there. The "
+                "exponents of its periodic motions are ln|multiplier|/duration of an `Orbit`."
+            )
+        # States on a section do not show the exponent 0 along the motion.
+        machine = machine.observed_every(machine.cycle)
+    method = chosen(machine, method)
+    the_map = cycle_map(machine, method=method)
+    if rests is not None:
+        the_map = dataclasses.replace(the_map, rests=flag("rests", rests))
+    return the_map, map_state(the_map.machine, start, "start")
+
+
+class Growth(NamedTuple):
+    """The greatest exponent of a motion, and how well averages over its sections agree."""
+
+    exponent: Scalar
+    per_cycle: Scalar
+    digits: Scalar
+    """See `agreement`."""
+    successful: Array
+
+
+def observe_growth(
+    machine: AbstractMachine, start: State, cycles: Any, *, settle: Any, method: MethodLike,
+    rests: bool | None,
+) -> Growth:  # fmt: skip
+    """Compute the greatest exponent as `lyapunov` does, over a number of cycles that may be traced,
+    a multiple of 4. Sums replace lists of sections, so one program serves any number."""
+    the_map, start = _observed_map(machine, start, method, rests)
+    angles = angles_in(the_map.machine, without_modes(start))
+    window, half = 2, jnp.asarray(cycles // 2, float)
+    observe = _observer(the_map, start, window, rows=True)
+    carry = _initial_carry(the_map, start, settle, 1)
+
+    def bump(place):
+        inside = (place > 0) & (place < 1)
+        safe = jnp.where(inside, place, 0.5)
+        return jnp.where(inside, jnp.exp(-1 / (safe * (1 - safe))), 0.0)
+
+    def step(i, state):
+        carry, (rate, time, duration), (total, squares, first, second) = state
+        carry, (rates, durations, _, rows) = observe(carry, None)
+        place = window * i + 0.5 + jnp.arange(window)
+        weight = bump(place / (2 * half))
+        lost = jnp.any(rates == -jnp.inf)  # where a weight underflows, 0 · ∞ is NaN
+        rate = jnp.where(lost, -jnp.inf, rate + weight @ jnp.where(lost, 0.0, rates.ravel()))
+        seen = without_angles(rows, angles)
+        values = jnp.concatenate([seen, seen**2], axis=1)
+        parts = (bump(place / half) @ values, bump(place / half - 1) @ values)
+        sums = (total + values.sum(0), squares + (values**2).sum(0))
+        sums = (*sums, first + parts[0], second + parts[1])
+        return carry, (rate, time + weight @ durations, duration + durations.sum()), sums
+
+    row = raveled(without_modes(start))[0]
+    zeros = jnp.zeros(2 * without_angles(row[None], angles).size, row.dtype)
+    zero = jnp.zeros((), row.dtype)
+    state = (carry, (zero, zero, zero), (zeros, zeros, zeros, zeros))
+    carry, (rate, time, duration), sums = jax.lax.fori_loop(0, half.astype(int), step, state)
+    total, squares, first, second = sums
+    mean = total / (2 * half)
+    spread = jnp.sqrt(jnp.maximum(squares / (2 * half) - mean**2, 0.0))
+    unit = bump((jnp.arange(_NODES) + 0.5) / _NODES).mean() * half
+    digits = digits_of((first - second) / unit, spread, mean)
+    good = carry[-1] == RESULTS.successful
+    exponent = jnp.where(good, rate / time, jnp.nan)
+    return Growth(exponent, exponent * duration / (2 * half), digits, good)
 
 
 @compiled
@@ -265,8 +334,9 @@ def _observe_windows(the_map: CycleMap, start, carry, windows, window: int) -> A
     return jax.lax.scan(observe_one, carry, jnp.arange(_AT_ONCE // window))
 
 
-def _observer(the_map: CycleMap, start, window: int) -> Any:
-    """Return a function for `jax.lax.scan` that returns rates, durations and integrals."""
+def _observer(the_map: CycleMap, start, window: int, rows: bool = False) -> Any:
+    """Return a function for `jax.lax.scan` that returns rates, durations and integrals; and the
+    states on the section as rows, if asked for."""
     machine, method, rests = the_map.machine, the_map.method, the_map.rests
     unravel = ravel_pytree(without_modes(start))[1]
     # Directions are relative to the sizes of components. With units of very different sizes,
@@ -302,7 +372,8 @@ def _observer(the_map: CycleMap, start, window: int) -> Any:
         logarithms = jnp.where(vanished, -jnp.inf, jnp.log(jnp.where(vanished, 1.0, sizes)))
         rates = _growth(tangents[..., 0])[:, None] if is_single else logarithms[None]
         result = RESULTS.where(result == RESULTS.successful, ended, result)
-        return ((new[-1], modes), frame, result), (rates, duration, integrals)
+        found = (rates, duration, integrals, new) if rows else (rates, duration, integrals)
+        return ((new[-1], modes), frame, result), found
 
     return observe
 

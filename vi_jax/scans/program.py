@@ -54,7 +54,8 @@ from ..machine import (
     with_leaves,
     without_modes,
 )
-from .measures import MEASURES, AbstractMeasure, Average, Escape, Numbers
+from .measures import MEASURES, AbstractMeasure, Average, Numbers
+from .statistics import Escape
 
 # The key of a lane's number among its values; it names no axis.
 LANE = "lane number"

@@ -564,7 +564,7 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # The force that friction has to hold depends on the bodies that rest now.
-        new = struck_modes(machine, lane.s, lane.state, modes, contact=contact)
+        new = struck_modes(machine, lane.s, lane.state, modes, contact=contact, before=at_event)
         modes = select(met, new, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(impacts) == 1:

@@ -341,16 +341,19 @@ def _with_own_rounding(
             found.append(jnp.where(jnp.isfinite(size), 4 * eps * size, jnp.inf))
         return tuple(found)
 
-    near = any_of(lane.s > 0, (jnp.abs(x.end.x) <= x.slack for x in own))
+    near = jnp.zeros((), bool)
+    for guard in own:
+        assert guard.slack is not None
+        near = near | (jnp.abs(guard.end.x) <= guard.slack)
     far = tuple(jnp.full_like(s, jnp.inf) for _ in own)
     slack = jax.lax.cond(stop_gradient(near), of_each, lambda _: far, None)
     by_number = {guard.number: x for guard, x in zip(own, slack, strict=True)}
-    return [
-        guard._replace(slack=jnp.minimum(guard.slack, by_number[guard.number]))
-        if guard.number in by_number
-        else guard
-        for guard in guards
-    ]
+    found = []
+    for guard in guards:
+        assert guard.slack is not None
+        least = jnp.minimum(guard.slack, by_number.get(guard.number, jnp.inf))
+        found.append(guard if guard.number not in by_number else guard._replace(slack=least))
+    return found
 
 
 def _mark_jump(guard: Crossing) -> Crossing:
@@ -538,7 +541,7 @@ def _landed(
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.attempts < _PATIENCE)
-    jumped = None if sudden is None else sudden & jumped
+    jumped = None if sudden is None or jumped is None else sudden & jumped
     return guard._replace(
         offset=offset, landed=landed, again=again, near=near, sudden=sudden, jumped=jumped
     )

@@ -5,13 +5,12 @@ from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._types import Scalar, State
-from ...machine import AbstractMachine, longest_step
+from ...machine import AbstractMachine, Shown, longest_step
 from ..smooth import Integrals, SmoothMachine
 
 # Places, as shares of a step, where guards are evaluated for a method without stages.
@@ -57,7 +56,7 @@ def has_relaxation(machine: AbstractMachine, s: Scalar, state: State) -> bool:
     return jax.eval_shape(machine.relaxation, s, state) is not None
 
 
-class AbstractMethod(eqx.Module):
+class AbstractMethod(Shown):
     """The interface of a method to the hybrid step."""
 
     @property

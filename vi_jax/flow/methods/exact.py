@@ -33,7 +33,7 @@ from ...machine import (
     stops_of,
     switches_of,
 )
-from ..smooth import Integrals, SmoothMachine, rate_of_integrals
+from ..smooth import Integrals, SmoothMachine, constant, rate_of_integrals
 from .base import AbstractMethod
 
 # The series of a matrix exponential is summed over lengths in which the state changes at most by
@@ -93,7 +93,7 @@ def clear(machine: ModalMachine, s: Scalar, state: State) -> Scalar:
     """Return a time of free flight in which no stop can be met; 0 if it is not known. A decaying
     mode stays within its amplitude a, and its acceleration within κa. So a parabola bounds the
     distance to a stop from below. The time is infinite if the amplitudes' sum does not reach it."""
-    machine, s, state = stop_gradient((machine, s, state))  # a length has no derivative
+    machine, s, state = constant((machine, s, state))  # a length has no derivative
     q, p = state.displacement, state.velocity
     place, rate = (0.0, 0.0) if machine.steady is None else _steady_response(machine, s)
     y, v = q - place, p - rate

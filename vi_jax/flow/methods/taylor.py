@@ -570,6 +570,10 @@ class Expansion(NamedTuple):
         return limit
 
 
+def _as_array(x: Any) -> Any:
+    return x if x is None or isinstance(x, Tracer) else np.asarray(x)
+
+
 class Taylor(AbstractMethod):
     """Power series of the motion, with coefficients by recursion over the machine's own field.
 
@@ -587,11 +591,7 @@ class Taylor(AbstractMethod):
 
     order: int = eqx.field(static=True, default=16)
     steps_per_cycle: int = eqx.field(static=True, default=8)  # pyright: ignore
-    rtol: np.ndarray | float | None = eqx.field(
-        kw_only=True,
-        default=None,
-        converter=lambda x: x if x is None or isinstance(x, Tracer) else np.asarray(x),
-    )
+    rtol: np.ndarray | float | None = eqx.field(kw_only=True, default=None, converter=_as_array)
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
     """The sizes of the state's numbers, set by `with_sizes`."""
 

@@ -14,9 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..machine import AbstractMachine, in_rows, nearest_images, stops_of
-from ._flight import Event, section_of
-from ._shooting import ROUNDING, Shooting
-from ._solution import (
+from .corrector import (
     Step,
     advance,
     find_zero_near,
@@ -26,6 +24,8 @@ from ._solution import (
     state_at,
     tangent_at,
 )
+from .equations import ROUNDING, Shooting
+from .flight import Event, section_of
 
 # Halves of a period are equal, or images of each other, if they differ by less than the first; by
 # less than the second, up to rounding. Choices.

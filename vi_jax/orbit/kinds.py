@@ -3,10 +3,10 @@
 import numpy as np
 
 from ..machine import RigidStop, SoftStop, clock_in_words
-from ._flight import Event
-from ._shooting import Shooting
-from ._sliding import SLIDING
-from ._solution import Step, since_section
+from .corrector import Step, since_section
+from .equations import Shooting
+from .flight import Event
+from .sliding import SLIDING
 
 FOLD, DOUBLING, TORUS = "fold", "period-doubling", "neimark-sacker"
 GRAZING, CROSSING, SYMMETRY = "grazing", "branch-point", "symmetry-breaking"
@@ -86,6 +86,8 @@ def grazing_in_words(problem: Shooting, at: Step, impact: int | None) -> str:
         return f"{what} {place_in_words(problem, at, clock)}"
     clock = float(problem.values(at.x)[0][impact])
     event, lost = problem.events[impact], problem.events[impact].of(machine)
-    soft = isinstance(lost, SoftStop)
-    noun = f"contact with the {event.name_on(machine)}" if soft else lost.word
-    return f"the {lost.name or noun} {place_in_words(problem, at, clock)} is lost"
+    noun = lost.name or lost.word
+    if lost.holds_mode:
+        what = "contact with the" if isinstance(lost, SoftStop) else "change of"
+        noun = f"{what} {event.name_on(machine)}"
+    return f"the {noun} {place_in_words(problem, at, clock)} is lost"

@@ -20,7 +20,7 @@ from jax.lax import stop_gradient
 from .._types import Flag, Scalar, State, Vector
 from ..flow import TIME, Integrals, Rates, force_rate, guard_rates, rounding_bounds
 from ..machine import RigidStop, push_of, stops_of
-from ._flight import Flight, force_on
+from .flight import Flight, force_on
 
 # Most hops of a chatter, and most corrections of the landing of each: choices. With restitution
 # 0.95 a rebound has 1e-4 of the first speed after 180 hops.

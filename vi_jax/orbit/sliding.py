@@ -27,10 +27,10 @@ from ..machine import (
     guard_of,
     mode_number,
 )
-from ._flight import Event, Flight
-from ._shooting import Leg, Shooting
-from ._solution import Step, find_zero_near, observe, on_host, state_at
-from ._surgery import without_events
+from .corrector import Step, find_zero_near, observe, on_host, state_at
+from .edit_events import without_events
+from .equations import Leg, Shooting
+from .flight import Event, Flight
 
 CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
 SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"

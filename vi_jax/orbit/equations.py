@@ -44,10 +44,10 @@ from ..machine import (
     with_component,
     with_leaf,
 )
-from ._chatter import Chatter, escape_margin, last_hop, remaining
-from ._flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
-from ._turns import Nearest, Path, pull_of, turns_of
+from .flight import LANDS, LEAVES, Event, Flight, guard_at, on_stop
+from .rest import Chatter, escape_margin, last_hop, remaining
 from .results import multipliers_of
+from .turns import Nearest, Path, pull_of, turns_of
 
 # A distance or a speed is zero within this share of a motion's largest: a choice, 100 tolerances.
 ROUNDING = 1e-9
@@ -126,8 +126,7 @@ class Observed(NamedTuple):
     @property
     def least_hold_force(self) -> float:
         """The least force on a body within its rest, relative to the motion's; within ±1."""
-        unit = self.length * (2 * np.pi / float(self.duration)) ** 2
-        return float(np.clip(self.pull.margin / unit, -1.0, 1.0))
+        return float(np.clip(self.pull.margin / self.pull.unit, -1.0, 1.0))
 
     @property
     def fastest(self) -> float:
@@ -250,6 +249,16 @@ class Shooting(eqx.Module):
         return bool(self.landings or self.held)
 
     @property
+    def stuck(self) -> tuple[int, ...]:
+        """Numbers of the events of dry frictions that hold their bodies all the time."""
+        return tuple(
+            number
+            for number, event in enumerate(events_of(self.machine))
+            if event.holds_mode and event.is_dry
+            and all(modes[mode_number(self.machine, number)] == 0 for modes in self.modes)
+        )  # fmt: skip
+
+    @property
     def is_double(self) -> bool:
         """True if these are the equations of a curve of double folds (see `Special`)."""
         return any(getattr(condition, "double", False) for condition in self.conditions)
@@ -268,7 +277,7 @@ class Shooting(eqx.Module):
         return tuple(found[self.legs :])
 
     def at(self, x: Unknowns) -> AbstractMachine:
-        x = jnp.asarray(x)
+        x = x if isinstance(x, np.ndarray) else jnp.asarray(x)
         n = x.shape[0]
         return self._with_parameters([x[i] for i in range(n - len(self.parameters), n)])
 
@@ -292,19 +301,23 @@ class Shooting(eqx.Module):
 
     def parts(self, x: Unknowns) -> tuple[Float[Array, " legs"], Float[Array, "legs states"]]:
         """Return clock and state at the start of each leg (before its event)."""
-        legs, x = self.legs, jnp.asarray(x)
+        return self._parts(jnp, jnp.asarray(x))
+
+    def _parts(self, array: Any, x: Any) -> tuple[Any, Any]:
+        legs = self.legs
         if not self.events:
-            return jnp.zeros((1,), x.dtype), x[: self.states][None]
+            return array.zeros((1,), x.dtype), x[: self.states][None]
         end = legs * (1 + self.states)
         clock = x[:legs]
         if self.autonomous:
-            clock = jnp.concatenate([jnp.zeros((1,), x.dtype), clock[1:]])
+            clock = array.concatenate([array.zeros((1,), x.dtype), clock[1:]])
         return clock, x[legs:end].reshape(legs, self.states)
 
     def values(self, x: Unknowns) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the `parts` and the period of a solution; host-side."""
-        clock, states = self.parts(x)
-        return np.asarray(clock), np.asarray(states), float(self.period(x))
+        x = np.asarray(x)
+        period = x[0] if self.autonomous else float(self.at(x).cycle) * self.cycles
+        return *self._parts(np, x), float(period)
 
     def lengths(self, x: Unknowns) -> np.ndarray:
         """Return the duration of each leg by the clock; host-side."""
@@ -321,7 +334,7 @@ class Shooting(eqx.Module):
         clock = jnp.asarray(clock) if self.events else jnp.zeros((0,))
         if self.autonomous:
             clock = (clock - clock[0]).at[0].set(period)
-        parameters = jnp.asarray(x)[-len(self.parameters) :]
+        parameters = jnp.asarray(x)[len(x) - len(self.parameters) :]
         return jnp.concatenate([clock, jnp.ravel(states), parameters])
 
     @property
@@ -334,7 +347,7 @@ class Shooting(eqx.Module):
     @property
     def radian(self) -> float:
         """The size of the clock, a cycle through 2π; host-side."""
-        return float(self.sizes[0])
+        return float(np.asarray(self.sizes)[0])
 
     def half_scale(self) -> np.ndarray:
         """Return the sizes of the clocks and states of half a period; host-side."""
@@ -379,8 +392,13 @@ class Shooting(eqx.Module):
 
         return self._for_event(leg, value, s, u)
 
-    def ends(self, clock: Float[Array, " legs"], period: Scalar) -> Float[Array, " legs"]:
-        return jnp.concatenate([clock[1:], clock[:1] + period])
+    def ends(
+        self, clock: Float[Array, " legs"], period: Scalar, next_clock: Array | None = None
+    ) -> Float[Array, " legs"]:
+        """Return the clock at the end of each leg. The last one ends at the first event a period
+        later, whose clock is `next_clock` if the motion does not repeat."""
+        following = clock if next_clock is None else next_clock
+        return jnp.concatenate([clock[1:], following[:1] + period])
 
     def leg_at(self, x: Unknowns, s: Any) -> tuple[Array, Array]:
         """Return the leg that contains a clock, modulo the period, and the clock there."""
@@ -464,6 +482,9 @@ class Shooting(eqx.Module):
         for number, lands in self._landing(leg):
             state_on_stop = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
             u = jnp.where(lands, state_on_stop, u)
+        for number in self.stuck:  # else any slip would stay as it is
+            state = events_of(machine)[number].stopped(machine, begin.s, self.unravel(u))
+            u = ravel_pytree(state)[0]
         end, integrals, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
             integrals = {name: x + begin.integrals[name] for name, x in integrals.items()}
@@ -503,16 +524,22 @@ class Shooting(eqx.Module):
         added = [condition.residual(self, x, observed, chatters) for condition in self.conditions]
         return jnp.concatenate([residual, jnp.stack(added)])
 
-    def motion_residual(self, x: Vector, steps: Scalar | None = None) -> Vector:
+    def motion_residual(
+        self, x: Vector, steps: Scalar | None = None, following: Vector | None = None
+    ) -> Vector:
         """Return the left sides of the motion's own equations, zero for a periodic motion: end of
         each leg minus begin of the next, then the guards. `steps` is the number of steps of a
-        flight, by default `self.steps`."""
-        return self._shoot(x, steps)[0]
+        flight, by default `self.steps`. The last leg leads to the first event of `following`, the
+        unknowns a period later, by default `x`."""
+        return self._shoot(x, steps, following)[0]
 
-    def _shoot(self, x: Vector, steps: Scalar | None = None) -> tuple[Vector, Chatter]:
+    def _shoot(
+        self, x: Vector, steps: Scalar | None = None, following: Vector | None = None
+    ) -> tuple[Vector, Chatter]:
         """Return the `motion_residual`, and the end of the chatter that begins each leg."""
         machine = self.at(x)
         clock, states = self.parts(x)
+        next_clock, next_states = self.parts(x if following is None else following)
 
         def end_of_leg(leg, s0, s1, u):
             after = self.after(machine, leg, s0, u)
@@ -523,14 +550,15 @@ class Shooting(eqx.Module):
             return end, self.guard(machine, leg, s0, u)[None], begin
 
         legs = jnp.arange(len(states))
-        ends = self.ends(clock, self.period(x))
+        ends = self.ends(clock, self.period(x), next_clock)
         ends_of_legs, guards, chatters = jax.vmap(end_of_leg)(legs, clock, ends, states)
-        next_states = jnp.roll(states, -1, axis=0)
+        next_states = jnp.concatenate([states[1:], next_states[:1]])
         ends_of_legs = nearest_images(self.angles, ends_of_legs, next_states)
         return jnp.concatenate([(ends_of_legs - next_states).ravel(), guards.ravel()]), chatters
 
-    def observe(self, x: Vector) -> Observed:
-        """Compute multipliers, extremes and the distances to grazing of a solution `x`.
+    def observe(self, x: Vector, following: Vector | None = None) -> Observed:
+        """Compute multipliers, extremes and the distances to grazing of a solution `x` (for
+        `following` see `motion_residual`).
 
         The monodromy matrix is the product over the legs of the flight's derivative times the
         saltation matrix of the event that begins the leg.
@@ -561,7 +589,8 @@ class Shooting(eqx.Module):
             return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
 
         legs = jnp.arange(len(states))
-        ends = self.ends(clock, self.period(x))
+        next_clock, _ = self.parts(x if following is None else following)
+        ends = self.ends(clock, self.period(x), next_clock)
         found = jax.vmap(follow)(legs, clock, ends, states)
         matrix, integrals, approach, agree, turns, positions, largest, begin, sizes = found
         monodromy = jnp.eye(self.states, dtype=x.dtype)
@@ -574,7 +603,7 @@ class Shooting(eqx.Module):
         Y = jnp.concatenate(positions)
         low, high, nearest, pull = turns
         i, j = jnp.argmin(nearest.margin), jnp.argmin(pull.margin)
-        nearest = jax.tree.map(lambda x: x[i], nearest)
+        nearest, pull = (jax.tree.map(lambda x, k=k: x[k], a) for a, k in ((nearest, i), (pull, j)))
         order_of_events = self._order_margin(machine, clock, ends - clock, states, sizes)
         totals = jax.tree.map(jnp.sum, integrals)
         time = totals.pop(TIME)
@@ -587,7 +616,7 @@ class Shooting(eqx.Module):
             y_min=jnp.minimum(jnp.min(Y), jnp.min(low)),
             y_max=jnp.maximum(jnp.max(Y), jnp.max(high)),
             nearest=nearest._replace(unit=sizes[i, nearest.event.astype(int)]),
-            pull=jax.tree.map(lambda x: x[j], pull),
+            pull=pull._replace(unit=sizes[j, pull.event.astype(int)] / self.sizes[0] ** 2),
             modes_agree=jnp.min(agree),
             order_margin=reduce(jnp.minimum, times_left, order_of_events),
             duration=time if timed else jnp.asarray(cycle_time(machine), x.dtype) * self.cycles,

@@ -13,14 +13,10 @@ import numpy as np
 from .._types import State
 from ..flow import simulate
 from ..machine import after_event, others_of, with_leaf
-from ._conditions import AbstractCondition, FixedComponent, Special
-from ._flight import Event
-from ._local_map import graze_at
-from ._motion_table import bifurcation_tests
-from ._problem import events_in
-from ._shooting import Shooting
-from ._sliding import SLIDING, change_at, without_part
-from ._solution import (
+from .boundary_events import PERIODS
+from .branch_events import bifurcation_tests
+from .conditions import AbstractCondition, FixedComponent, Special
+from .corrector import (
     Step,
     advance,
     jacobian_at,
@@ -30,9 +26,12 @@ from ._solution import (
     state_at,
     tangent_at,
 )
-from ._special_table import PERIODS
-from ._surgery import admissible_near, over_periods, repeated, without_events
-from ._words import (
+from .edit_events import admissible_near, over_periods, repeated, without_events
+from .equations import Shooting
+from .find import find_orbit
+from .flight import Event
+from .from_orbit import events_in
+from .kinds import (
     CROSSING,
     DOUBLING,
     FLIP,
@@ -48,9 +47,11 @@ from ._words import (
     TOGETHER,
     TORUS,
 )
-from .find import find_orbit
+from .local_map import graze_at
 from .results import Orbit
+from .sliding import SLIDING, change_at, without_part
 from .special import Point, point_at
+from .torus import Torus, torus_near
 
 _ORBIT = "orbit"
 
@@ -145,6 +146,11 @@ def _swapped(point: Point) -> Iterator[State]:
         for each in (after, event) if event.cycle == 0 else (after,):
             state, modes = after_event(machine, each.number, clock[i], state, modes)
         yield state
+
+
+def _torus(point: Point, distance: float) -> Torus:
+    name, width = point.problem.parameters[-1], float(point.scale[-1])
+    return torus_near(point.orbit, name, width, distance)
 
 
 def _search(
@@ -331,6 +337,7 @@ STARTS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] =
     (None, GRAZING): {_ORBIT: _orbit_beyond_grazing},
     (None, CROSSING): {_ORBIT: _crossing_orbit},
     (None, SYMMETRY): {_ORBIT: _crossing_orbit},
+    (None, TORUS): {"torus": _torus},
     (None, REST): {_ORBIT: _orbit_beyond_rest},
     **{(None, kind): {_ORBIT: _orbit_beyond_sliding} for kind in SLIDING},
     **{

@@ -17,13 +17,13 @@ from jax.flatten_util import ravel_pytree
 
 from ..flow import guard_rates
 from ..machine import after_event, events_of, guard_of, jump_of, stops_of
-from ._flight import Event, Flight
-from ._shooting import Shooting
-from ._solution import on_host, since_section, tangent_at
-from ._surgery import with_least_period, with_sections, without_events
-from ._turns import Path, turning_points
-from ._words import with_article
+from .corrector import on_host, since_section, tangent_at
+from .edit_events import with_least_period, with_sections, without_events
+from .equations import Shooting
+from .flight import Event, Flight
+from .kinds import with_article
 from .special import Point
+from .turns import Path, turning_points
 
 # A field that differs by less than this share of its size is continuous at a switch: a choice.
 _CONTINUOUS = 1e-9

@@ -22,6 +22,7 @@ from ..machine import (
     guard_of,
     prepared,
     section_number,
+    stop_in_words,
     stops_of,
 )
 
@@ -42,8 +43,7 @@ class Event(NamedTuple):
     def name_on(self, machine: AbstractMachine) -> str:
         event, events = self.of(machine), events_of(machine)
         if isinstance(event, RigidStop | SoftStop):
-            soft = "soft " if isinstance(event, SoftStop) else ""
-            return event.name or f"{event.side} {soft}stop"
+            return stop_in_words(machine, event)
         index = sum(other.word == event.word for other in events[: self.number])
         return event.name or f"{event.word} {index}"
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._checks import from_host
 from .._programs import compiled
 from .._types import Scalar, Scalars, State
 from ..flow import (
@@ -62,9 +63,9 @@ from ..machine import (
     with_modes,
     without_modes,
 )
-from ._flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
-from ._shooting import Shooting, Unknowns
-from ._solution import on_host, step_error
+from .corrector import on_host, step_error
+from .equations import Shooting, Unknowns
+from .flight import LANDS, LEAVES, Event, Flight, guard_at, section_of
 from .results import Orbit
 
 
@@ -201,24 +202,35 @@ def problem_of(
             "`ends_cycle` if it happens at `t - cycle`, or make the clock a component of the state."
         )
     period = float(orbit.duration) if autonomous else float(machine.cycle) * cycles
+    return equations_along(
+        machine, stepper, orbit.state, found, period, cycles, corners, (parameter,)
+    )
+
+
+def equations_along(
+    machine: AbstractMachine, method: AbstractMethod, state: State, found: list[Placed],
+    period: float, cycles: int, corners: list[AbstractMachine], parameters: tuple[str, ...] = (),
+) -> tuple[Shooting, np.ndarray]:  # fmt: skip
+    """Return the equations from event to event of a motion that begins in `state` on the section,
+    and its values of the unknowns. The steps of a flight are enough for all `corners`."""
     clocks, events = [place for place, _ in found], tuple(event for _, event in found)
     cycles_needed = longest_leg(clocks, events, period, cycles)
-    steps = steps_of(stepper, corners, without_modes(orbit.state), cycles_needed)
-    blank = Shooting(
-        machine, stepper, without_modes(orbit.state), cycles, (), (), steps, (parameter,)
-    )
-    states, modes = _follow_events(blank, orbit.state, found, period)
+    like = without_modes(state)
+    steps = steps_of(method, corners, like, cycles_needed)
+    blank = Shooting(machine, method, like, cycles, (), (), steps, parameters)
+    states, modes = _follow_events(blank, state, found, period)
     _check_instants(blank, found, states, modes)
     while steps_depend_on_motion(blank) and 2 * blank.steps <= _MOST:
         before = states
         blank = dataclasses.replace(blank, steps=2 * blank.steps)
-        states, modes = _follow_events(blank, orbit.state, found, period)
+        states, modes = _follow_events(blank, state, found, period)
         if np.max(np.abs(states - before) / _sizes(blank, states)) < _SETTLED:
             break  # keep the finer one: flights may need more steps along the branch
         blank = dataclasses.replace(blank, method=blank.method.tighter())
     problem = dataclasses.replace(blank, events=events, modes=modes)
     states = states[:-1] if found else states
-    x = problem.pack(np.asarray(clocks), states, [leaf(machine, parameter)], period)
+    values = np.array([leaf(machine, name) for name in parameters])
+    x = problem.pack(np.asarray(clocks), states, values, period)
     return with_sizes(problem, x), np.asarray(x)
 
 
@@ -235,7 +247,7 @@ def with_sizes(problem: Shooting, x: Unknowns, largest: np.ndarray | None = None
     if largest is not None and np.isfinite(largest).all():
         sizes = _sizes(problem, largest, _NOTHING)
     radian = period / problem.cycles / (2 * np.pi)
-    return dataclasses.replace(problem, sizes=jnp.append(radian, sizes))
+    return dataclasses.replace(problem, sizes=from_host(np.append(radian, sizes)))
 
 
 def with_grown_sizes(problem: Shooting, largest: np.ndarray) -> Shooting | None:
@@ -267,13 +279,13 @@ def _check_instants(
     guard is not zero there, so the equations cannot contain it."""
     machine, previous = blank.machine, 0.0
     span = max((abs(place) for place, _ in found), default=0.0)
-    sizes = blank.unravel(jnp.abs(jnp.asarray(states)).max(axis=0))
     for i, (place, event) in enumerate(found):
         if abs(place - previous) <= _SAME_INSTANT * span and event.cycle is None:
             state, modes = blank.unravel(jnp.asarray(states[i])), in_flight[i - 1]
             modes = tuple(jnp.asarray(mode) for mode in modes)
             before = Flight(machine, modes, blank.method, blank.like)
             guard = partial(guard_at, before, event, jnp.asarray(place))
+            sizes = blank.unravel(jnp.asarray(np.abs(states).max(axis=0)))
             if abs(float(guard(state))) > _OFF_ZERO * (float(size_of(guard, state, sizes)) or 1.0):
                 raise ValueError(
                     f"Argument `orbit` must have no event whose guard jumps, but that of "
@@ -316,16 +328,16 @@ def _follow_events(
     u, s = ravel_pytree(state)[0], 0.0
     states, in_flight = [], []
     # With clocks and steps as arguments, all flights share one program.
-    fly = partial(_fly, dataclasses.replace(blank, steps=1), float(blank.steps))
+    shared = dataclasses.replace(blank, steps=1)
+    fly = partial(_fly, shared, float(blank.steps))
     for place, event in found:
         if place > s:
             u = fly(modes, s, place, u)
         states.append(np.asarray(u))
-        after = blank.unravel(jnp.asarray(u))
         if (place, event.cycle) != (0.0, 0):  # the orbit's state is after that one
-            after, modes = after_event(machine, event.number, jnp.asarray(place), after, modes)
+            u, modes = _jump(shared, event.number, float(place), u, modes)
         in_flight.append(tuple(float(m) for m in modes))
-        u, s = ravel_pytree(after)[0], place
+        s = place
     states.append(np.asarray(fly(modes, s, period, u)))
     first = found[0][1] if found and found[0][1].cycle == 0 else None
     if first is not None and (jumps_on_section(machine) or first != section_of(machine, 0)):
@@ -414,17 +426,29 @@ def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, 
     kind, number, clock = (
         np.asarray(a) for a in (run.event_log.kind, run.event_log.number, run.event_log.phase)
     )
-    stops, switches = len(stops_of(machine)), len(switches_of(machine))
-    others = [kind == EventKind.mode, kind == EventKind.reset]
-    number = number + np.select(others, [stops, stops + switches], 0)
+    number = event_numbers(machine, kind, number)
     places = zip(*np.nonzero(kind >= 0), strict=True)
     return [(int(n), float(clock[n, j]), int(kind[n, j]), int(number[n, j])) for n, j in places]
+
+
+def event_numbers(machine: AbstractMachine, kind: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return the numbers among all events of the machine of those in an `EventLog`."""
+    stops, switches = len(stops_of(machine)), len(switches_of(machine))
+    others = [kind == EventKind.mode, kind == EventKind.reset]
+    return number + np.select(others, [stops, stops + switches], 0)
 
 
 @on_host
 def _fly(blank: Shooting, steps, modes, s0, s1, u):
     """Return the state at clock `s1`, from `u` at `s0`, without an event in between."""
     return Flight(blank.machine, modes, blank.method, blank.like).fly(s0, s1, u, steps)[0]
+
+
+@on_host
+def _jump(blank: Shooting, number: int, s, u, modes):
+    """Return the state and the modes after the event of this number."""
+    after, modes = after_event(blank.machine, number, s, blank.unravel(u), modes)
+    return ravel_pytree(after)[0], modes
 
 
 # Most events of a cycle that are logged, and of a period that are followed: choices.

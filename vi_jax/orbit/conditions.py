@@ -19,12 +19,12 @@ from jaxtyping import Array, Float
 from .._types import Scalar, Vector
 from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, quantity_of, units_of, with_leaf
-from ._chatter import Chatter
-from ._shooting import Observed, Shooting
-from ._sliding import SLIDING, excess_rates
-from ._solution import Step, jacobian_at, on_host
-from ._words import DOUBLING, REST, TORUS, TOUCHING
+from .corrector import Step, jacobian_at, on_host
+from .equations import Observed, Shooting
+from .kinds import DOUBLING, REST, TORUS, TOUCHING
+from .rest import Chatter
 from .results import compound
+from .sliding import SLIDING, excess_rates
 
 _SECTION = "section_"
 

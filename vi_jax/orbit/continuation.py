@@ -8,13 +8,25 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import flag, given_number, instance_of, interval, one_of, short, tuple_of_names
+from .._checks import (
+    flag,
+    from_host,
+    given_number,
+    instance_of,
+    interval,
+    one_of,
+    short,
+    tuple_of_names,
+)  # fmt: skip
 from ..flow import MethodLike
 from ..machine import check_leaf, leaf, may_rest
-from ._conditions import Special, hold_values, is_defective, known_names, rates_at, replacement_at
-from ._follow import check_walk, follow_both_ways, rescaled
-from ._motion_table import MotionTable
-from ._problem import (
+from .boundary_events import Intervals, SpecialTable
+from .branch_events import MotionTable
+from .conditions import Special, hold_values, is_defective, known_names, rates_at, replacement_at
+from .corrector import Step, advance, tangent_at
+from .curve import Boundary, Branch
+from .equations import Shooting
+from .from_orbit import (
     ADVICE,
     check_parameter,
     cycles_to_fly,
@@ -23,14 +35,11 @@ from ._problem import (
     steps_of,
     with_sizes,
 )
-from ._shooting import Shooting
-from ._sliding import SLIDING, change_at, without_part
-from ._solution import Step, advance, tangent_at
-from ._special_table import Intervals, SpecialTable
-from ._words import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, with_article
-from .curve import Boundary, Branch
+from .kinds import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, with_article
 from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
+from .sliding import SLIDING, change_at, without_part
 from .special import Point
+from .walk import check_walk, follow_both_ways, rescaled
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -104,7 +113,7 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if bool(orbit.rests > 0) or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
+    if int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
         problem, x = resting_problem_of(orbit, parameter, bounds, method)
     else:
         problem, x = problem_of(orbit, parameter, bounds, method)
@@ -216,7 +225,7 @@ def _check_watched(
 
 def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Shooting:
     """Set the sizes of the parameters, half the widths of their intervals."""
-    widths = jnp.asarray([0.5 * (high - low) for low, high in ranges])
+    widths = from_host(np.array([0.5 * (high - low) for low, high in ranges]))
     return dataclasses.replace(problem, widths=widths)
 
 
@@ -237,8 +246,9 @@ def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     if distance > _SAME and float(np.abs(np.asarray(orbit.multipliers) - 1).min()) < NEUTRAL:
         raise ValueError(
             "Argument `orbit` has a multiplier of exactly 1: branches cross there, or a component "
-            "of its state is neutral, such as a free position or a counter. Leave such a "
-            "component out of the state to follow the orbit."
+            "of its state is neutral, such as a free position, a counter, or the place at which "
+            "dry friction holds a body. Leave such a component out of the state to follow the "
+            "orbit."
         )
     if distance > _SAME:
         raise ValueError(

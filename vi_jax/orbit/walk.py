@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._checks import count, given_number
+from .._checks import count, from_host, given_number
 from .._messages import Interrupted, ReportProgress, at_work, warn
 from .._types import Vector
 from ..machine import nearest_images
-from ._problem import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
-from ._shooting import Shooting
-from ._solution import Step, advance, distance_along, locate_zero, on_host, step_error
-from ._surgery import half_difference, repeats_from
+from .corrector import Step, advance, distance_along, locate_zero, on_host, step_error
+from .edit_events import half_difference, repeats_from
+from .equations import Shooting
+from .from_orbit import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
 from .special import Point
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
@@ -176,7 +176,7 @@ def follow_both_ways(
 
     def make_result() -> Any:
         problem = max(back.table.problem, ahead.table.problem, key=lambda p: p.steps)
-        sizes = jnp.maximum(back.table.problem.sizes, ahead.table.problem.sizes)
+        sizes = from_host(np.maximum(back.table.problem.sizes, ahead.table.problem.sizes))
         problem = dataclasses.replace(problem, sizes=sizes)
         behind, before = (rescaled(w.steps, w.table.scale, problem.scale) for w in (back, ahead))
         first = len(behind) - 1
@@ -442,7 +442,7 @@ class Closing:
         problem = self.table.problem
         if not problem.events or problem.autonomous:
             return 0.0
-        return float(problem.period(jnp.asarray(step.x))) / problem.cycles
+        return problem.values(step.x)[2] / problem.cycles
 
     def _shift_cycles(self, x: np.ndarray, cycle: float, here: Step) -> np.ndarray:
         """Shift a motion by cycles and turns so that it is nearest to another one."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Flag, Scalar, State, Vector
 from ..flow import Rates, SmoothMachine, guard_rates
 from ..machine import event_of, events_of, guard_of, has_velocity, section_number, stops_of
-from ._flight import Flight, force_on
+from .flight import Flight, force_on
 
 # Newton's method has converged if it ends this close to a turn (as a share of the step): a choice.
 # The remainder changes the height in second order and is subtracted.

@@ -24,25 +24,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._messages import count_of
-from ._conditions import Special, is_defective, sum_of_minors
-from ._follow import SAME_CURVE, Ending, Event, Table, bound_rows
-from ._local_map import LocalMap, NoLocalMapError, graze_at
-from ._motion_table import bifurcation_tests
-from ._shooting import ROUNDING, Shooting
-from ._solution import (
+from .branch_events import bifurcation_tests
+from .conditions import Special, is_defective, sum_of_minors
+from .corrector import (
     MOST_SAMPLES,
     SPACING,
     Step,
     advance,
     crossing,
+    dip_of,
     distance_along,
     jacobian_and_rows,
     jacobian_at,
     locate_zero,
     on_host,
 )
-from ._surgery import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
-from ._words import (
+from .edit_events import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
+from .equations import ROUNDING, Shooting
+from .kinds import (
     AT_CODIMENSION_TWO,
     CROSSING,
     CUSP,
@@ -62,7 +61,9 @@ from ._words import (
     TORUS,
     TOUCHING,
 )
+from .local_map import LocalMap, NoLocalMapError, graze_at
 from .special import Point, point_at
+from .walk import SAME_CURVE, Ending, Event, Table, bound_rows
 
 # The thresholds here are choices.
 
@@ -400,12 +401,28 @@ def _zeros(problem: Shooting, steps: list[Step], test: Test) -> Iterator[tuple[f
         tested.append(test(step, like) if regular else (np.nan, like))
     for i, (here, new) in enumerate(itertools.pairwise(steps)):
         (before, like), (after, _) = tested[i], tested[i + 1]
-        if not (before * after < 0 or (after == 0 and before != 0)):
+        value = lambda s, like=like: test(s, like)[0]
+        scale, ends = max(abs(before), abs(after)), [(here, new)]
+        near, known = steps[i - 1 : i + 2], [x for x, _ in tested[i - 1 : i + 2]]
+        if i and (middle := _dip(problem, near, known, value)) is not None:
+            ends = [(here, middle), (new, middle)]
+        elif not (before * after < 0 or (after == 0 and before != 0)):
             continue
-        scale = max(abs(before), abs(after))
-        at = _zero(problem, here, new, lambda s, like=like: test(s, like)[0], scale)
-        if at is not None:
-            yield _place(problem, i, steps, at), at
+        for pair in ends:
+            at = _zero(problem, *pair, value, scale)
+            if at is not None:
+                yield _place(problem, i, steps, at), at
+
+
+def _dip(
+    problem: Shooting, steps: list[Step], values: list[float], test: Callable[[Step], float]
+) -> Step | None:
+    """Return a point between the last two of three at which a test has another sign than there."""
+    before, here, new = steps
+    back, ahead = distance_along(problem, before, here), distance_along(problem, here, new)
+    place = dip_of([-back, 0.0, ahead], values)
+    step = None if place is None else advance(problem, here.x, here.tangent, place)
+    return step if step is not None and bool(step.good) and test(step) * values[1] < 0 else None
 
 
 def _zero(

@@ -21,7 +21,7 @@ from .._programs import compiled
 from .._types import Flag, Scalar, State
 from ..flow import simulate
 from ..machine import frequency_ratio, own_modes, phase_at, with_modes
-from ._shooting import Shooting, Unknowns
+from .equations import Shooting, Unknowns
 from .results import ORBIT_RESULTS, Orbit
 from .root_finders import smallest_solution
 
@@ -295,6 +295,27 @@ def _known_bracket(
         middle = (low + high) // 2
         low, high = (middle, high) if value(places[middle]) * begin > 0 else (low, middle)
     return places[low], places[high]
+
+
+# A dip of a test within a step falls to this share of its values at the ends, by a parabola, or
+# beyond zero: a choice.
+_DIPS = 0.1
+
+
+def dip_of(places: list[float], values: list[float]) -> float | None:
+    """Return the place of the extremum of the parabola through three points, if their values have
+    one sign and the parabola comes near zero, or beyond, between the last two; else `None`."""
+    steps, heights = np.diff(places), np.sign(values[1]) * np.array(values)
+    if not (np.isfinite(heights).all() and heights.min() > 0 and steps.min() > 0):
+        return None
+    before, after = np.diff(heights) / steps
+    curvature = (after - before) / steps.sum()
+    slope = before + curvature * steps[0]
+    if not curvature > 0:
+        return None
+    shift = -0.5 * slope / curvature
+    is_low = heights[1] + 0.5 * slope * shift < _DIPS * heights[1:].min()
+    return float(places[1] + shift) if 0 < shift < steps[1] and is_low else None
 
 
 def find_zero_near(problem: Shooting, x: np.ndarray, test: Callable[[Step], float]) -> Step | None:

@@ -34,14 +34,19 @@ from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, jumps_on_section, section_in
-from ._conditions import HeldMultiplier, in_one_parameter, rates_at
-from ._flight import LANDS, LEAVES, section_of
-from ._flight import Event as MotionEvent
-from ._follow import Ending, Event, Table, bound_rows
-from ._shooting import ROUNDING, Shooting, Unknowns
-from ._sliding import SLIDING, change_at, locate_change
-from ._solution import SPACING, Step, advance, crossing, distance_along, observe, on_host, orbit_of
-from ._surgery import (
+from .conditions import HeldMultiplier, in_one_parameter, rates_at
+from .corrector import (
+    SPACING,
+    Step,
+    advance,
+    crossing,
+    dip_of,
+    distance_along,
+    observe,
+    on_host,
+    orbit_of,
+)
+from .edit_events import (
     ALIKE,
     ROUNDED,
     half_difference,
@@ -50,7 +55,10 @@ from ._surgery import (
     may_repeat,
     without_events,
 )
-from ._words import (
+from .equations import ROUNDING, Shooting, Unknowns
+from .flight import LANDS, LEAVES, section_of
+from .flight import Event as MotionEvent
+from .kinds import (
     CROSSING,
     DETAILS,
     DOUBLING,
@@ -69,7 +77,9 @@ from ._words import (
     place_in_words,
 )
 from .results import NEUTRAL, Orbit
+from .sliding import SLIDING, change_at, locate_change
 from .special import Point, further_of, point_at
+from .walk import Ending, Event, Table, bound_rows
 
 # These thresholds are choices; measured ones have the figure in the comment.
 
@@ -103,6 +113,9 @@ _AT_ZERO = 1e-5
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
 _MOST_HALVINGS = 17
 
+# Most parabolas to find a dip of a test within a step: one, if the dip is a parabola. A choice.
+_MOST_PARABOLAS = 3
+
 # Cosine of the angle between tangents of one branch so close to each other: a choice.
 _SAME_DIRECTION = 0.99
 
@@ -133,6 +146,7 @@ class MotionTable(Table):
         self.extrema, self.watched = extrema, watched
         self.symmetric = may_be_symmetric(problem, [problem.machine, *problem.corners(bounds)])
         self.size, self.duration = 0.0, 0.0  # those of the first motion
+        self._last_steps: tuple[Step, Step] | None = None
         self._last_numbers: tuple[Any, dict[tuple[str, str], tuple[float, float]]] = np.zeros(0), {}
 
     def advance(self, x, tangent, length) -> Step:
@@ -282,7 +296,12 @@ class MotionTable(Table):
     def points_between(self, here: Step, last: Step) -> Located:
         """Return bifurcations, extrema and zeros of watched functions between two points,
         sorted."""
-        found = [*self._bifurcations(here, last, _MOST_HALVINGS), *self._zeros(here, last)]
+        before, self._last_steps = self._last_steps, (here, last)
+        middle = None
+        if before is not None and before[1] is here:
+            middle = self._dip_between(before[0], here, last)
+        steps = (here, last) if middle is None else (here, middle, last)
+        found = [*self._split_bifurcations(steps, _MOST_HALVINGS), *self._zeros(here, last)]
         return sorted(found, key=lambda f: distance_along(self.problem, here, f[1]))
 
     def _zeros(self, here: Step, last: Step) -> Iterator[tuple[Point, Step]]:
@@ -347,6 +366,28 @@ class MotionTable(Table):
         if middle is None or not bool(middle.good):
             return self._double_bifurcation(here, last) or found
         return self._split_bifurcations((here, middle, last), halves_left - 1)
+
+    def _dip_between(self, before: Step, here: Step, last: Step) -> Step | None:
+        """Return a point between two at which a test has the other sign than at both: two
+        bifurcations in one step. The parabola through three points says where to look."""
+        length = distance_along(self.problem, here, last)
+        earlier = -distance_along(self.problem, before, here)
+        ends = [(s, step, bifurcation_tests(step)) for s, step in ((0.0, here), (length, last))]
+        first = earlier, before, bifurcation_tests(before)
+        for kind in ends[0][2]:
+            points = [first, *ends]
+            for _ in range(_MOST_PARABOLAS):
+                place = dip_of([s for s, _, _ in points], [tests[kind] for *_, tests in points])
+                if place is None or not 0 < place < length:
+                    break
+                step = self.advance(here.x, here.tangent, place)
+                if not bool(step.good):
+                    break
+                tests = bifurcation_tests(step)
+                if tests[kind] * ends[0][2][kind] < 0:
+                    return step
+                points = [ends[0], (place, step, tests), ends[1]]
+        return None
 
     def _split_bifurcations(self, steps: tuple[Step, ...], halves_left: int) -> Located:
         parts = (self._bifurcations(a, b, halves_left) for a, b in itertools.pairwise(steps))

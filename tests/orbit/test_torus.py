@@ -1,0 +1,119 @@
+"""Tori of maps of a ring, whose curves, exponents and windows have closed forms."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from kicked import Kicked, at
+
+TWIST, SHEAR = 0.3, 0.7
+
+
+class Ring(Kicked):
+    """In polar coordinates r ← r (1 + b - r²), φ ← φ + 2πa + 0.3 r² + locking r³ sin 3φ, seen as
+    (x, y + 0.7 x²). The curve r = √b has the exponent ln(1 - 2b), and without locking the rotation
+    number a + 0.3 b/2π."""
+
+    locking: Any = eqx.field(default=0.0, kw_only=True, converter=jnp.asarray)
+
+    def kick(self, *state):
+        x, y = state
+        y = y - SHEAR * x**2
+        square, cubic = x**2 + y**2, 3 * x**2 * y - y**3
+        turn = 2 * jnp.pi * self.a + TWIST * square + self.locking * cubic
+        growth, c, s = 1 + self.b - square, jnp.cos(turn), jnp.sin(turn)
+        x, y = growth * (c * x - s * y), growth * (s * x + c * y)
+        return x, y + SHEAR * x**2
+
+
+def rotation_of(a, b):
+    return a + TWIST * b / (2 * np.pi)
+
+
+@pytest.fixture(scope="module")
+def torus():
+    return vi.find_torus(Ring(0.21, 0.1), at(0.3, 0.1), settle=500)
+
+
+def test_a_torus_from_a_run(torus):
+    assert torus.successful and not torus.reason, torus
+    assert torus.rotation == pytest.approx(rotation_of(0.21, 0.1), abs=1e-13)
+    np.testing.assert_allclose(torus.exponents, [0, np.log(0.8)], atol=1e-11)
+    assert torus.tail < 1e-11 and torus.residual < 1e-12
+    x, y = torus.at(np.linspace(0, 1, 50))
+    np.testing.assert_allclose(np.hypot(x, y - SHEAR * x**2), np.sqrt(0.1), atol=1e-12)
+    turned = np.unwrap(np.arctan2(y - SHEAR * x**2, x)) / (2 * np.pi)
+    np.testing.assert_allclose(np.abs(np.diff(turned)), 1 / 49, atol=1e-12)
+    assert torus.clearance == torus.slowest_impact == np.inf
+    assert torus.states[0].shape == (torus.nodes,) and "rotation number 0.2147" in repr(torus)
+
+
+def test_too_few_nodes_are_noticed_by_tail_and_residual():
+    machine = Ring(0.3, 0.1, locking=1.0)
+    coarse = vi.find_torus(machine, at(0.3, 0.1), settle=500, nodes=9)
+    assert not coarse.successful and coarse.tail > 1e-4 and coarse.residual > 1e-4
+    assert "not resolved by 9 nodes" in coarse.reason
+
+
+def test_a_family_ends_at_the_neimark_sacker_point(torus):
+    family = vi.continue_torus(torus, parameter="b", bounds=(-0.1, 0.2), max_step=0.2)
+    assert family.ends == ("neimark-sacker", "bounds"), family
+    b = family.parameter
+    assert 0 < b[0] < 0.05 and b[-1] == 0.2
+    np.testing.assert_allclose(family.rotation, rotation_of(0.21, b), atol=1e-12)
+    np.testing.assert_allclose(family.exponents[:, 1], np.log(1 - 2 * b), atol=1e-9)
+    there = family.at(0.15)
+    machine: Any = there.machine
+    assert float(machine.b) == pytest.approx(0.15, abs=1e-14)
+    assert there.rotation == pytest.approx(rotation_of(0.21, 0.15), abs=1e-12)
+    with pytest.raises(ValueError, match="`value` must lie between"):
+        family.at(0.3)
+
+
+def test_a_torus_from_a_neimark_sacker_point():
+    orbit = vi.find_orbit(Ring(0.21, -0.05), at(0.01, 0.01), throw=True)
+    branch = vi.continue_orbit(orbit, parameter="b", bounds=(-0.2, 0.2))
+    (point,) = (point for point in branch.special if point.kind == "neimark-sacker")
+    assert point.parameter == pytest.approx(0, abs=1e-12)
+    for distance in (0.05, 0.1):
+        torus = point.switch(distance=distance)
+        b = float(torus.machine.b)
+        assert b > 0 and torus.successful, torus
+        assert torus.rotation == pytest.approx(rotation_of(0.21, b), abs=1e-12)
+        np.testing.assert_allclose(torus.exponents, [0, np.log(1 - 2 * b)], atol=1e-9)
+    assert vi.find_torus(orbit.machine, point).rotation == pytest.approx(0.21, abs=1e-3)
+
+
+def test_a_window_of_locking():
+    """On r = √b the angle moves by 2πa + 0.3 b + locking b³ᐟ² sin 3φ: it locks to 1:3 where that is
+    2π/3 at some φ."""
+    machine, b = Ring(0.3, 0.1, locking=0.05), 0.1
+    torus = vi.find_torus(machine, at(0.3, 0.1), settle=500)
+    family = vi.continue_torus(torus, parameter="a", bounds=(0.29, 0.35))
+    assert family.ends == ("bounds", "bounds")
+    (window,) = (window for window in family.windows if window.q == 3)
+    middle = 1 / 3 - TWIST * b / (2 * np.pi)
+    half = 0.05 * b**1.5 / (2 * np.pi)
+    assert (window.p, window.q) == (1, 3)
+    np.testing.assert_allclose(
+        [window.low, window.high], [middle - half, middle + half], atol=1e-12
+    )
+    orbit = window.orbit
+    assert orbit.successful and orbit.stable and int(orbit.cycles) == 3
+    locked: Any = orbit.machine
+    assert window.low < float(locked.a) < window.high
+
+
+def test_motions_that_are_no_torus_are_refused():
+    with pytest.raises(ValueError, match="this one repeats after 1 cycle: find"):
+        vi.find_torus(Ring(0.21, -0.2), at(0.1, 0.1))
+    with pytest.raises(ValueError, match="this one repeats after 5 cycles: find"):
+        vi.find_torus(Ring(0.2 - TWIST * 0.1 / (2 * np.pi), 0.1), at(0.3, 0.1))
+    with pytest.raises(ValueError, match=r"agree to [0-4]\.?\d* digits only"):
+        vi.find_torus(Ring(0.21, 1.4), at(0.3, 0.1))
+    with pytest.raises(ValueError, match="`nodes` must be odd"):
+        vi.find_torus(Ring(0.21, 0.1), at(0.3, 0.1), nodes=32)
