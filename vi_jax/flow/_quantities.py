@@ -29,6 +29,7 @@ from ..machine import (
     near_names,
     overridden,
     shown_modes,
+    with_some_past,
 )
 from .machine_checks import explain_errors
 
@@ -59,6 +60,7 @@ def average_names(machine: AbstractMachine, start: State) -> tuple[str, ...]:
     them jumps."""
     if not has_averages(machine):
         return ()
+    machine = with_some_past(machine, start)
     zero = jnp.zeros((), jnp.result_type(machine.position(start)))
     modes = shown_modes(machine, begin_modes(machine, zero, start))
     names = _checked_names(machine, "averages", machine.averages, start, (zero, start, *modes))

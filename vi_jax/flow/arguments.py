@@ -55,6 +55,7 @@ from ..machine import (
     modes_of,
     shown_modes,
     stops_of,
+    with_some_past,
     without_modes,
 )
 from ..machine import State as NamedState

@@ -25,7 +25,6 @@ from .._checks import concrete
 from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
-    FixedPast,
     HybridState,
     Recorded,
     delays_in,
@@ -39,6 +38,7 @@ from ..machine import (
     recorded_numbers,
     renews,
     size_of,
+    with_fixed_past,
     without_modes,
     without_past,
 )
@@ -183,8 +183,7 @@ def with_history(
             f"Argument `start` must have the history of a {type(machine).__name__}, but has that "
             "of another machine."
         )
-    past = [form.pack(before(-lag)) for lag in lags]
-    bound = reading(machine, FixedPast(form.by_name(past)))
+    bound = with_fixed_past(machine, form, before)
     return bound, Memory(form, pieces, jnp.ones(form.size, dtype))
 
 
@@ -201,12 +200,6 @@ def check_delays(machine: AbstractMachine, method: AbstractMethod) -> None:
             f"A {kind} must not have both `delays` and `renewed`, since its history would jump. "
             "Leave `renewed` out, and use differences of the drifting component."
         )
-
-
-def with_some_past(machine: AbstractMachine, start: State) -> AbstractMachine:
-    """Return a machine with its history at the start as its past, for checks; unchanged without
-    delays."""
-    return with_history(machine, start, None)[0] if has_delays(machine) else machine
 
 
 def with_first_history(machine: AbstractMachine, start: State) -> State:
@@ -232,9 +225,10 @@ def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
             )
         return size
     known = [concrete(x) for x in (machine.cycle, *lags)]
-    if any(x is None or x.ndim for x in known):
+    numbers = [float(x) for x in known if x is not None and x.ndim == 0]
+    if len(numbers) < len(known):
         return _UNKNOWN
-    cycle, *lengths = (float(x) for x in known)
+    cycle, *lengths = numbers
     # An odd number: places of many lanes at multiples of a power of two share the cache's lines.
     return int(min(_FEWEST + _PER_CYCLE * max(lengths) / cycle, 1e5)) | 1
 
@@ -259,9 +253,9 @@ def history_of_function(
     length = longest * (1 + 1e-6) / number
 
     def piece(n: Scalar) -> Array:
-        ends = [_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0)]
+        first, last = (_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0))
         head = jnp.stack([length, -jnp.ones_like(length)])
-        return jnp.concatenate([head, _in_time(hermite(*ends, length), length, unit)])
+        return jnp.concatenate([head, _in_time(hermite(first, last, length), length, unit)])
 
     rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
     rows = jnp.concatenate([rows, jnp.zeros((room - number, rows.shape[1]), rows.dtype)])
@@ -379,7 +373,8 @@ def _window(
     passed = stop_gradient(s - delay) + slack
     width = history.rows.shape[1]
     number = jnp.mod(stop_gradient(history.head - place), size)
-    starts, keys, pieces, known = [start], [-jnp.inf], [], [start]
+    starts, pieces, known = [start], [], [start]
+    keys: list[Any] = [-jnp.inf]
     closed = jnp.zeros_like(start, bool)
     image, level, reach = jnp.full_like(start, jnp.inf), -jnp.ones_like(start), s + delay
     for n in range(_WINDOW + 1):  # of the last, only the start is used

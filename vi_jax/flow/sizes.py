@@ -33,6 +33,7 @@ from ..machine import (
     scales_known,
     size_of,
     stops_of,
+    with_some_past,
     without_modes,
 )
 from .smooth import in_modes, stops_are_exact
@@ -84,8 +85,6 @@ def row_sizes(machine: AbstractMachine, start: State, rows: Array | None = None)
     along a motion, from `start` and `rows` (..., states). It is 1 for an angle, for a number that
     is zero to rounding, and for a machine whose numbers are about 1 by definition. States are
     compared relative to these sizes."""
-    from .history import with_some_past  # which needs the unit of s
-
     state = jtu.tree_map(lambda x: 1.0 * jnp.asarray(x), without_modes(start))  # integers too
     machine = with_some_past(machine, state)
     row, unravel = ravel_pytree(stop_gradient(state))

@@ -453,10 +453,11 @@ def _with_blocks(
             found = _patched(t, x, window, changed)
             if found is not None:
                 return found
+    out: Any = x
     if mask is None:
         out = _copy(t, x, not isinstance(update, Registers))
     else:
-        out, update = x, update if isinstance(update, Registers) else stored(t, update)
+        update = update if isinstance(update, Registers) else stored(t, update)
 
     def put(index: tuple[Index, ...]) -> None:
         place, inside = corner([i for o, i in enumerate(index) if o not in axes])

@@ -121,7 +121,8 @@ def write(
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
-        given, first = [read(a) for a in eqn.invars], next(iter(eqn.invars), None)
+        given: list[Any] = [read(a) for a in eqn.invars]
+        first = next(iter(eqn.invars), None)
         in_place = eqn.primitive.name in IN_PLACE and isinstance(given[0], Strided)
         if in_place and first in last.get(number, ()) and first in own:
             for var, x in env.items():  # what may read the old numbers later

@@ -29,7 +29,7 @@ from .declared import (
 )
 from .delay import (
     FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
-    recorded_numbers, without_past,
+    recorded_numbers, with_fixed_past, with_some_past, without_past,
 )
 from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .drives import (

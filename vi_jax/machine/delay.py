@@ -113,6 +113,21 @@ class FixedPast(eqx.Module):
         return self.past
 
 
+def with_fixed_past(machine: Machine, form: Recorded, before: Callable[[Scalar], Any]) -> Machine:
+    """Return a machine that reads the history before the start, each delay ago, at all times."""
+    past = [form.pack(before(-jnp.asarray(x, float))) for x in delays_in(machine).values()]
+    return reading(machine, FixedPast(form.by_name(past)))
+
+
+def with_some_past(machine: Machine, start: State) -> Machine:
+    """Return a machine with its history at the start as its past, for checks; unchanged without
+    delays."""
+    if not has_delays(machine):
+        return machine
+    before = history_before(machine, start)
+    return with_fixed_past(machine, form_of(machine, start, before), before)
+
+
 # --- the form of a machine in which its past is bound to it
 
 
@@ -254,7 +269,7 @@ def recorded_numbers(
 
 
 def _recorded(
-    machine: Machine, structure: Any, shapes: Any, s: Scalar, state: State, modes: Scalars
+    machine: Any, structure: Any, shapes: Any, s: Scalar, state: State, modes: Scalars
 ) -> Any:
     original = without_past(machine)
     whose = f"`recorded` of a {type(machine).__name__}"

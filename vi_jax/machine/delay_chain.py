@@ -170,7 +170,7 @@ def _longest(machine: Any) -> Any:
 
 
 @functools.lru_cache(maxsize=16)
-def _differences(p: int) -> Array:
+def _differences(p: int) -> np.ndarray:
     """Return the matrix that maps values at Chebyshev nodes, from 1 to -1, to derivatives there."""
     x = _nodes(p)
     c = np.r_[2, np.ones(p - 1), 2] * (-1.0) ** np.arange(p + 1)

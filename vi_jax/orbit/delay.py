@@ -37,10 +37,12 @@ def as_chain(machine: AbstractMachine, guess: Any) -> tuple[AbstractMachine, Any
     orbits as a state of the chain; another machine and its guess unchanged."""
     if not has_delays(machine):
         return machine, guess
-    chain: Any = delay_chain(machine)
     if guess is None or isinstance(guess, Orbit):
-        return chain, guess
-    is_batch = jnp.ndim(machine.position(without_modes(guess))) > 0
+        return delay_chain(machine), guess
+    state = without_modes(guess)
+    is_batch = jnp.ndim(machine.position(state)) > 0
+    first = jax.tree.map(lambda x: x[0], state) if is_batch else state
+    chain: Any = delay_chain(machine, start=first)
     return chain, (jax.vmap(chain.chained) if is_batch else chain.chained)(guess)
 
 
