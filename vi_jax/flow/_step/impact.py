@@ -434,7 +434,7 @@ def bring_to_rest(
         path, free = step.trial.paths[k], step.trial.free_machines[k]
         # At the event, not at the step's end: its derivatives include the event's time.
         position = step.plan.machine.coordinates[k].position
-        rate = rates(free.field, position, lane.s, at_event).v
+        rate = jax.jvp(position, (at_event,), (free.field(lane.s, at_event),))[1]
         speed = impact.share * jnp.maximum(sign * rate, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
         arguments = k, impact, speed, lane._replace(state=at_event), growth
