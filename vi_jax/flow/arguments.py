@@ -159,7 +159,7 @@ def make_plan(
     if isinstance(machine, Scene):
         _check_scalars(machine=machine, start=start)
     _check_numbers(machine)
-    check_start(machine, start, repeats=cycles > 1 or concrete(options.settle) != 0)
+    check_start(machine, start, repeats=bool(cycles > 1 or concrete(options.settle) != 0))
     if options.begin is None:
         check_prescribed(machine, start)
     machine, start = of_one_type(machine, start)
