@@ -51,6 +51,7 @@ from .machine import SliderCrank as SliderCrank
 from .machine import SoftStop as SoftStop
 from .machine import State as State
 from .machine import Switch as Switch
+from .machine import delay_chain as delay_chain
 from .machine import falling as falling
 from .machine import rising as rising
 from .machine import turn_of as turn_of

@@ -6,7 +6,7 @@ import os
 import reprlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache, partial
+from functools import lru_cache, partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -394,3 +394,29 @@ def concrete(value: object) -> np.ndarray | None:
     if isinstance(value, Tracer):
         return None
     return np.asarray(value)
+
+
+def array_module(*values: object) -> Any:
+    """Return `jax.numpy` if one of the values is a JAX array, traced or not, else `numpy`."""
+    return jnp if any(isinstance(x, jax.Array) for x in values) else np
+
+
+def on_host(tree: Any) -> Any:
+    """Return a tree whose JAX arrays are NumPy arrays. JAX compiles each operation on arrays
+    outside of a program, which takes about 20 ms."""
+    return jtu.tree_map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
+
+
+def by_numpy_if_known(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Decorator: apply a method to `on_host` of its object, if all numbers are known there."""
+
+    @wraps(method)
+    def applied(self: Any) -> Any:
+        leaves = jtu.tree_leaves(self)
+        if any(isinstance(x, Tracer) or not eqx.is_array_like(x) for x in leaves):
+            return method(self)
+        if not any(isinstance(x, jax.Array) for x in leaves):
+            return method(self)
+        return jtu.tree_map(jnp.asarray, method(on_host(self)))
+
+    return applied

@@ -2,7 +2,11 @@
 
 import functools
 import itertools
+import subprocess
+import sys
 
+import diffrax
+import jax
 import numpy as np
 import pytest
 import vi_jax as vi
@@ -67,3 +71,19 @@ def test_order_conditions(b, order):
     """Conditions up to the order hold to rounding; some of the next order do not."""
     assert max(worst(b, n) for n in range(1, order + 1)) < 2e-15
     assert worst(b, order + 1) > 1e-8
+
+
+def test_is_a_diffrax_solver_that_is_loaded_when_used():
+    solver = vi.Verner9()
+    assert isinstance(solver, diffrax.AbstractERK) and solver.order(None) == 9
+    # One program for both.
+    structures = [jax.tree.structure(vi.Adaptive(*x)) for x in ([], [solver])]
+    assert structures[0] == structures[1]
+    slow = "('diffrax', 'lineax', 'optimistix', 'optax', 'scipy', 'matplotlib')"
+    run = f"""
+import sys, vi_jax as vi
+scene = vi.Scene.ideal(frequency_ratio=0.87, restitution=0.6, gap=2.0, damping_ratio=0.0)
+print(vi.find_orbit(scene, scene.start(Y=1.6, V=-1.9), cycles=2).result)
+print([x for x in {slow} if x in sys.modules])"""
+    out = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["ORBIT_RESULTS.successful", "[]"]

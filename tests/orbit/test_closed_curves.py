@@ -88,3 +88,41 @@ def test_a_branch_closes_at_the_same_motion_a_cycle_later():
     assert abs(turned[-1] - turned[0]) == pytest.approx(np.pi, abs=1e-6)
     folds = [point.parameter for point in branch.special if point.kind == "fold"]
     np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)
+
+
+class Star(vi.AbstractMachine):
+    """z ← R (z - G/5) in the plane, with a turn R by 2π/7, and G = 0 where |z| = 1 and z⁷ has the
+    real part a. A clock that starts again at each kick ends the cycles, which no drive counts."""
+
+    a: float
+    cycle = 1.0
+
+    @property
+    def events(self):
+        return (vi.Reset(lambda machine, s, x: x.t - 1, Star.kick, ends_cycle=True),)
+
+    def kick(self, s, x):
+        c, d = 1.0, 0.0
+        for _ in range(7):
+            c, d = c * x.x - d * x.y, c * x.y + d * x.x
+        first, second = x.x**2 + x.y**2 - 1, c - self.a
+        u, v = x.x - 0.2 * (x.x * first - x.y * second), x.y - 0.2 * (x.y * first + x.x * second)
+        c, d = np.cos(2 * np.pi / 7), np.sin(2 * np.pi / 7)
+        return vi.State(x=c * u - d * v, y=d * u + c * v, t=0.0)
+
+    def field(self, s, x):
+        return vi.State(x=0.0 * x.x, y=0.0 * x.y, t=1.0)
+
+
+def test_a_branch_without_a_drive_closes_at_the_same_motion_a_cycle_later():
+    """A round of the isola leads from z to the next of the seven z, the motion one cycle later."""
+    angle = np.arccos(0.3) / 7
+    start = vi.State(x=np.cos(angle), y=np.sin(angle), t=0.0)
+    orbit = vi.find_orbit(Star(0.3), start, 7, throw=True)
+    branch = vi.continue_orbit(orbit, parameter="a", bounds=(-3.0, 3.0))
+    assert branch.ends == ("closed", "closed")
+    angles = np.unwrap(np.arctan2(branch.column("section_y"), branch.column("section_x")))
+    np.testing.assert_allclose(np.cos(7 * angles), branch.parameter, atol=1e-10)
+    assert abs(angles[-1] - angles[0]) == pytest.approx(2 * np.pi / 7, abs=1e-6)
+    folds = [point.parameter for point in branch.special]
+    np.testing.assert_allclose(np.sort(folds), [-1, 1], atol=1e-9)

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.orbit import _special_table as module
+from vi_jax.orbit._local_map import NoLocalMapError
 
 from grazings import grazing_of
 
@@ -67,7 +69,7 @@ def test_a_fold_and_a_doubling_graze_where_a_grazing_is_resonant(kind, frequency
     assert meets.detail.endswith("with one impact in 1 period")
 
 
-def test_resonant_grazings_of_a_linear_oscillator():
+def test_resonant_grazings_of_a_linear_oscillator(monkeypatch):
     """eₙ ∝ sin(2πn ω_d/ω) vanishes at ω = 2n ω_d/m, with the damped frequency ω_d. A motion of n
     cycles begins there if all earlier entries are positive."""
     damped = np.sqrt(1 - 0.05**2)
@@ -93,6 +95,17 @@ def test_resonant_grazings_of_a_linear_oscillator():
         # There the motion without impacts has the gap, 1, as its amplitude.
         swing = np.hypot(1 - frequency**2, 0.1 * frequency)
         assert amplitude == pytest.approx(swing, rel=1e-10)
+
+    def without_first(point):
+        if np.array_equal(point.parameters, curve.parameters[0]):
+            raise NoLocalMapError("Argument `point` must be a grazing at which the motion turns.")
+        return graze_at(point)
+
+    # One step without a local map does not hide the others.
+    graze_at = module.graze_at
+    monkeypatch.setattr(module, "graze_at", without_first)
+    again = module.points_of(curve.problem, curve.steps, curve.ends)
+    assert [point.parameters[1] for point in again] == [p.parameters[1] for p in curve.special]
 
 
 @pytest.mark.parametrize(

@@ -98,3 +98,38 @@ def test_minimal_kick_raises_if_modes_do_not_follow_from_the_state(orbit):
     """Perturbed starts have the machine's initial modes, which are not those of the orbit."""
     with pytest.raises(ValueError, match="must have modes that follow from its state"):
         vi.minimal_kick(orbit.machine, orbit, progress=False)
+
+
+class Other(Flipped):
+    def modes(self, s, x):
+        return (-1.0,)
+
+
+def test_basins_follow_the_modes_of_each_start(orbit, start):
+    """The section with the greatest position is in another mode than the starts."""
+    region = {"start.Y": (-1.5, -1.3), "start.V": (-0.1, 0.1)}
+    options = {"start": start, "resolution": 3, "settle": 300, "longest": 4, "progress": False}
+    (motion,) = vi.basins(Other(), region, **options).attractors
+    order, wanted = np.argsort(motion.sections["Y"]), np.argsort(orbit.sections.Y)
+    np.testing.assert_allclose(motion.sections["Y"][order], orbit.sections.Y[wanted], atol=1e-6)
+    np.testing.assert_array_equal(motion.modes[0][order], orbit.modes[0][wanted])
+
+
+class Marked(Flipped):
+    """The mode does not change, nor does it act."""
+
+    depth: Any = 0.0
+    contacts: tuple = (vi.RigidStop(0.1, 0.8),)
+
+
+@pytest.mark.parametrize(("machine", "motions"), [(Marked(), 2), (Flipped(depth=0.0), 1)])
+def test_motions_in_other_modes_are_others(machine, motions, start):
+    """The mode does not act, so that the sections of all these motions are the same."""
+    start = vi.simulate(machine, start, 600).last.state
+    state = vi.OscillatorState(jnp.full(2, start.Y), jnp.full(2, start.V))
+    guesses = vi.HybridState(state, (jnp.array([1.0, -1.0]),))
+    found, counts = vi.distinct_orbits(vi.find_orbit(machine, guesses, 4))
+    assert len(found) == motions and counts.sum() == 2
+    scanned = vi.scan(machine, {"depth": [0.0]}, measure="regime", start=start, settle=9)
+    assert int(scanned.period[0]) == int(found[0].cycles)
+    assert all(float(orbit.impacts) % 2 == 0 for orbit in found if motions == 1)

@@ -110,6 +110,36 @@ def test_changes_of_source_change_the_identity(identities, old, new, changed):
     assert {name for name in before if before[name] != after[name]} == changed
 
 
+@pytest.mark.parametrize(
+    ("study", "changed"),
+    [
+        ("import parts\ndef measure(m, run):\n    return parts.gain(run)\n", True),
+        ("import parts\ndef measure(m, run):\n    return parts.other(run)\n", False),
+        ("import parts as p\ndef measure(m, run):\n    return (lambda: p.gain(run))()\n", True),
+        ("def measure(m, run):\n    import parts\n    return parts.gain(run)\n", True),
+        ("from parts import gain\ndef measure(m, run):\n    return [*map(gain, run)]\n", True),
+    ],
+)  # fmt: skip
+def test_helpers_in_modules_change_the_identity(tmp_path, monkeypatch, study, changed):
+    helpers = "FACTOR = 2\ndef gain(x):\n    return FACTOR * x\ndef other(x):\n    return x\n"
+    found = []
+    for factor in "23":
+        folder = tmp_path / factor
+        folder.mkdir()
+        (folder / "parts.py").write_text(helpers.replace("2", factor))
+        (folder / "work.py").write_text(study)
+        with monkeypatch.context() as patched:
+            patched.syspath_prepend(folder)
+            for name in ("parts", "work"):
+                patched.delitem(sys.modules, name, raising=False)
+            import parts  # noqa: F401
+            import work
+
+            found.append(identity(work.measure))
+    assert not any(one.startswith(UNVERIFIABLE) for one in found)
+    assert (found[0] != found[1]) == changed
+
+
 @pytest.mark.slow
 def test_the_identity_does_not_depend_on_the_process(tmp_path):
     """The order of sets differs between the processes."""

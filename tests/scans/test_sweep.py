@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.scans import moved_by_stops
 
 SCENE = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.01)
 
@@ -13,10 +14,32 @@ def test_a_sweep_moves_the_body_with_an_approaching_stop():
     sweep = vi.sweep(SCENE, "stops.0.gap", gaps, settle=50, cycles=8)
     assert bool(sweep.successful.all())
     assert (np.asarray(sweep.y_max) <= np.array(gaps) + 1e-12).all()
+    moved = moved_by_stops(SCENE, SCENE.start(Y=3.0, V=-0.7))
+    assert (float(moved.Y), float(moved.V)) == (2.0, -0.7)
     with pytest.raises(ValueError, match="beyond a stop"):
         vi.sweep(SCENE, "stops.0.gap", gaps, start=SCENE.start(Y=3.0))
     with pytest.raises(ValueError, match="in one row"):
         vi.sweep(SCENE, "stops.0.gap", [])
+
+
+@pytest.mark.slow
+def test_a_sweep_stays_on_its_branch_wherever_the_section_is():
+    """Two motions of two cycles exist, with one impact and with two. Just before an impact the stop
+    overtakes the body, which approaches it; just after, the body leaves it."""
+    scene = vi.Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=2.0, damping_ratio=0.02)
+    orbit = vi.find_orbit(scene, scene.start(Y=1.2827, V=1.0074), 2, throw=True)
+    motion, speeds = vi.simulate(scene, orbit.state, 1, samples=500).samples, []
+    for offset in (-1.0, -1e-4, 1e-4):
+        phase = float(orbit.impact_phase[0] + offset) % (2 * np.pi)
+        i = round(phase / (2 * np.pi) * 500)
+        near = scene.start(Y=motion.state.Y[i], V=motion.state.V[i])
+        moved = scene.at_section(phase)
+        start = vi.find_orbit(moved, near, 2, throw=True).state
+        options = {"start": start, "settle": 200, "cycles": 8, "progress": False}
+        sweep = vi.sweep(moved, "stops.0.gap", [2.0, 1.994, 1.988], **options)
+        assert sweep.impacts.tolist() == [1, 1, 1] and sweep.period.tolist() == [2, 2, 2]
+        speeds.append(sweep.impact_speed)
+    np.testing.assert_allclose(speeds, [speeds[0]] * 3, rtol=1e-9)
 
 
 def _described(y_min, period, impacts, zeta=None):

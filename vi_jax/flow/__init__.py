@@ -1,5 +1,7 @@
 """Simulation: methods of integration, the hybrid step, closed forms, `simulate` and its results."""
 
+from typing import TYPE_CHECKING, Any
+
 # The names that other packages import.
 # ruff: noqa: F401, I001
 # fmt: off
@@ -14,7 +16,7 @@ from .events import Rates, force_rate, guard_rates
 from .sizes import rounding_bounds, row_sizes, sizes_on_host
 from .methods import (
     AbstractMethod, Adaptive, ExactFlight, FixedStep, ImplicitSteps, MethodLike, Taylor,
-    Unrolled, Verner9, chosen, preset,
+    chosen, preset,
 )
 from .methods.exact import lack_of_closed_form
 from .noise import WhiteNoise, check_noise, lane_key, words_of
@@ -26,3 +28,14 @@ from .smooth import (
     TIME, Integrals, SmoothMachine, carried, elapsed, in_modes, means,
 )
 from .suggest import Suggestion, suggest_method
+
+if TYPE_CHECKING:
+    from .methods.solvers import Unrolled, Verner9
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ("Unrolled", "Verner9"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from .methods import solvers  # loads diffrax
+
+    return getattr(solvers, name)

@@ -130,6 +130,11 @@ class Lane(NamedTuple):
     come at times known in advance."""
     completed: Flag | None = None
     """True if the interval is complete, while events are applied; `None` between steps."""
+    history: Any = None
+    """The history of a machine with delays, between steps (see `history.py`)."""
+    slip: Scalar | None = None
+    """A number of value 0 with the derivative of the last event's time relative to `s`, in a step
+    of a machine with delays."""
 
     def end_if(self, happened: Flag, condition: Flag | None, reason: str | float) -> "Lane":
         """Return the lane, ended with `reason` (a name in `RESULTS` or its number) if an event
@@ -232,6 +237,11 @@ class Plan(eqx.Module):
     """The machine's own modes at the start, if the start contains them."""
     stop: Any = None
     """A condition that ends a lane early (see `RunOptions`); the rest of its record is NaN."""
+    history: Any = None
+    """The history of a machine with delays at the start, and in `memory` its constants."""
+    memory: Any = None
+    view: Any = None
+    """The part of the history that the current step reads."""
 
     sizes: State | None = None
     """The size of each number of the state (see `sizes.sizes_of`), at most 1."""
@@ -253,6 +263,15 @@ class Plan(eqx.Module):
             return extent
         in_mode_zero = lane.modes[mode_number(self.machine, number)] == 0
         return jnp.where(in_mode_zero, extent[1], extent[0])
+
+    def slip_rounding(self, switch: int, lane: "Lane") -> Scalar | float:
+        """Return a bound of the rounding error of a slip; `switch` is the friction's index."""
+        rounding = 256 * float(jnp.finfo(lane.s.dtype).eps)
+        if self.extents is None:
+            return rounding
+        number = len(stops_of(self.machine)) + switch
+        place = len(self.machine.coordinates) + self.others(lane.state).index(number)
+        return rounding * self.extents[place][0]
 
     def rounding_bounds(self, k: int, state: State) -> tuple[Scalar | float, Scalar | float]:
         """Return bounds of the rounding errors of position and velocity of coordinate number k."""

@@ -252,6 +252,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         labels=labels_in(machine, jtu.tree_map(lambda x: x[0], points)),
         units=stated(machine),
         modes=tuple(x[::parts] for x in modes),
+        history=lane.history,
         outcomes=outcomes_of(machine),
         **_outcome(machine, lane),
     )

@@ -44,7 +44,9 @@ from ..machine import (
     convert_start,
     counter_of,
     field_in,
+    has_delays,
     has_velocity,
+    history_of,
     in_clock,
     is_autonomous,
     may_rest,
@@ -64,6 +66,7 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._quantities import average_names, check_units, quantity_names
+from .history import with_history
 from .methods import AbstractMethod, MethodLike, chosen
 from .sizes import rounding_bounds
 
@@ -145,11 +148,14 @@ def make_plan(
     if options.clock is not None:
         machine = in_clock(machine, options.clock)
     require_session("machine", machine)
-    modes, start = modes_of(start), convert_start(machine, without_modes(start))
+    modes, history = modes_of(start), history_of(start)
+    start, memory = convert_start(machine, without_modes(start)), None
     start = jtu.tree_map(strongly_typed, start)
     check_leaves("start", start)
     require_session("start", start)
     method.check(machine)
+    if has_delays(machine):
+        machine, memory = with_history(machine, as_floats(machine, start), history)
     if samples and is_autonomous(machine, start):
         raise ValueError(
             "Argument `samples` must be 0 for a machine whose cycles end on a section, but got "
@@ -194,6 +200,8 @@ def make_plan(
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
         start_modes=_own_modes(machine, start, modes, dtype),
+        history=jtu.tree_map(lambda x: x.astype(dtype), history),
+        memory=memory,
     )
     return plan, start
 

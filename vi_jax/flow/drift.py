@@ -238,7 +238,7 @@ class FlowToEvent:
         def acceleration(moving, fixed, rest):
             (smooth, _), (s, state, _) = self._combined(fixed, rest), moving
             free = hold_contacts(smooth.machine, smooth.modes, smooth.contact, but=k)
-            return rates(free.field, smooth.machine.coordinates[k].position, s, state).a
+            return rates(free.field, smooth.machine.coordinates[k], s, state).a
 
         return acceleration
 

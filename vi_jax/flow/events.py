@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Flag, Scalar, Scalars, State
-from ..machine import horner
+from ..machine import Coordinate, horner
 from .smooth import SmoothMachine
 
 # d(state)/ds as a function of s and the state.
@@ -30,9 +30,13 @@ class Rates(NamedTuple):
         return Rates(factor * self.x - offset, factor * self.v, factor * self.a)
 
 
-def rates(field: Field, coordinate: Callable[[State], Scalar], s: Scalar, state: State) -> Rates:
-    """Return the rates of `coordinate(state)` along the flow of `field`."""
-    return guard_rates(field, lambda _, state: coordinate(state), s, state)
+def rates(field: Field, coordinate: Coordinate, s: Scalar, state: State) -> Rates:
+    """Return the rates of a coordinate along the flow of `field`."""
+    if not coordinate.moves_at_velocity:
+        return guard_rates(field, lambda _, state: coordinate.position(state), s, state)
+    # Without a derivative of the field.
+    v, a = jax.jvp(coordinate.velocity, (state,), (field(s, state),))
+    return Rates(coordinate.position(state), v, a)
 
 
 def guard_rates(
@@ -50,8 +54,7 @@ def guard_rates(
 
 
 def force_rate(
-    machine: SmoothMachine, position: Callable[[State], Scalar], holding: SmoothMachine, s: Scalar,
-    state: State,
+    machine: SmoothMachine, coordinate: Coordinate, holding: SmoothMachine, s: Scalar, state: State
 ) -> Scalar:  # fmt: skip
     """Return d/ds of the acceleration that a body would have if it were free, as it is in
     `machine`, along the flow of `holding`, in which it may be held. It is a constant for
@@ -59,7 +62,7 @@ def force_rate(
     s, state = jax.lax.stop_gradient((s, state))
 
     def force(s, state):
-        return rates(machine.field, position, s, state).a
+        return rates(machine.field, coordinate, s, state).a
 
     flow = holding.field(s, state)
     return jax.lax.stop_gradient(jax.jvp(force, (s, state), (jnp.ones_like(s), flow))[1])

@@ -2,24 +2,28 @@
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.lax import stop_gradient
 from jaxtyping import Array
 
 from .. import lanes
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     begin_modes,
+    frictions_in,
     has_contact_friction,
     holds_anywhere,
     is_in_range,
+    limited_in,
     on_held_surfaces,
     outcomes_of,
     prepared,
+    pressed_contacts,
     replaced,
     stops_of,
     struck_modes,
@@ -35,11 +39,13 @@ from ._machine_checks import (
     explain_errors,
 )
 from ._step.hybrid import iterate
+from ._step.impact import is_compound
 from .events import Rates, force_rate, rates
+from .history import begun, is_covered, with_sizes, with_view
 from .noise import in_modes_of
 from .results import code
 from .sizes import at_most_one, extents_of, sizes_of
-from .smooth import constant, hold_contacts, in_modes, limited_of, stops_are_exact
+from .smooth import constant, hold_contacts, in_modes, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -57,14 +63,14 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     s = zero if plan.begin is None else zero + plan.begin
     modes = begin_modes(machine, s, start, plan.start_modes)
     free = in_modes(machine, modes)
-    current = [rates(free.field, x.position, s, start) for x in machine.coordinates]
+    current = [rates(free.field, x, s, start) for x in machine.coordinates]
     # At rest the sign of the acceleration is the direction of motion.
     direction = tuple(jnp.where(x.v == 0, jnp.sign(x.a), jnp.sign(x.v)) for x in current)
     contact = None
     if plan.rests:
-        jerks = [force_rate(free, x.position, free, s, start) for x in machine.coordinates]
+        jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
         contact = _contacts_at(plan, start, current, jerks)
-        if len(limited_of(machine)) > 1:
+        if len(limited_in(machine)) > 1:
             contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
@@ -77,9 +83,14 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
             start = jtu.tree_map(lambda a, b, rests=rests: jnp.where(rests, a, b), on_stop, start)
         if has_contact_friction(machine) or (stops_of(machine) and holds_anywhere(machine)):
             modes = struck_modes(machine, s, start, modes, contact=contact)
+        if is_compound(machine):
+            contact = pressed_contacts(machine, s, start, modes, contact)
     slides = any(x.blends for x in switches_of(machine))
     if slides or holds_anywhere(machine) or has_contact_friction(machine):
         start = on_held_surfaces(machine, s, start, modes, contact or ())
+    fault = jnp.where(bad, code("bad_start"), zero)
+    for i in frictions_in(machine):
+        fault = jnp.where(jnp.isnan(modes[i]) & ~bad, code("jammed"), fault)
     length = zero + jax.lax.stop_gradient(machine.cycle) / plan.method.steps_per_cycle
     if plan.method.adaptive:
         length = length / 8
@@ -97,7 +108,7 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
         attempts=zero,
         part=plan.first_part(zero) if plan.instants > 1 else zero,
         done=zero,
-        fault=jnp.where(bad, code("bad_start"), zero),
+        fault=fault,
         steps=zero,
         spent=zero,
         rejected=zero,
@@ -127,12 +138,12 @@ def _pressed_together(
 
     def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
         held = constant(hold_contacts(plan.machine, modes, contact))
-        current = [rates(held.field, x.position, s, start) for x in bodies]
-        jerks = [force_rate(held, x.position, held, s, start) for x in bodies]
+        current = [rates(held.field, x, s, start) for x in bodies]
+        jerks = [force_rate(held, x, held, s, start) for x in bodies]
         more = _contacts_at(plan, start, current, jerks)
         return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
 
-    return jax.lax.scan(add_contacts, contact, None, length=len(limited_of(plan.machine)) - 1)[0]
+    return jax.lax.scan(add_contacts, contact, None, length=len(limited_in(plan.machine)) - 1)[0]
 
 
 def _rests_on(
@@ -169,6 +180,8 @@ class Ends(NamedTuple):
     rejected: Scalar
     at: tuple[Scalar, Scalar, State] | None
     """The cycle, the clock and the state at the end; `None` for a machine without outcomes."""
+    history: Any = None
+    """The history at the end, of a machine with delays."""
 
 
 def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends, State, Record]:
@@ -197,6 +210,8 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
         sizes = jtu.tree_map(at_most_one, sizes)
         method = plan.method.with_sizes(sizes)
         plan = dataclasses.replace(plan, method=method, sizes=sizes, extents=extents)
+        if plan.memory is not None:
+            plan = with_sizes(plan, s, start, modes)
     numbers, rest = eqx.partition(plan, eqx.is_array)
     ends, (states, records) = lanes.run(
         partial(_begin, rest), partial(_step, rest), partial(_end, rest),
@@ -213,9 +228,22 @@ def run_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> tuple[Ends
 def _begin(rest: Plan, inputs: _Inputs) -> tuple[Lane, lanes.Emitted]:
     numbers, start, wanted = inputs
     plan = eqx.combine(numbers, rest)
-    lane = initial_lane(plan, start, wanted)
+    if plan.memory is None:
+        lane = initial_lane(plan, start, wanted)
+    else:
+        lane = _with_history(plan, start, wanted)
     first, state = plan.settle <= 0, plan.recorded_state(start, lane.modes)
     return lane, lanes.Emitted(_is_active(plan, lane), first, (state, plan.empty_record(start)))
+
+
+def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
+    """Return the initial lane of a machine with delays."""
+    zero = jnp.zeros_like(plan.machine.position(start))
+    s = zero if plan.begin is None else zero + plan.begin
+    history = begun(plan, start, s)
+    lane = initial_lane(with_view(plan, history, s), start, wanted)
+    bad = (lane.fault == 0) & ~stop_gradient(is_covered(plan, history, s))
+    return lane._replace(history=history, fault=jnp.where(bad, code("bad_start"), lane.fault))
 
 
 def _step(rest: Plan, inputs: _Inputs, lane: Lane) -> tuple[Lane, lanes.Emitted]:
@@ -235,4 +263,4 @@ def _end(rest: Plan, inputs: _Inputs, lane: Lane) -> Ends:
     plan, at = eqx.combine(inputs[0], rest), None
     if outcomes_of(plan.machine):
         at = plan.cycle_of(lane.done), plan.clock(lane.s, lane.state), lane.state
-    return Ends(lane.fault, lane.steps, lane.rejected, at)
+    return Ends(lane.fault, lane.steps, lane.rejected, at, lane.history)

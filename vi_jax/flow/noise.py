@@ -21,12 +21,12 @@ from ..machine import (
     cycle_time,
     is_autonomous,
     leaf_names,
+    limited_in,
     others_of,
     prepared,
 )
 from ._lane import Impulses, Plan, has_fixed_cycle, s_counts_cycles
 from ._machine_checks import explain_errors
-from .smooth import limited_of
 
 # Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3 (SC 2011).
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -244,7 +244,7 @@ def _check_velocities(machine: AbstractMachine, start: State, amplitudes: tuple)
         jnp.zeros_like(x) if a is None else jnp.ones_like(x)
         for x, a in zip(leaves, amplitudes, strict=True)
     ]
-    for k in limited_of(machine):
+    for k in limited_in(machine):
         place = machine.coordinates[k].position
         velocity = concrete(jax.jvp(place, (start,), (tree.unflatten(direction),))[1])
         if velocity is not None and np.any(velocity):

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .._checks import one_of
+from .._checks import array_module, concrete, one_of
 from .._messages import count_of
 from .._types import Scalar, State, xr
 from ..machine import (
@@ -50,7 +50,11 @@ else:
         def __eq__(self, other):
             if not isinstance(other, self.kind):
                 raise ValueError(f"A {self.kind.__name__} has no order with {other!r}.")
-            return jnp.equal(self.number, other.number)
+            known = concrete(self.number), concrete(other.number)
+            if known[0] is None or known[1] is None:
+                return jnp.equal(self.number, other.number)
+            same = np.asarray(np.equal(*known))
+            return jnp.asarray(same) if isinstance(self.number, jax.Array) else same
 
         def __ne__(self, other):
             return ~(self == other)
@@ -107,7 +111,8 @@ else:
         @classmethod
         def where(cls, condition, a, b):
             """Apply `jnp.where` to two members."""
-            return _Member(jnp.where(condition, a.number, b.number), cls)
+            array = array_module(condition, a.number, b.number)
+            return _Member(array.where(condition, a.number, b.number), cls)
 
 
 def names_of(kind: Any) -> np.ndarray:
@@ -321,6 +326,14 @@ class RESULTS(NamedEnumeration):
     unstable = (
         "The error of a fixed step was as large as the state, as under strong damping. Take more "
         "steps, define the machine's `relaxation` or `step_limit`, or use `Adaptive`."
+    )
+    jammed = (
+        "No motion with a closed contact or a sticking body fulfils Coulomb's law of friction, as "
+        "for a rod that is pushed into rough ground (Painlevé's paradox)."
+    )
+    full_history = (
+        "The steps within the longest delay are more than the history holds. Write a larger "
+        "`history_size` in the machine's class, such as `history_size = 1024`."
     )
     ended = "An event of the machine ended the motion, with the outcome `Run.outcome`."
 
@@ -548,6 +561,8 @@ class Run(Summarized):
     """The state after the event, a pytree like the start; NaN without."""
     outcomes: tuple[str, ...] = eqx.field(static=True, default=())
     """The names of the outcomes with which events and stops of the machine end a motion."""
+    history: Any = None
+    """The history at the end, of a machine with delays, from which `last` continues."""
 
     @property
     def successful(self) -> jax.Array:
@@ -562,11 +577,13 @@ class Run(Summarized):
     @property
     def last(self) -> State:
         """The state on the last section: a start to continue from, or a guess for `find_orbit`. For
-        a machine with discrete modes it is a `HybridState`, which contains them."""
+        a machine with discrete modes or delays it is a `HybridState`, which contains them and the
+        history."""
         # Batch axes come before the axis of the sections, those of an array in the state after it.
         # `steps` has one number for each lane, so that its axes are the batch axes.
         place = (*[slice(None)] * self.steps.ndim, -1)
-        return jtu.tree_map(lambda x: x[place], with_modes(self.sections, self.modes))
+        last, modes = jtu.tree_map(lambda x: x[place], (self.sections, self.modes))
+        return with_modes(last, modes, self.history)
 
     def mean_averages(self) -> dict[str, Scalar]:
         """Return the machine's own averages over the time of all cycles, of one lane."""
@@ -610,12 +627,12 @@ class Run(Summarized):
     def summary(self) -> str:
         """Return the last section and cycle, and the reason why the run ended, as text."""
         if self.steps.ndim:
-            good = int(jnp.sum(self.successful))
-            ended = "" if self.outcome is None else f", {int(jnp.sum(self.outcome >= 0))} ended"
+            good = int(np.sum(self.successful))
+            ended = "" if self.outcome is None else f", {int(np.sum(self.outcome >= 0))} ended"
             return f"Run of {self.steps.size} lanes {self.steps.shape}, {good} successful{ended}"
         cycles = self.impacts.shape[-1]
         lines = [
-            f"Run of {count_of(cycles, 'cycle')}, {count_of(int(jnp.sum(self.impacts)), 'impact')}"
+            f"Run of {count_of(cycles, 'cycle')}, {count_of(int(np.sum(self.impacts)), 'impact')}"
         ]
         units, outcome = dict(self.units), self._outcome_in_words()
         last = without_modes(self.last) if outcome is None else self.outcome_state
@@ -627,7 +644,7 @@ class Run(Summarized):
         for average, x in self.averages.items() if outcome is None else ():
             lines.append(f"    mean {average}: {in_unit(f'{x[-1]:.6g}', units, average)}")
         if self.errors is not None:
-            worst = max(float(jnp.max(x)) for x in jtu.tree_leaves(self.errors.sections))
+            worst = max(float(np.max(x)) for x in jtu.tree_leaves(self.errors.sections))
             lines.append(f"  error of the sections, estimated: {worst:.2g}")
         lines.append(f"  steps: {int(self.steps)} tried, {int(self.rejected)} rejected")
         ended = outcome or ("completed" if bool(self.successful) else RESULTS[self.result])

@@ -22,9 +22,9 @@ from ..machine import (
     field_in,
     has_contact_friction,
     holds_anywhere,
+    limited_in,
     push_of,
     shown_modes,
-    stops_of,
     velocity_change,
 )
 
@@ -32,11 +32,6 @@ from ..machine import (
 def constant(tree: Any) -> Any:
     """Return a tree without derivatives. Its booleans, integers and texts stay what they are."""
     return jtu.tree_map(lambda x: stop_gradient(x) if eqx.is_inexact_array(x) else x, tree)
-
-
-def limited_of(machine: AbstractMachine) -> list[int]:
-    """Return the numbers of the coordinates that stops limit."""
-    return sorted({stop.coordinate for stop in stops_of(machine)})
 
 
 class SmoothMachine(eqx.Module):
@@ -59,7 +54,7 @@ class SmoothMachine(eqx.Module):
         flow, dry = field_in(machine, s, state, self.modes), holds_anywhere(machine)
         if not self.contact and not dry:
             return flow
-        limited = limited_of(machine) if self.contact else []
+        limited = limited_in(machine) if self.contact else []
         several = len(limited) > 1 or has_contact_friction(machine)
         if several or dry:
             flow = constrained_rate(machine, flow, s, state, self.modes, self.contact)[0]

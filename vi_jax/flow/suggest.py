@@ -1,11 +1,11 @@
 """`suggest_method`: the fastest method for an error, measured on the user's own computer."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,12 +17,14 @@ from jaxtyping import Array
 
 from .._checks import count, require
 from .._messages import warning_once
+from .._programs import compiled
 from .._types import Scalar, State
 from ..machine import AbstractMachine, convert_start, in_rows, longest_step, size_of, without_modes
 from ._simulate import jit, simulate
 from .arguments import check_start, machine_of
-from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, Verner9, preset
-from .sizes import row_sizes, sizes_on_host
+from .methods import AbstractMethod, Adaptive, ExactFlight, FixedStep, Taylor, preset
+from .methods.verner import Verner9
+from .sizes import row_sizes
 
 # Tried numbers of steps in a cycle, each a tenth to a third more than the last, and tolerances.
 # Times are medians of this many rounds. All are choices.
@@ -108,14 +110,16 @@ def suggest_method(
         start = machine.start()
     start = convert_start(machine, start)
     check_start(machine, start)
-    bench = _Bench(machine, start, cycles, lanes)
+    decay_time, longest, speed = _times_and_speed(machine, start)
+    bench = _Bench(machine, start, cycles, lanes, float(speed))
     best = preset(machine, "reference")
     exact = isinstance(best, ExactFlight)
-    stiff = not exact and _is_stiff(machine, start)
+    # Does something decay much faster than the motion?
+    stiff = not exact and decay_time is not None and float(longest) > _STIFF * float(decay_time)
     if exact:
         reference = best.tighter()
     elif stiff:
-        reference = Adaptive(diffrax.Kvaerno5(), rtol=1e-12, steps_per_cycle=10)
+        reference = Adaptive(_stiff_solver(), rtol=1e-12, steps_per_cycle=10)
     else:  # at most half as long as the shortest steps that are tried
         reference = Adaptive(rtol=1e-14, steps_per_cycle=2 * max(_STEPS))
     bench.set_reference(reference)
@@ -130,7 +134,7 @@ def suggest_method(
     else:
         tried = [] if stiff else _fixed(bench, error)
         tried += _until(bench, error, _adaptive(Verner9()))
-        tried += _until(bench, error, _adaptive(diffrax.Kvaerno5())) if stiff else []
+        tried += _until(bench, error, _adaptive(_stiff_solver())) if stiff else []
         with contextlib.suppress(NotImplementedError):  # a primitive has no recursion
             tried += _until(bench, error, _series(error))
     accurate = [t for t in tried if t.error <= error]
@@ -143,11 +147,16 @@ def suggest_method(
     return Suggestion(found.method, bool(timed), found.error, tuple(tried))
 
 
-def _is_stiff(machine: AbstractMachine, start: State) -> bool:
-    """Return whether something decays much faster than the motion, at its start."""
-    s = jnp.zeros(())
-    decay_time = machine.relaxation(s, start)
-    return decay_time is not None and bool(longest_step(machine, s, start) > _STIFF * decay_time)
+@compiled
+def _times_and_speed(machine: AbstractMachine, start: State) -> tuple[Any, Any, Scalar]:
+    """Return the time of the fastest decay (`None` if unknown), the longest step, and the size of
+    the first velocity, all at the start."""
+    s, numbers = jnp.zeros(()), without_modes(start)
+    row, unravel = ravel_pytree(numbers)
+    sizes = unravel(row_sizes(machine, start, row))
+    # Stops limit everything except velocities.
+    speed = size_of(machine.coordinates[0].velocity, numbers, sizes)
+    return machine.relaxation(s, start), longest_step(machine, s, start), speed
 
 
 def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMethod]]) -> list[Tried]:
@@ -160,7 +169,13 @@ def _until(bench: "_Bench", error: float, methods: list[tuple[str, AbstractMetho
     return tried
 
 
-def _adaptive(solver: diffrax.AbstractSolver) -> list[tuple[str, AbstractMethod]]:
+def _stiff_solver() -> Any:
+    import diffrax  # slow to load
+
+    return diffrax.Kvaerno5()
+
+
+def _adaptive(solver: Any) -> list[tuple[str, AbstractMethod]]:
     name = f"Adaptive({type(solver).__name__}(), rtol="
     return [(f"{name}{x:.0e})", Adaptive(solver, rtol=x)) for x in _TOLERANCES[:-1]]
 
@@ -173,7 +188,7 @@ def _series(error: float) -> list[tuple[str, AbstractMethod]]:
 
 
 def _fixed(bench: "_Bench", error: float) -> list[Tried]:
-    """Find the fewest fixed steps within the error, by bisection: each number compiles anew."""
+    """Find the fewest fixed steps within the error, by bisection."""
     tried, low, high = [], 0, len(_STEPS) - 1
     while low <= high:
         middle = (low + high) // 2
@@ -187,18 +202,29 @@ def _fixed(bench: "_Bench", error: float) -> list[Tried]:
     return tried
 
 
+class _AnyFixedStep(FixedStep):
+    """`FixedStep` whose number of steps is an argument of the compiled program."""
+
+    steps_per_cycle: Any = 10
+
+
+class _AnyAdaptive(Adaptive):
+    steps_per_cycle: Any = eqx.field(kw_only=True, default=5)
+
+
+_SHARED: dict[type, Any] = {FixedStep: _AnyFixedStep, Adaptive: _AnyAdaptive}
+
+
 class _Bench:
     """The run by which methods are compared, for lanes that differ in their first velocity."""
 
     reference: np.ndarray
     sizes: np.ndarray
 
-    def __init__(self, machine: AbstractMachine, start: State, cycles: int, lanes: int):
+    def __init__(
+        self, machine: AbstractMachine, start: State, cycles: int, lanes: int, speed: float
+    ):
         self.machine, self.start, self.cycles = machine, start, cycles
-        numbers, unravel = ravel_pytree(without_modes(start))
-        sizes = unravel(jnp.asarray(sizes_on_host(machine, start, np.asarray(numbers))))
-        # Stops limit everything except velocities.
-        speed = size_of(machine.coordinates[0].velocity, without_modes(start), sizes)
         self.offsets = speed * (np.linspace(-0.1, 0.1, lanes) if lanes > 1 else np.zeros(1))
         self.compiled: dict[Any, Callable] = {}
 
@@ -215,7 +241,13 @@ class _Bench:
         return jnp.append(ended, found), jnp.append(jnp.ones_like(offset), sizes)
 
     def program(self, method: AbstractMethod) -> Callable[[], Any]:
-        """Return a function that runs all lanes; other tolerances do not compile again."""
+        """Return a function that runs all lanes; other tolerances and numbers of steps do not
+        compile again."""
+        shared = _SHARED.get(type(method))
+        if shared is not None:
+            values = {f.name: getattr(method, f.name) for f in dataclasses.fields(method)}
+            steps = np.asarray(float(method.steps_per_cycle))
+            method = eqx.tree_at(lambda m: m.steps_per_cycle, shared(**values), steps)
         numbers, rest = eqx.partition(method, lambda x: isinstance(x, np.ndarray))
         key = jtu.tree_structure(rest), tuple(map(repr, jtu.tree_leaves(rest)))
         if key not in self.compiled:

@@ -302,12 +302,17 @@ def _(t, p, avals, d, x, *starts):
 
 
 @placed("dynamic_update_slice")
-def _(t, p, avals, d, x, update, *starts):
+def _(t, p, avals, d, x, update, *starts, mask=None):
     begin, axes = _starts(t, starts, d[2:], update.shape, x.shape), range(x.ndim)
     if all(isinstance(i, int) for i in begin):
         update = computed(t, update)
     inside = t.constant(True, "i1")
-    return _with_blocks(t, x, update, axes, axes, lambda _: ([*begin], inside))
+    return _with_blocks(t, x, update, axes, axes, lambda _: ([*begin], inside), None, mask)
+
+
+IN_PLACE = ("dynamic_update_slice", "scatter")
+"""The primitives whose rules have a keyword argument `mask`: with it they change an array in memory
+in place, in these lanes, and its old numbers must not be used any more."""
 
 
 def _patched(t: Text, x: Array, window: Sequence[tuple[int, int]], new: Callable) -> Pieces | None:
@@ -400,7 +405,10 @@ def _fill_value(given, dtype):
     return np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
 
 
-def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices, update) -> Array:
+def _scatter(
+    how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices, update,
+    mask: Value | None = None,
+) -> Array:  # fmt: skip
     """Return an array with numbers written at indices that depend on data, or combined by the rule
     `how`. Numbers outside the array are dropped, unless the mode is to clip."""
     d = p["dimension_numbers"]
@@ -413,20 +421,22 @@ def _scatter(how: str | None, t: Text, p: dict, avals, dtypes, x: Array, indices
         [n - sizes.get(a, 1) for a, n in enumerate(x.shape)], "CLIP" in str(p["mode"]),
     )  # fmt: skip
     combined = partial(ELEMENTWISE[how], t, {}, dtypes) if how else None
-    return _with_blocks(t, x, computed(t, update), inner, axes, partial(blocks.corner, t), combined)
+    corner = partial(blocks.corner, t)
+    return _with_blocks(t, x, computed(t, update), inner, axes, corner, combined, mask)
 
 
 def _with_blocks(
     t: Text, x: Array, update: Array, inner: Sequence[int], axes: Sequence[int],
     corner: Callable, combined: Callable[[Value, Value], Value] | None = None,
+    mask: Value | None = None,
 ) -> Array:  # fmt: skip
     """Return an array with blocks of other numbers. They extend along its axes `inner`, which
     correspond to `axes` of `update`. `corner` maps indices along the other axes of `update` to the
     first indices of a block and whether it is valid. `combined` gets the old number and that of
-    `update`, which by default replaces it."""
+    `update`, which by default replaces it. With a `mask` see `IN_PLACE`."""
     sizes = dict(zip(inner, [update.shape[o] for o in axes], strict=True))
     others = [n for o, n in enumerate(update.shape) if o not in axes]
-    if int(np.prod(others, dtype=int)) == 1:
+    if mask is None and int(np.prod(others, dtype=int)) == 1:
         first, inside = corner([0] * len(others))
         if all(isinstance(i, int) for i in first) and inside.number:
             window = [(i, sizes.get(a, 1)) for a, i in enumerate(first)]
@@ -443,13 +453,18 @@ def _with_blocks(
             found = _patched(t, x, window, changed)
             if found is not None:
                 return found
-    out = _copy(t, x, not isinstance(update, Registers))
+    if mask is None:
+        out = _copy(t, x, not isinstance(update, Registers))
+    else:
+        out, update = x, update if isinstance(update, Registers) else stored(t, update)
 
     def put(index: tuple[Index, ...]) -> None:
         place, inside = corner([i for o, i in enumerate(index) if o not in axes])
         for a, i in zip(inner, [index[o] for o in axes], strict=True):
             place[a] = plus(t, place[a], i)
         value = update.at(t, index)
+        if mask is not None:
+            return out.put(t, place, value, t.both(mask, inside))
         new = lambda old: value if combined is None else combined(old, value)
         put_at(t, out, place, lambda old: t.select(inside, new(old), old))
 

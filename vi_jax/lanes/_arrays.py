@@ -302,22 +302,25 @@ class Memory:
 
     def load(self, t: Text, place: Index, kind: str) -> Value:
         if isinstance(place, Value):
-            return gathered(t, self._base(t), self._of_slots(t, place), kind)
+            return gathered(t, self.pointer(t), self._of_slots(t, place), kind)
         stored = stored_kind(kind)
         aligned = f"align {self._alignment(t, stored)}"
         where = self._address(t, place, stored)
         value = t.load(f"load {t.vector(stored)}, ptr {where}, {aligned}", stored)
         return _flag_if(t, value, kind)
 
-    def store(self, t: Text, place: Index, value: Value) -> None:
+    def store(self, t: Text, place: Index, value: Value, mask: Value | None = None) -> None:
+        """Store a number where the mask, if one is given, holds."""
         if isinstance(place, Value):
-            return scattered(t, self._base(t), self._of_slots(t, place), value)
+            return scattered(t, self.pointer(t), self._of_slots(t, place), value, mask)
+        if mask is not None:
+            value = t.select(mask, value, self.load(t, place, value.kind))
         value = _as_stored(t, value)
         kind = value.kind
         where, aligned = self._address(t, place, kind), f"align {self._alignment(t, kind)}"
         t.store(f"store {t.vector(kind)} {value.text}, ptr {where}, {aligned}")
 
-    def _base(self, t: Text) -> str:
+    def pointer(self, t: Text) -> str:
         if isinstance(self.block, Block):
             return t.once(f"getelementptr i8, ptr %arena, i64 {self.block.start * t.width * 8}")
         pointer, begin = self.block
@@ -328,7 +331,7 @@ class Memory:
             pointer, begin = self.block
             place = begin + t.width * _BYTES[kind] * place
             return t.once(f"getelementptr i8, ptr {pointer}, i64 {place}")
-        return t.once(f"getelementptr {t.vector(kind)}, ptr {self._base(t)}, i64 {place}")
+        return t.once(f"getelementptr {t.vector(kind)}, ptr {self.pointer(t)}, i64 {place}")
 
     def _alignment(self, t: Text, kind: str) -> int:
         return min(64, t.width * _BYTES[kind]) if isinstance(self.block, Block) else 8
@@ -353,9 +356,9 @@ class Strided(Array):
     def at(self, t: Text, index: Sequence[Index]) -> Value:
         return self.source.load(t, place_of(t, index, self.strides, self.offset), self.kind)
 
-    def put(self, t: Text, index: Sequence[Index], value: Value) -> None:
+    def put(self, t: Text, index: Sequence[Index], value: Value, mask: Value | None = None) -> None:
         assert isinstance(self.source, Memory)
-        self.source.store(t, place_of(t, index, self.strides, self.offset), value)
+        self.source.store(t, place_of(t, index, self.strides, self.offset), value, mask)
 
     def viewed(
         self, t: Text, shape: Sequence[int], strides: Sequence[int], more: Index = 0
@@ -500,16 +503,19 @@ def replace(t: Text, old: Sequence[Array], new: Sequence[Array], mask: Value | N
     pairs = [
         (a, b) for a, b in zip(old, new, strict=True) if isinstance(a, Strided) and not same(a, b)
     ]
-    blocks = [a.source.block for a, _ in pairs if isinstance(a.source, Memory)]
-
-    def separate(x: Array) -> Array:
-        is_separate = isinstance(x, Strided) and not (
-            isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
-        )
-        return x if is_separate else stored(t, x)
-
-    for a, b in [(a, separate(b)) for a, b in pairs]:
+    changed = [a for a, _ in pairs]
+    for a, b in [(a, separate(t, b, changed)) for a, b in pairs]:
         fill(t, a, b if mask is None else selected(t, mask, b, a))
+
+
+def separate(t: Text, x: Array, changed: Sequence[Strided]) -> Array:
+    """Return an array that does not change if others in memory do."""
+    blocks = [a.source.block for a in changed if isinstance(a.source, Memory)]
+    is_separate = isinstance(x, Strided) and not (
+        isinstance(x.source, Memory) and any(x.source.block is b for b in blocks)
+    )
+    is_constant = isinstance(x, Formula) and x.value is not None
+    return x if is_separate or is_constant else stored(t, x)
 
 
 def same(a: Array, b: Array) -> bool:

@@ -37,10 +37,11 @@ def engine_of(text: str) -> Any:
     return _engine_with(llvm(), object_code(llvm(), text, None))
 
 
-def compile_in_background(text: str, cpu: str | None) -> Future:
-    """Compile a kernel's text on another thread. The future's result is the engine, which holds the
-    code in memory, and the address of `kernel`."""
-    return _worker().submit(_load_or_compile, llvm(), text, cpu, _level(), _cache_folder())
+def compile_in_background(text: str, cpu: str | None, passes: bool) -> Future:
+    """Compile a kernel's text on another thread, with or without LLVM's passes. The future's result
+    is the engine, which holds the code in memory, and the address of `kernel`."""
+    options = _level(), passes
+    return _worker().submit(_load_or_compile, llvm(), text, cpu, options, _cache_folder())
 
 
 @functools.cache
@@ -50,15 +51,15 @@ def _worker() -> ThreadPoolExecutor:
 
 
 def _load_or_compile(
-    binding: Any, text: str, cpu: str | None, level: int, store: Path | None
+    binding: Any, text: str, cpu: str | None, options: tuple[int, bool], store: Path | None
 ) -> tuple[Any, int]:
     """Return an engine with a text's code and the address of `kernel`. The code is read from the
     folder `store` if it is there, else compiled and stored."""
-    parts = (text, cpu, level, *_host(binding), binding.llvm_version_info)
+    parts = (text, cpu, *options, *_host(binding), binding.llvm_version_info)
     name = f"{hashlib.blake2b(repr(parts).encode(), digest_size=20).hexdigest()}.o"
     code = store and _read(store / name)
     if code is None:
-        code = object_code(binding, text, cpu, level)
+        code = object_code(binding, text, cpu, *options)
         if store is not None:
             _write(store / name, code)
     engine = _engine_with(binding, code)
@@ -73,7 +74,9 @@ def _host(binding: Any) -> tuple[str, str]:
     return binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 
 
-def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> bytes:
+def object_code(
+    binding: Any, text: str, cpu: str | None, level: int = 1, passes: bool = True
+) -> bytes:
     """Return the object code of a text for a processor (LLVM's name, or `None` for this one). LLVM
     does not vectorize, since the text is vector code already, and does not unroll loops."""
     name, features = _host(binding) if cpu is None else (cpu, "")
@@ -87,11 +90,12 @@ def object_code(binding: Any, text: str, cpu: str | None, level: int = 1) -> byt
         raise RuntimeError(message) from None
     module.triple = binding.get_default_triple()
     module.data_layout = str(machine.target_data)
-    options = binding.create_pipeline_tuning_options(speed_level=level)
-    options.loop_vectorization = options.slp_vectorization = False
-    options.loop_unrolling = False
-    builder = binding.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
+    if passes:
+        options = binding.create_pipeline_tuning_options(speed_level=level)
+        options.loop_vectorization = options.slp_vectorization = False
+        options.loop_unrolling = False
+        builder = binding.create_pass_builder(machine, options)
+        builder.getModulePassManager().run(module, builder)
     return machine.emit_object(module)
 
 

@@ -42,7 +42,7 @@ from ._arrays import (
 from ._operations import kind_of
 from ._program import LaneProgram
 from ._text import RARE, Text, Value, attributes, is_float
-from ._vector import Unsupported, write
+from ._vector import Functions, Unsupported, write
 
 # The greatest memory for arrays per thread, a choice. Programs that need more run on XLA's backend,
 # with a warning.
@@ -88,6 +88,7 @@ class _Writer:
     def __init__(self, program: LaneProgram, width: int, one_for_all: tuple[bool, ...]):
         self.program = program
         self.t = Text(width)
+        self.t.functions = Functions([program.begin, program.step, program.end])
         self.one_for_all = one_for_all or (False,) * len(program.in_avals)
 
     def text(self, bits: int) -> str:
@@ -109,7 +110,9 @@ class _Writer:
         claimed, released = allocation_lines(t)
         t.lines += ["exit:", *released, "  ret void", "}"]
         declared = t.declared.values()
-        return "\n".join([*declared, _PREAMBLE, *claimed, *t.lines, attributes(bits), RARE, ""])
+        functions = t.functions.texts
+        lines = [*declared, *functions, _PREAMBLE, *claimed, *t.lines, attributes(bits), RARE, ""]
+        return "\n".join(lines)
 
     def _entry(self) -> None:
         """Write the code that runs once per thread: addresses of all arrays, and strides."""
@@ -165,7 +168,8 @@ class _Writer:
         t = self.t
         t.open("step")
         active, n = group.active, len(self.inputs)
-        carry, going, complete, row = self._run(self.program.step, group.arrays, active)
+        own = group.arrays[n:]
+        carry, going, complete, row = self._run(self.program.step, group.arrays, active, own)
         going = t.both(active, going)
         complete = t.both(active, complete)
         self._store_row(group.lane, complete, group.rows, row)
@@ -275,10 +279,11 @@ class _Writer:
         return _Group(arrays, old.lane, rows, active)
 
     def _run(
-        self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value
+        self, jaxpr: ClosedJaxpr, args: list[Any], mask: Value, owned: list[Any] | None = None
     ) -> tuple[list[Any], Value, Value, list[Any]]:
-        """Return results of `begin` or `step`: carry, flags (lane continues, has a row), row."""
-        out: list[Any] = write(self.t, jaxpr, args, mask)
+        """Return results of `begin` or `step`: carry, flags (lane continues, has a row), row. Large
+        arrays that are `owned` may be changed in place."""
+        out: list[Any] = write(self.t, jaxpr, args, mask, owned or ())
         n = len(self.program.carry_avals)
         return out[:n], out[n].item(), out[n + 1].item(), out[n + 2 :]
 

@@ -112,6 +112,8 @@ class Text:
         self.arena = Arena()
         # The least and the greatest number of loop counters and of indices computed from them.
         self.ranges: dict[str, tuple[int, int]] = {}
+        # Functions for parts that are called several times; `None` if all calls are written inline.
+        self.functions: Any = None
         self._stores = 0
         self._names = 0
         # The operations in blocks that dominate the current one, a table for each open scope.

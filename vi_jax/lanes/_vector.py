@@ -1,8 +1,8 @@
 """Writing a jaxpr of one lane's scalars and small arrays as vector code for a group of lanes."""
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +10,14 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ._array_rules import PLACED, STRUCTURAL, any_in, select_parts
+from ._array_rules import IN_PLACE, PLACED, STRUCTURAL, any_in, select_parts
 from ._arrays import (
     MOST_IN_REGISTERS,
     Array,
     Formula,
     Index,
     Masked,
+    Memory,
     Registers,
     Strided,
     addressable,
@@ -29,6 +30,7 @@ from ._arrays import (
     reserve,
     same,
     selected,
+    separate,
     stored,
     table,
     times,
@@ -92,11 +94,15 @@ def constants(t: Text, array: object) -> Array:
     return Registers.of(array.shape, kind, lambda i: t.constant(array[i], kind))
 
 
-def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) -> list[Any]:
+def write(
+    t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value, owned: Sequence[Any] = ()
+) -> list[Any]:
     """Append the operations of a jaxpr to a text, as LLVM code for one group of lanes; return its
     results as `Array`s. `mask` holds in the lanes that need them. Code that none of them needs may
-    be skipped. Results of other lanes are arbitrary."""
+    be skipped. Results of other lanes are arbitrary. Arguments that are `owned` may be changed in
+    place, in the lanes of the mask: a block of one that is not used any more."""
     jaxpr, env = inner(closed), {}
+    own = {v for v, x in zip(jaxpr.invars, args, strict=True) if any(x is y for y in owned)}
     needed = _needed_equations(jaxpr)
     uses, last = _uses(jaxpr, needed)
 
@@ -114,7 +120,16 @@ def write(t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value) ->
     put(jaxpr.constvars, [constants(t, x) for x in getattr(closed, "consts", ())])
     put(jaxpr.invars, args)
     for number, eqn in enumerate(needed):
-        put(eqn.outvars, _write_equation(t, eqn, [read(a) for a in eqn.invars], mask))
+        given, first = [read(a) for a in eqn.invars], next(iter(eqn.invars), None)
+        in_place = eqn.primitive.name in IN_PLACE and isinstance(given[0], Strided)
+        if in_place and first in last.get(number, ()) and first in own:
+            for var, x in env.items():  # what may read the old numbers later
+                if var is not first and not isinstance(x, Registers):
+                    env[var] = separate(t, x, [given[0]])
+            put(eqn.outvars, _write_equation(t, eqn, given, mask, in_place=True))
+            own.add(eqn.outvars[0])
+        else:
+            put(eqn.outvars, _write_equation(t, eqn, given, mask))
         for var in last.get(number, ()):  # so that its memory is reused
             env.pop(var, None)
     return [read(a) for a in jaxpr.outvars]
@@ -144,10 +159,13 @@ def _needed_equations(jaxpr: Jaxpr) -> list[Any]:
     return kept[::-1]
 
 
-def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any]:
+def _write_equation(
+    t: Text, eqn: Any, args: list[Any], mask: Value, in_place: bool = False
+) -> list[Any]:
     name, params = eqn.primitive.name, eqn.params
     if (body := called(eqn)) is not None:
-        return write(t, body, args, mask)
+        results = None if t.functions is None else t.functions.call(t, body, args, mask)
+        return write(t, body, args, mask) if results is None else results
     if name in CONTROL:
         return CONTROL[name](t, params, [computed(t, x) for x in args], mask)
     if name == "custom_linear_solve":
@@ -163,7 +181,7 @@ def _write_equation(t: Text, eqn: Any, args: list[Any], mask: Value) -> list[Any
         return _elementwise(t, name, params, dtypes, args, avals)
     if name in PLACED:
         dtypes = [a.aval.dtype for a in eqn.invars]
-        out = PLACED[name](t, params, avals, dtypes, *args)
+        out = PLACED[name](t, params, avals, dtypes, *args, **({"mask": mask} if in_place else {}))
     else:
         out = STRUCTURAL[name](t, params, avals, *args)
     return [to_registers(t, x) for x in (out if eqn.primitive.multiple_results else [out])]
@@ -219,6 +237,99 @@ def _elementwise(t: Text, name, params, dtypes, args, avals) -> list[Array]:
 
     write_loops(t, shape, put, joined_cuts(*(x.cuts for x in args)))
     return list(outs)
+
+
+# A part that is called more than once becomes a function if it has at least so many operations. A
+# choice, since a call of 20 vectors costs about as much as 10 operations.
+_LEAST_FUNCTION = 100
+
+
+class _Function(NamedTuple):
+    name: str
+    results: list[tuple[tuple[int, ...], str]]
+    """The shape and the kind of each result."""
+    memory: int
+    """The number of vectors that it needs for large arrays."""
+
+
+class Functions:
+    """The parts of a program that are called several times, such as its field, each written once as
+    a function. Its arguments and results are numbers in registers."""
+
+    def __init__(self, jaxprs: Sequence[ClosedJaxpr | Jaxpr]):
+        self.texts: list[str] = []
+        self._calls: dict[int, int] = {}
+        self._found: dict[tuple, _Function | None] = {}
+        for jaxpr in jaxprs:
+            self._count(inner(jaxpr))
+
+    def _count(self, jaxpr: Jaxpr) -> None:
+        for eqn in jaxpr.eqns:
+            body = called(eqn)
+            for each in _bodies(eqn) if body is None else [inner(body)]:
+                number = self._calls.get(id(each), 0)
+                if body is not None:
+                    self._calls[id(each)] = number + 1
+                if not number:
+                    self._count(each)
+
+    def call(
+        self, t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any], mask: Value
+    ) -> list[Any] | None:
+        """Return the results of a call, or `None` if it should be written inline."""
+        jaxpr = inner(closed)
+        if self._calls.get(id(jaxpr), 0) < 2 or not all(isinstance(x, Registers) for x in args):
+            return None
+        key = id(jaxpr), *((x.shape, x.kind) for x in args)
+        if key not in self._found:
+            is_large = size_of(jaxpr) >= _LEAST_FUNCTION
+            self._found[key] = self._written(t, closed, args) if is_large else None
+        found = self._found[key]
+        if found is None:
+            return None
+        block = t.arena.take(max(found.memory, 1))
+        values = [f"{t.vector(x.kind)} {x.text}" for x in (*_flat(args), mask)]
+        given = ", ".join([f"ptr {Memory(block).pointer(t)}", *values])
+        call = t.raw(f"call fastcc {self._type(t, found.results)} @{found.name}({given})")
+        number = iter(range(len(_numbers(found.results))))
+
+        def result(kind: str) -> Value:
+            what = f"{self._type(t, found.results)} {call}, {next(number)}"
+            return Value(t.raw(f"extractvalue {what}"), kind)
+
+        return [
+            Registers.of(shape, kind, lambda _, kind=kind: result(kind))
+            for shape, kind in found.results
+        ]
+
+    def _written(self, t: Text, closed: ClosedJaxpr | Jaxpr, args: list[Any]) -> _Function | None:
+        """Write a function; `None` if its results are not all in registers."""
+        own = Text(t.width)
+        own.declared, own.functions = t.declared, self
+        given = [mapped(own, lambda x: Value(own.fresh(), x.kind), x) for x in args]
+        mask = Value(own.fresh(), "i1")
+        results = [computed(own, x) for x in write(own, closed, given, mask)]
+        if not all(isinstance(x, Registers) for x in results):
+            return None
+        shapes = [(x.shape, x.kind) for x in results]
+        found = _Function(f"part{len(self.texts)}", shapes, own.arena.size)
+        kind, name = self._type(t, found.results), "poison"
+        for i, x in enumerate(_flat(results)):
+            name = own.raw(f"insertvalue {kind} {name}, {t.vector(x.kind)} {x.text}, {i}")
+        values = [f"{t.vector(x.kind)} {x.text}" for x in (*_flat(given), mask)]
+        parameters = ", ".join(["ptr %arena", *values])
+        of_type = f"define internal fastcc {kind}"
+        head = f"{of_type} @{found.name}({parameters}) noinline #0 {{\nentry:"
+        self.texts.append("\n".join([head, *own.lines, f"  ret {kind} {name}", "}"]))
+        return found
+
+    def _type(self, t: Text, results: list[tuple[tuple[int, ...], str]]) -> str:
+        return "{ " + ", ".join(t.vector(kind) for kind in _numbers(results)) + " }"
+
+
+def _numbers(results: list[tuple[tuple[int, ...], str]]) -> list[str]:
+    """Return the kind of each number of some results."""
+    return [kind for shape, kind in results for _ in np.ndindex(shape)]
 
 
 def _only_number(x: Array) -> Value | None:

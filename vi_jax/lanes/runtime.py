@@ -33,6 +33,11 @@ _MOST_KERNELS = 64
 # derivative with respect to one number none. With AVX2 only up to 32 numbers were measured.
 _MOST_NUMBERS = {512: 64, 256: 32}
 
+# Derivatives of so few lanes are compiled without LLVM's passes, which take half of its time. They
+# run up to 9 % slower so, as the derivatives of a search for an orbit. Programs of values would run
+# up to 29 % slower, and one lane would differ from the same lane of a batch by rounding.
+_FEW_LANES = 2
+
 # More than the cores of any machine; a process may not be granted as many threads.
 _MOST_THREADS = 1024
 
@@ -111,9 +116,9 @@ class Kernel:
     """The machine code of a program for groups of `width` lanes. It is compiled on another thread
     and lives as long as this object."""
 
-    def __init__(self, text: str, cpu: str | None, width: int):
-        self.key, self.width = key_of(text, cpu), width
-        self._code = compile_in_background(text, cpu)
+    def __init__(self, text: str, cpu: str | None, width: int, passes: bool = True):
+        self.key, self.width = key_of(text, cpu, passes), width
+        self._code = compile_in_background(text, cpu, passes)
 
     @functools.cached_property
     def function(self) -> Any:
@@ -188,9 +193,11 @@ def _pool(number: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(number, thread_name_prefix="lanes")
 
 
-def key_of(text: str, cpu: str | None) -> int:
-    """Return a number for a program's text and a processor, equal in all processes."""
-    digest = hashlib.blake2b((text + (cpu or "")).encode(), digest_size=7).digest()
+def key_of(text: str, cpu: str | None, passes: bool = True) -> int:
+    """Return a number for a program's text, a processor and LLVM's passes, equal in all
+    processes."""
+    content = text + (cpu or "") + ("" if passes else "without passes")
+    digest = hashlib.blake2b(content.encode(), digest_size=7).digest()
     return int.from_bytes(digest, "little")
 
 
@@ -208,12 +215,14 @@ def kernel_of(program: AnyProgram, lanes: int, one_for_all: tuple[bool, ...] = (
     cpu = _cpu.get()
     bits = _register_bits(cpu)
     width = _width(program, lanes, bits)
+    derived = isinstance(program, ReverseProgram) or any(program.tangents)
+    passes = not derived or lanes > _FEW_LANES
     with _lock:
         keys = _keys.setdefault(program, {})
-        kernel = _in_use.get(keys.get((cpu, width, one_for_all), -1))
+        kernel = _in_use.get(keys.get((cpu, passes, width, one_for_all), -1))
     if kernel is None:
-        kernel = _new_kernel(program, cpu, (width, bits, one_for_all))
-        keys[cpu, width, one_for_all] = kernel.key
+        kernel = _new_kernel(program, cpu, passes, (width, bits, one_for_all))
+        keys[cpu, passes, width, one_for_all] = kernel.key
     _recent.put(kernel.key, kernel)
     return kernel
 
@@ -234,7 +243,7 @@ def _width(program: AnyProgram, lanes: int, bits: int) -> int:
 
 
 def _new_kernel(
-    program: AnyProgram, cpu: str | None, form: tuple[int, int, tuple[bool, ...]]
+    program: AnyProgram, cpu: str | None, passes: bool, form: tuple[int, int, tuple[bool, ...]]
 ) -> Kernel:
     """Return the kernel of a program without a text for these arguments `form` of `kernel_text`. It
     is compiled only if its text is new."""
@@ -242,11 +251,11 @@ def _new_kernel(
         check(jaxpr.jaxpr)
     backward = isinstance(program, ReverseProgram)
     text = reverse_text(program, *form) if backward else kernel_text(program, *form)
-    key = key_of(text, cpu)
+    key = key_of(text, cpu, passes)
     with _lock:
         kernel = _in_use.get(key)
         if kernel is None:
-            kernel = _in_use[key] = Kernel(text, cpu, form[0])
+            kernel = _in_use[key] = Kernel(text, cpu, form[0], passes)
     return kernel
 
 

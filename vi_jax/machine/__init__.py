@@ -15,29 +15,35 @@ from .clocks import (
 )
 from .contacts import (
     added, check_takes, constrained_rate, contact_constraints, field_in, forces, on_held_surfaces,
-    push_gains, push_of, shown_modes, velocity_change, with_friction_impulse,
+    push_gains, push_of, row_of, shown_modes, velocity_change, with_friction_impulse,
 )
 from .coordinates import (
-    Coordinate, angles_in, component, has_component, is_angle, nearest_images, with_component,
+    Coordinate, Row, angles_in, component, has_component, is_angle, nearest_images, with_component,
     without_turns, wrap_angles,
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
 from .declared import (
-    clock_of, has_own_modes, is_builtin, others_of, outcomes_of, overridden, section_in, stops_of,
-    switches_of, with_earlier_clock,
+    clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in,
+    stops_of, switches_of, with_earlier_clock,
 )
+from .delay import (
+    FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
+    recorded_numbers, without_past,
+)
+from .delay_chain import delay_chain
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
     SliderCrank,
 )
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    HybridState, Reset, Switch, after_event, begin_modes, begun, event_of, events_of,
-    friction_on, guard_of, has_contact_friction, holds_anywhere, is_autonomous, jump_of,
+    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes, event_of,
+    events_of, friction_on, guard_of, has_contact_friction, history_of, holds_anywhere,
+    is_autonomous, jump_of,
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )
-from .friction import ContactFriction, DryFriction
+from .friction import ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes
 from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (
@@ -47,5 +53,6 @@ from .numbers import (
     stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
 )
 from .scene import Parameters, Scene
+from .settle import Strike, strike
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop, stop_in_words

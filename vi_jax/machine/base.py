@@ -235,6 +235,8 @@ class AbstractMachine(Shown):
     | `modes` | discrete modes by name, which events change |
     | `position`, `velocity`, `placed` | the coordinate of contacts that name none |
     | `coordinates` | several coordinates by index |
+    | `delays` | delays by name; then the past follows the state in functions |
+    | `recorded`, `before` | what is delayed, by default the state; its history before the start |
     | `averages` | means over a cycle: a power, a mean force |
     | `quantities` | functions of the state, by name, included in results |
     | `renewed` | a drifting component, set back in each cycle |
@@ -281,6 +283,8 @@ class AbstractMachine(Shown):
         events: Any = eqx.field(init=False)
         modes: Any = eqx.field(init=False)
         coordinates: Any = eqx.field(init=False)
+        delays: Any = eqx.field(init=False)
+        before: Any = eqx.field(init=False)
     else:
 
         @property
@@ -314,6 +318,24 @@ class AbstractMachine(Shown):
             `on`; a contact without `on` acts on the machine's `position`, `velocity` and
             `placed`."""
             return _coordinates_in(self)
+
+        @derived
+        def delays(self) -> Mapping[str, Any]:
+            """The delays by name, lengths in `s` that may depend on parameters. The field, guards
+            and resets then receive the past after the state: `past.turn.x` is x one delay `turn`
+            ago."""
+            return {}
+
+        @derived
+        def before(self) -> Any:
+            """The history before the start: a state like `recorded`, or a function of t ≤ 0; by
+            default the start."""
+            return None
+
+    def recorded(self, *args: Any, **kwargs: Any) -> Any:
+        """Return what is delayed, numbers by name: `recorded(s, state, past, *modes)`, by default
+        the state."""
+        return args[1]
 
     def start(self) -> State:
         """Return the default start. **Raises:** `ValueError` if the machine defines none."""

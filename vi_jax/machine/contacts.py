@@ -18,7 +18,8 @@ import numpy as np
 from jax.lax import stop_gradient
 
 from .._types import Flag, Machine, Scalar, Scalars, State
-from .declared import stops_of, switches_of
+from .coordinates import Row
+from .declared import limited_in, stops_of, switches_of
 from .state import like
 
 # A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other
@@ -36,14 +37,40 @@ def push_of(coordinate: Any, state: State) -> State:
     return jax.jvp(lambda V: coordinate.placed(state, place, V), (velocity,), (one,))[1]
 
 
+def row_of(coordinate: Any, s: Scalar, state: State) -> Row:
+    """Return the row of a coordinate in the equations of contacts."""
+    if coordinate.row is not None:
+        return coordinate.row(state)
+    return Row(push_of(coordinate, state), coordinate.mass_at(s, state))
+
+
 def velocity_change(coordinate: Any, state: State, change: State) -> Scalar:
     """Return the change of a coordinate's velocity for this change of the state."""
     return jnp.asarray(jax.jvp(coordinate.velocity, (state,), (change,))[1])
 
 
-def push_gains(bodies: Sequence[Any], state: State, pushes: Sequence[State]) -> list[list[Scalar]]:
+def push_gains(
+    bodies: Sequence[Any], rows: Sequence[Row], state: State, pushes: Sequence[State]
+) -> list[list[Scalar]]:
     """Return the change of each coordinate's velocity (row) by each push (column)."""
-    return [[velocity_change(body, state, push) for push in pushes] for body in bodies]
+    return [
+        [
+            velocity_change(body, state, push) if row.slopes is None else _product(row.slopes, push)
+            for push in pushes
+        ]
+        for body, row in zip(bodies, rows, strict=True)
+    ]
+
+
+def _product(slopes: State, push: State) -> Scalar:
+    """Return the sum of the products of two trees' numbers, without known zeros."""
+    terms = []
+    for a, b in zip(jtu.tree_leaves(slopes), jtu.tree_leaves(push), strict=True):
+        if not any(isinstance(x, np.ndarray) and not x.any() for x in (a, b)):
+            is_one = isinstance(a, np.ndarray) and (a == 1).all()
+            term = b if is_one else a * b
+            terms.append(jnp.sum(term) if jnp.ndim(term) else term)
+    return jnp.asarray(sum(terms[1:], terms[0]) if terms else 0.0)
 
 
 def forces(
@@ -110,13 +137,14 @@ def with_friction_impulse(
     stop's impulse."""
     stop = stops_of(machine)[number]
     body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
-    push, drag = push_of(body, before), push_of(along, before)
-    gains = push_gains((body, along), before, (push, drag))
+    rows = [row_of(x, s, before) for x in (body, along)]
+    push, drag = (row.push for row in rows)
+    gains = push_gains((body, along), rows, before, (push, drag))
     normal, slip = body.velocity(before), along.velocity(before)
     wanted = body.velocity(after) - normal
     active = jnp.ones((), bool)
     sticking = forces(gains, (active, active), (wanted, -(1 + friction.restitution) * slip))
-    ratio = body.mass_at(s, before) / along.mass_at(s, before)
+    ratio = rows[0].mass / rows[1].mass
     level, outward = friction.level * ratio, -float(stop.sign)
     slips = jnp.abs(sticking[1]) > level * jnp.maximum(outward * sticking[0], 0.0)
     # Friction acts against the slip after the impact, which the stop's push changes, too.
@@ -141,11 +169,12 @@ def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple
 
 
 class ContactConstraints(NamedTuple):
-    """The constraints of bodies at rest on stops: a row for each coordinate that stops limit, in
-    their order, then a row for each friction on a stop."""
+    """The constraints of bodies at rest on stops and of dry frictions: a row for each coordinate
+    that stops limit, in their order, then for each friction on a stop, then for each dry one."""
 
     coordinates: list[Any]
     """The coordinates whose velocities are held; for a friction the one along the stop."""
+    rows: list[Row]
     pushes: list[State]
     """The change of the state by each force; for a stop with the friction on a slipping body."""
     acts: list[Flag]
@@ -153,39 +182,50 @@ class ContactConstraints(NamedTuple):
     stop_frictions: list[tuple[int, Any, int, Scalar]]
     """For each friction on a stop: its index among the switches, the friction, the row of its stop,
     and the share of the friction's push in the stop's."""
-    masses: list[Any]
-    """The effective mass of each row; empty without friction on stops."""
+    dry: list[int]
+    """The indices of the dry frictions among the switches."""
+
+    def amounts(self, state: State, wanted: Sequence[Scalar]) -> list[Scalar]:
+        """Return the amount of each push that changes the held velocities as `wanted`."""
+        gains = push_gains(self.coordinates, self.rows, state, self.pushes)
+        return forces(gains, self.acts, wanted)
 
 
 def contact_constraints(
-    machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar]
-) -> ContactConstraints:
-    """Return the constraints of bodies at rest on stops. **Arguments:** `modes`, those of switches
-    first; `contact`, as in `EventContext`; empty for no rest."""
-    limited = sorted({stop.coordinate for stop in stops_of(machine)}) if contact else []
+    machine: Any, s: Scalar, state: State, modes: Sequence[Scalar], contact: Sequence[Scalar],
+    *, with_dry: bool = True,
+) -> ContactConstraints:  # fmt: skip
+    """Return the constraints of bodies at rest on stops, and of dry frictions if `with_dry`; these
+    take no part in impacts, since their forces are finite. **Arguments:** `modes`, those of
+    switches first; `contact`, as in `EventContext`; empty for no rest."""
+    limited = limited_in(machine) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
-    stops, switches = (stops_of(machine), switches_of(machine)) if contact else ((), ())
-    frictions = [(i, x) for i, x in enumerate(switches) if x.friction_stop is not None]
+    stops, switches = stops_of(machine) if contact else (), switches_of(machine)
+    frictions = [(i, x) for i, x in enumerate(switches) if contact and x.friction_stop is not None]
     numbers = [*limited, *(x.along for _, x in frictions)]
-    push_along = {k: push_of(coordinates[k], state) for k in numbers}
-    pushes, acts = [push_along[k] for k in numbers], [contact[k] > 0 for k in limited]
-    masses = {k: coordinates[k].mass_at(s, state) for k in numbers} if frictions else {}
-    stop_frictions = []
+    by_number = {k: row_of(coordinates[k], s, state) for k in numbers}
+    rows, acts = [by_number[k] for k in numbers], [contact[k] > 0 for k in limited]
+    pushes, stop_frictions = [row.push for row in rows], []
     for i, friction in frictions:
         stop = stops[friction.friction_stop]
         row = limited.index(stop.coordinate)
         rests = contact[stop.coordinate] == 1.0 + friction.friction_stop
         # The stop pushes the body away, and friction acts against the slip.
-        ratio = masses[stop.coordinate] / masses[friction.along]
+        ratio = by_number[stop.coordinate].mass / by_number[friction.along].mass
         ratio = modes[i] * friction.level * stop.sign * ratio
         share = jnp.where(rests, ratio, 0.0)
-        pushes[row] = added(pushes[row], (share,), (push_along[friction.along],))
+        pushes[row] = added(pushes[row], (share,), (by_number[friction.along].push,))
         acts = [*acts, rests & (modes[i] == 0)]
         stop_frictions.append((i, friction, row, share))
     bodies = [coordinates[k] for k in numbers]
-    return ContactConstraints(
-        bodies, pushes, acts, stop_frictions, [masses[k] for k in numbers if frictions]
-    )
+    dry = [i for i, x in enumerate(switches) if x.is_dry] if with_dry else []
+    for i in dry:
+        row = switches[i].row(machine, s, state)
+        bodies, rows, pushes = (
+            [*bodies, switches[i].as_velocity(machine, s)], [*rows, row], [*pushes, row.push]
+        )  # fmt: skip
+        acts = [*acts, modes[i] == 0]
+    return ContactConstraints(bodies, rows, pushes, acts, stop_frictions, dry)
 
 
 def constrained_rate(
@@ -196,38 +236,23 @@ def constrained_rate(
     Forces on shared bodies are solved for together. Also return for each friction, by its index
     among the switches, the force along the surface, the normal force (`None` without a stop), and
     the effective mass."""
-    bodies, pushes, acts, stop_frictions, masses = contact_constraints(
-        machine, s, state, modes, contact
-    )
-    wanted, first = [-velocity_change(body, state, flow) for body in bodies], len(bodies)
-    dry = _add_dry_frictions(machine, s, state, modes, (bodies, pushes, acts))
-    for i, _ in dry:
-        wanted.append(-switches_of(machine)[i].slip_rate(machine, s, state, flow))
-    amounts = forces(push_gains(bodies, state, pushes), acts, wanted)
+    held = contact_constraints(machine, s, state, modes, contact)
+    first, switches = len(held.rows) - len(held.dry), switches_of(machine)
+    wanted = [-velocity_change(body, state, flow) for body in held.coordinates[:first]]
+    wanted += [-switches[i].slip_rate(machine, s, state, flow) for i in held.dry]
+    amounts = held.amounts(state, wanted)
     pace, found = machine.pace(s, state), {}
-    for (i, mass), amount in zip(dry, amounts[first:], strict=True):
-        force = amount * mass
-        found[i] = force if pace is None else force / pace, None, mass
-    for row, (i, friction, stop, _) in enumerate(stop_frictions, start=first - len(stop_frictions)):
-        sign = stops_of(machine)[friction.friction_stop].sign
-        found[i] = amounts[row] * masses[row], -sign * amounts[stop] * masses[stop], masses[row]
-    return added(flow, amounts, pushes), found
-
-
-def _add_dry_frictions(
-    machine: Machine, s: Scalar, state: State, modes: Sequence[Scalar], rows: tuple[list, ...]
-) -> list[tuple[int, Any]]:
-    """Add a row for each friction on a body to `ContactConstraints`. Return the frictions' indices
-    and masses. They take no part in impacts, since their forces are finite."""
-    found = []
-    for i, friction in enumerate(switches_of(machine)):
-        if friction.is_dry:
-            push, mass = friction.row(machine, s, state)
-            row = friction.as_velocity(machine, s), push, modes[i] == 0
-            for part, value in zip(rows, row, strict=True):
-                part.append(value)
-            found.append((i, mass))
-    return found
+    for i, row, amount in zip(held.dry, held.rows[first:], amounts[first:], strict=True):
+        force = amount * row.mass
+        found[i] = force if pace is None else force / pace, None, row.mass
+    for number, (i, friction, stop, _) in enumerate(
+        held.stop_frictions, start=first - len(held.stop_frictions)
+    ):
+        sign, masses = stops_of(machine)[friction.friction_stop].sign, (x.mass for x in held.rows)
+        masses = list(masses)
+        pressing = -sign * amounts[stop] * masses[stop]
+        found[i] = amounts[number] * masses[number], pressing, masses[number]
+    return added(flow, amounts, held.pushes), found
 
 
 def on_held_surfaces(
@@ -236,10 +261,9 @@ def on_held_surfaces(
     """Return a state in which bodies stick, or that slides along surfaces, without the rounding of
     its slips and of its distances from the surfaces. A motion that begins with a small slip sticks
     at once, so a slip has no derivatives."""
-    bodies, pushes, acts, _, _ = contact_constraints(machine, s, state, modes, contact)
-    _add_dry_frictions(machine, s, state, modes, (bodies, pushes, acts))
-    wanted = [-body.velocity(state) for body in bodies]
-    state = added(state, forces(push_gains(bodies, state, pushes), acts, wanted), pushes)
+    held = contact_constraints(machine, s, state, modes, contact)
+    amounts = held.amounts(state, [-body.velocity(state) for body in held.coordinates])
+    state = added(state, amounts, held.pushes)
     for i, switch in enumerate(switches_of(machine)):
         if switch.blends:  # both fields lead to the same place of the surface
             both = ((*modes[:i], jnp.full_like(s, m), *modes[i + 1 :]) for m in (1.0, -1.0))

@@ -15,6 +15,18 @@ from .._types import Machine, Scalar, State
 from .numbers import components, split_index
 
 
+class Row(NamedTuple):
+    """The row of a coordinate in the equations of contacts."""
+
+    push: State
+    """The change of the state by an impulse that changes the velocity by one."""
+    mass: Any
+    """The effective mass."""
+    slopes: State | None = None
+    """The derivative of its velocity with respect to the state's velocities, with zeros in place of
+    positions; `None` if unknown."""
+
+
 class Coordinate(NamedTuple):
     """A coordinate that stops limit."""
 
@@ -29,6 +41,10 @@ class Coordinate(NamedTuple):
     push: Callable[[State], State] | None = None
     """The change of the state by an impulse that changes the velocity by one; by default the
     derivative of `placed` with respect to the velocity."""
+    row: Callable[[State], Row] | None = None
+    """Its `Row`, if push, mass and slopes are computed together."""
+    moves_at_velocity: bool = False
+    """True if d(position)/ds is the velocity, exactly."""
 
     def mass_at(self, s: Scalar, state: State) -> Any:
         """Return the mass in a state."""

@@ -162,6 +162,11 @@ def has_own_modes(machine: Any) -> bool:
 stops_of, switches_of, others_of = map(attrgetter, ("_stops", "_switches", "_others"))
 
 
+def limited_in(machine: Machine) -> list[int]:
+    """Return the numbers of the coordinates that stops limit."""
+    return sorted({stop.coordinate for stop in stops_of(machine)})
+
+
 def clock_of(machine: Machine, state: State) -> Scalar | None:
     """Return the component of the state that counts cycles; `None` if `s` does."""
     return machine._clock(state)

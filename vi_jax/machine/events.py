@@ -5,6 +5,7 @@ An argument `number` is that of an event. `modes` are all of the machine, before
 `contact` is as in `EventContext`.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
 from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import choose_modes, frictions_in
+from .friction import frictions_in, settled_modes
 from .numbers import Shown, size_of
 from .state import changed
 
@@ -73,9 +74,6 @@ def after_event(
     new, changed = event.after(machine, s, state, *modes[part], **keywords)
     if event.holds_mode:
         changed = (*modes[: part.start], changed, *modes[part.stop :])
-        if event.is_dry and len(frictions_in(machine)) > 1:
-            changed, was_sticking = constant_modes(changed, s), modes[part.start] == 0
-            changed = choose_modes(machine, s, new, changed, contact, (part.start, was_sticking))
     return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
 
 
@@ -141,14 +139,9 @@ def struck_modes(
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
     are unchanged, or `own`."""
-    event_modes, flow = [], None
-    solve_together = holds_anywhere(machine) and len(frictions_in(machine)) > 1
-    if solve_together:
-        flow = field_in(machine, s, state, modes)
+    event_modes = []
     for number, event in enumerate(events_of(machine)):
-        if solve_together and (event.is_dry or getattr(event, "friction_stop", None) is not None):
-            event_modes.append(event.slip_sign(machine, s, state, flow))  # pyright: ignore
-        elif event.holds_mode:
+        if event.holds_mode:
             _, part, keywords = event_of(machine, number, modes, contact)
             mode = event.struck(machine, s, state, *modes[part], **keywords)
             if before is not None and isinstance(event, Switch) and not event.slides:
@@ -158,8 +151,8 @@ def struck_modes(
             event_modes.append(mode)
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
-    if solve_together:
-        modes = constant_modes(choose_modes(machine, s, state, modes, contact), s)
+    if frictions_in(machine):
+        modes = constant_modes(settled_modes(machine, s, state, modes, contact), s)
     return modes
 
 
@@ -212,13 +205,16 @@ class HybridState(Shown):
 
     - `state`: the state, as the machine's field receives it.
     - `modes`: the machine's discrete modes, a tuple in the order of its `modes`.
+    - `history`: the history of a machine with delays, as a run returns it; by default `None`, the
+      machine's `before`.
     """
 
     state: Any
     modes: tuple[Any, ...]
+    history: Any = None
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("state", "modes") or name.startswith("__"):
+        if name in ("state", "modes", "history") or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.state, name)
 
@@ -236,14 +232,20 @@ def modes_of(state: State) -> tuple[Any, ...] | None:
     return state.modes if isinstance(state, HybridState) else None
 
 
-def with_modes(state: State, modes: tuple[Any, ...] | None) -> State:
-    """Return the state with these own modes of the machine; unchanged without modes."""
-    return HybridState(state, modes) if modes else state
+def history_of(state: State) -> Any:
+    """Return the history of a machine with delays in a state, or `None`."""
+    return state.history if isinstance(state, HybridState) else None
+
+
+def with_modes(state: State, modes: tuple[Any, ...] | None, history: Any = None) -> State:
+    """Return the state with these own modes of the machine, and this history; unchanged without
+    both."""
+    return HybridState(state, modes or (), history) if modes or history is not None else state
 
 
 def replaced(state: State, new: State) -> State:
-    """Return another state in the same modes."""
-    return HybridState(new, state.modes) if isinstance(state, HybridState) else new
+    """Return another state in the same modes, with the same history."""
+    return dataclasses.replace(state, state=new) if isinstance(state, HybridState) else new
 
 
 def begun(machine: Machine, state: State, axes: int = 0) -> State:

@@ -3,8 +3,7 @@
 import abc
 import functools
 import inspect
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import pi
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -29,22 +28,20 @@ from .._types import Flag, Machine, Scalar, Scalars, State
 from .contacts import (
     added,
     constrained_rate,
+    contact_constraints,
     field_in,
     forces,
     push_gains,
-    push_of,
     rate_of,
+    row_of,
     velocity_change,
 )
-from .declared import hashable, stops_of, switches_of
+from .coordinates import Row
+from .declared import hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
+from .settle import Contacts, settle
 from .state import with_components
-
-# In a tried set of modes, a force may have the wrong sign up to this share of the largest friction
-# force: a choice, far above the accuracy of an event, at which the force equals the largest
-# friction and the body does not accelerate yet.
-_FORCE_TOLERANCE = 1e-6
 
 
 class Friction(AbstractSwitch):
@@ -97,11 +94,19 @@ class Friction(AbstractSwitch):
         return self.slip_sign(machine, s, state)
 
     def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
-        flow = None if around is None else field_in(machine, s, state, around.modes)
-        slips = self.slip_sign(machine, s, state, flow)
-        if not self.is_known(around):
-            return slips
-        return jnp.where(slips == 0, self._mode_at_rest(machine, s, state, around, True), slips)
+        """Return the direction of slip: `settled_modes` decides which bodies stick."""
+        return self.slip_sign(machine, s, state)
+
+    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
+        """Return the state without a slip that vanishes, and the mode unchanged: `settled_modes`
+        decides."""
+        return self.stopped(machine, s, state, mode, around), mode
+
+    @abc.abstractmethod
+    def stopped(
+        self, machine: Machine, s: Scalar, state: State, mode: Scalar, around: EventContext | None
+    ) -> State:
+        """Return the state with a slip of zero, where it vanishes to rounding."""
 
     def guard(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the guard of slip that vanishes, or of a force that exceeds friction. It is
@@ -115,32 +120,15 @@ class Friction(AbstractSwitch):
         touches = self.touches(machine, around.contact)
 
         def forces() -> tuple[Scalar, Scalar]:
-            pull, largest = self._balanced_force(machine, s, state, around, mode)
-            return pull - largest, -pull - largest
+            solve: Any = _solve_forces
+            _, found = solve(machine, s, state, around.with_mode(mode), around.contact)
+            each = found[around.mode_index]
+            force, largest, _ = self.held(machine, s, state, around.contact, each)
+            return -force - largest, force - largest
 
         # Without sticking, no force is computed.
         without_forces = jnp.where(touches, slip_guard, -1.0)
         return jax.lax.cond((mode == 0) & touches, forces, lambda: (without_forces, without_forces))
-
-    def _balanced_force(
-        self, machine: Machine, s: Scalar, state: State, around: Any, mode: Scalar
-    ) -> tuple[Any, Any]:
-        """Return the force that friction balances on a body that sticks, and the largest one."""
-        solve: Any = _solve_forces
-        _, found = solve(machine, s, state, around.with_mode(mode), around.contact)
-        force, largest, _ = self.held(machine, s, state, around.contact, found[around.mode_index])
-        return -force, largest
-
-    def _mode_at_rest(
-        self, machine: Machine, s: Scalar, state: State, around: Any, sticks: Flag | bool
-    ) -> Scalar:
-        """Return the mode of a body without slip: sticking if it may and the force is not too
-        large, else the direction of the force."""
-        if not self.is_known(around):
-            return jnp.zeros_like(s)
-        pull, largest = self._balanced_force(machine, s, state, around, jnp.zeros_like(s))
-        holds = sticks & (jnp.abs(pull) <= largest) | ~self.touches(machine, around.contact)
-        return jnp.where(holds, 0.0, jnp.where(pull < 0, -1.0, 1.0))
 
 
 @eqx.filter_jit
@@ -207,19 +195,18 @@ class DryFriction(Friction):
             return jnp.asarray(call_law(self.slip, machine, s, state))
         return machine._coordinate_on(self.on, self.mass).velocity(state)
 
-    def row(self, machine: Machine, s: Scalar, state: State) -> tuple[State, Any]:
-        """Return the change of the state by an impulse of unit slip, and the effective mass."""
+    def row(self, machine: Machine, s: Scalar, state: State) -> Row:
+        """Return the slip's row in the equations of contacts."""
         if self.push is None:
-            body = machine._coordinate_on(self.on, self.mass)
-            push, mass = push_of(body, state), body.mass_at(s, state)
+            row = row_of(machine._coordinate_on(self.on, self.mass), s, state)
             if self.slip is None:
-                return push, mass
-            push = jtu.tree_map(lambda x: x / mass, push)
+                return row
+            push = jtu.tree_map(lambda x: x / row.mass, row.push)
         else:
             none = jtu.tree_map(jnp.zeros_like, state)
             push = with_components(none, self.push, "`push` of a DryFriction", all_of_them=False)
         gain = velocity_change(self.as_velocity(machine, s), state, push)
-        return jtu.tree_map(lambda x: x / gain, push), 1 / gain
+        return Row(jtu.tree_map(lambda x: x / gain, push), 1 / gain)
 
     @property
     def slip_takes_time(self) -> bool:
@@ -248,21 +235,16 @@ class DryFriction(Friction):
 
     def push_in(self, machine, s, state, mode):
         """Return the change of the slip by the force on a body that slides, and its push."""
-        push, mass = self.row(machine, s, state)
-        return -mode * self.sliding(machine, s, state, mode) / mass, push
+        row = self.row(machine, s, state)
+        return -mode * self.sliding(machine, s, state, mode) / row.mass, row.push
 
-    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
-        new = self.stopped(machine, s, state)
-        return new, self._mode_at_rest(machine, s, new, around, mode != 0)
-
-    def stopped(self, machine: Machine, s: Scalar, state: State) -> State:
-        """Return the state with a slip of zero, where it vanishes to rounding."""
+    def stopped(self, machine, s, state, mode, around):
         if self.slip is None and self.push is None:
             body = machine._coordinate_on(self.on, self.mass)
             velocity = body.velocity(state)
             return body.placed(state, body.position(state), jnp.zeros_like(velocity))
-        slip, (push, _) = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
-        return added(state, (-slip,), (push,))
+        slip, row = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
+        return added(state, (-slip,), (row.push,))
 
 
 class ContactFriction(Friction):
@@ -288,16 +270,16 @@ class ContactFriction(Friction):
     def speed_of_slip(self, machine, s, state):
         return machine.coordinates[self.along].velocity(state)
 
-    def after(self, machine, s, state, mode, *, around: EventContext | None = None):
-        # The slip vanishes to rounding. Its correction must not change the velocity at the stop.
+    def stopped(self, machine, s, state, mode, around):
+        # The correction must not change the velocity at the stop.
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
         both = (machine.coordinates[stop.coordinate], along)
-        pushes = [push_of(body, state) for body in both]
+        rows = [row_of(body, s, state) for body in both]
+        pushes = [row.push for row in rows]
         stops = [self.touches(machine, () if around is None else around.contact), mode != 0]
         wanted = [-body.velocity(state) for body in both]
-        amounts = forces(push_gains(both, state, pushes), stops, wanted)
-        state = added(state, amounts, pushes)
-        return state, self._mode_at_rest(machine, s, state, around, mode != 0)
+        amounts = forces(push_gains(both, rows, state, pushes), stops, wanted)
+        return added(state, amounts, pushes)
 
     def touches(self, machine, contact):
         if not contact:
@@ -327,68 +309,132 @@ def _argument_count(function: Callable[..., Any]) -> int:
     return min(max(count, 1), 3)
 
 
-def choose_modes(
+# A body that a force sets in motion does not stick again at once: at this event its force equals
+# the largest one to the accuracy of the event, which this share exceeds. A choice.
+_RELEASED = 1e-6
+
+
+def settled_modes(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    released: tuple[int, Flag] | None = None,
+    released: dict[int, Flag] | None = None,
 ) -> Scalars:  # fmt: skip
-    """Return the modes of several frictions after one has changed: the first set that is consistent
-    with all forces, in the order of decreasing numbers of sticking bodies. A friction with slip
-    keeps its direction, and that in `released` (index and flag) does not stick. Each of the others
-    sticks or slips either way."""
-    indices = frictions_in(machine)
-    switches = switches_of(machine)
-    flow = field_in(machine, s, state, modes)
-    signs = [switches[i].slip_sign(machine, s, state, flow) for i in indices]
-    slips = [x != 0 for x in signs]
-    if released is not None:  # the slip of a sticking body is rounding
-        slips = [
-            x & (modes[i] != 0) & (i != released[0]) if switches[i].is_dry else x
-            for i, x in zip(indices, slips, strict=True)
-        ]
-    sets = itertools.product((0.0, 1.0, -1.0), repeat=len(indices))
-    ordered = jnp.asarray(sorted(sets, key=lambda x: sum(map(abs, x))), jnp.result_type(s))
+    """Return the modes with those of all frictions after a jump, or after events of frictions. Each
+    body without slip sticks, or begins to slip; NaN if no motion fulfils the laws of friction.
 
-    def try_next(x: tuple[Any, ...]) -> tuple[Any, ...]:
-        _, number, _ = x
-        new, chosen = list(modes), ordered[number]
-        for k, (i, slip_sign, slip) in enumerate(zip(indices, signs, slips, strict=True)):
-            new[i] = jnp.where(slip, slip_sign, chosen[k])
-        good = _is_consistent(machine, s, state, tuple(new), contact, indices, slips, released)
-        return tuple(new), number + 1, jnp.where(good, 1.0, 0.0)
+    **Arguments:** `modes`, for a friction with slip its direction; `contact`, as in `EventContext`;
+    `released`, after events of frictions: for each friction whether its force has just become too
+    large.
+    """
+    indices, switches = frictions_in(machine), switches_of(machine)
+    slips, holds, flow = [], [], field_in(machine, s, state, modes)
+    for i in indices:
+        friction, ratio = switches[i], getattr(switches[i], "static_ratio", 1.0)
+        slip = friction.slip_sign(machine, s, state, flow)
+        if released is not None:  # the slip of a sticking body is rounding
+            slip = jnp.where(modes[i] == 0, 0.0, slip)
+            begins = released.get(i, jnp.zeros((), bool))
+            ratio = jnp.where(begins, 1 - _RELEASED, ratio)
+        slips.append(slip)
+        holds.append(ratio + jnp.zeros_like(s))
+    solve: Any = _settled
+    found, _ = solve(machine, s, state, modes, contact, tuple(slips), tuple(holds))
+    new = list(modes)
+    for i, mode in zip(indices, found, strict=True):
+        new[i] = mode
+    return tuple(new)
 
-    zero = jnp.zeros_like(s)
-    begin = tuple(modes), jnp.zeros((), int), zero
-    found, _, good = jax.lax.while_loop(
-        lambda x: (x[2] == 0) & (x[1] < len(ordered)), try_next, stop_gradient(begin)
+
+def pressed_contacts(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
+) -> Scalars:
+    """Return the contacts (as in `EventContext`) without those that the forces of this state open,
+    in these modes of frictions."""
+    indices, switches = frictions_in(machine), switches_of(machine)
+    slips = tuple(modes[i] for i in indices)
+    ratios = (getattr(switches[i], "static_ratio", 1.0) for i in indices)
+    solve: Any = _settled
+    holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
+    return solve(machine, s, state, modes, contact, slips, holds)[1]
+
+
+@eqx.filter_jit
+def _settled(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
+    slips: Scalars, holds: Scalars,
+) -> tuple[Scalars, Scalars]:  # fmt: skip
+    """Return the modes of frictions by their slips, and the contacts that stay closed; jitted like
+    `_solve_forces`."""
+    indices, switches = frictions_in(machine), switches_of(machine)
+    order = [i for i in indices if switches[i].is_dry or contact]
+    order.sort(key=lambda i: switches[i].is_dry)
+    slip_of, hold_of = (
+        dict(zip(indices, slips, strict=True)),
+        dict(zip(indices, holds, strict=True)),
     )
-    return tuple(jnp.where(good > 0, new, old) for new, old in zip(found, modes, strict=True))
+    if not order and not contact:
+        return slips, contact
+    free = tuple(0.0 * x if i in indices else x for i, x in enumerate(modes))
+    held = contact_constraints(machine, s, state, free, contact)
+    touches = [switches[i].touches(machine, contact) for i in order]
+    slip = [jnp.where(x, slip_of[i], 0.0) for i, x in zip(order, touches, strict=True)]
+    level = [switches[i].sliding(machine, s, state, slip_of[i]) for i in held.dry]
+    none = jnp.zeros((0,), s.dtype)
+    question, of = _question(machine, s, state, free, contact, held)
+    question = question._replace(
+        level=jnp.stack([x + 0 * s for x in level]) if level else none,
+        slip=jnp.stack(slip) if slip else none,
+        hold=jnp.stack([hold_of[i] for i in order]) if order else none,
+        touches=jnp.stack(touches[: len(of)]) if of else None,
+    )
+    answer = settle(question, of, has_ratios=bool(held.dry))
+    for n, i in enumerate(order):
+        mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
+        slip_of[i] = jnp.where(touches[n], mode, slip_of[i])
+    kept = list(contact)
+    for row, k in enumerate(limited_in(machine) if contact else ()):
+        kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
+    return tuple(slip_of.values()), tuple(kept)
+
+
+def _question(
+    machine: Machine, s: Scalar, state: State, modes: Sequence[Scalar], contact: Scalars, held: Any
+) -> tuple[Contacts, tuple[int, ...]]:
+    """Return gains and rates of the `held` rows of a state, and each tangent's contact. In `modes`
+    frictions are in mode 0, without a force."""
+    flow, pace = field_in(machine, s, state, tuple(modes)), machine.pace(s, state)
+    switches, one = switches_of(machine), jnp.ones_like(s)
+    of = tuple(stop for _, _, stop, _ in held.stop_frictions)
+    first = len(held.rows) - len(held.dry)
+    n = first - len(of)
+    outward, closed = [one] * len(held.rows), []
+    for row, k in enumerate(limited_in(machine) if contact else ()):
+        for number, stop in enumerate(stops_of(machine)):
+            if stop.coordinate == k:
+                on = contact[k] == 1.0 + number
+                outward[row] = jnp.where(on, -float(stop.sign), outward[row])
+        closed.append(contact[k] > 0)
+    rates = [velocity_change(body, state, flow) for body in held.coordinates[:first]]
+    rates += [switches[i].slip_rate(machine, s, state, flow) for i in held.dry]
+    gains = push_gains(held.coordinates, held.rows, state, held.pushes)
+    masses = [row.mass for row in held.rows]
+    sign = jnp.stack(outward)
+    matrix = jnp.stack([
+        jnp.stack([jnp.asarray(x / mass, s.dtype) for x, mass in zip(row, masses, strict=True)])
+        for row in gains
+    ])  # fmt: skip
+    rate = sign * jnp.stack(rates)
+    nothing = jnp.zeros((0,), s.dtype)
+    question = Contacts(
+        sign[:, None] * matrix * sign,
+        rate if pace is None else rate / pace,
+        jnp.stack([x.level + 0 * s for _, x, _, _ in held.stop_frictions]) if of else nothing,
+        jnp.stack(closed) if n else jnp.zeros((0,), bool),
+        nothing, nothing, nothing,
+    )  # fmt: skip
+    return question, of
 
 
 def frictions_in(machine: Machine) -> list[int]:
     """Return the indices of the frictions among a machine's switches."""
     switches = enumerate(switches_of(machine))
     return [i for i, x in switches if x.is_dry or x.friction_stop is not None]
-
-
-def _is_consistent(
-    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
-    indices: list[int], slips: list[Flag], released: tuple[int, Flag] | None,
-) -> Flag:  # fmt: skip
-    """Return whether all forces agree with these modes: sticking bodies are held, and bodies that
-    begin to slip are accelerated in that direction."""
-    solve: Any = _solve_forces
-    total, forces = solve(machine, s, state, modes, contact)
-    good = jnp.ones((), bool)
-    for i, slip in zip(indices, slips, strict=True):
-        friction, mode = switches_of(machine)[i], modes[i]
-        if i not in forces:  # on a stop without a resting body
-            continue
-        force, holds, mass = friction.held(machine, s, state, contact, forces[i])
-        rate = friction.slip_rate(machine, s, state, total)
-        sticks = jnp.abs(force) <= holds
-        if released is not None and released[0] == i:
-            sticks = sticks & ~released[1]
-        slides = mode * rate * mass >= -_FORCE_TOLERANCE * holds
-        touches = friction.touches(machine, contact)
-        good = good & (slip | ~touches | jnp.where(mode == 0, sticks, slides))
-    return good

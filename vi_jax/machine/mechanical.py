@@ -21,7 +21,8 @@ from .._types import Scalar, State
 from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
-from .coordinates import Coordinate, component
+from .coordinates import Coordinate, Row, component
+from .declared import overridden
 from .numbers import split_index
 from .state import State as Named
 from .state import like
@@ -246,7 +247,9 @@ class Mechanical(AbstractMachine):
             functools.partial(_velocity, self, on),
             functools.partial(_placed, self, on),
             functools.partial(_effective_mass, self, on),
-            functools.partial(_push_state, self, on),
+            lambda state: _row(self, on, state).push,
+            functools.partial(_row, self, on),
+            overridden(self, AbstractMachine, "pace") is None,
         )
 
     def _names_on(self, on: Any) -> tuple[str, str] | None:
@@ -324,12 +327,12 @@ def _rate_along(function: Callable[[Named], Any], q: Named, name: str, speed: An
     return jax.jvp(lambda x: function(q.replace(**{name: x})), (getattr(q, name),), (speed,))[1]
 
 
-def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
-    """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity,
-    and the effective mass 1/(J M⁻¹Jᵀ)."""
-    names = machine.free_names
-    slopes = dict(zip(machine.q_names, _gradient(machine, on, q), strict=True))
-    slopes = [slopes[name] for name in names]
+def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any, list[Any]]:
+    """Return M⁻¹Jᵀ/(J M⁻¹Jᵀ), the change of the velocities for a unit change of a gap's velocity;
+    the effective mass 1/(J M⁻¹Jᵀ); and J."""
+    names, gradient = machine.free_names, _gradient(machine, on, q)
+    by_name = dict(zip(machine.q_names, gradient, strict=True))
+    slopes = [by_name[name] for name in names]
     push = solved(machine.masses(q), slopes)
     gain = _dot(slopes, push)
     if _is_zero(gain):
@@ -338,23 +341,28 @@ def _push(machine: Mechanical, on: Any, q: Named) -> tuple[list[Any], Any]:
             "Its gap must depend on a coordinate that is not prescribed."
         )
     pushes = {name: 0.0 if _is_zero(x) else x / gain for name, x in zip(names, push, strict=True)}
-    return [pushes.get(name, 0.0) for name in machine.q_names], 1 / gain
+    return [pushes.get(name, 0.0) for name in machine.q_names], 1 / gain, gradient
 
 
 def _effective_mass(machine: Mechanical, on: Any, s: Scalar, state: State) -> Any:
     return _push(machine, on, machine.places(state))[1]
 
 
-def _push_state(machine: Mechanical, on: Any, state: State) -> Any:
-    q, name = machine.places(state), _coordinate_name(machine, on)
-    push = dict(zip(machine.q_names, _push(machine, on, q)[0], strict=True))
+def _row(machine: Mechanical, on: Any, state: State) -> Row:
+    name = _coordinate_name(machine, on)
+    push, mass, slopes = _push(machine, on, machine.places(state))
+    push = dict(zip(machine.q_names, push, strict=True))
     if name in push:
         push[name] = 1.0
     zero = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
-    q = machine.places(zero)
-    v = {x: (jnp if isinstance(push[x], jax.Array) else np).full_like(y, push[x])
-         for x, y in vars(q).items()}  # fmt: skip
-    return _in_state(zero, q, Named(**v))
+
+    def as_velocities(values: Iterable[Any]) -> Any:
+        both = zip(vars(machine.places(zero)).items(), values, strict=True)
+        v = {x: (jnp if isinstance(value, jax.Array) else np).full_like(y, value)
+             for (x, y), value in both}  # fmt: skip
+        return zero.replace(v=Named(**v))
+
+    return Row(as_velocities(push.values()), mass, as_velocities(slopes))
 
 
 def _placed(machine: Mechanical, on: Any, state: State, Y: Any, V: Any) -> Any:

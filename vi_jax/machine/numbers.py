@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from .._checks import on_host
 from .._types import Machine, Scalar, State
 from .declared import warn_of_unread
 
@@ -308,7 +309,7 @@ class Summarized(eqx.Module):
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        return self.summary() if known(self) else super().__repr__()
+        return on_host(self).summary() if known(self) else super().__repr__()
 
 
 def known(tree: object) -> bool:

@@ -10,7 +10,7 @@ from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
 from .grazing import SCENARIOS, Grazing, Motions, grazing
 from .results import (
-    ORBIT_RESULTS, STABILITY, Orbit, Orbits, check_multipliers, complex_in_words,
+    ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, complex_in_words,
     distance, distinct_among, distinct_orbits, in_one_line, multipliers_of, stability_of,
 )
 from .root_finders import AbstractRootFinder, Gradient, Newton

@@ -119,7 +119,7 @@ def _duration(free: Flight, stop: RigidStop, s: Scalar, u: Vector) -> Scalar:
     """Estimate the duration of a hop, with a force that grows linearly."""
     s, u = stop_gradient((s, u))
     here, body = _rates(free, stop, s, u), free.machine.coordinates[stop.coordinate]
-    rise = stop.sign * force_rate(free.smooth, body.position, free.smooth, s, free.unravel(u))
+    rise = stop.sign * force_rate(free.smooth, body, free.smooth, s, free.unravel(u))
     root = jnp.sqrt(jnp.maximum(0.25 * here.a**2 - 2 * rise * here.v / 3, 0.0))
     minus, plus = root - 0.5 * here.a, root + 0.5 * here.a
     if_pressed = -2 * here.v / jnp.where(plus > 0, plus, 1.0)

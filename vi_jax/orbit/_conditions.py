@@ -8,6 +8,7 @@ Quantities of a motion have names and are differentiable functions of its unknow
 import abc
 import dataclasses
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -84,7 +85,7 @@ def rates_at(
     return jax.jvp(values, (x,), (direction,))
 
 
-# A singular value of M - I is zero within this share of the largest one: a choice.
+# Multipliers are equal within this distance: a choice, far above their errors at a located point.
 _DOUBLE = 1e-4
 
 
@@ -288,7 +289,14 @@ def sum_of_minors(matrix: Array | np.ndarray) -> Array:
 
 
 def is_defective(problem: Shooting, step: Step, multiplier: float) -> bool:
-    """Return whether a double multiplier has one eigenvector only: a complex pair can begin."""
+    """Return whether at most one eigenvector belongs to a multiplier: it is simple, or double so
+    that a complex pair can begin."""
+    from scipy.linalg import schur  # slow to load
+
     sizes, M = np.asarray(problem.sizes)[1:], step.observed.monodromy
-    values = np.linalg.svd(M * sizes / sizes[:, None] - multiplier * np.eye(len(M)))[1]
-    return bool(len(values) < 2 or values[-2] > _DOUBLE * values[0])
+    matrix = M * sizes / sizes[:, None]
+    is_equal = lambda value: abs(value - multiplier) <= _DOUBLE
+    # Only the part of the matrix in the plane of both counts: near a grazing the others are large.
+    found: Any = schur(matrix, output="complex", sort=is_equal)
+    triangle, _, equal = found
+    return bool(equal < 2 or abs(triangle[0, 1]) > _DOUBLE)

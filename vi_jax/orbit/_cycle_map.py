@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -165,6 +164,8 @@ def cycle_map(
         machine = at_section(machine, section)
     default = preset(machine)
     if isinstance(default, FixedStep):  # its errors are too large for an orbit
+        import diffrax  # slow to load
+
         default = Adaptive(diffrax.Tsit5(), rtol=1e-11)
     method = chosen(machine, method, default)
     method.check(machine)

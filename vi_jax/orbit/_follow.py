@@ -23,7 +23,7 @@ from ..machine import nearest_images
 from ._problem import COARSE, steps_depend_on_motion, with_finer_steps, with_grown_sizes
 from ._shooting import Shooting
 from ._solution import Step, advance, distance_along, locate_zero, on_host, step_error
-from ._surgery import half_difference
+from ._surgery import half_difference, repeats_from
 from .special import Point
 
 # Reasons to end of every curve: Ctrl-C was pressed, the corrector fails, the curve closes, a bound.
@@ -470,8 +470,6 @@ def _starts_with_rates(problem: Shooting, x, along):
 
 def _other_starts(problem: Shooting, x: Vector) -> list[Vector]:
     """Return the same motion from other events, or without events from its other sections."""
-    if problem.autonomous and not problem.omits_sections:
-        return []
     clock, states = problem.parts(x)
     if not problem.events:
         sections = zip(*(part[1:] for part in problem.sections(x)), strict=True)
@@ -479,7 +477,7 @@ def _other_starts(problem: Shooting, x: Vector) -> list[Vector]:
         return [jnp.concatenate([state, x[states.size :]]) for state in later]
     found, period = [], problem.period(x)
     for first in range(1, problem.legs):
-        if problem.events[first:] + problem.events[:first] == problem.events:
+        if repeats_from(problem, first):
             later = jnp.concatenate([clock[first:], clock[:first] + period])
             found.append(problem.pack(later, jnp.roll(states, -first, axis=0), x, period))
     return found

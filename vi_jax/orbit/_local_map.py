@@ -41,6 +41,10 @@ _SHARE, _TRIES, _AGREE, _STEPS = 0.02, 10, 0.03, 8
 _WEAK = 0.03
 
 
+class NoLocalMapError(ValueError):
+    """A grazing has no local map; the message is that of an argument `point`."""
+
+
 class Kick(NamedTuple):
     """The change of the state by an impact: vector·(-h)^order at a fixed reading of the clock, with
     the least distance h without the impact."""
@@ -68,14 +72,15 @@ def soft_kick(
 
     length = _SHARE * float(problem.period(x)) / problem.cycles
     (field, change), (y, deepest) = fields(u), deepest_at(length)
-    deep_change = fields(deepest)[1]
+    deep_change, sizes = fields(deepest)[1], np.asarray(problem.sizes)[1:]
     # A stiff stop pushes by rounding, up to the error of the touch's place.
     place_error = _TOUCH_ERROR * np.abs(gradient) @ np.abs(u) / y**2
-    rounding = max(_CONTINUOUS * np.abs(field).max(), place_error * np.abs(deep_change).max())
-    if np.abs(change).max() > rounding:
+    largest = lambda rates: np.abs(rates / sizes).max()
+    rounding = max(_CONTINUOUS * largest(field), place_error * largest(deep_change))
+    if largest(change) > rounding:
         rate_beyond = rate + float(fast @ change)
         if rate_beyond <= 0:
-            raise ValueError(
+            raise NoLocalMapError(
                 "Argument `point` must be a grazing at which the motion leaves the surface again, "
                 "but beyond the surface it would stick or continue: d²h/ds² changes from "
                 f"{rate:.3g} to {rate_beyond:.3g}."
@@ -93,7 +98,8 @@ def soft_kick(
         measured.append((y, _change_by_contact(problem, x, number, leg, clock, deepest, length)))
         if len(measured) > 1:
             (y0, k0), (y1, k1) = measured[-2:]
-            order = log2(np.linalg.norm(k0) / np.linalg.norm(k1)) / log2(y0 / y1) / 2
+            order = log2(np.linalg.norm(k0 / sizes) / np.linalg.norm(k1 / sizes))
+            order /= 2 * log2(y0 / y1)
             orders.append(order)
             if len(orders) > 1 and abs(orders[-1] - orders[-2]) < _AGREE:
                 break
@@ -138,7 +144,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     def root(function: Any, low: float, high: float) -> float:
         guard = lambda s1: float(function(s1)[1])
         if guard(low) * guard(high) > 0:
-            raise ValueError(
+            raise NoLocalMapError(
                 "Argument `point` must be a grazing of a stop that is less stiff: a contact so "
                 "brief that it bends the motion little is less deep than rounding. Take a "
                 "`RigidStop`."
@@ -161,7 +167,7 @@ def _change_by_contact(problem: Shooting, x, number, leg, s, deep, length) -> np
     first = negative[0] if negative else 0
     end_index = next((i for i in range(first, len(values)) if values[i] >= 0), None)
     if end_index is None:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing at which the motion leaves the surface again, but "
             "a brief contact does not end."
         )
@@ -205,7 +211,8 @@ class Touch(NamedTuple):
 
 @on_host
 def _turn_margins(problem: Shooting, x):
-    """Return distance and clock of each turn; (legs, events, steps) each."""
+    """Return the distance of each turn, as a share of its size along the motion, and its clock;
+    (legs, events, steps) each."""
     machine = problem.at(x)
     clock, states = problem.parts(x)
 
@@ -215,21 +222,23 @@ def _turn_margins(problem: Shooting, x):
         _, _, path = flight.fly(s0, s1, after, problem.steps, rows=problem.steps)
         h = (s1 - s0) / problem.steps
         _, margins = turning_points(Path(flight, path[0], path[1], h, not problem.events))
-        return jnp.stack([margin for margin, _ in margins]), jnp.stack([s for _, s in margins])
+        sizes = problem.guard_sizes(flight, s0, after)
+        shares = [margin / size for (margin, _), size in zip(margins, sizes, strict=False)]
+        return jnp.stack(shares), jnp.stack([s for _, s in margins])
 
     ends = problem.ends(clock, problem.period(x))
     return jax.vmap(follow)(jnp.arange(problem.legs), clock, ends, states)
 
 
 def find_touches(
-    problem: Shooting, x: np.ndarray, number: int, clock: float, length: float
+    problem: Shooting, x: np.ndarray, number: int, clock: float
 ) -> list[tuple[int, int, float]]:
-    """Return event, leg and clock of each touch of a motion of extent `length`, each once. The
-    known touch may fall on the end of a flight, where no turn is found."""
+    """Return event, leg and clock of each touch of a motion, each once. The known touch may fall on
+    the end of a flight, where no turn is found."""
     (distances, places), period = _turn_margins(problem, x), float(problem.period(x))
     leg, leg_clock = problem.leg_at(x, clock)
     found = [(number, int(leg), float(leg_clock))]
-    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES * length):
+    for leg, other, step in np.argwhere(np.abs(distances) <= _TOUCHES):
         place = float(places[leg, other, step])
         time_differences = [
             abs((place - known + period / 2) % period - period / 2)
@@ -283,7 +292,7 @@ def touch_at(
     event = events_of(problem.machine)[number]
     u, gradient, rate, slope, fast, impact = _at_touch(problem, x, along, number, leg, clock)
     if not rate > 0:
-        raise ValueError(
+        raise NoLocalMapError(
             f"Argument `point` must be a grazing at which the motion turns, but the "
             f"distance's second derivative is {float(rate):.3g} there."
         )
@@ -293,7 +302,7 @@ def touch_at(
         kick = soft_kick(problem, x, number, leg, clock, u, gradient, fast, float(rate))
     else:
         called = Event(number).name_on(problem.machine)
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be the grazing of a stop or a switch, but it touches the "
             f"{called}, whose jump does not vanish with the speed."
         )
@@ -306,7 +315,7 @@ _STEEP = 1e-6
 
 class LocalMap(eqx.Module):
     """The map z ↦ N (z + kick·(-h)₊^order), h = slope·(p - p*) + ∂h·z, of neighbours of a grazing
-    motion, with their displacement z from it at the touch.
+    motion, with their displacement z from it at the touch, in the sizes of the state.
 
     A motion that grazes several times in its period has such a map for each touch, from which it
     leads to the next. Host arrays; m touches, n states.
@@ -367,7 +376,8 @@ class Section(NamedTuple):
     slope: np.ndarray
     """Derivative of the state with respect to the parameter."""
     matrix: np.ndarray
-    """The matrix from just after the first touch's kick to the next section."""
+    """The matrix from just after the first touch's kick to the next section, in the state's sizes.
+    """
 
 
 class LocalGrazing(NamedTuple):
@@ -378,19 +388,24 @@ class LocalGrazing(NamedTuple):
     map: LocalMap
     section: Section
 
+    @property
+    def sizes(self) -> np.ndarray:
+        """The sizes of the state, the units of the map's displacements."""
+        return np.asarray(self.problem.sizes)[1:]
+
 
 def graze_at(point: Point) -> LocalGrazing:
     problem, x, number, clock = _without_touch(point)
     problem, x = with_least_period(problem, x)
     scale, tangent = problem.scale, tangent_at(problem, x)
     if abs(tangent[-1]) < _STEEP:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing away from a fold, but the motion without the "
             "impact turns back there in its parameter."
         )
     along = tangent * scale / (tangent[-1] * scale[-1])
     period = float(problem.period(x))
-    places = find_touches(problem, x, number, clock, point.step.observed.length)
+    places = find_touches(problem, x, number, clock)
     touches = [touch_at(problem, x, along, *place) for place in places]
     touches.sort(key=lambda touch: touch.clock % period)
     touches = touches[-1:] + touches[:-1]  # the section follows the first touch
@@ -398,13 +413,15 @@ def graze_at(point: Point) -> LocalGrazing:
         touch.clock + (np.mod(following.clock - touch.clock, period) or period)
         for touch, following in zip(touches, [*touches[1:], touches[0]], strict=True)
     ]
+    sizes = np.asarray(problem.sizes)[1:]
+    matrices = [
+        transport(problem, x, touch.leg, touch.clock, end)
+        for touch, end in zip(touches, ends, strict=True)
+    ]
     local = LocalMap(
-        np.stack([
-            transport(problem, x, touch.leg, touch.clock, end)
-            for touch, end in zip(touches, ends, strict=True)
-        ]),
-        np.stack([touch.gradient for touch in touches]),
-        np.stack([touch.kick.vector for touch in touches]),
+        np.stack(matrices) * sizes / sizes[:, None],
+        np.stack([touch.gradient for touch in touches]) * sizes,
+        np.stack([touch.kick.vector for touch in touches]) / sizes,
         np.array([touch.kick.order for touch in touches]),
         np.array([touch.slope for touch in touches]),
     )  # fmt: skip
@@ -414,12 +431,12 @@ def graze_at(point: Point) -> LocalGrazing:
 def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
     """Return the motion without the grazing impact, the event's number and its clock."""
     if point.kind != "grazing" or not point.touches:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing at which something is touched, but is "
             f"{with_article(point.kind)}: {point.detail}."
         )
     if point.problem.landings:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing of a motion without rest on a stop, but this one "
             "rests."
         )
@@ -429,7 +446,7 @@ def _without_touch(point: Point) -> tuple[Shooting, np.ndarray, int, float]:
         clock = since_section(old, x, float(nearest.clock))
         return *with_sections(old, x), int(nearest.event), clock
     if old.events[i].cycle is not None:
-        raise ValueError(
+        raise NoLocalMapError(
             "Argument `point` must be a grazing of a stop, but there the section of the machine "
             "is touched: beyond it the motion has another number of cycles."
         )
@@ -482,7 +499,8 @@ def _section(problem: Shooting, x: np.ndarray, along: np.ndarray, touch: Touch) 
     matrix = transport(problem, x, touch.leg, touch.clock, place)
     if problem.events and problem.events[0].cycle is not None:  # the section is an event
         matrix = _event_matrix(problem, x, 0) @ matrix
-    return Section(state, slope, matrix)
+    sizes = np.asarray(problem.sizes)[1:]
+    return Section(state, slope, matrix * sizes / sizes[:, None])
 
 
 @on_host

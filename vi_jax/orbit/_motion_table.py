@@ -538,14 +538,15 @@ def _rate(problem: Shooting, machine: AbstractMachine, u: Vector) -> Vector:
 
 @on_host
 def _section_rate(problem: Shooting, x: Vector) -> tuple[Vector, Scalar]:
-    """Return the rate of a motion on its section, and its period."""
+    """Return the rate of a motion on its section, in the sizes of the state, and its period."""
     machine = problem.at(x)
     u = problem.after(machine, 0, jnp.zeros((), x.dtype), problem.parts(x)[1][0])
-    return _rate(problem, machine, u), problem.period(x)
+    return _rate(problem, machine, u) / problem.sizes[1:], problem.period(x)
 
 
 def _size_of(problem: Shooting, x: Unknowns) -> float:
-    """Return the distance that an autonomous motion would move in its period at its first rate."""
+    """Return the distance that an autonomous motion would move in its period at its first rate, in
+    the sizes of the state."""
     rate, period = _section_rate(problem, x)
     return float(np.linalg.norm(rate) * period)
 
@@ -562,7 +563,10 @@ def _hopf_between(problem: Shooting, here: Step, new: Step) -> Step | None:
     size, other = np.linalg.norm(rates, axis=1)
     guess = here.x + size / (size + other) * (new.x - here.x)
     found = _hopf_equilibrium(problem, guess)
-    if found is None or np.linalg.norm(found[0] - guess) > np.linalg.norm(new.x - here.x):
+    if found is None:
+        return None
+    moved, step = ((a - b) / problem.scale for a, b in ((found[0], guess), (new.x, here.x)))
+    if np.linalg.norm(moved) > np.linalg.norm(step):
         return None
     return _motion_about(problem, here, *found)
 
@@ -617,19 +621,22 @@ def _hopf_equilibrium(problem: Shooting, guess: np.ndarray) -> tuple[np.ndarray,
         return None
     y = y * scale
     vector = y[n + 2 : 2 * n + 2] + 1j * y[2 * n + 2 :]
-    return np.append(2 * np.pi / y[n + 1], y[: n + 1]), vector / np.linalg.norm(vector)
+    return np.append(2 * np.pi / y[n + 1], y[: n + 1]), vector / np.linalg.norm(vector / sizes)
 
 
 def _motion_about(problem: Shooting, here: Step, x: np.ndarray, vector: np.ndarray) -> Step | None:
     """Return a tiny motion about an equilibrium, where it passes the section."""
     _, section, slope = _linearise(problem, x)
-    section_part, steep = slope @ vector, np.linalg.norm(slope)
-    distance = np.linalg.norm(here.x[1:-1] - x[1:-1])
+    sizes = problem.scale[1:-1]
+    section_part, steep = slope @ vector, np.linalg.norm(slope * sizes)
+    distance = np.linalg.norm((here.x[1:-1] - x[1:-1]) / sizes)
     if abs(section_part) <= _VANISHES * steep or abs(section) > _VANISHES * steep * distance:
         return None  # the motion does not cross the section
     # The phase of the linear motion in which the section rises through zero.
     direction = (vector * (-1j * np.conj(section_part))).real
-    direction = np.concatenate([[0.0], direction / np.linalg.norm(direction), [0.0]])
+    direction /= np.linalg.norm(direction / sizes)
+    direction = np.concatenate([[0.0], direction, [0.0]])
     x = x + _TINY * distance * direction
-    found = here._replace(x=x, tangent=-direction, observed=observe(problem, x))
+    tangent = -direction / problem.scale
+    found = here._replace(x=x, tangent=tangent, observed=observe(problem, x))
     return found if np.abs(found.observed.multipliers - 1).min() < _ONE else None

@@ -556,7 +556,7 @@ class Shooting(eqx.Module):
             h = (s1 - begin.s) / self.steps
             flight = self.flight(machine, leg)
             turns = turns_of(Path(flight, path[0], path[1], h, not self.events))
-            sizes = self._guard_sizes(flight, s0, after)
+            sizes = self.guard_sizes(flight, s0, after)
             largest = jnp.max(jnp.abs(path[1]), axis=0)
             return matrix, integrals, approach, agree, turns, positions, largest, begin, sizes
 
@@ -596,7 +596,7 @@ class Shooting(eqx.Module):
             escape_margin=jnp.stack([jnp.zeros((), x.dtype), *escapes])[1:],
         )
 
-    def _guard_sizes(self, flight: Flight, s: Scalar, u: Vector) -> Vector:
+    def guard_sizes(self, flight: Flight, s: Scalar, u: Vector) -> Vector:
         """Return the change of each event's guard over the sizes of state and clock, or 1. One more
         entry belongs to no event."""
 

@@ -410,10 +410,10 @@ def since_section(problem: Shooting, x: Unknowns, clock: Any) -> Any:
     return np.mod(clock - begin, float(problem.period(x)))
 
 
-def _first_state(problem: Shooting, x: Unknowns, sections: State | None = None) -> State:
+def _first_state(problem: Shooting, x: Unknowns) -> State:
     """Return the state on the first section of a solution, with the machine's own modes."""
-    sections = sections_at(problem, x)[0] if sections is None else sections
-    modes = problem.modes_in(int(sections_at(problem, x)[1][0][0])) if problem.modes[0] else ()
+    sections, (legs, _), _ = sections_at(problem, x)
+    modes = problem.modes_in(int(legs[0])) if problem.modes[0] else ()
     state = jax.tree.map(lambda x: x[0], sections)
     return with_modes(state, own_modes(problem.machine, modes))
 
@@ -466,8 +466,10 @@ def _impact_energies(problem: Shooting, xs: Array, states: State) -> Array:
 
 def orbit_of(problem: Shooting, step: Step) -> Orbit:
     observed, machine = step.observed, problem.at(step.x)
-    sections, _, residual = sections_at(problem, step.x)
-    state = _first_state(problem, step.x, sections)
+    sections, (legs, _), residual = sections_at(problem, step.x)
+    modes = [own_modes(machine, problem.modes_in(int(leg))) for leg in legs if problem.modes[0]]
+    modes = tuple(map(jnp.asarray, zip(*modes, strict=True)))
+    state = with_modes(jax.tree.map(lambda x: x[0], sections), tuple(x[0] for x in modes))
     admissible = observed.admissible(range(len(problem.events)))
     hits = hits_of(problem, step, state)
     order = np.argsort(hits.clock)
@@ -477,6 +479,7 @@ def orbit_of(problem: Shooting, step: Step) -> Orbit:
         method=problem.method,
         state=state,
         sections=sections,
+        modes=modes,
         cycles=jnp.asarray(problem.cycles, jnp.int32),
         duration=duration,
         frequency_ratio=frequency_ratio(machine, duration / problem.cycles),

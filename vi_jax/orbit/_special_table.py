@@ -26,7 +26,7 @@ import numpy as np
 from .._messages import count_of
 from ._conditions import Special, is_defective, sum_of_minors
 from ._follow import SAME_CURVE, Ending, Event, Table, bound_rows
-from ._local_map import LocalMap, graze_at
+from ._local_map import LocalMap, NoLocalMapError, graze_at
 from ._motion_table import bifurcation_tests
 from ._shooting import ROUNDING, Shooting
 from ._solution import (
@@ -219,9 +219,8 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
             symmetric = kind == FOLD and condition.kind in TOUCHING and _is_symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
     if condition.kind == GRAZING:
-        with contextlib.suppress(ValueError):  # without a local map
-            for place, step, detail_here in _resonant_grazings(problem, condition.impact, steps):
-                found.append((place, point(RESONANT, step, detail_here, impact=condition.impact)))
+        for place, step, detail_here in _resonant_grazings(problem, condition.impact, steps):
+            found.append((place, point(RESONANT, step, detail_here, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
 
 
@@ -252,19 +251,24 @@ def _resonant_grazings(
     """Yield the resonant grazings of a curve: the position in steps with a fraction, the point, and
     a description of the curve that begins there."""
 
-    def local(step: Step) -> LocalMap:
-        return graze_at(point_at(problem, step, GRAZING, "", impact)).map
-
-    # If another impact is lost as well, at an end, the map has a pole: its sign is rounding.
     usually_lost = steps[len(steps) // 2].observed.lost
-    maps = [None if (step.observed.lost & ~usually_lost).any() else local(step) for step in steps]
+
+    def local(step: Step) -> LocalMap | None:
+        # If another impact is lost as well, at an end, the map has a pole: its sign is rounding.
+        if (step.observed.lost & ~usually_lost).any():
+            return None
+        with contextlib.suppress(NoLocalMapError):
+            return graze_at(point_at(problem, step, GRAZING, "", impact)).map
+
+    maps = [local(step) for step in steps]
     is_planar = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if is_planar else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
         begins = AT_CODIMENSION_TWO[RESONANT] if is_planar else begins
         description = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
-        test = lambda step, n=n, sign=sign: local(step).resonance(n, sign)
-        values = [np.nan if each is None else each.resonance(n, sign) for each in maps]
+        resonance = lambda each, n=n, sign=sign: each.resonance(n, sign) if each else np.nan
+        test = lambda step, resonance=resonance: resonance(local(step))
+        values = [resonance(each) for each in maps]
         for i, (before, after) in enumerate(itertools.pairwise(values)):
             if not before * after < 0:
                 continue
@@ -272,7 +276,8 @@ def _resonant_grazings(
             if step is None or not bool(step.good):
                 continue
             small = _ENTRY * max(abs(before), abs(after))
-            if abs(test(step)) <= small and (local(step).passages(n) >= small).all():
+            at = local(step)
+            if at and abs(resonance(at)) <= small and (at.passages(n) >= small).all():
                 yield _place(problem, i, steps, step), step, description
 
 

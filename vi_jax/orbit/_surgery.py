@@ -56,11 +56,26 @@ def _are_images(machine: AbstractMachine, first: Event, second: Event) -> bool:
     return first.of(machine).holds_mode and second.of(machine).holds_mode
 
 
+def repeats_from(problem: Shooting, first: int) -> bool:
+    """Return whether the events and modes of a motion are the same from another event on, with
+    cycles counted from there."""
+    events = problem.events[first:] + problem.events[:first]
+    modes = problem.modes[first:] + problem.modes[:first]
+    begin, cycle = (
+        next((event.cycle for event in row if event.cycle is not None), 0)
+        for row in (problem.events, events)
+    )
+    events = (
+        e if e.cycle is None else e._replace(cycle=(e.cycle - cycle + begin) % problem.cycles)
+        for e in events
+    )
+    return (tuple(events), modes) == (problem.events, problem.modes)
+
+
 def may_repeat(problem: Shooting) -> bool:
     """Return whether the second half of a period with these events can equal the first."""
-    events, half = problem.events, len(problem.events) // 2
-    later = tuple(event.shifted(-(problem.cycles // 2)) for event in events[half:])
-    return problem.cycles % 2 == 0 and events[:half] == later
+    half, odd = divmod(len(problem.events), 2)
+    return problem.cycles % 2 == 0 and not odd and repeats_from(problem, half)
 
 
 @on_host
@@ -199,7 +214,9 @@ def with_least_period(old: Shooting, x: np.ndarray) -> tuple[Shooting, np.ndarra
     for cycles in range(1, old.cycles):
         repetitions, remainder = divmod(old.cycles, cycles)
         difference = np.abs(np.roll(rows, -cycles, axis=0) - rows) / np.asarray(old.sizes)[1:]
-        if not remainder and difference.max() < _SAME and len(old.events) % repetitions == 0:
+        if remainder or difference.max() >= _SAME or len(old.events) % repetitions:
+            continue
+        if repeats_from(old, len(old.events) // repetitions):
             break
     else:
         return old, x

@@ -277,12 +277,11 @@ def _point_near_resonance(kind: str, point: Point, distance: float) -> Point:
     graze, sign = graze_at(dataclasses.replace(point, kind=GRAZING)), -1 if kind == DOUBLING else 1
     problem, local, touch = graze.problem, graze.map, graze.touches[0]
     _check_plain(problem)
-    sizes = np.asarray(problem.sizes)[1:]
 
     def depth(n: int) -> float:
         """Return the depth of an impact that equals its kick's remainder n periods later."""
-        remainder = np.linalg.matrix_power(local.matrix, n) @ touch.kick.vector
-        return float(np.linalg.norm(touch.gradient * sizes) * np.linalg.norm(remainder / sizes))
+        remainder = np.linalg.matrix_power(local.matrix, n) @ local.kicks[0]
+        return float(np.linalg.norm(local.gradients[0]) * np.linalg.norm(remainder))
 
     periods = range(1, PERIODS + 1)
     n = next((n for n in periods if abs(local.resonance(n, sign)) < _RESONANT * depth(n)), 1)

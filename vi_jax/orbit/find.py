@@ -400,6 +400,7 @@ def find_orbit(
             f"{root_finder.arcs}."
         )
     orbit = _find(the_map, state, root_finder, impact_log, multipliers)
+    orbit = dataclasses.replace(orbit, multipliers=multipliers_of(orbit.monodromy))
     if throw:
         orbit = raised(orbit, ~orbit.successful, "The search failed", orbit.result)
     return trimmed(orbit)
@@ -467,6 +468,7 @@ def _find_one(
     if observed.modes is not None:
         modes = jnp.roll(jnp.take(observed.modes, last - place, axis=1), 1, axis=0)
         rows = jnp.concatenate([sections, modes], axis=1)
+        angles = None if angles is None else np.append(angles, np.zeros(modes.shape[1], bool))
     unit = jax.lax.stop_gradient(root.unit)
     scale = unit * (sizes if modes is None else jnp.append(sizes, jnp.ones(modes.shape[1])))
     least = _least_period(rows, error / unit, scale, angles)
@@ -508,12 +510,13 @@ def _find_one(
         y_max=y_max,
         clearance=clearance,
         monodromy=monodromy,
-        multipliers=multipliers_of(monodromy),
+        multipliers=jnp.full(len(monodromy), jnp.nan, jnp.result_type(x.dtype, jnp.complex64)),
         residual=root.residual,
         error=error,
         iterations=root.steps.astype(jnp.int32),
         history=root.history,
         averages=means(sums, duration),
+        modes=() if modes is None else tuple(modes.T),
         result=_result_of(
             is_found, least < cycles, grazing=near_grazing, drifts=drifts, equilibrium=is_still,
             other_modes=(root.converged > 0) & ~recurs, not_simulated=jnp.isnan(root.residual),

@@ -80,7 +80,8 @@ class Attractors(NamedTuple):
     impacts: np.ndarray
     """Impacts at the touches in a period; the mean over one without a period."""
     places: np.ndarray
-    """States after the first touch, less the smooth motion there; (lanes, SOUGHT, states)."""
+    """States after the first touch, less the smooth motion there, in the sizes of the state;
+    (lanes, SOUGHT, states)."""
     depth: np.ndarray
     """The deepest penetration √(-h), without an impact."""
 
@@ -273,7 +274,8 @@ class SimulatedAttractors(NamedTuple):
     impacts: np.ndarray
     """As `Attractors.impacts`; NaN if a touch is not one of a rigid stop."""
     places: np.ndarray
-    """States on the section, less the smooth motion; (lanes, SOUGHT, states)."""
+    """States on the section, less the smooth motion, in the sizes of the state; (lanes, SOUGHT,
+    states)."""
     far: np.ndarray
     """As `period`, for lanes that left; 0 for others."""
     hits: np.ndarray
@@ -304,6 +306,7 @@ def simulate_attractors(graze: LocalGrazing, offsets: np.ndarray) -> SimulatedAt
         transient_length(local) * problem.cycles,
     )  # fmt: skip
     displacements = rows[:, problem.cycles - 1 :: problem.cycles] - smooth[:, None]
+    displacements, smooth = displacements / graze.sizes, smooth / graze.sizes
     hits = impacts.reshape(len(rows), SOUGHT, problem.cycles).sum(axis=2) - len(problem.impacts)
     size = kick_sizes(local, offsets)
     u, kick_sum = local.kicks.T, np.zeros(len(section.state))
@@ -362,9 +365,10 @@ def _position_of(problem: Shooting, states):
 
 
 def positions(graze: LocalGrazing, offsets: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-    """Return the first coordinate at displacements from the smooth section state, less its own."""
+    """Return the first coordinate at displacements, in the sizes of the state, from the smooth
+    section state, less its own."""
     smooth = graze.section.state + np.outer(offsets, graze.section.slope)
-    moved = _position_of(graze.problem, smooth[:, None] + displacements)
+    moved = _position_of(graze.problem, smooth[:, None] + displacements * graze.sizes)
     return moved - _position_of(graze.problem, smooth)[:, None]
 
 
@@ -615,11 +619,11 @@ def _forecast(graze: LocalGrazing, periods: int) -> tuple[Grazing, Attractors]:
         value=float(graze.x[-1]),
         touched=" and the ".join(names),
         cycles=graze.problem.cycles,
-        matrix=local.matrix,
+        matrix=local.matrix * graze.sizes[:, None] / graze.sizes,
         multipliers=values[np.argsort(-np.abs(values))].astype(complex),
         rate=np.array([t.rate for t in graze.touches]),
-        gradient=local.gradients,
-        kick=local.kicks,
+        gradient=np.array([t.gradient for t in graze.touches]),
+        kick=np.array([t.kick.vector for t in graze.touches]),
         order=local.orders,
         slope=local.slopes,
         entries=local.entries(12),

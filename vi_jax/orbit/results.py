@@ -2,17 +2,16 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._checks import given_number, short
+from .._checks import array_module, by_numpy_if_known, concrete, given_number, on_host, short
 from .._messages import count_of
 from .._types import State, xr
 from ..flow import (
@@ -66,35 +65,57 @@ class STABILITY(NamedEnumeration):
 NEUTRAL = 1e-9
 
 
-def multipliers_of(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
-    """Return the eigenvalues of a monodromy matrix, the largest modulus first, or NaN."""
+def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
+    """Return the eigenvalues of monodromy matrices, the largest modulus first, or NaN. They are
+    computed by NumPy if the matrices are known."""
+    known = concrete(monodromy)
+    if known is None:
+        return jnp.vectorize(_multipliers, signature="(n,n)->(n)")(monodromy)
+    finite = np.asarray(np.isfinite(known).all(axis=(-2, -1), keepdims=True))
+    safe = np.where(finite, known, np.eye(known.shape[-1], dtype=known.dtype))
+    if known.shape[-1] == 2:
+        values = eigenvalues(*_half_trace_and_determinant(safe))
+    else:
+        values = np.linalg.eigvals(safe).astype(np.result_type(known.dtype, np.complex64))
+    values = np.take_along_axis(values, np.argsort(-abs(values), axis=-1, kind="stable"), axis=-1)
+    return jnp.asarray(np.where(finite[..., 0], values, np.nan))
+
+
+def _multipliers(monodromy: Float[Array, "n n"]) -> Complex[Array, " n"]:
     finite = jnp.all(jnp.isfinite(monodromy))
     safe = jnp.where(finite, monodromy, jnp.eye(monodromy.shape[0], dtype=monodromy.dtype))
     if monodromy.shape == (2, 2):
-        half = 0.5 * (safe[0, 0] + safe[1, 1])
-        values = eigenvalues(half, safe[0, 0] * safe[1, 1] - safe[0, 1] * safe[1, 0])
+        values = eigenvalues(*_half_trace_and_determinant(safe))
     else:
         values = jnp.linalg.eigvals(safe)
     order = jnp.argsort(-jnp.abs(values))
     return jnp.where(finite, values[order], jnp.nan)
 
 
-def eigenvalues(
-    half: Float[Array, "..."], determinant: Float[Array, "..."]
-) -> Complex[Array, "... 2"]:
+def _half_trace_and_determinant(matrix: Any) -> tuple[Any, Any]:
+    a, b, c, d = (matrix[..., i, j] for i in range(2) for j in range(2))
+    return 0.5 * (a + d), a * d - b * c
+
+
+def eigenvalues(half: Any, determinant: Any) -> Any:
     """Return the eigenvalues of 2x2 matrices from half their trace and their determinant."""
+    array = array_module(half)
+    square = half * half - determinant
     # Pinned: computed again with other rounding, it might be zero in one use and not in another
     # (seen with JAX 0.12: 1 ± 0.7 for 1 and 1).
-    square = pin(half * half - determinant).astype(jnp.result_type(half, jnp.complex64))
+    square = square if array is np else pin(square)
+    square = square.astype(array.result_type(half, array.complex64))
     double = square == 0  # the derivative of the root is infinite there
-    root = jnp.where(double, 0.0, jnp.sqrt(jnp.where(double, 1.0, square)))
-    return jnp.stack([half + root, half - root], axis=-1)
+    root = array.where(double, 0.0, array.sqrt(array.where(double, 1.0, square)))
+    return array.stack([half + root, half - root], axis=-1)
 
 
-def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
-    largest = multipliers[jnp.argmax(jnp.abs(multipliers))]
-    size = jnp.abs(largest)
-    real = jnp.abs(largest.imag) <= NEUTRAL * size
+def stability_of(multipliers: Complex[Array, "*batch n"]) -> STABILITY:
+    array = array_module(multipliers)
+    place = array.argmax(abs(multipliers), axis=-1, keepdims=True)
+    largest = array.take_along_axis(multipliers, place, axis=-1)[..., 0]
+    size = abs(largest)
+    real = abs(largest.imag) <= NEUTRAL * size
     unstable_kind = STABILITY.where(
         real & (largest.real > 0),
         STABILITY.fold,
@@ -102,8 +123,8 @@ def stability_of(multipliers: Complex[Array, " n"]) -> STABILITY:
     )
     verdict = STABILITY.where(size < 1, STABILITY.stable, unstable_kind)
     rounding = max(NEUTRAL, 100 * float(jnp.finfo(size.dtype).eps))
-    verdict = STABILITY.where(jnp.abs(size - 1) <= rounding, STABILITY.neutral, verdict)
-    return STABILITY.where(jnp.isnan(size), STABILITY.unknown, verdict)
+    verdict = STABILITY.where(abs(size - 1) <= rounding, STABILITY.neutral, verdict)
+    return STABILITY.where(array.isnan(size), STABILITY.unknown, verdict)
 
 
 def compound(matrix: Float[Array, "n n"]) -> Float[Array, "pairs pairs"]:
@@ -206,8 +227,11 @@ class Orbit(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the period, by name (see
     `AbstractMachine.averages`)."""
+    modes: tuple[Float[Array, "... cycles"], ...] = ()
+    """The machine's own modes on the sections (see `AbstractMachine.modes`)."""
 
     @property
+    @by_numpy_if_known
     def successful(self) -> Bool[Array, "..."]:
         """True if an orbit was found, of the given period or a smaller one."""
         return (self.result == ORBIT_RESULTS.successful) | (
@@ -215,21 +239,18 @@ class Orbit(Summarized):
         )
 
     @property
+    @by_numpy_if_known
     def stable(self) -> Bool[Array, "..."]:
         """True if all multipliers lie inside the unit circle, by more than rounding; false also if
         they are not known (see `stability`)."""
         return self.stability == STABILITY.stable
 
     @property
+    @by_numpy_if_known
     def stability(self) -> STABILITY:
         """Stable, neutral, or how stability was lost: fold, period doubling or Neimark–Sacker."""
-
-        def verdict(successful, multipliers):
-            return STABILITY.where(successful, stability_of(multipliers), STABILITY.unknown)
-
-        for _ in range(self.multipliers.ndim - 1):
-            verdict = jax.vmap(verdict)
-        return verdict(self.successful, self.multipliers)
+        verdict = stability_of(self.multipliers)
+        return STABILITY.where(self.successful, verdict, STABILITY.unknown)
 
     @property
     def quantities(self) -> dict[str, Float[Array, "... cycles"]]:
@@ -238,17 +259,20 @@ class Orbit(Summarized):
         return quantities_on(self.machine, self.sections, self.residual.ndim)
 
     @property
+    @by_numpy_if_known
     def slowest_impact(self) -> Float[Array, "..."]:
         """Smallest V⁻, the distance to a grazing at which an impact is lost; infinite without
         impacts. The distance to other grazings is `clearance`."""
-        speed = jnp.where(jnp.isnan(self.impact_speed), jnp.inf, self.impact_speed)
-        return jnp.min(speed, axis=-1, initial=jnp.inf)
+        array = array_module(self.impact_speed)
+        speed = array.where(array.isnan(self.impact_speed), jnp.inf, self.impact_speed)
+        return array.min(speed, axis=-1, initial=jnp.inf)
 
     @property
+    @by_numpy_if_known
     def admissible(self) -> Bool[Array, "..."]:
         """True if the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
-        size = jnp.maximum(jnp.abs(self.y_min), jnp.abs(self.y_max))
+        size = array_module(self.y_max).maximum(abs(self.y_min), abs(self.y_max))
         inside = self.clearance >= 0
         for stop in stops_of(self.machine):
             if stop.coordinate:
@@ -305,6 +329,8 @@ class Orbit(Summarized):
         per_impact = ("impact_phase", "impact_speed", "impact_stop")
         variables = states("section", self.sections, (*batch, "section"))
         variables |= states("section", self.quantities, (*batch, "section"))
+        modes = {f"mode_{i}": x for i, x in enumerate(self.modes)}
+        variables |= states("section", modes, (*batch, "section"))
         variables |= present({name: getattr(self, name) for name in scalars} | self.averages, batch)
         variables |= present({name: getattr(self, name) for name in per_impact}, (*batch, "impact"))
         variables |= present({"multipliers": self.multipliers}, (*batch, "multiplier"))
@@ -318,11 +344,11 @@ class Orbit(Summarized):
         """Describe the motion, its impacts and its multipliers."""
         if self.residual.ndim:
             found = self.successful
-            counted = f"{int(jnp.sum(self.stable))} of them stable"
-            if jnp.any(found & (self.stability == STABILITY.unknown)):
+            counted = f"{int(np.sum(self.stable))} of them stable"
+            if np.any(found & (self.stability == STABILITY.unknown)):
                 counted = STABILITY[STABILITY.unknown]
             searches = f"{self.residual.size} searches {self.residual.shape}"
-            return f"{searches}: {int(jnp.sum(found))} orbits found, {counted}"
+            return f"{searches}: {int(np.sum(found))} orbits found, {counted}"
         if not bool(self.successful):
             reason = ORBIT_RESULTS[self.result]
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_advice(self)}"
@@ -344,7 +370,7 @@ class Orbit(Summarized):
                 lines.append(f"  impact: {name} at {clock}, V⁻ = {fast}")
         for name, x in self.averages.items():
             lines.append(f"  mean {name}: {in_unit(f'{float(x):.9g}', units, name)}")
-        listed = int(jnp.sum(self.impact_stop >= 0))
+        listed = int(np.sum(self.impact_stop >= 0))
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts: find it with `impact_log={count}`")
         if self.stability != STABILITY.unknown:
@@ -411,11 +437,15 @@ def trimmed(orbit: Orbit) -> Orbit:
     """Remove the padding of the impacts of one orbit; return traced or batched orbits unchanged."""
     if isinstance(orbit.residual, Tracer) or orbit.residual.ndim:
         return orbit
-    keep = slice(int(orbit.impacts))
     per_impact = ("impact_phase", "impact_speed", "impact_stop")
-    cut = {name: getattr(orbit, name)[keep] for name in per_impact}
-    sections = jtu.tree_map(lambda x: x[: int(orbit.cycles)], orbit.sections)
-    return dataclasses.replace(orbit, **cut, sections=sections)
+    cut = {name: _first(getattr(orbit, name), int(orbit.impacts)) for name in per_impact}
+    cycles, kept = int(orbit.cycles), (orbit.sections, orbit.modes)
+    sections, modes = jtu.tree_map(lambda x: _first(x, cycles), kept)
+    return dataclasses.replace(orbit, **cut, sections=sections, modes=modes)
+
+
+def _first(x: Array, number: int) -> Array:
+    return jnp.asarray(on_host(x)[:number])
 
 
 def distance(here: Any, there: Any, unit: Any = 1) -> Any:
@@ -425,6 +455,23 @@ def distance(here: Any, there: Any, unit: Any = 1) -> Any:
     whether two states, or two motions, are the same; `unit` are their `row_sizes`.
     """
     return (abs(here - there) / (unit + abs(there))).max(axis=-1)
+
+
+class MotionSections(NamedTuple):
+    """The sections of periodic motions: of one, or of several with equal periods."""
+
+    states: Float[np.ndarray, "... cycles states"]
+    modes: Float[np.ndarray, "... cycles modes"]
+    """The machine's own modes there."""
+
+    def passes(
+        self, state: np.ndarray, modes: np.ndarray, sizes: Any, angles: np.ndarray | None,
+        tolerance: float,
+    ) -> Bool[np.ndarray, "..."]:  # fmt: skip
+        """Return whether each motion passes through a state in these modes, on any section: then
+        the motion from there is the same one. `sizes` and `tolerance` as in `distance`."""
+        near = distance(nearest_images(angles, self.states, state), state, sizes) <= tolerance
+        return (near & (self.modes == modes).all(axis=-1)).any(axis=-1)
 
 
 class Orbits(list[Orbit]):
@@ -453,7 +500,8 @@ def distinct_orbits(orbits: Orbit, *, tolerance: float = 1e-6) -> tuple[Orbits, 
     Host-side: not to be traced.
 
     **Arguments:** a batch of orbits from `find_orbit` (of any shape); two motions are the same if
-    their sections agree to `tolerance`, relative to the size of each component of the state.
+    their sections agree to `tolerance`, relative to the size of each component of the state, and
+    the machine's modes there are equal.
 
     **Returns:** the orbits, a list that prints one motion a line, by period and then by least Y,
     each on the section on which it was first found; and the number of searches that found each.
@@ -469,7 +517,7 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
     """Return the different motions in several batches of searches, possibly for different periods,
     and the number of searches of each batch that found each, (motions, batches)."""
     chosen: list[Orbit] = []
-    paths: list[tuple[np.ndarray, np.ndarray]] = []
+    paths: list[tuple[MotionSections, np.ndarray]] = []
     counts: list[np.ndarray] = []
     for batch, orbits in enumerate(batches):
         shape = orbits.residual.shape
@@ -481,29 +529,33 @@ def distinct_among(batches: Sequence[Orbit], tolerance: float) -> tuple[Orbits, 
         found = in_one_row(orbits.successful)
         flat = jtu.tree_map(in_one_row, orbits)
         sections, cycles = np.asarray(in_rows(flat.sections, 2)), flat.cycles
+        modes = np.zeros((*sections.shape[:2], 0))
+        modes = np.stack(flat.modes, axis=-1) if flat.modes else modes
         angles = angles_in(orbits.machine, jtu.tree_map(lambda x: x[0, 0], flat.sections))
         for i in np.flatnonzero(found):
-            path = sections[i, : cycles[i]]
+            path = MotionSections(sections[i, : cycles[i]], modes[i, : cycles[i]])
             j = _index_of(paths, path, tolerance, angles)
             if j == len(paths):
                 chosen.append(trimmed(jtu.tree_map(lambda x, i=i: jnp.asarray(x[i]), flat)))
-                paths.append((path, sizes_on_host(chosen[j].machine, chosen[j].state, path)))
+                sizes = sizes_on_host(chosen[j].machine, chosen[j].state, path.states)
+                paths.append((path, sizes))
                 counts.append(np.zeros(len(batches), int))
             counts[j][batch] += 1
-    order = sorted(range(len(chosen)), key=lambda j: (len(paths[j][0]), float(chosen[j].y_min)))
+    order = sorted(
+        range(len(chosen)), key=lambda j: (int(chosen[j].cycles), float(chosen[j].y_min))
+    )
     table = np.array([counts[j] for j in order], int).reshape(len(order), len(batches))
     return Orbits(chosen[j] for j in order), table
 
 
 def _index_of(
-    paths: list[tuple[np.ndarray, np.ndarray]], path: np.ndarray, tolerance: float,
+    paths: list[tuple[MotionSections, np.ndarray]], path: MotionSections, tolerance: float,
     angles: np.ndarray | None,
 ) -> int:  # fmt: skip
     """Return the index of a motion among the known ones, from any of its sections on, or their
     number. `paths` holds the sections of each, and the sizes of their components."""
     for j, (other, sizes) in enumerate(paths):
-        if len(other) == len(path):
-            here = nearest_images(angles, path[0], other)
-            if distance(here, other, sizes).min() <= tolerance:
+        if len(other.states) == len(path.states):
+            if other.passes(path.states[0], path.modes[0], sizes, angles, tolerance):
                 return j
     return len(paths)

@@ -11,16 +11,12 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optax
-import optimistix as optx
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .._checks import count, instance_of, number, require
 from .._types import Scalar
-
-Matrix = Float[Array, "n n"]
+from ._linear import Matrix, solve, svd
 
 # Above this singular value a motion is so unstable that rounding hides what is neutral: a choice.
 _STEEP = 1e3
@@ -35,13 +31,13 @@ def rounding(dtype: object) -> float:
 def smallest_solution(matrix: Matrix, right_side: Array, threshold: float | None = None) -> Array:
     """Return the smallest solution of `matrix @ step = right_side`; singular values below the
     share `threshold` of the greatest are zero. `right_side - matrix @ step` is unreachable."""
-    left, sizes, right = jnp.linalg.svd(stop_gradient(matrix))
+    left, sizes, right = svd(stop_gradient(matrix))
     threshold = rounding(matrix.dtype) if threshold is None else threshold
     is_zero = sizes <= threshold * jnp.minimum(sizes[0], _STEEP)
     size = jnp.where(sizes[0] > 0, sizes[0], 1.0)
     # Directions without an image get one, so that the matrix can be inverted.
     filled = (left * (is_zero.astype(matrix.dtype) * size)) @ right
-    return jnp.linalg.solve(matrix + filled, right_side)
+    return solve(matrix + filled, right_side)
 
 
 # A motion smaller than the first share of the guess, or than the second, is at rest: choices.
@@ -86,7 +82,7 @@ def _tolerance(value: Any) -> Any:
 
 
 class Newton(AbstractRootFinder):
-    """Newton's method, damped by a trust region (optimistix' dogleg): quadratic near the orbit.
+    """Newton's method, damped by a trust region (Powell's dogleg): quadratic near the orbit.
 
     **Arguments:**
 
@@ -104,26 +100,78 @@ class Newton(AbstractRootFinder):
     arcs: int = eqx.field(kw_only=True, static=True, default=1)
     usual_tolerance: ClassVar[float] = 1e-10
 
-    def _solver(self, dtype):
-        # If a direction is neutral, take the smallest of all steps.
-        linear_solver = lx.SVD(rcond=rounding(dtype))
-        return optx.Dogleg(rtol=1e-15, atol=1e-15, linear_solver=linear_solver)
-
     def init(self, residual, x):
-        """Return the first memory, the dogleg's state."""
-        fn = _with_aux(residual)
-        shapes, aux = eqx.filter_eval_shape(fn, x, None)
-        return self._solver(x.dtype).init(fn, x, None, {}, shapes, aux, frozenset())
+        """Return the first memory. The first step accepts its trial in any case."""
+        nothing, one = jnp.zeros_like(x), jnp.ones((), x.dtype)
+        jacobian = jnp.zeros((x.size, x.size), x.dtype)
+        return _Dogleg(x, nothing, jacobian, one, jnp.ones((), bool))
 
     def step(self, residual, x, memory):
         """Try one dogleg step; the place moves only if the residual falls."""
-        solver, fn = self._solver(x.dtype), _with_aux(residual)
-        x, memory, _ = solver.step(fn, x, None, {}, memory, frozenset())
-        return x, memory, x, _largest(memory.f_info.residual)
+        trial, old, radius = memory.trial, memory.residual, memory.radius
+        new, jacobian = _with_jacobian(residual, trial)
+        predicted = old.ravel() + memory.jacobian @ (trial - x).ravel()
+        foreseen = 0.5 * (jnp.sum(predicted**2) - jnp.sum(old**2))
+        change = 0.5 * jnp.sum(new**2) - 0.5 * jnp.sum(old**2)
+        accepted = (change <= _POOR * foreseen) | memory.is_first
+        good = (change < _GOOD * foreseen) & (foreseen < 0) & ~memory.is_first
+        radius = radius * jnp.where(accepted, jnp.where(good, _LONGER, 1.0), _SHORTER)
+        x, new = jnp.where(accepted, trial, x), jnp.where(accepted, new, old)
+        jacobian = jnp.where(accepted, jacobian, memory.jacobian)
+        move = _dogleg(jacobian, new.ravel(), radius).reshape(x.shape)
+        memory = _Dogleg(x + move, new, jacobian, radius, jnp.zeros((), bool))
+        return x, memory, x, _largest(new)
 
 
-def _with_aux(residual: Residual) -> Callable[[Unknowns, Any], tuple[Unknowns, None]]:
-    return lambda x, args: (residual(x), None)
+class _Dogleg(NamedTuple):
+    """The memory of `Newton`."""
+
+    trial: Unknowns
+    residual: Unknowns
+    """At the place, as the Jacobian."""
+    jacobian: Matrix
+    radius: Scalar
+    """Of the trust region, over the length of Newton's step."""
+    is_first: Array
+
+
+# Gould, Orban, Sartenaer and Toint (Sensitivity of trust-region algorithms to their parameters,
+# 2005): the share of the foreseen change of the residual below which a trial is refused, and above
+# which the radius grows; the factors of the radius.
+_POOR, _GOOD, _LONGER, _SHORTER = 0.01, 0.99, 3.5, 0.25
+
+
+def _with_jacobian(residual: Residual, x: Unknowns) -> tuple[Unknowns, Matrix]:
+    def along(direction):
+        return jax.jvp(residual, (x,), (direction.reshape(x.shape),))
+
+    values, columns = jax.vmap(along, out_axes=(0, -1))(jnp.eye(x.size, dtype=x.dtype))
+    return values[0], columns.reshape(x.size, x.size)
+
+
+def _dogleg(jacobian: Matrix, residual: Array, radius: Scalar) -> Array:
+    """Return the step on the path from here over the least point along the gradient to Newton's
+    point, at the `radius` over the length of Newton's step (Nocedal and Wright, 4.1)."""
+    left, values, right = svd(jacobian)
+    # If a direction is neutral, take the smallest of all steps.
+    reachable = values > rounding(jacobian.dtype) * values[0]
+    parts = (residual @ left) / jnp.where(reachable, values, 1.0)
+    newton = -(jnp.where(reachable, parts, 0.0) @ right)
+    gradient = residual @ jacobian
+    curvature, eps = jnp.sum((jacobian @ gradient) ** 2), jnp.finfo(jacobian.dtype).eps
+    curved = curvature > eps
+    cauchy = -gradient * jnp.where(
+        curved, jnp.sum(gradient**2) / jnp.where(curved, curvature, 1.0), 0.0
+    )
+    length, reach = jnp.linalg.norm(cauchy), radius * jnp.linalg.norm(newton)
+    shorter = cauchy * jnp.where(length > eps, reach / jnp.where(length > eps, length, 1.0), 0.0)
+    # |cauchy + t (newton - cauchy)| = reach, by the stable one of two formulas for the root.
+    leg = newton - cauchy
+    a, half_b, c = jnp.sum(leg**2), jnp.sum(cauchy * leg), length**2 - reach**2
+    root = jnp.sqrt(half_b**2 - a * c)
+    t = jnp.where(half_b > 0, -c / (half_b + root), (root - half_b) / a)
+    between = cauchy + jnp.clip(t, 0.0, 1.0) * leg
+    return jnp.where(length > reach, shorter, jnp.where(radius < 1, between, newton))
 
 
 class Gradient(AbstractRootFinder):
@@ -138,7 +186,7 @@ class Gradient(AbstractRootFinder):
     - `arcs`: as for `Newton`.
     """
 
-    optimiser: optax.GradientTransformation | None = eqx.field(static=True, default=None)
+    optimiser: Any = eqx.field(static=True, default=None)
     tolerance: Any = eqx.field(kw_only=True, default=None, converter=_tolerance)
     max_steps: int = eqx.field(kw_only=True, static=True, default=1000)
     arcs: int = eqx.field(kw_only=True, static=True, default=1)
@@ -146,11 +194,15 @@ class Gradient(AbstractRootFinder):
 
     def __check_init__(self):
         if self.optimiser is not None:
+            import optax  # slow to load
+
             wanted = "an `optax.GradientTransformation`, such as `optax.adam(0.01)`"
             instance_of("optimiser", self.optimiser, optax.GradientTransformation, wanted)
 
     @property
-    def _optimiser(self) -> optax.GradientTransformation:
+    def _optimiser(self) -> Any:
+        import optax  # slow to load
+
         if self.optimiser is not None:
             return self.optimiser
         return optax.adam(optax.cosine_decay_schedule(0.02, self.max_steps))
@@ -168,7 +220,7 @@ class Gradient(AbstractRootFinder):
 
         gradient, values = jax.grad(loss, has_aux=True)(x)
         update, memory = self._optimiser.update(gradient, memory, x)
-        return jnp.asarray(optax.apply_updates(x, update)), memory, x, _largest(values)
+        return x + update, memory, x, _largest(values)
 
 
 def _largest(values: Array) -> Array:

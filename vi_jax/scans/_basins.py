@@ -31,20 +31,24 @@ from ..machine import (
     AbstractMachine,
     angles_in,
     attributes,
+    begun,
     check_leaf,
     components,
     cycles_in_words,
     in_rows,
     in_words,
     is_angle,
+    modes_of,
     nearest_images,
     state_in_words,
     unit_of,
     units_of,
     with_leaf,
     with_leaves,
+    with_modes,
+    without_modes,
 )
-from ..orbit import distance
+from ..orbit import MotionSections
 from . import _geometry as geometry
 from ._scan import LanesFailed, interrupted, scan
 from .measures import CODES, REGIMES, Regime, Sections, flags
@@ -63,6 +67,8 @@ class Attractor(NamedTuple):
     """Impacts in a period."""
     sections: dict[str, np.ndarray]
     """Its section states, arrays of shape (period,)."""
+    modes: tuple[np.ndarray, ...]
+    """The machine's own modes there, arrays of shape (period,)."""
     starts: int
     """Number of starts that ended on it."""
     fraction: float
@@ -263,14 +269,16 @@ _RESERVED = {"measure", "paired", "cycles", "derivatives", "axes", "noise", "key
 
 
 class _Mark(Sections):
-    """The one of the last section states with the greatest position, equal on each motion."""
+    """The one of the last section states with the greatest position, equal on each motion, and the
+    machine's own modes there."""
 
     def described(self, start):
         return {name: {"unit_of": name} for name in components(start)}
 
     def __call__(self, machine, run):
         highest = jnp.argmax(jax.vmap(machine.position)(run.sections)[-self.number :])
-        return {name: x[highest] for name, x in super().__call__(machine, run).items()}
+        modes = {f"mode_{i}": x[-self.number :] for i, x in enumerate(run.modes)}
+        return {name: x[highest] for name, x in (super().__call__(machine, run) | modes).items()}
 
 
 @warning_once
@@ -348,9 +356,10 @@ def _find_basins(
         share = float(np.mean(on_motion))
         attractors.append(Attractor(
             label=number,
-            period=len(motion),
+            period=len(motion.states),
             impacts=float(np.median(impacts[on_motion])),
-            sections=dict(zip(components(begin), motion.T, strict=True)),
+            sections=dict(zip(components(begin), motion.states.T, strict=True)),
+            modes=tuple(motion.modes.T),
             starts=int(np.sum(on_motion)),
             fraction=share,
             error=math.sqrt(share * (1 - share) / label.size),
@@ -461,10 +470,13 @@ def starts_in(
 def _label_lanes(
     data: "xr.Dataset", machine: AbstractMachine, begin: object, apart: float, longest: int,
     method: AbstractMethod,
-) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
-    """Return labels, and each motion's section states (period, components), most lanes first."""
+) -> tuple[np.ndarray, list[MotionSections]]:  # fmt: skip
+    """Return labels, and each motion's sections, most lanes first."""
     names, period = list(components(begin)), np.asarray(data["period"]).ravel()
     states = np.stack([np.asarray(data[name]).ravel() for name in names], axis=1)
+    of_modes = [f"mode_{i}" for i in range(len(modes_of(begun(machine, begin)) or ()))]
+    modes = np.array([np.asarray(data[name]).ravel() for name in of_modes]).reshape(-1, len(states))
+    modes = modes.T
     label = np.where(np.isin(period, list(REGIMES)), period, int(REGIMES.failed)).astype(int)
     settled = np.flatnonzero(period > 0)
     if not settled.size:
@@ -474,26 +486,32 @@ def _label_lanes(
     unit = sizes_on_host(machine, begin, np.vstack([states[settled], starts]))
     # Lanes on one motion lie in few cells. A result for one of them holds for all.
     cells = np.floor(states[settled] / (unit * apart)).astype(np.int64)
-    cells = np.column_stack([period[settled].astype(np.int64), cells])
+    cells = np.column_stack([period[settled].astype(np.int64), modes[settled], cells])
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    motions: list[np.ndarray] = []
+    motions: list[MotionSections] = []
     motion_of_cell, known = np.empty(first.size, int), {}
     angles = angles_in(machine, begin)
     for i, lane in enumerate(settled[first]):
         p, state = int(period[lane]), states[lane]
-        # The motions of this period, (motions, period, components), and their indices.
-        rows, numbers = known.get(p, (np.empty((0, p, len(names))), []))
-        distances = distance(nearest_images(angles, rows, state), state, unit).min(axis=1)
-        close = np.flatnonzero(distances <= apart)
-        if close.size:
-            motion_of_cell[i] = numbers[close[0]]
-            continue
+        # The motions of this period, and their indices.
+        same_period, numbers = known.get(p, (None, []))
+        if same_period is not None:
+            close = np.flatnonzero(same_period.passes(state, modes[lane], unit, angles, apart))
+            if close.size:
+                motion_of_cell[i] = numbers[close[0]]
+                continue
         motion_of_cell[i] = len(motions)
-        section_state = with_leaves(begin, dict(zip(names, state, strict=True)))
+        section_state = with_leaves(without_modes(begin), dict(zip(names, state, strict=True)))
+        section_state = with_modes(section_state, tuple(modes[lane]))
         # The same number of cycles for all periods, for one compiled program.
         run = simulate(machine, section_state, longest, method=method)
-        motions.append(np.asarray(in_rows(run.sections))[1 : p + 1])
-        known[p] = np.concatenate([rows, motions[-1:]]), [*numbers, motion_of_cell[i]]
+        rows = np.asarray(in_rows(run.sections))[1 : p + 1]
+        motions.append(MotionSections(rows, np.reshape(run.modes, (-1, longest + 1)).T[1 : p + 1]))
+        paths = [motions[n] for n in numbers] + motions[-1:]
+        known[p] = (
+            MotionSections(*map(np.stack, zip(*paths, strict=True))),
+            [*numbers, motion_of_cell[i]],
+        )
     found = motion_of_cell[inverse.ravel()]
     order = np.argsort(-np.bincount(found), kind="stable")
     label[settled] = np.argsort(order)[found]
@@ -710,5 +728,11 @@ def _distance(
 ) -> float:
     """Return the distance of sections, relative to the widths, at the best shift in phase."""
     x, y = (np.stack([m.sections[name] for name in names], axis=1) for m in (a, b))
-    shifted = (np.roll(y, shift, axis=0) for shift in range(len(y)))
-    return float(min((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted))
+    shifts = [n for n in range(len(y)) if _same_modes(a, b, n)]
+    shifted = (np.roll(y, n, axis=0) for n in shifts)
+    moves = ((np.abs(nearest_images(angles, x, z) - z) / widths).max() for z in shifted)
+    return float(min(moves, default=np.inf))
+
+
+def _same_modes(a: Attractor, b: Attractor, shift: int) -> bool:
+    return all((x == np.roll(y, shift)).all() for x, y in zip(a.modes, b.modes, strict=True))

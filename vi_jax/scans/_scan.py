@@ -179,8 +179,8 @@ def run_blocks(
 
     Local threads have one core and one block each; on an accelerator, or over several devices,
     there is one thread. On Ctrl-C all blocks are written that have ended by then. Blocks that a
-    cluster seems to have lost are submitted once more (a killed worker can leave Dask waiting for
-    ever: https://github.com/dask/distributed/issues/3196).
+    cluster seems to have lost are submitted again (a killed worker can leave Dask waiting for
+    ever: https://github.com/dask/distributed/issues/3196), after waits that double.
     """
     # As NumPy arrays it is sent with every task: shared data would be lost with their worker.
     packed = jtu.tree_map(lambda x: np.asarray(x) if eqx.is_array(x) else x, program)
@@ -218,14 +218,14 @@ def run_blocks(
             except (futures.CancelledError, futures.BrokenExecutor) as error:
                 raise ClusterLost from error
             del running[future]
-            for other in [x for x in running if resubmitted and running[x] == where]:
+            for other in [x for x in running if resubmitted and running[x] is where]:
                 other.cancel()
                 del running[other]
 
-        since, longest, resubmitted = time.monotonic(), 0.0, False
+        since, longest, resubmitted, patience = time.monotonic(), 0.0, False, _LONG
         try:
             while True:
-                for where in itertools.islice(waiting, at_once - len(running)):
+                for where in itertools.islice(waiting, max(0, at_once - len(running))):
                     begin(where)
                 if not running:
                     return
@@ -235,10 +235,11 @@ def run_blocks(
                 waited = time.monotonic() - since
                 if done:
                     since, longest = time.monotonic(), max(longest, waited, _PATIENCE)
+                    patience = _LONG
                 elif _has_workers(place.cluster) and hasattr(place.cluster, "get_executor"):
-                    if not resubmitted and waited > _LONG * (longest or _LONG * _PATIENCE):
-                        resubmitted = True
-                        for where in list(running.values()):
+                    if waited > patience * (longest or _LONG * _PATIENCE):
+                        resubmitted, patience = True, 2 * patience
+                        for where in {id(where): where for where in running.values()}.values():
                             begin(where)
                 for future in done:
                     finish(future)

@@ -211,8 +211,9 @@ def sweep(
     """Sweep one parameter slowly: run-up with rising values, close-down with falling ones.
 
     At each value the motion continues from its state at the previous one (the paper's continuation
-    method). It stays on its branch until that ends, so sweeps up and down show hysteresis. Works
-    under `jit` and `vmap` (over other parameters, starts, or values).
+    method). It stays on its branch until that ends, so sweeps up and down show hysteresis. A body
+    that a moved stop has overtaken begins on that stop, with its velocity. Works under `jit` and
+    `vmap` (over other parameters, starts, or values).
 
     **Arguments:**
 
@@ -298,13 +299,14 @@ def _values(values: Any) -> tuple[jax.Array, np.ndarray | None]:
 
 
 def moved_by_stops(machine: AbstractMachine, state: State) -> State:
-    """Return the state with the body moved to a stop that is beyond it, at rest."""
+    """Return the state with each body that a stop has overtaken moved onto that stop. It keeps its
+    velocity, with which it flies on, hits the stop at once, or rests on it."""
     new = without_modes(state)
     for stop in stops_of(machine):
         body = machine.coordinates[stop.coordinate]
         Y = body.position(new)
         beyond = stop.beyond(Y) > 0
-        moved = body.placed(new, stop.place, jnp.zeros_like(Y))
+        moved = body.placed(new, stop.place, body.velocity(new))
         new = jtu.tree_map(lambda a, b, c=beyond: jnp.where(c, a, b), moved, new)
     return replaced(state, new)
 

@@ -65,7 +65,7 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
 
 def least_period(
     sections: State,
-    impacts: Int[Array, " cycles"],
+    exact: Float[Array, "rows cycles"],
     *,
     longest: int,
     tolerance: Number | None = None,
@@ -73,33 +73,35 @@ def least_period(
     sizes: Any = 1.0,
     angles: np.ndarray | None = None,
 ) -> Int[Array, ""]:
-    """Return the fewest drive cycles after which a motion repeats, its impacts too, or
+    """Return the fewest drive cycles after which a motion repeats, its impacts and modes too, or
     `REGIMES.unsettled`.
 
     A motion that still spirals in may repeat better after several turns of the spiral than after
     its period. So it counts as settled if some period fits within the tolerance. The least period
     that fits within a hundred times the tolerance is returned. But a period is left out if another
     fits ten thousand times better; in a spiral none does. A period fits only if the impacts of each
-    cycle agree: near a grazing, sections hardly differ.
+    cycle and the modes agree: near a grazing, sections hardly differ.
 
-    **Arguments:** `sections`, more than `longest`; `impacts` of the cycle before each; `tolerance`,
+    **Arguments:** `sections`, more than `longest`; `exact`, numbers that repeat exactly, the
+    impacts of the cycle before each section and the machine's own modes there; `tolerance`,
     relative to `sizes` (`row_sizes`) + |state|, by default the larger of 1e-6 and ten times
     `wander`, the error of sections under their method; `angles`, True for angles.
     """
     states = in_rows(sections).T
     if tolerance is None:
         tolerance = jnp.maximum(_TOLERANCE, _WANDERS * jnp.asarray(wander, states.dtype))
-    rows = jnp.concatenate([states, impacts[None].astype(states.dtype)])
+    rows, size = jnp.concatenate([states, exact.astype(states.dtype)]), len(states)
     count = states.shape[1] - longest
     last = rows[:, longest:]
-    angles = None if angles is None else np.append(angles, False)
-    scale = jnp.asarray(sizes)[..., None] + jnp.abs(last[:-1])
+    angles = None if angles is None else np.append(angles, np.zeros(len(exact), bool))
+    scale = jnp.asarray(sizes)[..., None] + jnp.abs(last[:size])
 
     def compared(_, p):
         before = jax.lax.dynamic_slice_in_dim(rows, longest - p, count, axis=1)
         now = last if angles is None else nearest_images(angles, last.T, before.T).T
         difference = jnp.abs(now - before)
-        return _, jnp.where(jnp.any(difference[-1] > 0), jnp.inf, jnp.max(difference[:-1] / scale))
+        others = jnp.any(difference[size:] > 0)
+        return _, jnp.where(others, jnp.inf, jnp.max(difference[:size] / scale))
 
     periods = jnp.arange(1, longest + 1, dtype=jnp.int32)
     _, difference = jax.lax.scan(compared, None, periods)
@@ -381,8 +383,9 @@ class Regime(AbstractMeasure):
         sections = jtu.tree_map(lambda x: x[1:], run.sections)
         first = jtu.tree_map(lambda x: x[0], run.sections)
         begin = self.start if jtu.tree_leaves(self.start) else first
+        exact = jnp.stack([run.impacts, *(x[1:] for x in run.modes)])
         period = least_period(
-            sections, run.impacts, longest=self.longest, tolerance=self.tolerance,
+            sections, exact, longest=self.longest, tolerance=self.tolerance,
             wander=self.wander, sizes=row_sizes(machine, begin, in_rows(sections)),
             angles=angles_in(machine, first),
         )  # fmt: skip

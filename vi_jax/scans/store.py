@@ -389,9 +389,9 @@ _GENERATED = (types.GetSetDescriptorType, types.MemberDescriptorType, types.Wrap
 
 def identity(thing: object) -> str:
     """Return a digest of a function or an object, from its source code and its content: defaults,
-    variables that it closes over, globals that it names, class and attributes. Functions and
-    classes among them count too, unless they are a library's. If something has neither source nor
-    content, the result begins with `UNVERIFIABLE` and names it."""
+    variables that it closes over, globals and members of modules that it names, class and
+    attributes. Functions and classes among them count too, unless they are a library's. If
+    something has neither source nor content, the result begins with `UNVERIFIABLE` and names it."""
     digest = hashlib.sha256()
     try:
         for word in _words(thing, {}):
@@ -437,18 +437,49 @@ def _parts(thing: Any) -> list[Any]:
     if isinstance(thing, property):
         return [thing.fget]
     if isinstance(thing, type | types.FunctionType):
-        name = [thing.__module__, thing.__qualname__]
-        is_users = (thing.__module__ or "").partition(".")[0] not in _LIBRARIES
+        name, is_users = [thing.__module__, thing.__qualname__], _is_users(thing.__module__)
         if isinstance(thing, type):
             return [*name, *thing.__bases__, *_members(thing)] if is_users else name
-        used = inspect.getclosurevars(thing)
+        nonlocals = inspect.getclosurevars(thing).nonlocals
         if not is_users:
-            return [*name, used.nonlocals]
+            return [*name, nonlocals]
         if inspect.getfile(thing) == "<string>":  # Python 3.13 names the source of `python -c` so
             raise OSError("it was made by `exec`")
         source = inspect.getsource(thing)
-        return [source, thing.__defaults__, thing.__kwdefaults__, used.nonlocals, used.globals]
+        named = _named(thing.__code__)
+        known = {n: thing.__globals__[n] for n in sorted(named) if n in thing.__globals__}
+        known |= {n: sys.modules[n] for n in sorted(named - {*known}) if n in sys.modules}
+        modules = [
+            x for x in (*known.values(), *nonlocals.values()) if isinstance(x, types.ModuleType)
+        ]
+        inside = list(_members_of_modules(modules, named))
+        return [source, thing.__defaults__, thing.__kwdefaults__, nonlocals, known, inside]
     return [type(thing), *thing.__reduce_ex__(2)[1:3]]
+
+
+def _is_users(module: str | None) -> bool:
+    return (module or "").partition(".")[0] not in _LIBRARIES
+
+
+def _named(code: types.CodeType) -> set[str]:
+    """Return the names that a function reads, of globals, modules and attributes, also within the
+    functions that it defines."""
+    inner = (x for x in code.co_consts if isinstance(x, types.CodeType))
+    return {*code.co_names}.union(*map(_named, inner))
+
+
+def _members_of_modules(modules: list[types.ModuleType], named: set[str]) -> Iterator[Any]:
+    """Yield the members that a function may read from a user's modules, with their names."""
+    modules, visited = list(modules), set[int]()
+    for module in modules:  # grows
+        if not _is_users(module.__name__) or id(module) in visited:
+            continue
+        visited.add(id(module))
+        for name in sorted(named & {*vars(module)}):
+            member = getattr(module, name)
+            if isinstance(member, types.ModuleType):
+                modules.append(member)
+            yield from (f"{module.__name__}.{name}", member)
 
 
 def _members(kind: type) -> Iterator[Any]:

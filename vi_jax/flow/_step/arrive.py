@@ -11,15 +11,19 @@ from ...machine import (
     AbstractEvent,
     AbstractMachine,
     after_event,
+    constant_modes,
     event_of,
     events_of,
+    frictions_in,
     guard_of,
     has_velocity,
     holds_anywhere,
-    mode_number,
+    limited_in,
     others_of,
     outcomes_of,
+    pressed_contacts,
     section_number,
+    settled_modes,
     stops_of,
     struck_modes,
     switches_of,
@@ -29,7 +33,7 @@ from ..drift import FlowToEvent
 from ..events import Rates, guard_rates, offset_to_turn, rates
 from ..results import EventKind, code_of_outcome
 from ..sizes import guard_rounding
-from ..smooth import hold_contacts, in_modes, is_affine, limited_of, stops_are_exact
+from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .guards import JUMPED, Crossing, furthest_landing
 from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
 from .trial import AppliedStep, Release, Trial
@@ -116,6 +120,7 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     none = jnp.zeros_like(taken)
     new, modes, any_chosen, happens, jumps = old, modes_before, none, none, none
     kind, logged_number, value, chosen = EventKind.mode, 0.0, jnp.nan, {}
+    frictions, released = frictions_in(machine), {}
     for number, due in zip(numbers, x.due, strict=True):
         event, part, _ = event_of(machine, number, modes_before, ())
         before = machine, lane.s, old, *modes_before[part]
@@ -128,7 +133,9 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if event.holds_mode:
             slides = _must_slide(plan, number, lane._replace(state=its_state, modes=its_modes))
             lane = lane.end_if(chosen[number], slides, "sliding")
-            its_kind, its_value = EventKind.mode, its_modes[mode_number(machine, number)]
+            its_kind, its_value = EventKind.mode, its_modes[part.start]
+            if part.start in frictions:
+                released[part.start] = here & (modes_before[part.start] == 0), here
         else:
             jumps = jumps | here
             its_kind, its_value = EventKind.reset, event.value(*before)
@@ -141,6 +148,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         if len(numbers) > 1:
             its_entry = select(here, its_entry, (kind, logged_number, value))
         (kind, logged_number, value), happens = its_entry, happens | here
+    if released:
+        modes, value = _after_friction(plan, lane._replace(state=new, modes=modes), released, value)
     clock = plan.clock(lane.s, old)
     lane = lane.log_event(taken & happens, clock, kind, logged_number, value)
     lane = _update_after(plan, lane._replace(state=new, modes=modes), happens, jumps, old)
@@ -157,6 +166,28 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
     if section is not None:
         lane = lane.complete_interval(section)
     return _DueEvents(lane, tuple(due), near)
+
+
+def _after_friction(
+    plan: Plan, lane: Lane, events: dict[int, tuple[Flag, Flag]], value: Scalar | float
+) -> tuple[Scalars, Scalar]:
+    """Return the modes after an event of a friction, and the new mode for the log, if it happened;
+    else those of the lane and `value`. `events`: for each friction's mode, whether its force became
+    too large, and whether its event happened."""
+    any_event = any_of(jnp.zeros((), bool), (here for _, here in events.values()))
+    released = {i: when for i, (when, _) in events.items()}
+
+    def settled(modes: Scalars) -> Scalars:
+        contact = lane.contact or ()
+        return constant_modes(
+            settled_modes(plan.machine, lane.s, lane.state, modes, contact, released), lane.s
+        )
+
+    modes = jax.lax.cond(any_event, settled, lambda modes: modes, lane.modes)
+    found = jnp.asarray(value, lane.s.dtype)
+    for i, (_, here) in events.items():
+        found = jnp.where(here, modes[i], found)
+    return modes, found
 
 
 def with_outcome(machine: AbstractMachine, event: AbstractEvent, lane: Lane, here: Flag) -> Lane:
@@ -209,15 +240,21 @@ def release_pulled(
         return lane
     old, modes_before = before
     contacts, direction = list(contact), list(lane.direction)
-    for k in limited_of(machine):
+    together = is_compound(machine)
+    kept = pressed_contacts(machine, s, lane.state, modes, contact) if together else contact
+    for k in limited_in(machine):
 
         def pressing(modes: Scalars, state: State, k: int = k) -> Scalar:
             free = hold_contacts(machine, modes, contact, but=k)
-            return rates(free.field, machine.coordinates[k].position, s, state).a
+            return rates(free.field, machine.coordinates[k], s, state).a
 
         sign, _ = plan.sign_and_gap(k, contact[k])
-        pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
-        leaves = when & (contact[k] > 0) & stop_gradient((pressed >= 0) & (pulled < 0))
+        if together:
+            leaves = kept[k] == 0
+        else:
+            pressed, pulled = sign * pressing(modes_before, old), sign * pressing(modes, lane.state)
+            leaves = stop_gradient((pressed >= 0) & (pulled < 0))
+        leaves = when & (contact[k] > 0) & leaves
         if contact_before is not None:
             leaves = leaves & (contact_before[k] == contact[k])
         clock, stop = plan.clock(lane.s, lane.state), contact[k] - to_event(0)
@@ -270,7 +307,7 @@ def _directions_after_event(plan: Plan, lane: Lane, when: Flag, old: State) -> S
     for k, coordinate in enumerate(plan.machine.coordinates):
         after, known = coordinate.velocity(new), has_velocity(plan.machine, new)
         if not known or after is not coordinate.velocity(old):
-            here = rates(smooth.field, coordinate.position, lane.s, new)
+            here = rates(smooth.field, coordinate, lane.s, new)
             # The second number of a state without velocities may be anything.
             after = after if known else here.v
             after = stop_gradient(jnp.where(after == 0, here.a, after))
@@ -318,7 +355,7 @@ def arrive(plan: Plan, lane: Lane, trial: Trial, taken: Flag) -> tuple[Lane, Fla
         ),
         **{
             name: select(taken, getattr(arrived, name), getattr(lane, name))
-            for name in ("state", "direction", "contact", "modes", "below")
+            for name in ("state", "direction", "contact", "modes", "below", "slip")
         },
     )
     return arrived, completed
@@ -440,7 +477,8 @@ def _at_fixed_clock(step: AppliedStep, lane: Lane) -> Lane:
     moving = lane.s, lane.state, lane.record.integrals
     flow = FlowToEvent(step.plan, smooth, lane.part, moving)
     _, state, integrals = flow.with_flow_derivatives(s - lane.s)
-    return lane._replace(s=s, state=state).update_record(integrals=integrals)
+    slip = None if lane.slip is None else lane.slip + (lane.s - s)
+    return lane._replace(s=s, state=state, slip=slip).update_record(integrals=integrals)
 
 
 def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> Lane:
@@ -479,7 +517,7 @@ def on_its_stops(plan: Plan, lane: Lane) -> State:
     """Return the state with the bodies that rest, at least one, exactly on their stops. While they
     are held, their positions are accurate to the method's error only."""
     assert lane.contact is not None
-    codes = {k: lane.contact[k] for k in limited_of(plan.machine)}
+    codes = {k: lane.contact[k] for k in limited_in(plan.machine)}
     return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in codes.items()}, codes)[0]
 
 

@@ -26,6 +26,7 @@ from ...machine import (
     clock_of,
     events_of,
     guard_of,
+    limited_in,
     section_number,
     sides_of,
     size_of,
@@ -35,7 +36,7 @@ from .._lane import Lane, Plan, any_of, select, to_event
 from ..events import Rates, guard_rates, landing, rates
 from ..methods import Stage
 from ..sizes import guard_rounding
-from ..smooth import SmoothMachine, is_affine, limited_of, stops_are_exact
+from ..smooth import SmoothMachine, is_affine, stops_are_exact
 
 # Places in a step of a motion known in advance where guards are evaluated, as shares of it.
 SHARES = tuple(n / 8 for n in range(1, 8))
@@ -115,12 +116,12 @@ def inner_guards(
     if not stages:
         return InnerGuards({}, {}, {}, {})
     machine, arguments = plan.machine, (lane.modes, lane.contact or ())
-    limited = limited_of(machine) if plan.rests else []
+    limited = limited_in(machine) if plan.rests else []
     contacts: Any = lane.contact
     checked = events_within_step(plan, lane.state)
 
     def moves(k: int, s: Scalar, state: State) -> Rates:
-        return rates(free_machines[k].field, machine.coordinates[k].position, s, state)
+        return rates(free_machines[k].field, machine.coordinates[k], s, state)
 
     slow = {k: jnp.zeros((), bool) for k in limited}
     if not plan.method.resolves(machine):

@@ -25,17 +25,21 @@ from ...lanes import pin_flag
 from ...machine import (
     DryFriction,
     SoftStop,
+    constant_modes,
     counts_turns,
+    frictions_in,
     is_alive,
     others_of,
     section_in,
     section_number,
+    settled_modes,
     stops_of,
     struck_modes,
     switches_of,
     with_earlier_clock,
 )
 from .._lane import FREE, Lane, Plan, Record, any_of, select, to_event, total
+from ..history import extended, is_full, opened
 from ..noise import with_impulse
 from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
@@ -50,8 +54,7 @@ _MOST_ATTEMPTS, _MOST_IMPACTS = 64.0, 16.0
 # No motion needs this many steps in one interval; a power of two, by choice.
 _MOST_STEPS = 65536.0
 
-# A slip jumps if it changes by this share of itself: a choice. If it is zero to rounding, the modes
-# stay the same.
+# A slip jumps if it changes by more than this share of itself, and than rounding: a choice.
 _JUMPS = 1e-6
 
 # A step of this share of a cycle is long enough to show whether anything moves: a choice, below the
@@ -63,6 +66,9 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     """Take one step of one lane: advance, aim or land. A lane that has ended is unchanged. Returns
     the lane; whether an interval ended; the record of that interval."""
     active = (lane.done < plan.intervals) & (lane.fault == 0)
+    history = lane.history
+    if history is not None:
+        plan, lane = opened(plan, lane)
     smooth = hold_contacts(plan.machine, lane.modes, lane.contact)
     integrals = carried(smooth, lane.s, lane.state, lane.record.integrals)
     motion = plan.method.foresee(smooth, lane.s, lane.state, integrals)
@@ -96,11 +102,23 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
         spent=jnp.where(reached, 0.0, lane.spent + 1.0),
         rejected=lane.rejected + jnp.where(rejected, 1.0, 0.0),
     )
-    fault = new.fault
-    for condition, reason in _faults(plan, lane, trial, taken, rejected, new):
+    fault, ends = new.fault, _faults(plan, lane, trial, taken, rejected, new)
+    if history is not None:
+        step, jumps = (lane, trial, taken), _jumps(plan, trial)
+        history = extended(plan, history, step, arrived, new.s, jumps)
+        new = new._replace(history=history, slip=None)
+        ends.append((is_full(plan, history), code("full_history")))
+    for condition, reason in ends:
         stops_here = active & (fault == 0) & condition & (done < plan.intervals)
         fault = jnp.where(stops_here, reason, fault)
     return new._replace(fault=fault), completed, arrived.record
+
+
+def _jumps(plan: Plan, trial: Trial) -> Flag:
+    """Return whether a step ended at an event after which the motion is not smooth."""
+    events = [c for c in trial.crossings if c.number != section_number(plan.machine)]
+    released = [path.release.landed for path in trial.paths if path.release is not None]
+    return any_of(trial.good, [*(c.landed for c in events), *released])
 
 
 def _next_attempt(plan: Plan, lane: Lane, trial: Trial, taken: Flag, length: Scalar) -> Scalar:
@@ -162,17 +180,23 @@ def _update_frictions(plan: Plan, old: Lane, new: Lane, cycle_ended: Flag) -> La
     dry = [x for x in switches_of(machine) if isinstance(x, DryFriction)]
     if not any(renewed or x.slip_takes_time for x in dry):
         return new
-    jumps = jnp.zeros((), bool)
-    for friction in dry:
-        before, after = (friction.speed_of_slip(machine, x.s, x.state) for x in (old, new))
-        jumps = jumps | (jnp.abs(after - before) > _JUMPS * (jnp.abs(after) + jnp.abs(before)))
-    jumps = pin_flag(cycle_ended & stop_gradient(jumps), new.s)
+    modes, any_jumps = list(new.modes), jnp.zeros((), bool)
+    for i, friction in enumerate(switches_of(machine)):
+        if isinstance(friction, DryFriction):
+            before, after = (friction.speed_of_slip(machine, x.s, x.state) for x in (old, new))
+            least = _JUMPS * (jnp.abs(after) + jnp.abs(before)) + plan.slip_rounding(i, new)
+            jumps = stop_gradient(jnp.abs(after - before) > least)
+            slips = friction.slip_sign(machine, new.s, new.state)
+            modes[i], any_jumps = jnp.where(jumps, slips, modes[i]), any_jumps | jumps
+    any_jumps = pin_flag(cycle_ended & any_jumps, new.s)
 
     def new_modes(new: Lane) -> Scalars:
-        return struck_modes(machine, new.s, new.state, new.modes, contact=new.contact or ())
+        # A body that sticks, and whose surface did not jump, has no slip but rounding.
+        settled = settled_modes(machine, new.s, new.state, tuple(modes), new.contact or (), {})
+        return constant_modes(settled, new.s)
 
     # Rare: skipped if no lane of a group has such a jump.
-    return new._replace(modes=jax.lax.cond(jumps, new_modes, lambda new: new.modes, new))
+    return new._replace(modes=jax.lax.cond(any_jumps, new_modes, lambda new: new.modes, new))
 
 
 def _next_length(plan: Plan, lane: Lane, trial: Trial, taken: Flag, rejected: Flag) -> Scalar:
@@ -222,11 +246,13 @@ def _faults(
     """Return conditions that end a lane, and the reasons' numbers; the first true one is the
     reason. `new` is the lane after the trial."""
     impacts, broken = new.record.impacts, code("not_finite")
+    jams = [(jnp.isnan(new.modes[i]), code("jammed")) for i in frictions_in(plan.machine)]
     many = impacts > _MOST_IMPACTS
     if is_alive(plan.machine, trial.state) is not None:
         # If a clock breaks down, the steps shrink to zero.
         broken = code("stalled")
     ends = [
+        *jams,
         (impacts > plan.max_impacts, code("chatter")),
         (((new.attempts >= _MOST_ATTEMPTS) | (new.spent >= _MOST_STEPS)) & many, code("chatter")),
         (new.attempts >= _MOST_ATTEMPTS, _reason_for_giving_up(plan, lane, new.target)),

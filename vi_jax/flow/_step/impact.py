@@ -10,33 +10,36 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
+import numpy as np
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import (
     AbstractMachine,
-    Coordinate,
     RigidStop,
+    Row,
+    Strike,
     added,
     contact_constraints,
     forces,
     friction_on,
     has_contact_friction,
     holds_anywhere,
+    limited_in,
     longest_step,
     push_gains,
-    push_of,
+    row_of,
     stops_of,
+    strike,
     struck_modes,
-    with_friction_impulse,
 )
 from .._lane import Lane, Plan, add_entry, any_of, select, to_event, with_item
 from ..drift import FlowToEvent
 from ..events import force_rate, rates
 from ..results import EventKind
-from ..smooth import SmoothMachine, hold_contacts, in_modes, limited_of
+from ..smooth import SmoothMachine, hold_contacts, in_modes
 from .trial import AppliedStep
 
 # Number of roundings by which a rebound may be faster than the approach: a choice, a few more than
@@ -57,7 +60,7 @@ class ImpactResult(NamedTuple):
 
 def is_compound(machine: AbstractMachine) -> bool:
     """Return whether several velocities change in an impact, across stops or along them; static."""
-    return len(limited_of(machine)) > 1 or has_contact_friction(machine)
+    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
 
 
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
@@ -124,6 +127,10 @@ _NO_SPEED, _WEAK, _STILL = 1e-12, 1e-7, 30.0
 # Speeds whose relative difference is smaller are equal: a choice, far above rounding.
 _EQUAL = 1e-9
 
+# Contacts that close within this time (for a cycle of about 2π) of an impact close with it: a
+# choice, below the accuracy of an event's time. A box that falls flat turned after 5 bounces.
+_AT_ONCE = 1e-11
+
 # Contacts that share less than this of each other's velocity are struck separately: a choice.
 _UNCOUPLED = 1e-6
 
@@ -133,15 +140,23 @@ _ROUNDS = 4096.0
 
 
 class _Round(NamedTuple):
-    """A sequence of impacts, between two of them."""
+    """A sequence of impacts, between two of them; arrays have a number for each stop, then for each
+    stop with friction, as in `machine.settle`."""
 
     lane: Lane
-    contact: dict[int, Scalar]
-    """For each coordinate, as in `ImpactResult`."""
-    approach: dict[int, Scalar]
+    velocity: Array
+    impulse: Array
+    """The sum of all impulses so far."""
+    lost: Scalar
+    """The energy lost so far."""
+    struck: Array
+    """For each stop, the number of the round in which it was struck last, or 0."""
+    approach: Array
+    """For each stop, its greatest speed of approach."""
     fastest: Scalar
-    """The greatest speed of approach so far."""
     goes_on: Scalar
+    retry: Scalar
+    """1 if the impacts of a group had no solution: it is resolved without restitution."""
     rounds: Scalar
 
 
@@ -150,28 +165,29 @@ class _Instant(NamedTuple):
 
     plan: Plan
     taken: Flag
-    s: Scalar
     met: Flag
     """True if the step landed on any stop."""
     at_event: State
     """The state before the impacts."""
-    bodies: dict[int, Coordinate]
-    """The coordinates that stops limit, by number, like all that follows except for stops."""
-    before: dict[int, Scalar]
-    """Their velocities before the impacts."""
-    gains: list[list[Scalar]]
-    """Their changes by each other's push (see `machine.contacts`)."""
-    landed: dict[int, Flag]
-    touches: dict[int, Flag]
+    rows: list[Row]
+    """For each stop, then for each friction on a stop."""
+    outward: Array
+    """The sign of the velocity that opens a contact; 1 for a friction."""
+    strike: Strike
+    """Gains, velocities before the impacts and frictions."""
+    of: tuple[int, ...]
+    landed: Array
+    touches: Array
     """For each stop, true if its contact is closed."""
-    coupled: dict[int, Flag]
-    """For each coordinate, true if an impact acts on it, through closed contacts."""
-    slow: dict[int, Scalar | float]
+    coupled: Array
+    """For each stop, true if an impact acts on it, through closed contacts."""
+    slow: Array
     """Bounds of the rounding errors of the velocities."""
 
-    def forces(self, on: dict[int, Flag], wanted: dict[int, Scalar]) -> dict[int, Scalar]:
-        found = forces(self.gains, list(on.values()), list(wanted.values()))
-        return dict(zip(self.bodies, found, strict=True))
+    def after(self, impulse: Array) -> State:
+        """Return the state after these impulses."""
+        amounts = self.outward * impulse / jnp.stack([1.0 * x.mass for x in self.rows])
+        return added(self.at_event, list(amounts), [row.push for row in self.rows])
 
 
 def resolve_impact_sequence(
@@ -185,231 +201,180 @@ def resolve_impact_sequence(
     (several balls without restitution) is replaced by its limit: the contacts that are still being
     struck come to rest against each other.
     """
+    machine, stops = plan.machine, stops_of(plan.machine)
     instant = _before_impacts(plan, taken, lane, landed, at_event)
-    zero = jnp.zeros_like(lane.s)
-    nothing = dict.fromkeys(instant.bodies, zero)
+    zero, n = jnp.zeros_like(lane.s), len(stops)
     # A contact without any speed, as between bodies released together, may come to rest.
-    contacts = dict(nothing)
-    for number, stop in enumerate(stops_of(plan.machine)):
-        k = stop.coordinate
-        contacts[k] = jnp.where(landed[number], to_event(number), contacts[k])
-    lane = lane._replace(state=select(instant.met, at_event, lane.state))
-    begin = _Round(lane, contacts, nothing, zero, jnp.where(instant.met, 1.0, zero), zero)
+    struck = jnp.where(instant.landed, 0.5, zero)
+    velocity = instant.strike.velocity
+    begin = _Round(
+        lane, velocity, 0 * velocity, zero, struck, 0 * velocity[:n], zero,
+        jnp.where(instant.met, 1.0, zero), zero, zero,
+    )  # fmt: skip
     end = jax.lax.while_loop(
         lambda x: (x.goes_on > 0) & (x.rounds < _ROUNDS), lambda x: _next_impacts(instant, x), begin
     )
-    endless = end.rounds >= _ROUNDS
-    lane = end.lane.end_if(instant.met, endless, "simultaneous")
+    lane = end.lane.end_if(instant.met, end.rounds >= _ROUNDS, "simultaneous")
+    lane = lane.end_if(instant.met, end.retry > 1, "jammed")
+    energy = lane.record.impact_energy
+    if energy is not None:
+        lost = jnp.where(taken & instant.met, end.lost, 0.0)
+        lane = lane.update_record(impact_energy=energy + lost)
+    state = select(instant.met, instant.after(end.impulse), lane.state)
     results = {}
-    for k, body in instant.bodies.items():
-        contact, fastest = end.contact[k], end.approach[k]
-        leaves = -plan.sign_and_gap(k, contact)[0] * body.velocity(lane.state)
+    for k in limited_in(machine):
+        body, contact, fastest, latest = machine.coordinates[k], zero, zero, zero
+        for i, stop in enumerate(stops):
+            if stop.coordinate == k:
+                last = end.struck[i] > latest
+                moved = body.placed(state, stop.place, -stop.sign * end.velocity[i])
+                state = select(last, moved, state)
+                contact = jnp.where(last, to_event(i), contact)
+                latest, fastest = (
+                    jnp.maximum(latest, end.struck[i]),
+                    jnp.maximum(fastest, end.approach[i]),
+                )
+        leaves = -plan.sign_and_gap(k, contact)[0] * body.velocity(state)
         share = leaves / jnp.where(fastest > 0, fastest, 1.0)
         results[k] = ImpactResult(contact, fastest, jnp.clip(share, 0.0, 1.0))
-    return lane, results
+    return lane._replace(state=state), results
 
 
 def _before_impacts(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> _Instant:
-    bodies = {k: plan.machine.coordinates[k] for k in limited_of(plan.machine)}
-    coordinates = list(bodies.values())
-    pushes = [push_of(body, at_event) for body in coordinates]
-    gains = push_gains(coordinates, at_event, pushes)
-    met = jnp.zeros_like(taken)
-    coupled, touches = dict.fromkeys(bodies, met), {}
-    for number, stop in enumerate(stops_of(plan.machine)):
-        k, here = stop.coordinate, landed[number]
-        met, coupled[k] = met | here, coupled[k] | here
+    machine, s, stops = plan.machine, lane.s, stops_of(plan.machine)
+    frictions = [friction_on(machine, number) for number in range(len(stops))]
+    of = tuple(number for number, x in enumerate(frictions) if x is not None)
+    numbers = [*(x.coordinate for x in stops), *(frictions[i].along for i in of)]
+    bodies = {k: machine.coordinates[k] for k in dict.fromkeys(numbers)}
+    rows = {k: row_of(body, s, at_event) for k, body in bodies.items()}
+    places = [list(bodies).index(k) for k in numbers]
+    gains = push_gains(
+        list(bodies.values()), list(rows.values()), at_event, [x.push for x in rows.values()]
+    )
+    gains = jnp.stack([jnp.stack([gains[i][j] for j in places]) for i in places])
+    outward = np.asarray([*(-float(x.sign) for x in stops), *(1.0 for _ in of)])
+    touches, slow = [], []
+    for number, stop in enumerate(stops):
+        k = stop.coordinate
         depth = stop_gradient(stop.beyond(bodies[k].position(at_event)))
+        speed = jnp.abs(stop_gradient(bodies[k].velocity(at_event)))
         size = plan.extent(k) + jnp.abs(stop_gradient(stop.gap))
-        closed = here | (jnp.abs(depth) <= 256 * float(jnp.finfo(depth.dtype).eps) * size)
+        near = 256 * float(jnp.finfo(depth.dtype).eps) * size + plan.in_units(_AT_ONCE) * speed
+        closed = landed[number] | (jnp.abs(depth) <= near)
         if lane.contact is not None:
             closed = closed | (lane.contact[k] == to_event(number))
-        touches[number] = closed
-    acts = _acting(plan.machine, bodies, gains, pushes, at_event)
-    coupled = _coupled(plan, acts, touches, coupled)
-    before = {k: body.velocity(at_event) for k, body in bodies.items()}
-    slow = {k: plan.rounding_bounds(k, at_event)[1] for k in bodies}
-    return _Instant(
-        plan, taken, lane.s, met, at_event, bodies, before, gains, landed, touches, coupled, slow
+        touches.append(closed)
+        slow.append(plan.rounding_bounds(k, at_event)[1] + jnp.zeros_like(s))
+    landed_, touches = jnp.stack(list(landed.values())), jnp.stack(touches)
+    masses = jnp.stack([jnp.asarray(1.0 * rows[k].mass, s.dtype) for k in numbers])
+    velocity = jnp.stack([bodies[k].velocity(at_event) for k in numbers])
+    zero = jnp.zeros_like(s)
+    numbers_of = Strike(
+        outward[:, None] * gains * outward / masses,
+        outward * velocity,
+        jnp.stack([frictions[i].level + zero for i in of]) if of else velocity[:0],
+        jnp.zeros((len(stops),), s.dtype),
+        jnp.stack([frictions[i].restitution + zero for i in of]) if of else velocity[:0],
+        touches,
     )
+    coupled = _coupled(_acting(gains, of), touches, landed_)
+    return _Instant(
+        plan, taken, jnp.any(landed_), at_event, [rows[k] for k in numbers], outward,
+        numbers_of, of, landed_, touches, coupled, jnp.stack(slow),
+    )  # fmt: skip
 
 
-def _acting(
-    machine: AbstractMachine, bodies: dict[int, Coordinate], gains: list[list[Scalar]],
-    pushes: list[State], state: State,
-) -> list[list[Flag]]:  # fmt: skip
-    """Return for each pair of coordinates whether impacts change each other's velocity, also by
-    friction. Products of both changes do not depend on units."""
-    size = range(len(gains))
-    both = [[jnp.abs(gains[i][j] * gains[j][i]) for j in size] for i in size]
-    for number, stop in enumerate(stops_of(machine)):
-        friction = friction_on(machine, number)
-        if friction is not None:
-            along, j = machine.coordinates[friction.along], list(bodies).index(stop.coordinate)
-            response = push_gains([*bodies.values()], state, [push_of(along, state)])
-            for i, change in enumerate(push_gains([along], state, pushes)[0]):
-                dragged = jnp.abs(change * response[i][0])
-                both[i][j], both[j][i] = both[i][j] + dragged, both[j][i] + dragged
-    return [[stop_gradient(x) > _UNCOUPLED**2 for x in row] for row in both]
+def _acting(gains: Array, of: tuple[int, ...]) -> Array:
+    """Return for each pair of stops whether impacts change each other's velocity, also by friction.
+    Products of both changes do not depend on units."""
+    n = gains.shape[0] - len(of)
+    both = jnp.abs(gains * gains.T)
+    acts = both[:n, :n]
+    for row, stop in enumerate(of, start=n):
+        here = np.arange(n) == stop
+        dragged = jnp.where(here[:, None], both[row, :n], 0.0)
+        acts = acts + dragged + dragged.T
+    return stop_gradient(acts) > _UNCOUPLED**2
 
 
-def _coupled(
-    plan: Plan, acts: list[list[Flag]], touches: dict[int, Flag], landed: dict[int, Flag]
-) -> dict[int, Flag]:
-    """Return for each coordinate whether an impact on one of those `landed` acts on it through
-    closed contacts. `touches`: for each stop, whether its contact is closed."""
-    closes = dict.fromkeys(landed, jnp.zeros((), bool))
-    for number, stop in enumerate(stops_of(plan.machine)):
-        closes[stop.coordinate] = closes[stop.coordinate] | touches[number]
-    closed, coupled, size = list(closes.values()), list(landed.values()), len(landed)
-    # A pass in both directions carries each mark two contacts further, for any numbering.
-    for _ in range(max(1, size // 2)):
-        for i in (*range(size), *reversed(range(size - 1))):
-            for j in range(size):
-                if j != i:
-                    coupled[i] = coupled[i] | (closed[i] & coupled[j] & acts[i][j])
-    return dict(zip(landed, coupled, strict=True))
+def _coupled(acts: Array, touches: Array, landed: Array) -> Array:
+    """Return for each stop whether an impact on one of those `landed` acts on it through closed
+    contacts."""
+    coupled = landed
+    for _ in range(acts.shape[0] - 1):
+        coupled = coupled | touches & jnp.any(acts & coupled, 1)
+    return coupled
 
 
 def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     """Return the sequence after its next impacts: those of the contacts that close fastest."""
-    plan, lane = instant.plan, sequence.lane
-    stops, state = stops_of(plan.machine), lane.state
-    velocities = {k: body.velocity(state) for k, body in instant.bodies.items()}
-    closing = _closing(instant, sequence, velocities)
-    fastest = stop_gradient(jnp.max(jnp.stack(list(closing.values()))))
+    plan, lane, V = instant.plan, sequence.lane, sequence.velocity
+    stops = stops_of(plan.machine)
+    n = len(stops)
+    closing = _closing(instant, sequence)
+    fastest = stop_gradient(jnp.max(closing))
     most = jnp.maximum(sequence.fastest, fastest)
     goes_on = fastest > _NO_SPEED * most
-    weak = goes_on & (fastest <= _WEAK * most)
-
-    hits, rebounds = {}, {}
-    for number, stop in enumerate(stops):
-        hit = goes_on & ~weak & (stop_gradient(closing[number]) >= (1 - _EQUAL) * fastest)
-        hits[number] = hit
-        rebounds[number] = stop.velocity_after(stop.sign * jnp.where(hit, closing[number], 0.0))
-    separately = _one_after_other(instant, velocities, hits, rebounds)
-    found = jnp.zeros_like(goes_on)
-    for number, hit in hits.items():
-        hits[number], found = hit & ~(separately & found), found | hit
+    weak, retry = goes_on & (fastest <= _WEAK * most), sequence.retry > 0
+    hits = goes_on & ~weak & (stop_gradient(closing) >= (1 - _EQUAL) * fastest)
+    speed = jnp.where(hits, closing, 0.0)
+    rebounds = jnp.stack([
+        -stop.sign * stop.velocity_after(stop.sign * speed[i]) for i, stop in enumerate(stops)
+    ])  # fmt: skip
+    share = jnp.where(weak | retry, 0.0, rebounds / jnp.where(speed > 0, speed, 1.0))
     # In the limit the contacts that are still being struck come to rest.
-    slow = {
-        k: weak & (sequence.contact[k] > 0) & (jnp.abs(stop_gradient(V)) <= _STILL * fastest)
-        for k, V in velocities.items()
-    }
-    new, pushed = _pushed_state(instant, state, velocities, slow, hits, rebounds)
-    lane = _with_losses(instant, lane._replace(state=new), state, pushed)
-    contacts, approaches = dict(sequence.contact), dict(sequence.approach)
-    for number, hit in hits.items():
-        stop, k = stops[number], stops[number].coordinate
-        speed = jnp.maximum(closing[number], 0.0)
-        lane = lane.end_if(hit, gains_speed(stop, speed, rebounds[number]), "bad_impact")
-        lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, number, speed)
+    slow = (sequence.struck > 0) & (jnp.abs(stop_gradient(V[:n])) <= _STILL * fastest)
+    group = jnp.where(weak, slow, jnp.where(retry, instant.touches, hits))
+    tangential = jnp.where(weak | retry, 0.0, instant.strike.tangential)
+    blow = strike(
+        instant.strike._replace(
+            velocity=V, restitution=share, tangential=tangential, struck=group
+        ), instant.of,
+    )  # fmt: skip
+    impulse = jnp.where(goes_on & ~blow.unsolved, blow.impulse, 0.0)
+    after = V + instant.strike.gains @ impulse
+    # A struck contact leaves as its law says, without the rounding of the gains.
+    alone = jnp.sum(jnp.where(group, 1.0, 0.0)) == 1
+    exact = alone & hits & (blow.share == 1) & ~blow.unsolved
+    after = after.at[:n].set(jnp.where(exact, share * speed, after[:n]))
+    lost = sequence.lost - jnp.dot(impulse, 0.5 * (V + after))
+    acted = goes_on & ~blow.unsolved
+    total = sequence.impulse + impulse
+    new = instant.after(total) if any(x.modes is not None for x in stops) else None
+    for i, stop in enumerate(stops):
+        hit = hits[i] & acted
+        lane = lane.end_if(
+            hit,
+            gains_speed(stop, speed[i], stop.velocity_after(stop.sign * speed[i])),
+            "bad_impact",
+        )
+        lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, i, speed[i])
         if stop.modes is not None:
-            given = plan.machine, lane.s, state, new, lane.modes
+            given = plan.machine, lane.s, instant.after(sequence.impulse), new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
-        contacts[k] = jnp.where(hit, to_event(number), contacts[k])
-        approaches[k] = jnp.where(hit, jnp.maximum(approaches[k], speed), approaches[k])
-    goes_on = jnp.where(goes_on & ~weak, 1.0, 0.0)
-    return _Round(lane, contacts, approaches, most, goes_on, sequence.rounds + 1.0)
+    return _Round(
+        lane, after, total, lost,
+        jnp.where(hits & acted, sequence.rounds + 1.0, sequence.struck),
+        jnp.where(hits & acted, jnp.maximum(sequence.approach, speed), sequence.approach),
+        most,
+        jnp.where(goes_on & ~weak & (sequence.retry + blow.unsolved < 2), 1.0, 0.0),
+        jnp.where(goes_on & blow.unsolved, sequence.retry + 1.0, 0.0),
+        sequence.rounds + 1.0,
+    )  # fmt: skip
 
 
-def _one_after_other(
-    instant: _Instant, velocities: dict[int, Scalar], hits: dict[int, Flag],
-    rebounds: dict[int, Scalar],
-) -> Flag:  # fmt: skip
-    """Return whether contacts that close equally fast are nevertheless struck one after the other,
-    in their order: with friction, if one of them would have to pull, or if different laws would
-    gain energy together."""
-    if has_contact_friction(instant.plan.machine):
-        return jnp.ones((), bool)
-    on = dict.fromkeys(velocities, jnp.zeros((), bool))
-    wanted = {k: jnp.zeros_like(V) for k, V in velocities.items()}
-    signs = dict(wanted)
-    for number, hit in hits.items():
-        stop = stops_of(instant.plan.machine)[number]
-        k = stop.coordinate
-        on[k] = on[k] | hit
-        wanted[k] = jnp.where(hit, rebounds[number] - velocities[k], wanted[k])
-        signs[k] = jnp.where(hit, float(stop.sign), signs[k])
-    amounts = stop_gradient(instant.forces(on, wanted))
-    gained, size, pulls = jnp.zeros(()), jnp.zeros(()), jnp.zeros((), bool)
-    for k, body in instant.bodies.items():
-        amount, V, change = amounts[k], velocities[k], wanted[k]
-        work = body.mass_at(instant.s, instant.at_event) * amount * (V + 0.5 * change)
-        gained, size = gained + work, size + jnp.abs(work)
-        pulls = pulls | (amount * signs[k] > _EQUAL * jnp.abs(change))
-    return stop_gradient(pulls | (gained > _EQUAL * size))
-
-
-def _pushed_state(
-    instant: _Instant, state: State, velocities: dict[int, Scalar], slow: dict[int, Flag],
-    hits: dict[int, Flag], rebounds: dict[int, Scalar],
-) -> tuple[State, list[tuple[Coordinate, Scalar]]]:  # fmt: skip
-    """Return the state after the next impacts, and the push of each coordinate's velocity. `hits`
-    and `rebounds` (velocities) are by the numbers of stops."""
-    machine, stops = instant.plan.machine, stops_of(instant.plan.machine)
-    on, wanted, places = dict(slow), {k: -V for k, V in velocities.items()}, {}
-    for k, body in instant.bodies.items():
-        places[k] = body.position(state)
-        for number, hit in hits.items():
-            if stops[number].coordinate == k:
-                on[k], places[k] = on[k] | hit, jnp.where(hit, stops[number].place, places[k])
-                wanted[k] = jnp.where(hit, rebounds[number] - velocities[k], wanted[k])
-    amounts = instant.forces(on, wanted)
-    new = state
-    for k, body in instant.bodies.items():
-        moved = body.placed(state, places[k], velocities[k] + amounts[k])
-        new = jtu.tree_map(
-            lambda a, b, c, on=on[k]: a if c is b else a + jnp.where(on, c - b, 0.0),
-            new, state, moved,
-        )  # fmt: skip
-    pushed = []
-    for number, hit in hits.items():
-        friction = friction_on(machine, number)
-        if friction is not None:
-            k = stops[number].coordinate
-            result = with_friction_impulse(machine, number, friction, instant.s, state, new)
-            new = select(hit, result.state, new)
-            amounts[k] = jnp.where(hit, result.pushed, amounts[k])
-            along = machine.coordinates[friction.along]
-            pushed.append((along, jnp.where(hit, result.dragged, 0.0)))
-    return new, [*pushed, *((body, amounts[k]) for k, body in instant.bodies.items())]
-
-
-def _closing(instant: _Instant, x: _Round, velocities: dict[int, Scalar]) -> dict[int, Scalar]:
+def _closing(instant: _Instant, x: _Round) -> Array:
     """Return for each stop the speed of approach, if it may be hit next; else a negative number.
     Impacts that coincide without acting on each other are two instants for derivatives. Therefore
     only contacts take part that an impact changed, or that act on those of `landed`."""
-    found = {}
-    for number, stop in enumerate(stops_of(instant.plan.machine)):
-        k = stop.coordinate
-        speed = stop.approach(velocities[k])
-        size = stop_gradient(speed)
-        changed = jnp.abs(stop_gradient(velocities[k] - instant.before[k])) > _NO_SPEED * x.fastest
-        acts = instant.landed[number] | ((changed | instant.coupled[k]) & (size > instant.slow[k]))
-        found[number] = jnp.where(acts & instant.touches[number] & (size > 0), speed, -1.0)
-    return found
-
-
-def _with_losses(
-    instant: _Instant, lane: Lane, before: State, pushed: list[tuple[Coordinate, Scalar]]
-) -> Lane:
-    """Return the lane with the energy lost in impacts: the work of each impulse at its contact's
-    mean velocity. A law that gains energy ends the lane."""
-    lost, size = jnp.zeros_like(lane.s), jnp.zeros_like(lane.s)
-    for body, amount in pushed:
-        V, left = body.velocity(before), body.velocity(lane.state)
-        mass = body.mass_at(instant.s, before)
-        lost = lost - mass * amount * 0.5 * (V + left)
-        size = size + mass * jnp.abs(amount) * (jnp.abs(V) + jnp.abs(left))
-    energy = lane.record.impact_energy
-    if energy is not None:
-        hit = instant.taken & instant.met
-        lane = lane.update_record(impact_energy=energy + jnp.where(hit, lost, 0.0))
-    wrong = stop_gradient(lost) < -1e-9 * stop_gradient(size)
-    return lane.end_if(instant.met, wrong, "bad_impact")
+    n = instant.landed.shape[0]
+    speed, before = -x.velocity[:n], -instant.strike.velocity[:n]
+    size = stop_gradient(speed)
+    changed = jnp.abs(stop_gradient(speed - before)) > _NO_SPEED * x.fastest
+    acts = instant.landed | ((changed | instant.coupled) & (size > instant.slow))
+    return jnp.where(acts & instant.touches & (size > 0), speed, -1.0)
 
 
 # Longest remaining chatter that is completed, as a share of the longest step, in double and in
@@ -433,8 +398,8 @@ def bring_to_rest(
         sign, _ = step.plan.sign_and_gap(k, impact.contact)
         path, free = step.trial.paths[k], step.trial.free_machines[k]
         # At the event, not at the step's end: its derivatives include the event's time.
-        position = step.plan.machine.coordinates[k].position
-        rate = jax.jvp(position, (at_event,), (free.field(lane.s, at_event),))[1]
+        body = step.plan.machine.coordinates[k]
+        rate = rates(free.field, body, lane.s, at_event).v
         speed = impact.share * jnp.maximum(sign * rate, 0.0)
         growth = None if path.force_rates is None else path.force_rates[1]
         arguments = k, impact, speed, lane._replace(state=at_event), growth
@@ -505,12 +470,10 @@ def _without_rebounds(
     contact = [zero for _ in machine.coordinates]
     for k, ends in rests.items():
         contact[k] = jnp.where(ends, contacts[k], zero)
-    held = contact_constraints(machine, s, state, modes, contact)
+    held = contact_constraints(machine, s, state, modes, contact, with_dry=False)
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
-    amounts = forces(
-        push_gains(bodies, state, held.pushes), held.acts, [-velocity for velocity in before]
-    )
+    amounts = held.amounts(state, [-velocity for velocity in before])
     new, pushed = added(state, amounts, held.pushes), list(amounts)
     for row, (_, _, index, drag) in enumerate(
         held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
@@ -535,7 +498,8 @@ def stop_bodies(
         shifts.append(sign * gap - body.position(state))
     if len(rests) > 1:
         coordinates, on = list(bodies.values()), list(rests.values())
-        gains = push_gains(coordinates, state, [push_of(body, state) for body in coordinates])
+        rows = [row_of(body, s, state) for body in coordinates]
+        gains = push_gains(coordinates, rows, state, [row.push for row in rows])
         deltas, shifts = forces(gains, on, deltas), forces(gains, on, shifts)
     new, lost = state, jnp.zeros_like(deltas[0])
     for (k, body), change, shift, V in zip(bodies.items(), deltas, shifts, velocities, strict=True):
@@ -559,7 +523,7 @@ def _remaining_chatter(
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
     at_rest = body.placed(state, jnp.asarray(sign * gap), jnp.zeros_like(s))
-    pressing = sign * rates(free.field, body.position, s, at_rest).a
+    pressing = sign * rates(free.field, body, s, at_rest).a
     force = pressing * (1 - impact.share)
     ends = force > 0
     time = jnp.where(ends, 2 * speed / jnp.where(ends, force, 1.0), jnp.inf)
@@ -567,7 +531,7 @@ def _remaining_chatter(
     # Hops no higher than rounding cannot be resolved, however long they last.
     height = speed**2 / jnp.where(pressing > 0, 2 * pressing, 1.0)
     if growth is None:  # another impact of this instant may have changed it
-        growth = force_rate(free, body.position, free, s, at_rest)
+        growth = force_rate(free, body, free, s, at_rest)
     not_yet, hop, wait = _time_until_pressed(speed, pressing, sign * growth)
     height = jnp.where(not_yet, speed * hop - 0.5 * pressing * hop * hop, height)
     size = plan.extent(k) + jnp.abs(gap)
@@ -624,7 +588,7 @@ def _resting_bodies(
     for k, hit in impacts.items():
         sign, _ = plan.sign_and_gap(k, hit.contact)
         speeds[k] = jnp.maximum(
-            -sign * rates(free.field, plan.machine.coordinates[k].position, s, state).v, 0.0
+            -sign * rates(free.field, plan.machine.coordinates[k], s, state).v, 0.0
         )
         stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
         closed[k] = jnp.where(stays, hit.contact, contact[k])

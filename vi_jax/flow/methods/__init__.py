@@ -6,6 +6,5 @@
 from .base import AbstractMethod, Foreseen, Stage, stages_to_step_to
 from .choice import MethodLike, chosen, preset
 from .exact import ExactFlight
-from .runge_kutta import Adaptive, FixedStep, ImplicitSteps, Unrolled
+from .runge_kutta import Adaptive, FixedStep, ImplicitSteps
 from .taylor import Taylor
-from .verner import Verner9

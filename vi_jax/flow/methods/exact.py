@@ -25,6 +25,7 @@ from ...machine import (
     Scene,
     forces,
     horner,
+    limited_in,
     modal,
     overridden,
     phase_at,
@@ -32,7 +33,7 @@ from ...machine import (
     stops_of,
     switches_of,
 )
-from ..smooth import Integrals, SmoothMachine, constant, limited_of, rate_of_integrals
+from ..smooth import Integrals, SmoothMachine, constant, rate_of_integrals
 from .base import AbstractMethod
 
 # The series of a matrix exponential is summed over lengths in which the state changes at most by
@@ -232,7 +233,7 @@ def _series_flight(
 def _resting_projection(machine: ModalMachine, contact: Scalars) -> Any:
     """Return a function that removes from an acceleration the part that resting contacts cancel:
     each contact's push keeps its velocity constant."""
-    limited = limited_of(machine) if contact else []
+    limited = limited_in(machine) if contact else []
     if not limited:
         return lambda pull: pull
     rows, pushes = ([x[k] for k in limited] for x in (machine.rows, machine.pushes))

@@ -2,10 +2,10 @@
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -125,28 +125,17 @@ def _tangent(linear: Callable[[Vector], Vector], right: Vector) -> Vector:
     return dot(inverse_of(columns), right)
 
 
-class Unrolled(diffrax.AbstractSolver):
-    """Any explicit or diagonally implicit diffrax Runge–Kutta solver, with its stages unrolled.
-
-    diffrax keeps the stages in a buffer filled by an inner loop, which XLA cannot fuse. This solver
-    has the same tableau, error estimate and interpolant, and can replace a diffrax solver anywhere.
-    The stages of an implicit solver are solved by Newton's method with one matrix for all stages of
-    a step; its own `root_finder` is not used.
-
-    **Arguments:** `solver`, a Runge–Kutta solver such as `diffrax.Tsit5()` or `diffrax.Kvaerno5()`;
-    `tolerance` of the stages, relative to `sizes` + |y| (default 1e-12); `sizes`, a number for each
-    array of y (default 1).
-
-    **Raises:** `TypeError` if `solver` is not one.
-    """
+class UnrolledStages(eqx.Module):
+    """The unrolled stages of an explicit or diagonally implicit Runge–Kutta solver. `vi.Unrolled`
+    is the same as a diffrax solver. The split needs diffrax, which is slow to load, only for
+    diffrax's own solvers."""
 
     solver: Any  # not checked to be a solver before `__check_init__`
     tolerance: Any = eqx.field(kw_only=True, default=None)
     sizes: Any = eqx.field(kw_only=True, default=None)
-    term_structure: ClassVar[Any] = diffrax.AbstractTerm
 
     def __check_init__(self):
-        if not isinstance(self.solver, diffrax.AbstractERK | diffrax.AbstractESDIRK):
+        if not (isinstance(self.solver, Verner9) or _is_diffrax(self.solver, "ERK", "ESDIRK")):
             raise TypeError(
                 "Argument `solver` must be an explicit or diagonally implicit diffrax Runge–Kutta "
                 f"solver, but got {self.solver!r}."
@@ -155,28 +144,10 @@ class Unrolled(diffrax.AbstractSolver):
     @property
     def implicit(self) -> bool:
         """True if its stages are equations to be solved."""
-        return isinstance(self.solver, diffrax.AbstractESDIRK)
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
+        return _is_diffrax(self.solver, "ESDIRK")
 
     def order(self, terms):
         return self.solver.order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        """Return `None`: the first stage is evaluated anew in each step."""
-        return None
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, slopes, _ = self.step_with_stages(terms, t0, t1, y0, args)
-        control = terms.contr(t0, t1)
-        stages = [terms.prod(slope, control) for slope in slopes]
-        k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *stages)
-        return y1, error, {"y0": y0, "y1": y1, "k": k}, None, diffrax.RESULTS.successful
 
     def step_with_stages(self, terms, t0, t1, y0, args):
         """Return the end of a step over [t0, t1], its error, and the slopes of its stages; and for
@@ -233,13 +204,33 @@ class Unrolled(diffrax.AbstractSolver):
         return y1, error, [unravel(k) for k in slopes], _with_error_weights(tableau, places)
 
 
-def _with_error_weights(tableau: diffrax.ButcherTableau, places: list[tuple]) -> list[tuple]:
+def _is_diffrax(solver: object, *kinds: str) -> bool:
+    """Return whether a solver is one of diffrax's. If diffrax is not loaded, it cannot be one."""
+    diffrax: Any = sys.modules.get("diffrax")
+    return diffrax is not None and isinstance(
+        solver, tuple(getattr(diffrax, f"Abstract{kind}") for kind in kinds)
+    )
+
+
+class _Field(NamedTuple):
+    """A vector field as a diffrax term."""
+
+    vf: Callable[[Any, Any, Any], Any]
+
+    def contr(self, t0, t1):
+        return t1 - t0
+
+    def prod(self, slope, control):
+        return jtu.tree_map(lambda x: control * x, slope)
+
+
+def _with_error_weights(tableau: Any, places: list[tuple]) -> list[tuple]:
     return [(*x, float(b)) for x, b in zip(places, tableau.b_error, strict=True)]
 
 
-def _tableau(solver: Any) -> diffrax.ButcherTableau:
+def _tableau(solver: Any) -> Any:
     tableau = solver.tableau
-    if not isinstance(tableau, diffrax.ButcherTableau):
+    if not hasattr(tableau, "b_sol"):
         raise TypeError(f"Argument `solver` must have one Butcher tableau, but got {solver!r}.")
     return tableau
 
@@ -254,18 +245,22 @@ _UNSTABLE = 0.4
 _VISIBLE = 1e-6
 
 
-def _unrolled(solver: object) -> Unrolled:
-    return solver if isinstance(solver, Unrolled) else Unrolled(solver)
+def _unrolled(solver: object) -> UnrolledStages:
+    if isinstance(solver, Verner9):  # the default's program serves diffrax's class too
+        solver = Verner9()
+    return solver if isinstance(solver, UnrolledStages) else UnrolledStages(solver)
 
 
-def _implicit_solver(solver: Unrolled, tolerance: Any, sizes: Any, beside: Integrals) -> Unrolled:
+def _implicit_solver(
+    solver: UnrolledStages, tolerance: Any, sizes: Any, beside: Integrals
+) -> UnrolledStages:
     """Return an implicit solver for a state of these sizes, and for the integrals `beside` it."""
     if sizes is not None:
         sizes = sizes, jtu.tree_map(jnp.ones_like, beside)
-    return Unrolled(solver.solver, tolerance=tolerance, sizes=sizes)
+    return UnrolledStages(solver.solver, tolerance=tolerance, sizes=sizes)
 
 
-def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside):
+def _runge_kutta(solver: UnrolledStages, smooth: SmoothMachine, s0, s1, state, beside):
     """Return the results of a step of the solver: the state, the integrals `beside` it, the errors
     of both, the slopes at the stages, and the stages."""
 
@@ -274,7 +269,7 @@ def _runge_kutta(solver: Unrolled, smooth: SmoothMachine, s0, s1, state, beside)
         return pin((smooth.field(s, state), rate_of_integrals(smooth, s, state, beside)))
 
     y1, error, slopes, places = solver.step_with_stages(
-        diffrax.ODETerm(field), s0, s1, (state, beside), None
+        _Field(field), s0, s1, (state, beside), None
     )
     return *y1, error, slopes, [Stage(c, s, y[0], weight) for c, s, y, weight in places]
 
@@ -315,7 +310,7 @@ class Adaptive(_RungeKutta):
     `ValueError` for tolerances out of (0, 1], or fewer than 5 steps.
     """
 
-    solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
+    solver: UnrolledStages = eqx.field(default_factory=Verner9, converter=_unrolled)
     # Arrays, so that another tolerance does not compile again.
     rtol: Any = eqx.field(kw_only=True, default=1e-9, converter=_as_array)
     atol: Any = eqx.field(
@@ -351,7 +346,7 @@ class Adaptive(_RungeKutta):
     def step_with_stages(self, smooth, s0, s1, state, beside):
         """Return the results of one Runge–Kutta step, its error norm (root mean square over the
         components of the state and the integrals of averages), and its stages."""
-        rtol, atol, floor = self._tolerances(s0)
+        rtol, atol, floor = self.tolerances(s0)
         solver = self.solver
         if solver.implicit:
             solver = _implicit_solver(solver, jnp.maximum(0.01 * rtol, floor), self.sizes, beside)
@@ -369,7 +364,7 @@ class Adaptive(_RungeKutta):
         norm = jnp.sqrt(jax.lax.stop_gradient(sum(map(jnp.sum, parts)) / number))
         return new, integrals, norm, stages
 
-    def _tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
+    def tolerances(self, like: Scalar) -> tuple[Scalar, Scalar, float]:
         """Return rtol, atol and the floor of both, below which rounding would reject all steps."""
         floor = 8 * float(jnp.finfo(like.dtype).eps)
         rtol = jnp.maximum(jnp.asarray(self.rtol, like.dtype), floor)
@@ -379,7 +374,7 @@ class Adaptive(_RungeKutta):
     def guard_error(self, stages, values, h, longest, *, acts, size):
         """Return the error of a component whose rate is the guard, such as the impulse of a force
         that holds a body. A guard that is not such a force has the tolerance 1e-6."""
-        rtol, atol, _ = self._tolerances(h)
+        rtol, atol, _ = self.tolerances(h)
         if not acts:
             rtol, atol = jnp.maximum(rtol, _VISIBLE), jnp.maximum(atol, _VISIBLE)
         values = jax.lax.stop_gradient(values)
@@ -419,7 +414,7 @@ class FixedStep(_RungeKutta):
     steps.
     """
 
-    solver: Unrolled = eqx.field(default_factory=Verner9, converter=_unrolled)
+    solver: UnrolledStages = eqx.field(default_factory=Verner9, converter=_unrolled)
     steps_per_cycle: int = eqx.field(static=True, default=10)  # pyright: ignore
 
     takes_implicit: ClassVar[bool] = False

@@ -1,14 +1,13 @@
-"""Verner's pair of Runge–Kutta methods of orders 9 and 8, as a diffrax solver.
+"""Verner's pair of Runge–Kutta methods of orders 9 and 8.
 
 J. H. Verner, Numerically optimal Runge–Kutta pairs with interpolants, Numerical Algorithms 53
 (2010), 383–396; the coefficients of the pair that its author calls the most robust, rounded to
 double precision from the exact ones.
 """
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-import diffrax
+import equinox as eqx
 import numpy as np
 
 # fmt: off
@@ -73,21 +72,25 @@ _B_EMBEDDED = (
 # fmt: on
 
 
-class Verner9(diffrax.AbstractERK):
-    """Verner's method of order 9 with an error estimate of order 8, in 15 stages and one for the
-    estimate; for `FixedStep`, `Adaptive`, or diffrax itself.
+class Tableau(NamedTuple):
+    """The coefficients of an explicit method, with the names of `diffrax.ButcherTableau`."""
 
-    8 steps a cycle are as accurate as 12 of `diffrax.Dopri8` for the paper's motor (error 4e-10),
-    and 20 as 36 (7e-14). Steps end on samples here; diffrax's own interpolation is cubic.
-    """
+    c: np.ndarray
+    a_lower: tuple[np.ndarray, ...]
+    b_sol: np.ndarray
+    b_error: np.ndarray
+    ssal: bool = False  # the solution is not the last stage
 
-    tableau: ClassVar[Any] = diffrax.ButcherTableau(
+
+class Verner9(eqx.Module):
+    """The pair as the methods use it; `vi.Verner9` is the same as a diffrax solver."""
+
+    tableau: ClassVar[Any] = Tableau(
         c=np.array(_C),
         a_lower=tuple(np.array(row) for row in _A),
         b_sol=np.array(_B),
         b_error=np.array(_B) - np.array(_B_EMBEDDED),
     )
-    interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
         return 9
