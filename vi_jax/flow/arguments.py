@@ -60,7 +60,6 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._quantities import average_names, check_units, quantity_names
-from .history import check_delays, with_history, with_some_past
 from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,
@@ -168,7 +167,7 @@ def make_plan(
     if isinstance(machine, Scene):
         _check_scalars(machine=machine, start=start)
     _check_numbers(machine)
-    check_start(machine, start, repeats=cycles > 1 or concrete(options.settle) != 0)
+    check_start(machine, start, repeats=bool(cycles > 1 or concrete(options.settle) != 0))
     if options.begin is None:
         check_prescribed(machine, start)
     machine, start = of_one_type(machine, start)
