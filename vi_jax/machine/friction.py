@@ -148,7 +148,8 @@ class DryFriction(Friction):
     While the body slides, the friction force is `level`, against the motion. At zero slip the body
     sticks as long as the force that holds it is at most `static_ratio` times the level at zero
     speed. Otherwise it slides on, or begins to slide. The machine's field does not contain the
-    friction. Several sticking frictions are solved for together, also with contacts at rest.
+    friction. Several frictions are solved for together, also with contacts at rest. Those with the
+    same `on` or `slip` are one friction with the sum of the forces.
 
     **Arguments:**
 
