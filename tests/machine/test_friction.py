@@ -328,3 +328,44 @@ def test_derivatives_from_a_start_that_slides_along_a_surface():
     last = lambda u, c: vi.simulate(OnSurface(c=c), vi.State(x=0.2, u=u), 1).last.x
     found = jax.grad(last, (0, 1))(0.0, 0.0)
     np.testing.assert_allclose(found, [0.0, 2 * np.pi], atol=1e-9)
+
+
+class Rubbed(vi.AbstractMachine):
+    """A body with dry frictions whose levels and static ratios are given."""
+
+    amplitude: Any = 1.0
+    levels: Any = (0.4,)
+    ratios: Any = (1.375,)
+    cycle = 2 * jnp.pi / 0.3
+
+    @property
+    def contacts(self):
+        given = zip(self.levels, self.ratios, strict=True)
+        return tuple(vi.DryFriction(x, on="u", static_ratio=r) for x, r in given)
+
+    def field(self, t, z):
+        return dict(x=z.u, u=self.amplitude * jnp.cos(0.3 * t) - z.x)
+
+
+def test_frictions_on_one_velocity_add():
+    """Levels 0.1 and 0.3 equal one of 0.4; the largest forces at rest add, too."""
+
+    def ends(levels, ratios):
+        def last(amplitude):
+            machine = Rubbed(amplitude, levels, ratios)
+            return vi.simulate(machine, vi.State(x=0.1, u=0.0), 2).last
+
+        return jax.tree.leaves(jax.vmap(last)(jnp.array([0.3, 0.6, 1.0])))
+
+    one, two = ends((0.4,), (1.375,)), ends((0.1, 0.3), (1.0, 1.5))
+    np.testing.assert_allclose(one, two, rtol=0, atol=1e-10)  # events: to rounding
+    assert np.std(one[0]) > 0.1
+
+    class Opposite(Rubbed):
+        contacts = (
+            vi.DryFriction(0.1, on="u"),
+            vi.DryFriction(0.3, slip=lambda z: -z.u, push={"u": -1.0}),
+        )
+
+    with pytest.raises(ValueError, match=r"a Opposite must have .* 0 and 1 are mult"):
+        vi.simulate(Opposite(), vi.State(x=0.1, u=0.0), 1)

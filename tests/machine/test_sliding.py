@@ -91,3 +91,31 @@ def test_sliding_ends_where_one_side_points_away():
     np.testing.assert_allclose(leaves, [np.arcsin(1 / a)], atol=1e-8)
     leaves = phases[kinds == 3][modes == -1.0]
     np.testing.assert_allclose(leaves, [np.pi + np.arcsin(1 / a)], atol=1e-8)
+
+
+class Both(vi.AbstractMachine):
+    """x and y meet; then both slide on x = y with the mean of their rates, by Filippov's rule."""
+
+    events = vi.Switch(lambda m, t, z: z.x - z.y, slides=True)
+    cycle = 1.0
+
+    def field(self, t, z, mode):
+        return dict(x=-2.0 * mode, y=jnp.where(-mode > 0, -3.0, 1.5))
+
+
+class Twice(Both):
+    events = (Both.events, vi.Switch(lambda m, t, z: z.y - z.x, slides=True))
+
+    def field(self, t, z, mode, other):
+        return dict(x=-2.0 * mode, y=jnp.where(other > 0, -3.0, 1.5))
+
+
+def test_one_surface_needs_one_switch():
+    """They meet at t = 1/7. With the weight w of the upper side, 2 - 4w = -3 + 4.5w gives the rate
+    -6/17 of both."""
+    start = vi.State(x=1.5, y=1.0)
+    run = vi.simulate(Both(), start, 1)
+    expected = 1.5 - 2 / 7 - 6 / 17 * 6 / 7
+    np.testing.assert_allclose([run.last.x, run.last.y], expected, atol=1e-12)
+    with pytest.raises(ValueError, match=r"of a Twice must have .* 0 and 1 are multiples"):
+        vi.simulate(Twice(), start, 1)

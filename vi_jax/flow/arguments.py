@@ -60,6 +60,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._quantities import average_names, check_units, quantity_names
+from .history import check_delays, with_history
 from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,

@@ -120,6 +120,7 @@ def check_before_modes(machine: AbstractMachine, s: Scalar, state: State) -> Non
     with explain_errors(f"`cycle` of a {type(machine).__name__}"):
         jnp.asarray(machine.cycle)
     _check_frictions(machine, s, state)
+    _check_surfaces(machine, state)
     switches = switches_of(machine)
     if switches and all(x.acts for x in switches) and not has_own_modes(machine):
         check_field(machine, s, state, ())
@@ -344,6 +345,62 @@ def _check_frictions(machine: AbstractMachine, s: Scalar, state: State) -> None:
                 raise TypeError(f"{label} must be computable, but: {error}") from None
         if friction.slip is None and not isinstance(machine, Mechanical):
             _check_is_velocity(machine, friction.on, s, state)
+
+
+# Surfaces are compared in this many random states. Vectors of values whose angle is smaller than
+# the second number are multiples of each other. Choices.
+_STATES, _PARALLEL = 6, 1e-9
+
+
+def _check_surfaces(machine: AbstractMachine, state: State) -> None:
+    """**Raises:** `ValueError` if two frictions, or two switches with `slides=True`, have functions
+    that are multiples of each other: their forces or modes on the surface are not unique."""
+    switches = switches_of(machine)
+    groups = {
+        "dry frictions": (
+            [(i, x.speed_of_slip) for i, x in enumerate(switches) if isinstance(x, DryFriction)],
+            "Give them the same `on` or `slip`, or write one friction with the sum of their forces",
+        ),
+        "switches with `slides=True`": (
+            [(i, x.function) for i, x in enumerate(switches) if x.blends],
+            "Write one switch, and use its mode for the other's, with the sign of the factor",
+        ),
+    }
+    for kind, (functions, advice) in groups.items():
+        if len(functions) < 2 or is_builtin(type(machine)):
+            continue
+        try:
+            with jax.ensure_compile_time_eval():
+                pair = _parallel([f for _, f in functions], machine, state)
+        except Exception:  # the error is raised with a better message when the function is traced
+            continue
+        if pair is not None:
+            one, other = (functions[i][0] for i in pair)
+            raise ValueError(
+                f"The {kind} of a {type(machine).__name__} must have surfaces of their own, but "
+                f"the functions of numbers {one} and {other} are multiples of each other. {advice}."
+            )
+
+
+def _parallel(functions: Sequence[Any], machine: Any, state: State) -> tuple[int, int] | None:
+    """Return the first two functions of machine, `s` and state that are multiples of each other, or
+    `None`. Traced parameters are replaced by random numbers."""
+    draw = np.random.default_rng(0).uniform
+    known = jtu.tree_map(
+        lambda x: draw(0.2, 0.9, jnp.shape(x)) if isinstance(x, Tracer) else x, machine
+    )
+    states = jtu.tree_map(lambda x: jnp.asarray(draw(-1, 1, (_STATES, *jnp.shape(x)))), state)
+    instants = jnp.asarray(draw(0, 1, _STATES))
+    values = np.array([
+        jax.vmap(lambda s, x, f=f: jnp.asarray(f(known, s, x)))(instants, states) for f in functions
+    ])  # fmt: skip
+    unit = values / np.linalg.norm(values, axis=1, keepdims=True)
+    for i in range(len(unit)):
+        for j in range(i):
+            across = unit[i] - (unit[i] @ unit[j]) * unit[j]
+            if np.linalg.norm(across) < _PARALLEL:
+                return j, i
+    return None
 
 
 def _check_is_velocity(machine: AbstractMachine, on: str, s: Scalar, state: State) -> None:

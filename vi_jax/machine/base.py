@@ -35,7 +35,7 @@ from .declared import (
 )
 from .event import AbstractEvent, AbstractSwitch, Section
 from .events import Reset
-from .friction import ContactFriction
+from .friction import ContactFriction, DryFriction, joined
 from .numbers import PLAIN, Shown, components, unit_in
 from .stop import RigidStop, SoftStop, Wall
 
@@ -86,10 +86,20 @@ def _stops_in(machine: Machine) -> tuple[RigidStop, ...]:
 
 @cached_in_trace
 def _switches_in(machine: Machine) -> tuple[AbstractSwitch, ...]:
-    """Return the soft stops and frictions among contacts, marked `acts`, then the switches."""
+    """Return the soft stops and frictions among contacts, marked `acts`, then the switches. Dry
+    frictions on one velocity are one friction."""
     contacts, found = contacts_in(machine), []
     index, stop_number = _index_by_on(contacts), 0
+    on_surface: dict[Any, list[DryFriction]] = {}
     for x in contacts:
+        if isinstance(x, DryFriction):
+            on_surface.setdefault(x.surface(_coordinate_key), []).append(x)
+    for x in contacts:
+        if isinstance(x, DryFriction):
+            same = on_surface[x.surface(_coordinate_key)]
+            if x is not same[0]:
+                continue
+            x = joined(same)
         if isinstance(x, RigidStop):
             if x.friction is not None:
                 found.append(with_static(_friction_on(x, stop_number, index), acts=True))

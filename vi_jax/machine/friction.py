@@ -73,6 +73,10 @@ class Friction(AbstractSwitch):
         """Return whether the other forces on the body are known."""
         return around is not None
 
+    def static_share(self, machine: Machine, s: Scalar, state: State) -> Any:
+        """Return the largest force without slip divided by that of a slipping body."""
+        return 1.0
+
     def slip_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
         """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
@@ -145,7 +149,8 @@ class DryFriction(Friction):
     While the body slides, the friction force is `level`, against the motion. At zero slip the body
     sticks as long as the force that holds it is at most `static_ratio` times the level at zero
     speed. Otherwise it slides on, or begins to slide. The machine's field does not contain the
-    friction. Several sticking frictions are solved for together, also with contacts at rest.
+    friction. Several frictions are solved for together, also with contacts at rest. Those with the
+    same `on` or `slip` are one friction with the sum of the forces.
 
     **Arguments:**
 
@@ -234,6 +239,15 @@ class DryFriction(Friction):
         """Return the largest force that friction can balance on a body at rest."""
         return self.sliding(machine, s, state, jnp.zeros_like(s)) * self.static_ratio
 
+    def static_share(self, machine, s, state):
+        return self.static_ratio
+
+    def surface(self, key_of: Callable[[Any], Any]) -> Any:
+        """Return a key: frictions with the same one act on one velocity, so their forces add.
+        **Arguments:** `key_of`, a key of a function."""
+        is_plain = type(self) is DryFriction and self.push is None
+        return key_of(self.on), key_of(self.slip), None if is_plain else id(self)
+
     def push_in(self, machine, s, state, mode):
         """Return the change of the slip by the force on a body that slides, and its push."""
         row = self.row(machine, s, state)
@@ -246,6 +260,40 @@ class DryFriction(Friction):
             return body.placed(state, body.position(state), jnp.zeros_like(velocity))
         slip, row = self.speed_of_slip(machine, s, state), self.row(machine, s, state)
         return added(state, (-slip,), (row.push,))
+
+
+class JointFriction(DryFriction):
+    """Dry frictions on one velocity: their forces add."""
+
+    parts: tuple[DryFriction, ...] = eqx.field(kw_only=True)
+
+    def _total(self, of_part: Callable[[DryFriction], Any]) -> Any:
+        """Return a sum of forces, each as one on the mass of the first."""
+        one = self.parts[0].mass
+        whole, ratios = (1.0 if one is None else one), []
+        for part in self.parts:
+            ratios.append(1.0 if part.mass is None else whole / part.mass)
+        return sum(k * of_part(x) for k, x in zip(ratios, self.parts, strict=True))
+
+    def sliding(self, machine, s, state, mode):
+        return self._total(lambda x: x.sliding(machine, s, state, mode))
+
+    def sticking(self, machine, s, state):
+        return self._total(lambda x: x.sticking(machine, s, state))
+
+    def static_share(self, machine, s, state):
+        kinetic = self.sliding(machine, s, state, jnp.zeros_like(s))
+        share = self.sticking(machine, s, state) / jnp.where(kinetic > 0, kinetic, 1.0)
+        return jnp.where(kinetic > 0, share, 1.0)
+
+
+def joined(frictions: Sequence[DryFriction]) -> DryFriction:
+    """Return one friction with the sum of these forces, all on one velocity."""
+    first = frictions[0]
+    if len(frictions) == 1:
+        return first
+    given = {"on": first.on, "mass": first.mass, "slip": first.slip, "push": first.push}
+    return JointFriction(first.level, **given, acts=first.acts, parts=tuple(frictions))
 
 
 class ContactFriction(Friction):
@@ -329,7 +377,8 @@ def settled_modes(
     indices, switches = frictions_in(machine), switches_of(machine)
     slips, holds, flow = [], [], field_in(machine, s, state, modes)
     for i in indices:
-        friction, ratio = switches[i], getattr(switches[i], "static_ratio", 1.0)
+        friction = switches[i]
+        ratio = friction.static_share(machine, s, state)
         slip = friction.slip_sign(machine, s, state, flow)
         if released is not None:  # the slip of a sticking body is rounding
             slip = jnp.where(modes[i] == 0, 0.0, slip)
@@ -352,7 +401,7 @@ def pressed_contacts(
     in these modes of frictions."""
     indices, switches = frictions_in(machine), switches_of(machine)
     slips = tuple(modes[i] for i in indices)
-    ratios = (getattr(switches[i], "static_ratio", 1.0) for i in indices)
+    ratios = (switches[i].static_share(machine, s, state) for i in indices)
     solve: Any = _settled
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
     return solve(machine, s, state, modes, contact, slips, holds)[1]

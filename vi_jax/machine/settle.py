@@ -1,4 +1,4 @@
-"""Which contacts push, stick, slip or open: one linear complementarity problem, in numbers.
+"""Contacts that push, stick, slip or open: one linear complementarity problem, in numbers.
 
 For one state the rows J of contacts and frictions give the gains G = J M⁻¹ Jᵀ and the free rates b,
 so that forces λ cause the rates a = G λ + b. Rows are ordered: normals, tangents, dry frictions.

@@ -95,8 +95,10 @@ class RigidStop(Wall, AbstractEvent):
     required impulse is at most μ times that of the stop; its velocity along the stop is then
     reversed and scaled by `tangential_restitution`. Otherwise it slips against μ times the stop's
     impulse. A body that rests on the stop slips against μ times the normal force, or sticks, which
-    may jam it. Newton's and Coulomb's laws together may gain energy where the velocities across and
-    along a stop are coupled (T. R. Kane). Such an impact ends its lane as `RESULTS.bad_impact`.
+    may jam it. If no motion fulfils these laws (P. Painlevé), the lane ends as `RESULTS.jammed`.
+    Newton's and Coulomb's laws together may gain energy where the velocities across and along a
+    stop are coupled (T. R. Kane). Such an impact takes the largest share of the restitution that
+    gains none.
     """
 
     gap: Float[Array, "..."] = eqx.field(converter=real("gap"))

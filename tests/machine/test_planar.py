@@ -1,0 +1,164 @@
+"""Planar bodies with corners on a floor: blocks that slide, tip, land and bounce, and Painlevé's
+rod. Numbers of blocks are closed forms, or follow from the linear complementarity problem."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+from planar import Block, Rod
+
+SHORT = 1e-4
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """Return a function that simulates many blocks for a cycle; one program does it for all."""
+
+    def one(given, speeds):
+        drop = given.pop("drop")
+        machine = Block(**given)
+        start = machine.at(y=machine.half_height + drop, v=speeds)
+        run = vi.simulate(machine, start, 1, event_log=8)
+        return run, machine.energy(run.last) - machine.energy(start)
+
+    def many(*cases):
+        defaults = dict(half_width=0.2, half_height=0.5, mu=0.3, restitution=0.0, push=0.0)
+        rows = [{**defaults, "weight": 9.81, "cycle": SHORT, "drop": 0.0, **x} for x, _ in cases]
+        rows += rows[-1:] * (16 - len(rows))
+        speeds = [v for _, v in cases] + [cases[-1][1]] * (16 - len(cases))
+        columns = {name: jnp.array([x[name] * 1.0 for x in rows]) for name in rows[0]}
+        v = dict(zip(("x", "y", "tilt"), jnp.array(speeds, float).T, strict=True))
+        return program(columns, v)
+
+    program = jax.jit(jax.vmap(one))
+    return many
+
+
+def velocities(run, count):
+    return np.stack([run.last.v.x, run.last.v.y, run.last.v.tilt], 1)[:count]
+
+
+STILL = (0, 0, 0)
+
+
+@pytest.mark.slow
+def test_a_pushed_block_rests_slides_or_tips(blocks):
+    """A block of 0.4 m by 1 m, pushed at its centre."""
+    cases = [(0.3, 0), (0.2, 3), (0.35, 4.5), (0.45, 4.5), (0.45, 6)]
+    run, _ = blocks(*((dict(mu=mu, push=force), STILL) for mu, force in cases))
+    expected = [
+        STILL, (1.038, 0, 0), (1.0665, 0, 0),
+        (0.372413793103, 0.148965517241, -0.744827586207),  # tips without sliding
+        (1.344709090909, 0.535090909091, -2.675454545455),  # tips and slides
+    ]  # fmt: skip
+    assert bool(run.successful.all())
+    # While it tips, the acceleration changes by some 1e-8 in this time.
+    np.testing.assert_allclose(velocities(run, 5) / SHORT, expected, atol=1e-7)
+    np.testing.assert_allclose(velocities(run, 3) / SHORT, expected[:3], atol=1e-11)
+
+
+@pytest.mark.slow
+def test_blocks_land_on_one_corner_and_on_two(blocks):
+    """Falls of a flat block, and G. W. Housner's block that turned about its other corner."""
+    flat = dict(half_width=0.5, half_height=0.25, restitution=0.5, weight=0.0)
+    tall = dict(half_width=0.25, half_height=1.0)
+    speeds, frictions = [(0, -1, 0), (1, -1, 0), (0.3, -1, 0.2)], (0.0, 1e-12, 0.1)
+    cases = [({**flat, "mu": mu}, v) for v in speeds for mu in frictions]
+    cases += [({**tall, "mu": mu, "weight": 0.0}, (1, -0.25, -1)) for mu in (2, 0.1, 0)]
+    cases += [({**tall, "mu": mu}, (1, -0.25, -1)) for mu in (2, 0.1)]
+    run, gain = blocks(*cases)
+    assert bool(run.successful.all()) and bool((gain < 1e-14).all())
+    found = velocities(run, 14)
+    # The same without friction and with hardly any.
+    np.testing.assert_allclose(found[1:9:3], found[:9:3], atol=3e-12)
+    for i, v in enumerate(speeds[:2]):
+        np.testing.assert_allclose(found[3 * i], [v[0], 0.5, 0], atol=1e-12)
+        drag = 0.1 * 1.5 * np.sign(v[0])
+        np.testing.assert_allclose(found[3 * i + 2], [v[0] - drag, 0.5, 0], atol=1e-12)
+    # Two corners that strike one after the other, then the first again.
+    smooth, rough = (0.369822410, 0.314125789), (0.264625105, 0.359846513, 0.365945257)
+    np.testing.assert_allclose(found[6], (0.3, *smooth), atol=1e-9)
+    np.testing.assert_allclose(found[8], rough, atol=1e-9)
+    ratio = 1 - 1.5 * np.sin(np.arctan(0.25)) ** 2
+    np.testing.assert_allclose(-found[9:12, 2], [ratio, 0.808510638, 0.7], atol=1e-9)
+    assert abs(found[9, 2] + ratio) < 1e-12
+    # Under its weight it rests on that corner and turns on.
+    assert run.rests[12:14, 0].tolist() == [1, 1]
+    np.testing.assert_allclose(found[12:, 2], found[9:11, 2], atol=20 * SHORT)
+
+
+@pytest.mark.slow
+def test_a_block_that_falls_flat_bounces_to_rest_without_turning(blocks):
+    """It falls by 0.05 m with g = 10, so it strikes at 0.1 s, and every bounce is half as long."""
+    fall = dict(half_width=1.0, half_height=0.1, restitution=0.5, drop=0.05, weight=10.0, cycle=1.5)
+    run, gain = blocks(*(({**fall, "mu": mu}, STILL) for mu in (0.0, 1e-12, 0.5)))
+    np.testing.assert_allclose(gain[:3], -0.5, atol=1e-12)
+    np.testing.assert_allclose(run.last.y[:3], 0.1, atol=1e-15)
+    for part in (run.last.tilt, run.last.v.tilt, run.last.v.x, run.last.x):
+        np.testing.assert_allclose(part[:3], 0.0, atol=2e-12)
+    expected = np.repeat([0.1, 0.2, 0.25, 0.275], 2)
+    np.testing.assert_allclose(run.event_log.phase[:3, 0], [expected] * 3, atol=1e-10)
+    assert (run.rests[:3, 0] == 2).all()
+
+
+class Box(vi.Mechanical):
+    """A box on two supports without friction, which bounces without loss."""
+
+    q, mass = ("y", "turn"), (1.0, 1 / 6)
+    half: float = 0.5
+    cycle = 2 * np.sqrt(2 / 9.81)
+
+    @property
+    def contacts(self):
+        reach = lambda q, side: q.y + side * self.half * jnp.tan(q.turn) - 0.5 / jnp.cos(q.turn)
+        sides = (lambda q: reach(q, -1)), (lambda q: reach(q, 1))
+        return tuple(vi.RigidStop(0.0, 1.0, "left", on=x) for x in sides)
+
+    def force(self, t, q, v):
+        return dict(y=-9.81, turn=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["standard", "reference"])
+def test_a_box_falls_flat_for_ever(method):
+    def run(half):
+        box = Box(half)
+        return vi.simulate(box, box.at(y=1.5), 100, method=method)
+
+    found = jax.vmap(run)(jnp.array([0.3, 0.375, 0.4, 0.5]))
+    assert bool(found.successful.all()) and bool((found.impacts == 2).all())
+    np.testing.assert_allclose(found.sections.turn, 0.0, atol=1e-10)
+    np.testing.assert_allclose(found.sections.y, 1.5, atol=1e-10)
+
+
+def test_a_rod_that_slides_into_the_ground_jams():
+    """P. Painlevé's rod: beyond this friction no acceleration fulfils Coulomb's law, unless the rod
+    turns fast enough to lift its end."""
+    limit = (1 + 3 * np.cos(1) ** 2) / (3 * np.sin(1) * np.cos(1))
+    below, beyond = limit * (1 - 1e-6), limit * (1 + 1e-6)
+
+    def one(mu, slip, turning, cycle):
+        rod = Rod(mu, cycle=cycle)
+        start = rod.sliding(1.0, slip, turning)
+        run = vi.simulate(rod, start, 1)
+        tip = run.last.y - jnp.sin(run.last.theta)
+        return run.result, run.last.v.theta, tip, rod.energy(run.last) - rod.energy(start)
+
+    cases = [
+        (below, -1, 0, 1e-7), (beyond, -1, 0, 1e-7), (1.6, -1, 0, 1e-2),
+        (1.6, -1, 4, 1e-5), (1.6, 1, 0, 1e-5), (0.8, -1, 0, 1e-5),
+    ]  # fmt: skip
+    result, turning, tip, gain = jax.vmap(one)(*jnp.array(cases, float).T)
+    jams = result == vi.RESULTS.jammed
+    assert jams.tolist() == [False, True, True, False, False, False]
+    assert bool((result == vi.RESULTS.successful)[~jams].all())
+    # Lift-off with the acceleration of the free end; the others stay on the floor.
+    np.testing.assert_allclose(tip[3], 0.5 * 3.65353576 * 1e-10, rtol=1e-4)
+    np.testing.assert_allclose(tip[4:], 0.0, atol=1e-15)
+    # θ'' = 3 λ (μ σ' sin θ - cos θ), with the normal force λ and the friction against the slip.
+    s, c, times = np.sin(1), np.cos(1), 1e-5
+    for i, push, drag in ((4, 2.41739128, -1.6), (5, 12.5028225, 0.8)):
+        np.testing.assert_allclose(turning[i] / times, 3 * push * (drag * s - c), rtol=1e-3)
+    assert bool((gain[~jams] < 1e-12).all())

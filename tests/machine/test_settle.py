@@ -1,0 +1,312 @@
+"""Forces, modes and impulses of contacts, as numbers, compared with closed forms (g = 9.81 and unit
+masses) and with the conditions of contact themselves."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from vi_jax.machine.settle import Contacts, Strike, settle, strike
+
+g = 9.81
+N, D = 4, 2
+"""All questions are padded to four contacts with friction and two dry frictions, in batches of 240,
+so that one program answers them."""
+ANSWER = jax.jit(jax.vmap(lambda x: settle(x, tuple(range(N)))))
+BLOWS = jax.jit(jax.vmap(lambda x: strike(x, (0, 1))))
+
+
+def padded(J, inverse_mass, force, friction, slip=0.0, dry=()):
+    """Return the `Contacts` of contacts with the rows J (normals, tangents, dry frictions)."""
+    J = np.atleast_2d(np.asarray(J, float))
+    n, d = len(friction), len(dry)
+    at = np.array([*range(n), *range(N, N + n), *range(2 * N, 2 * N + d)])
+    gains, rates = np.eye(2 * N + D), np.zeros(2 * N + D)
+    gains[np.ix_(at, at)] = J @ inverse_mass @ J.T
+    rates[at] = J @ inverse_mass @ np.asarray(force, float)
+    friction, level = np.pad(friction, (0, N - n)), np.pad(np.array(dry, float), (0, D - d))
+    slips = np.zeros(N + D)
+    slips[at[n:] - N] = slip
+    return Contacts(gains, rates, friction, np.arange(N) < n, slips, level, np.ones(N + D))
+
+
+def each(function, questions):
+    """Return the results of a function of a batch of questions, one for each question."""
+    found, count = [], len(questions)
+    for begin in range(0, count, 240):
+        batch = [questions[min(i, count - 1)] for i in range(begin, begin + 240)]
+        result = function(jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *batch))
+        result = jax.tree.map(np.asarray, result)
+        found += [jax.tree.map(lambda x, i=i, r=result: x[i], result) for i in range(240)]
+    return found[:count]
+
+
+def answers(questions):
+    return each(ANSWER, questions)
+
+
+def block(width, height):
+    """Return the inverse masses of (x, y, θ), and the rows of the lower corners."""
+    inverse = np.diag([1, 1, 12 / (width**2 + height**2)])
+    corners = [(-width / 2, -height / 2), (width / 2, -height / 2)]
+    return [[0, 1, x] for x, _ in corners] + [[1, 0, -y] for _, y in corners], inverse
+
+
+def incline(angle, mu):
+    weight = [g * np.sin(angle), -g * np.cos(angle)]
+    return padded([[0, 1], [1, 0]], np.eye(2), weight, [mu])
+
+
+def pushed(width, height, at, force, mu):
+    """A block pushed at a height above the floor."""
+    return padded(*block(width, height), [force, -g, -force * (at - height / 2)], [mu, mu])
+
+
+def drawer(length, width, offset, force, mu):
+    """A drawer pulled beside its middle, which two rails guide without play: four contacts."""
+    places = [(x, y) for x in (-length / 2, length / 2) for y in (-width / 2, width / 2)]
+    rows = [[0, -np.sign(y), -np.sign(y) * x] for x, y in places] + [[1, 0, -y] for _, y in places]
+    inverse = np.diag([1, 1, 12 / (length**2 + width**2)])
+    return padded(rows, inverse, [force, 0, -force * offset], [mu] * 4)
+
+
+def stack(masses, frictions, forces):
+    n, rows = len(masses), np.zeros((2 * len(masses), 2 * len(masses)))
+    for i in range(n):
+        rows[i, n + i] = rows[n + i, i] = 1
+        if i:
+            rows[i, n + i - 1] = rows[n + i, i - 1] = -1
+    force = np.concatenate([forces, -g * np.array(masses)])
+    return padded(rows, np.diag(1 / np.tile(masses, 2)), force, frictions)
+
+
+def rod(angle, mu, slip, speed):
+    """A rod of length 2 whose tip slides on the floor, turning at a speed."""
+    s, c = np.sin(angle), np.cos(angle)
+    asked = padded([[0, 1, -c], [1, 0, s]], np.diag([1, 1, 3]), [0, -g, 0], [mu], slip)
+    asked.rates[[0, N]] += speed**2 * np.array([s, c])
+    return asked
+
+
+MU_P = (1 + 3 * np.cos(1) ** 2) / (3 * np.sin(1) * np.cos(1))
+TIPS = (g / 2 - 0.3 * g / 2) / 0.4
+NEAR = 1e-9
+
+
+def test_known_answers():
+    """Most are closed forms. Forces and rates are compared to 1e-12, thresholds to 1e-9."""
+    halves = [incline(0.4, 0.5), incline(0.5, 0.5), incline(np.arctan(0.5) * (1 - NEAR), 0.5)]
+    found = iter(
+        answers([
+            *halves, incline(np.arctan(0.5) * (1 + NEAR), 0.5),
+            *(pushed(1, 1, 0.9, 0.3 * g * f, 0.3) for f in (1 - NEAR, 1 + NEAR)),
+            *(pushed(1, 1, 0.9, TIPS * f, 0.3) for f in (1 - NEAR, 1 + NEAR)),
+            *(pushed(0.5, 1, 0.8, 3.065625 * f, 0.9) for f in (1 - NEAR, 1 + NEAR, 1.5)),
+            *(drawer(1, 0.4, 0.8, 2, mu) for mu in (0.5, 0.625 * (1 - NEAR), 0.625 * (1 + NEAR))),
+            stack([1, 2, 3], [0.3, 0.4, 0.5], [0, 30, 0]),
+            *(rod(1, MU_P * f, -1, 0) for f in (1 - NEAR, 1 + NEAR)),
+            *(rod(1, 1.6, -1, w) for w in (0, 4)), rod(1, 1.6, 1, 0), rod(1, 0.8, -1, 0),
+        ])
+    )  # fmt: skip
+
+    def normals(x, n=2):
+        return x.force[:n]
+
+    def near(value, expected, size=10):
+        np.testing.assert_allclose(value, expected, rtol=0, atol=1e-12 * size)
+
+    # An incline: sticks up to atan μ.
+    holds, slides, below, above = itertools.islice(found, 4)
+    near([holds.force[N], holds.rate[N]], [-g * np.sin(0.4), 0])
+    near(slides.rate[N], g * (np.sin(0.5) - 0.5 * np.cos(0.5)))
+    assert below.mode[0] == 0 and above.mode[0] == 1
+    # A block pushed at a height of 0.9 slides from μ m g on, and tips while it slides.
+    rests, slips, stands, tips = itertools.islice(found, 4)
+    near(rests.rate, 0)
+    assert (slips.mode[:2] == 1).all()
+    assert stands.force[0] > 0 and tips.force[0] == 0 < tips.rate[0]
+    # One with more friction tips without sliding.
+    stands, begins, tips = itertools.islice(found, 3)
+    assert stands.force[0] > 0 and begins.force[0] == 0 < begins.rate[0]
+    assert not tips.kept[0] and tips.kept[1]
+    near(tips.force[[1, N + 1]], [10.54575, -3.1269375])
+    near(tips.rate[0], 1.4715)
+    assert tips.mode[1] == 0
+    # A drawer jams for μ ≥ L/2e; its forces are not unique, but its acceleration is.
+    runs, hardly, jams = itertools.islice(found, 3)
+    near(runs.rate[N], 0.4)
+    near([hardly.rate[N], jams.rate[N]], [2 * NEAR, 0])
+    assert hardly.mode[:4].any() and (normals(jams, 4) > -1e-15).all() and not jams.unsolved
+    pile = next(found)
+    near(normals(pile, 3), [58.86, 49.05, 29.43])
+    near(pile.force[N : N + 3], [-17.658, -19.62, 6.228])
+    near(pile.rate[N : N + 3], [1.962, 0.114, 0])
+    # Painlevé's rod: no solution beyond μ_P, but the rod lifts off if it turns fast enough.
+    below, beyond, at_rest, turning, back, weak = found
+    assert not below.unsolved and beyond.unsolved and at_rest.unsolved
+    assert not turning.unsolved and not turning.kept[0] and normals(turning, 1) == 0
+    near(turning.rate[0], -g + 16 * np.sin(1))
+    p = 1 + 3 * np.cos(1) ** 2 + 1.6 * 3 * np.sin(1) * np.cos(1)
+    near(back.force[0], g / p)
+    near(weak.force[0], 12.5028225, size=1e5)  # given with nine digits
+    near(weak.force[0] * (p - 7.2 * np.sin(1) * np.cos(1)), g, size=100)
+
+
+def random_question(rng, number):
+    """Return a question of up to four contacts and two dry frictions. Its rows are independent,
+    those of points of a planar body, or linearly dependent."""
+    n, d = number % 4 + 1, (number // 4) % 3
+    kind, mu = number % 3, rng.choice([0, 1e-12, 0.3, 0.6, 2], n)
+    if kind == 0:
+        rows = rng.normal(size=(2 * n + d, 2 * n + d + 1))
+    else:
+        x, y, turn = rng.normal(size=n), -np.abs(rng.normal(size=n)), rng.uniform(-0.5, 0.5, n)
+        if kind == 2:  # on one edge
+            y, turn = np.full(n, -1.0), np.zeros(n)
+        s, c = np.sin(turn), np.cos(turn)
+        normal = np.stack([-s, c, x * c + y * s], 1)
+        rows = np.concatenate([
+            normal, np.stack([c, s, x * s - y * c], 1), rng.normal(size=(d, 3))
+        ])  # fmt: skip
+    half = rng.normal(size=(rows.shape[1],) * 2)
+    inverse = half @ half.T + 0.1 * np.eye(len(half))
+    force = 3 * rng.normal(size=rows.shape[1])
+    slip = rng.choice([-1.0, 1.0], n + d) if number % 5 == 0 else 0.0
+    return padded(rows, inverse, force, mu, slip, 2 * rng.uniform(size=d))
+
+
+def violation(asked, answer):
+    """Return by how much an answer violates the conditions of contact, in units of the rates."""
+    lam, n = answer.force, N
+    a = asked.gains @ lam + asked.rates
+    size = np.abs(asked.rates).max() + (np.abs(asked.gains) @ np.abs(lam)).max()
+    own = np.diag(asked.gains)
+    push, drag = lam[:n], lam[n:]
+    bound = np.concatenate([asked.friction * np.maximum(push, 0), asked.level])
+    shut = asked.closed
+    on = np.concatenate([shut, asked.level > 0])
+    wrong = [np.where(shut, np.minimum(a[:n], 0), 0), np.minimum(push, 0) * own[:n]]
+    wrong += [np.where(shut, a[:n], 0) * (push * own[:n] > 1e-10 * size)]
+    free, given = on & (asked.slip == 0), on & (asked.slip != 0)
+    beyond = np.where(free, np.maximum(np.abs(drag) - bound, 0), 0) * own[n:]
+    wrong += [beyond, np.where(given, drag + asked.slip * bound, 0) * own[n:]]
+    # Inside the bound nothing slips; at it the force opposes the slip.
+    inside = free & ((bound - np.abs(drag)) * own[n:] > 1e-10 * size)
+    drags = free & (np.abs(drag) * own[n:] > 1e-10 * size)
+    along = np.where(drags, np.sign(drag) * a[n:], 0)
+    wrong += [np.where(inside, a[n:], 0), np.maximum(along, 0)]
+    return max(np.abs(x).max() for x in wrong) / size
+
+
+def solutions_with_given_slip(asked):
+    """Return how many sets of contacts are consistent if all slips are given."""
+    n, found = int(asked.closed.sum()), 0
+    columns = asked.gains[:, :N] - asked.gains[:, N : 2 * N] * (asked.friction * asked.slip[:N])
+    rates = asked.rates - asked.gains[:, 2 * N :] @ (asked.slip[N:] * asked.level)
+    for pushed_ones in itertools.product([False, True], repeat=n):
+        on = np.flatnonzero(pushed_ones)
+        matrix = columns[np.ix_(on, on)]
+        if len(on) and np.linalg.cond(matrix) > 1e10:
+            continue
+        push = np.linalg.solve(matrix, -rates[on]) if len(on) else np.zeros(0)
+        opens = columns[:n][:, on] @ push + rates[:n]
+        found += (push >= 0).all() and (np.delete(opens, on) >= 0).all()
+    return found
+
+
+@pytest.mark.parametrize("count", [240, pytest.param(3000, marks=pytest.mark.slow)])
+def test_random_questions_are_answered(count):
+    """Without slip a solution always exists. With given slips there may be none (Painlevé)."""
+    rng = np.random.default_rng(count)
+    questions = [random_question(rng, i) for i in range(count)]
+    unsolved = lost = 0
+    for asked, answer in zip(questions, answers(questions), strict=True):
+        assert not np.isnan(answer.force).any()
+        if answer.unsolved:
+            assert asked.slip.any()
+            unsolved += 1
+            lost += solutions_with_given_slip(asked) > 0
+        else:
+            assert violation(asked, answer) < 1e-10
+    assert 0 < unsolved < count / 10
+    # Lemke's method may end in a ray although a solution exists.
+    assert lost <= 0.01 * count
+
+
+def impact(J, inverse, velocity, friction, restitution, struck=(True, True)):
+    J = np.asarray(J, float)
+    gains = J @ inverse @ J.T
+    two = np.ones(2)
+    return Strike(gains, J @ velocity, friction * two, restitution * two, 0 * two, np.array(struck))
+
+
+def test_known_impacts():
+    """Housner's block without restitution, falls on two corners, and Kane's paradox."""
+    slender, flat = block(0.5, 2), block(1, 0.5)
+    falls = [(0, -1, 0), (1, -1, 0)]
+    frictions = (0.0, 1e-12, 0.1)
+    turning = np.array([1, -0.25, -1])  # about the left corner
+    cases = [impact(*slender, turning, mu, 0, (False, True)) for mu in (2, 0.1, 0)]
+    cases += [impact(*flat, np.array(v), mu, 0.5) for v in falls for mu in frictions]
+    # Kane: one contact, and two equal ones that do not act on each other.
+    twice = np.kron(np.array([[1, 0.8], [0.8, 1]]), np.eye(2))
+    kane = Strike(twice, -np.ones(4), 0.3 * np.ones(2), np.ones(2), np.zeros(2), np.ones(2) > 0)
+    cases += [kane._replace(struck=np.array([True, False])), kane]
+    blows = each(BLOWS, cases)
+    assert not any(x.unsolved for x in blows)
+    impulses, shares = [x.impulse for x in blows], [x.share for x in blows]
+
+    def after(i, shape, v):
+        J, inverse = shape
+        return np.array(v) + inverse @ np.array(J).T @ impulses[i]
+
+    # It turns on about the right corner, with this share of the speed if that corner sticks.
+    alpha = np.arctan(0.5 / 2)
+    ratios = [after(i, slender, turning)[2] / turning[2] for i in range(3)]
+    np.testing.assert_allclose(ratios[0], 1 - 1.5 * np.sin(alpha) ** 2, atol=1e-12)
+    np.testing.assert_allclose(ratios[1:], [0.808510638, 0.7], atol=1e-9)
+    for i, (v, mu) in enumerate(itertools.product(falls, frictions), start=3):
+        expected = [v[0] * (1 - 1.5 * mu), 0.5, 0]
+        np.testing.assert_allclose(after(i, flat, v), expected, atol=1e-12)
+    np.testing.assert_allclose(impulses[8][:2], [0.7125, 0.7875], atol=1e-12)
+    assert shares[:9] == [1] * 9
+    # Newton's and Coulomb's laws together would gain energy.
+    theta = 0.801749409
+    np.testing.assert_allclose(shares[9:], theta, atol=1e-9)
+    for i, here in ((9, [0, 2]), (10, [0, 2]), (10, [1, 3])):
+        v = -1 + (twice @ impulses[i])[here]
+        np.testing.assert_allclose(v, [theta, 0.230800893], atol=1e-9)
+        lost = impulses[i][here] @ (v - 1) / 2
+        assert abs(lost) < 1e-14
+
+
+def test_random_impacts_keep_the_conditions():
+    """No contact closes, no impact gains energy, impulses are in the cone of friction, and friction
+    that goes to zero changes nothing."""
+    rng = np.random.default_rng(4)
+    cases = []
+    for i in range(240):
+        x = random_question(rng, 12 * i + 1)
+        at = [0, 1, N, N + 1]
+        gains, v = x.gains[np.ix_(at, at)], x.rates[at]
+        v[:2] = -np.abs(v[:2]) * [1, i % 4 > 0]
+        mu, e = [(0, 0), (1e-12, 1e-12), (0.3, 0.3), (0.3, 1.5)][i % 4], rng.choice([0, 0.5, 1], 2)
+        cases.append(Strike(gains, v, np.array(mu), e, np.zeros(2), v[:2] < 0))
+    smooth = [x._replace(friction=0 * x.friction) for x in cases]
+    blows = each(BLOWS, [*cases, *smooth])
+    impulses, unsolved = [x.impulse for x in blows], [x.unsolved for x in blows]
+    assert sum(unsolved) <= 1
+    for i, x in enumerate(cases):
+        p = impulses[i]
+        after, size = x.velocity + x.gains @ p, np.abs(x.velocity).max()
+        if unsolved[i]:
+            continue
+        assert (np.where(x.struck, after[:2], 0) > -1e-11 * size).all()
+        assert (p[:2] >= -1e-14).all()
+        assert (np.abs(p[2:]) <= x.friction * p[:2] + 1e-12 * np.abs(p).max()).all()
+        gain = p @ (after + x.velocity) / 2
+        assert gain <= 1e-11 * np.abs(p @ x.velocity)
+        if i % 4 <= 1:
+            change = x.gains @ (p - impulses[len(cases) + i])
+            np.testing.assert_allclose(change, 0, atol=3e-10 * size)
