@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import vi_jax as vi
+from matplotlib.figure import Figure
 
 from kicked import SHEAR, TWIST, Ring, at, rotation_of
 
@@ -27,6 +28,14 @@ def test_a_torus_from_a_run(torus):
     assert torus.states[0].shape == (torus.nodes,) and "rotation number 0.2147" in repr(torus)
 
 
+def test_the_picture_of_a_torus_shows_its_curve_and_a_run(torus):
+    run = vi.simulate(torus.machine, at(0.3, 0.1), 50, settle=500)
+    dots, curve = vi.plot_torus(torus, run=run, ax=Figure().subplots()).lines
+    assert len(dots.get_xdata()) == 51
+    x, y = curve.get_data()
+    np.testing.assert_allclose(np.hypot(x, y - SHEAR * x**2), np.sqrt(0.1), atol=1e-12)
+
+
 def test_too_few_nodes_are_noticed_by_tail_and_residual():
     machine = Ring(0.3, 0.1, locking=1.0)
     coarse = vi.find_torus(machine, at(0.3, 0.1), settle=500, nodes=9)
@@ -41,6 +50,9 @@ def test_a_family_ends_at_the_neimark_sacker_point(torus):
     assert 0 < b[0] < 0.05 and b[-1] == 0.2
     np.testing.assert_allclose(family.rotation, rotation_of(0.21, b), atol=1e-12)
     np.testing.assert_allclose(family.exponents[:, 1], np.log(1 - 2 * b), atol=1e-9)
+    (line, mark) = vi.plot_torus(family, y="exponents", ax=Figure().subplots()).lines[1:3]
+    np.testing.assert_array_equal(line.get_ydata(), family.exponents[:, 1])
+    assert mark.get_label() == "neimark-sacker"
     there = family.at(0.15)
     machine: Any = there.machine
     assert float(machine.b) == pytest.approx(0.15, abs=1e-14)
@@ -49,6 +61,7 @@ def test_a_family_ends_at_the_neimark_sacker_point(torus):
         family.at(0.3)
 
 
+@pytest.mark.slow
 def test_a_torus_from_a_neimark_sacker_point():
     orbit = vi.find_orbit(Ring(0.21, -0.05), at(0.01, 0.01), throw=True)
     branch = vi.continue_orbit(orbit, parameter="b", bounds=(-0.2, 0.2))
@@ -63,6 +76,7 @@ def test_a_torus_from_a_neimark_sacker_point():
     assert vi.find_torus(orbit.machine, point).rotation == pytest.approx(0.21, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_window_of_locking():
     """On r = √b the angle moves by 2πa + 0.3 b + locking b³ᐟ² sin 3φ: it locks to 1:3 where that is
     2π/3 at some φ."""
