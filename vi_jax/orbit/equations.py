@@ -26,6 +26,7 @@ from .._types import Scalar, State, Vector
 from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
+    DryFriction,
     Turn,
     after_event,
     angles_in,
@@ -254,7 +255,7 @@ class Shooting(eqx.Module):
         return tuple(
             number
             for number, event in enumerate(events_of(self.machine))
-            if event.holds_mode and event.is_dry
+            if isinstance(event, DryFriction)
             and all(modes[mode_number(self.machine, number)] == 0 for modes in self.modes)
         )  # fmt: skip
 
@@ -474,8 +475,10 @@ class Shooting(eqx.Module):
             state_on_stop = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
             u = jnp.where(lands, state_on_stop, u)
         for number in self.stuck:  # else any slip would stay as it is
-            state = events_of(machine)[number].stopped(machine, begin.s, self.unravel(u))
-            u = ravel_pytree(state)[0]
+            friction = events_of(machine)[number]
+            assert isinstance(friction, DryFriction)
+            state, mode = self.unravel(u), jnp.zeros_like(begin.s)
+            u = ravel_pytree(friction.stopped(machine, begin.s, state, mode, None))[0]
         end, integrals, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
             integrals = {name: x + begin.integrals[name] for name, x in integrals.items()}

@@ -31,29 +31,7 @@ from .corrector import Step, find_zero_near, observe, on_host, state_at
 from .edit_events import without_events
 from .equations import Leg, Shooting
 from .flight import Event, Flight
-
-CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
-SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
-
-# Descriptions of each kind: of a motion without the brief part, and of one with it.
-SLIDING = {
-    CROSSING_SLIDING: (
-        "{name} passes its surface {place}, and beyond is held there for a while",
-        "{name} is no longer held {place}, and beyond passes its surface there at once",
-    ),
-    GRAZING_SLIDING: (
-        "{name} just touches its surface {place}, and beyond is held there for a while",
-        "{name} is no longer held {place}, and beyond does not come to its surface there",
-    ),
-    SWITCHING_SLIDING: (
-        "{name} is held {place} at once, and beyond first passes and comes back",
-        "{name} no longer passes and comes back {place}, and beyond is held there at once",
-    ),
-    ADDING_SLIDING: (
-        "{name} is just held {place}, and beyond leaves its surface and comes back",
-        "{name} no longer leaves its surface {place}, and beyond is held there throughout",
-    ),
-}
+from .kinds import ADDING_SLIDING, CROSSING_SLIDING, GRAZING_SLIDING, SWITCHING_SLIDING
 
 # A part of a motion vanishes if it is shorter than the first share of the period. The second share
 # is used if nothing else is found, as a corrector may not get closer. A guard below the third is
