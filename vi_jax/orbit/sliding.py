@@ -106,8 +106,8 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
     if abs(float(nearest.margin)) > _ZERO * nearest.unit:
         return None
     excess, _, next_mode = excess_force(problem, at, leg, number, place)
-    if not mode:
-        return Change(number, place, (0.0, next_mode, 0.0), False)
+    if not mode:  # to rounding it may still be held there
+        return Change(number, place, (0.0, next_mode or 1.0, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
     is_held = excess < _ZERO * nearest.unit / problem.radian
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
