@@ -29,6 +29,7 @@ from ..machine import (
     DryFriction,
     Turn,
     after_event,
+    after_one_event,
     angles_in,
     component,
     components,
@@ -736,7 +737,7 @@ class Shooting(eqx.Module):
                 return jnp.ones_like(s)
             j, before = mode_number(machine, event.number), self.flight(machine, leg - 1)
             modes, state = (before.modes, before.contact), self.unravel(u)
-            mode = after_event(machine, event.number, s, state, *modes)[1][j]
+            mode = after_one_event(machine, event.number, s, state, *modes)[1][j]
             wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 

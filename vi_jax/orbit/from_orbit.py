@@ -33,7 +33,7 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     Turn,
-    after_event,
+    after_one_event,
     begin_modes,
     check_again,
     component,
@@ -323,7 +323,7 @@ def _follow_events(
         states.append(np.asarray(u))
         after = blank.unravel(jnp.asarray(u))
         if (place, event.cycle) != (0.0, 0):  # the orbit's state is after that one
-            after, modes = after_event(machine, event.number, jnp.asarray(place), after, modes)
+            after, modes = after_one_event(machine, event.number, jnp.asarray(place), after, modes)
         in_flight.append(tuple(float(m) for m in modes))
         u, s = ravel_pytree(after)[0], place
     states.append(np.asarray(fly(modes, s, period, u)))
@@ -540,7 +540,7 @@ def _modes_in_legs(
         event, before = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
         if event.use != LEAVES:
             s, contact = jnp.asarray(clocks[i]), problem.flight(machine, i - 1).contact
-            modes = after_event(machine, event.number, s, before, modes, contact)[1]
+            modes = after_one_event(machine, event.number, s, before, modes, contact)[1]
         found[i] = modes
     return tuple(tuple(float(mode) for mode in modes) for modes in found)
 
