@@ -1,6 +1,7 @@
 """Packages import in one direction and nothing private; no file is too long."""
 
 import ast
+import graphlib
 import importlib
 import subprocess
 import sys
@@ -54,6 +55,16 @@ def test_packages_import_in_one_direction_and_nothing_private():
             assert len(words) <= 1 or words in LATE, (path, words)
             assert not name.startswith("_"), (path, name)
     assert seen > 100
+
+
+def test_files_of_orbit_import_in_no_circle():
+    room = {path.stem: path for path in FILES if path.parent == HOUSE / "orbit"}
+    room.pop("__init__")
+    graph = {
+        name: {words[1] for words, _ in imports(path) if words[:1] == ["orbit"] and words[1:]}
+        for name, path in room.items()
+    }
+    assert len([*graphlib.TopologicalSorter(graph).static_order()]) == len(room)
 
 
 def test_no_file_has_more_than_800_lines():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
-from vi_jax.plot.colors import MARKS
+from vi_jax.orbit import KINDS
 
 pytestmark = pytest.mark.slow
 NAME = "drive.frequency_ratio"
@@ -42,8 +42,8 @@ def test_a_sweep_lies_above_branches_and_below_marks(branch):
     assert len(ax.lines[0].get_xdata()) == 4
     assert vi.plot_multipliers(branch.orbit(0), ax=(own := _axes())) is own
     plain = vi.plot_branch(branch, ax=_axes(), y="y_max", special=False)
-    assert not [line for line in plain.lines if line.get_label() in MARKS]
+    assert not [line for line in plain.lines if line.get_label() in KINDS]
     dots, *others = ax.lines
-    marks = [line for line in others if line.get_label() in MARKS]
+    marks = [line for line in others if line.get_label() in KINDS]
     lines = [line for line in others if line not in marks]
     assert marks and max(x.zorder for x in lines) < dots.zorder < min(x.zorder for x in marks)

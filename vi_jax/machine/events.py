@@ -77,6 +77,19 @@ def after_event(
     return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
 
 
+def after_one_event(
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
+) -> tuple[State, Modes]:
+    """Return state and modes after an event that happens alone: those of all frictions are settled
+    after that of a friction."""
+    event, part, _ = event_of(machine, number, modes, contact)
+    new, changed = after_event(machine, number, s, state, modes, contact)
+    if event.holds_mode and part.start in frictions_in(machine):
+        released = {part.start: jnp.asarray(modes[part.start] == 0)}
+        changed = settled_modes(machine, s, new, changed, contact, released)
+    return new, constant_modes(changed, s)
+
+
 def _with_friction(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
     friction = friction_on(machine, number)
     if friction is None:

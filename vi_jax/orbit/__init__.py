@@ -10,6 +10,7 @@ from .closed_form import ClosedFormOrbits, closed_form_orbits
 from .curve import Boundary, Branch, branch_hits_in_words, column_names
 from .find import find_orbit, is_equilibrium
 from .grazing import SCENARIOS, Grazing, Motions, grazing
+from .kinds import KINDS
 from .results import (
     ORBIT_RESULTS, STABILITY, Orbit, Orbits, MotionSections, check_multipliers, complex_in_words,
     distance, distinct_among, distinct_orbits, in_one_line, multipliers_of, stability_of,
@@ -19,3 +20,4 @@ from .special import Point
 from .birkhoff import agreement, digits_of, rotation_number, without_angles
 from .torus import Torus, find_torus
 from .torus_branch import TorusBranch, Window, continue_torus
+from . import switch  # registers what begins at special points

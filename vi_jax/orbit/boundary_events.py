@@ -24,8 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._messages import count_of
-from .branch_events import bifurcation_tests
-from .conditions import Special, is_defective, sum_of_minors
+from .conditions import Special, bifurcation_tests, is_defective, sum_of_minors
 from .corrector import (
     MOST_SAMPLES,
     SPACING,
@@ -42,7 +41,6 @@ from .corrector import (
 from .edit_events import ALIKE, ROUNDED, half_difference, may_be_symmetric, over_periods, repeated
 from .equations import ROUNDING, Shooting
 from .kinds import (
-    AT_CODIMENSION_TWO,
     CROSSING,
     CUSP,
     DEGENERATE,
@@ -51,6 +49,7 @@ from .kinds import (
     FLIP,
     FOLD,
     GRAZING,
+    KINDS,
     RESONANCE_1,
     RESONANCE_2,
     RESONANCE_3,
@@ -203,7 +202,7 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
     condition: Special = problem.conditions[0]
 
     def point(kind: str, step: Step, detail: str | None = None, **fields: Any) -> Point:
-        detail = detail or AT_CODIMENSION_TWO.get(kind)
+        detail = detail or KINDS[kind].on_curve or None
         return point_at(problem, step, kind, detail, curve=condition.kind, **fields)
 
     found: list[tuple[float, Point]] = []
@@ -215,7 +214,8 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
             found.append((place, point(end, steps[place], index=place)))
     for kind, test in _tests_of(problem, condition).items():
         for place, step in _zeros(problem, steps, test):
-            if kind in _DOUBLE and not is_defective(problem, step, _DOUBLE[kind]):
+            is_resonance = kind in (RESONANCE_1, RESONANCE_2)
+            if is_resonance and not is_defective(problem, step, KINDS[kind].multiplier):
                 continue
             symmetric = kind == FOLD and condition.kind in TOUCHING and _is_symmetric(problem, step)
             found.append((place, point(SYMMETRY if symmetric else kind, step)))
@@ -223,10 +223,6 @@ def points_of(problem: Shooting, steps: list[Step], ends: tuple[str, str]) -> li
         for place, step, detail_here in _resonant_grazings(problem, condition.impact, steps):
             found.append((place, point(RESONANT, step, detail_here, impact=condition.impact)))
     return [point for _, point in sorted(found, key=lambda f: f[0])]
-
-
-# The multiplier that is double at a resonance.
-_DOUBLE = {RESONANCE_1: 1.0, RESONANCE_2: -1.0}
 
 
 def _is_symmetric(problem: Shooting, step: Step) -> bool:
@@ -265,7 +261,7 @@ def _resonant_grazings(
     is_planar = problem.states == 2  # folds and doublings begin at the same point
     for n, sign in itertools.product(range(1, PERIODS + 1), (1,) if is_planar else (1, -1)):
         begins = f"a curve of {'folds' if sign > 0 else 'period doublings'} begins"
-        begins = AT_CODIMENSION_TWO[RESONANT] if is_planar else begins
+        begins = KINDS[RESONANT].on_curve if is_planar else begins
         description = f"{begins} of the motion with one impact in {count_of(n, 'period')}"
         resonance = lambda each, n=n, sign=sign: each.resonance(n, sign) if each else np.nan
         test = lambda step, resonance=resonance: resonance(local(step))

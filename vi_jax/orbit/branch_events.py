@@ -34,7 +34,7 @@ from jaxtyping import Array
 
 from .._types import Scalar, Vector
 from ..machine import AbstractMachine, jumps_on_section, section_in
-from .conditions import HeldMultiplier, in_one_parameter, rates_at
+from .conditions import HeldMultiplier, bifurcation_tests, in_one_parameter, rates_at
 from .corrector import (
     SPACING,
     Step,
@@ -60,26 +60,24 @@ from .flight import LANDS, LEAVES, section_of
 from .flight import Event as MotionEvent
 from .kinds import (
     CROSSING,
-    DETAILS,
     DOUBLING,
     EXTREMUM,
     FOLD,
     GRAZING,
     HOPF,
+    KINDS,
     REST,
     SYMMETRY,
     TORUS,
     TURN,
     TURNS,
     WATCHED,
-    coincidence_in_words,
-    grazing_in_words,
-    place_in_words,
 )
 from .results import NEUTRAL, Orbit
-from .sliding import SLIDING, change_at, locate_change
+from .sliding import change_at, locate_change
 from .special import Point, further_of, point_at
 from .walk import Ending, Event, Table, bound_rows
+from .words import coincidence_in_words, grazing_in_words, place_in_words
 
 # These thresholds are choices; measured ones have the figure in the comment.
 
@@ -109,6 +107,9 @@ _BRIEF = 1e-3
 # A multiplier passes if it is this close to the zero of its test. Otherwise that is a pole of the
 # determinant, or a real pair μ, 1/μ.
 _AT_ZERO = 1e-5
+
+# The description of a branch point at which this branch begins.
+_BEGINS = "a multiplier touches 1: this branch begins at another one, on both sides"
 
 # Most halvings of a step to separate bifurcations in it: a 100,000th of it is left.
 _MOST_HALVINGS = 17
@@ -200,7 +201,7 @@ class MotionTable(Table):
         for i, event in enumerate(self.problem.events):
             approach = lambda step, i=i: float(step.observed.approach[i])
             if event.cycle is not None and not self.problem.conditions:
-                hopf_ending = lambda at: self._end_with(HOPF, at, DETAILS[HOPF], 0)
+                hopf_ending = lambda at: self._end_with(HOPF, at, KINDS[HOPF].detail, 0)
                 yield Event(approach, hopf_ending, partial(_hopf_between, self.problem))
             yield Event(approach, partial(self._ending, here, impact=i))
         # Ignore rounding for events that always coincide.
@@ -234,7 +235,8 @@ class MotionTable(Table):
         if change is not None and change.kind is not None:
             switch_name = MotionEvent(change.number).name_on(self.problem.machine)
             place = place_in_words(self.problem, at, change.clock)
-            detail = SLIDING[change.kind][change.exists].format(name=switch_name, place=place)
+            detail = (KINDS[change.kind].parts or ())[change.exists]
+            detail = detail.format(name=switch_name, place=place)
             return self._end_with(change.kind, at, detail, impact)
         if text is not None:
             return self._end_with(GRAZING, at, text(at))
@@ -420,7 +422,7 @@ class MotionTable(Table):
             at = self._crossing(here, at, FOLD)
         for kind, distances in _distances_from_circle(at).items():
             if np.sum(np.abs(distances) < 10 * _AT_ZERO) > (2 if kind == TORUS else 1):
-                return [(self._point(kind, at, f"{DETAILS[kind]}; twice, at once"), at)]
+                return [(self._point(kind, at, f"{KINDS[kind].detail}; twice, at once"), at)]
         return []
 
     def _bifurcation(self, kind: str, here: Step, last: Step) -> Located:
@@ -435,16 +437,16 @@ class MotionTable(Table):
         if kind in (FOLD, TURNS, CROSSING) and self._begins_at(here, at):
             return []  # both tests are zero there
         if held and kind == TURNS:
-            return [(self._point(TURN, at, DETAILS[TURN]), at)]
+            return [(self._point(TURN, at, KINDS[TURN].detail), at)]
         if kind == TURNS or (kind == CROSSING and (self.symmetric or not held)):
             at = self._crossing(here, at, kind)
         if np.abs(_distances_from_circle(at)[kind]).min(initial=np.inf) >= _AT_ZERO:
             return []
-        detail = DETAILS[kind]
+        detail = _BEGINS if kind == TURNS else KINDS[kind].detail
         if kind == TURNS:
             kind = CROSSING
         elif kind == CROSSING and self.symmetric and self._asymmetry(at) < ALIKE:
-            kind, detail = SYMMETRY, DETAILS[SYMMETRY]
+            kind, detail = SYMMETRY, KINDS[SYMMETRY].detail
         elif kind == CROSSING and held:
             kind, detail = FOLD, "a multiplier passes 1"
         return [(self._point(kind, at, detail), at)]
@@ -493,22 +495,6 @@ def _brief_flight(problem: Shooting, at: Step) -> int | None:
 
 # The number of multipliers that cross the unit circle at a change of sign of each test.
 _CROSSING_MULTIPLIERS = {FOLD: 1, TURNS: 0, DOUBLING: 1, CROSSING: 1, TORUS: 2}
-
-
-def bifurcation_tests(step: Step) -> dict[str, float]:
-    M, identity = step.observed.monodromy, np.eye(step.observed.monodromy.shape[0])
-    values = step.observed.multipliers
-    with np.errstate(invalid="ignore"):  # without an answer of the corrector these are NaN
-        doubling, crosses = np.linalg.det(M + identity), np.linalg.det(M - identity)
-    pairs = [1 - a * b for a, b in itertools.combinations(values, 2)]
-    turns = float(step.tangent[-1])
-    return {
-        FOLD: turns,
-        TURNS: turns,
-        DOUBLING: float(doubling),
-        CROSSING: float(crosses),
-        TORUS: float(np.real(np.prod(pairs))),
-    }
 
 
 def _changed_tests(here: Step, last: Step, *, held: bool) -> list[str]:

@@ -21,10 +21,10 @@ from ..flow import average_names, quantities_on, quantity_names
 from ..machine import components, frequency_ratio, in_unit, quantity_of, units_of, with_leaf
 from .corrector import Step, jacobian_at, on_host
 from .equations import Observed, Shooting
-from .kinds import DOUBLING, REST, TORUS, TOUCHING
+from .kinds import CROSSING, DOUBLING, FOLD, KINDS, REST, SLIDING, TORUS, TOUCHING, TURNS
 from .rest import Chatter
 from .results import compound
-from .sliding import SLIDING, excess_rates
+from .sliding import excess_rates
 
 _SECTION = "section_"
 
@@ -273,10 +273,28 @@ class Special(AbstractCondition):
         if self.kind in TOUCHING:
             return observed.approach[i] - self.speed
         matrix = compound(observed.monodromy) if self.kind == TORUS else observed.monodromy
-        sign = 1 if self.kind == DOUBLING else -1
-        matrix = matrix + sign * jnp.eye(matrix.shape[0], dtype=x.dtype)
+        matrix = matrix - KINDS[self.kind].multiplier * jnp.eye(matrix.shape[0], dtype=x.dtype)
         zero = sum_of_minors(matrix) if self.double else jnp.linalg.det(matrix)
         return zero * jnp.prod(observed.approach)
+
+
+def bifurcation_tests(step: Step) -> dict[str, float]:
+    """Return the tests of a solution for bifurcations, by kind; each changes its sign there."""
+    M, values = step.observed.monodromy, step.observed.multipliers
+
+    def determinant(kind: str) -> float:
+        with np.errstate(invalid="ignore"):  # without an answer of the corrector it is NaN
+            return float(np.linalg.det(M - KINDS[kind].multiplier * np.eye(len(M))))
+
+    pairs = [1 - a * b for a, b in itertools.combinations(values, 2)]
+    turns = float(step.tangent[-1])
+    return {
+        FOLD: turns,
+        TURNS: turns,
+        DOUBLING: determinant(DOUBLING),
+        CROSSING: determinant(CROSSING),
+        TORUS: float(np.real(np.prod(pairs))),
+    }
 
 
 def sum_of_minors(matrix: Array | np.ndarray) -> Array:

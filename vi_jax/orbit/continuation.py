@@ -35,9 +35,9 @@ from .from_orbit import (
     steps_of,
     with_sizes,
 )
-from .kinds import CROSSING, DOUBLING, FOLD, SYMMETRY, TORUS, TOUCHING, with_article
+from .kinds import CROSSING, FOLD, FOLLOWED, SLIDING, SYMMETRY, TOUCHING, with_article
 from .results import NEUTRAL, ORBIT_RESULTS, Orbit, check_multipliers, lies_on_a_stop
-from .sliding import SLIDING, change_at, without_part
+from .sliding import change_at, without_part
 from .special import Point
 from .walk import check_walk, follow_both_ways, rescaled
 
@@ -337,7 +337,7 @@ def boundary(
 
 def _check_point(point: Point) -> None:
     instance_of("point", point, Point, "a `Point`, from `Branch.special`")
-    if point.kind not in (FOLD, DOUBLING, TORUS, SYMMETRY, CROSSING, *TOUCHING):
+    if point.kind not in FOLLOWED:
         raise ValueError(
             "Argument `point` must be a fold, a period doubling, a Neimark–Sacker bifurcation, a "
             "symmetry breaking, a branch point, a rest that is lost, or a grazing or sliding "

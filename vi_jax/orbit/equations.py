@@ -26,8 +26,10 @@ from .._types import Scalar, State, Vector
 from ..flow import TIME, AbstractMethod, average_names, means
 from ..machine import (
     AbstractMachine,
+    DryFriction,
     Turn,
     after_event,
+    after_one_event,
     angles_in,
     component,
     components,
@@ -254,7 +256,7 @@ class Shooting(eqx.Module):
         return tuple(
             number
             for number, event in enumerate(events_of(self.machine))
-            if event.holds_mode and event.is_dry
+            if isinstance(event, DryFriction)
             and all(modes[mode_number(self.machine, number)] == 0 for modes in self.modes)
         )  # fmt: skip
 
@@ -483,8 +485,10 @@ class Shooting(eqx.Module):
             state_on_stop = ravel_pytree(on_stop(machine, number, self.unravel(u)))[0]
             u = jnp.where(lands, state_on_stop, u)
         for number in self.stuck:  # else any slip would stay as it is
-            state = events_of(machine)[number].stopped(machine, begin.s, self.unravel(u))
-            u = ravel_pytree(state)[0]
+            friction = events_of(machine)[number]
+            assert isinstance(friction, DryFriction)
+            state, mode = self.unravel(u), jnp.zeros_like(begin.s)
+            u = ravel_pytree(friction.stopped(machine, begin.s, state, mode, None))[0]
         end, integrals, path = flight.fly(begin.s, s, u, steps, averages, rows=rows)
         if self.landings:
             integrals = {name: x + begin.integrals[name] for name, x in integrals.items()}
@@ -750,7 +754,7 @@ class Shooting(eqx.Module):
                 return jnp.ones_like(s)
             j, before = mode_number(machine, event.number), self.flight(machine, leg - 1)
             modes, state = (before.modes, before.contact), self.unravel(u)
-            mode = after_event(machine, event.number, s, state, *modes)[1][j]
+            mode = after_one_event(machine, event.number, s, state, *modes)[1][j]
             wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 

@@ -23,7 +23,7 @@ from ..machine import (
     AbstractEvent,
     AbstractMachine,
     DryFriction,
-    after_event,
+    after_one_event,
     guard_of,
     mode_number,
 )
@@ -31,29 +31,7 @@ from .corrector import Step, find_zero_near, observe, on_host, state_at
 from .edit_events import without_events
 from .equations import Leg, Shooting
 from .flight import Event, Flight
-
-CROSSING_SLIDING, GRAZING_SLIDING = "crossing-sliding", "grazing-sliding"
-SWITCHING_SLIDING, ADDING_SLIDING = "switching-sliding", "adding-sliding"
-
-# Descriptions of each kind: of a motion without the brief part, and of one with it.
-SLIDING = {
-    CROSSING_SLIDING: (
-        "{name} passes its surface {place}, and beyond is held there for a while",
-        "{name} is no longer held {place}, and beyond passes its surface there at once",
-    ),
-    GRAZING_SLIDING: (
-        "{name} just touches its surface {place}, and beyond is held there for a while",
-        "{name} is no longer held {place}, and beyond does not come to its surface there",
-    ),
-    SWITCHING_SLIDING: (
-        "{name} is held {place} at once, and beyond first passes and comes back",
-        "{name} no longer passes and comes back {place}, and beyond is held there at once",
-    ),
-    ADDING_SLIDING: (
-        "{name} is just held {place}, and beyond leaves its surface and comes back",
-        "{name} no longer leaves its surface {place}, and beyond is held there throughout",
-    ),
-}
+from .kinds import ADDING_SLIDING, CROSSING_SLIDING, GRAZING_SLIDING, SWITCHING_SLIDING
 
 # A part of a motion vanishes if it is shorter than the first share of the period. The second share
 # is used if nothing else is found, as a corrector may not get closer. A guard below the third is
@@ -128,8 +106,8 @@ def _touching_part(problem: Shooting, at: Step) -> Change | None:
     if abs(float(nearest.margin)) > _ZERO * nearest.unit:
         return None
     excess, _, next_mode = excess_force(problem, at, leg, number, place)
-    if not mode:
-        return Change(number, place, (0.0, next_mode, 0.0), False)
+    if not mode:  # to rounding it may still be held there
+        return Change(number, place, (0.0, next_mode or 1.0, 0.0), False)
     # A surface holds a motion that touches it only if the field of the other side points to it.
     is_held = excess < _ZERO * nearest.unit / problem.radian
     return Change(number, place, (mode, 0.0, mode), False) if is_held else None
@@ -178,7 +156,7 @@ def _excess_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
     excess, modes = excess_rates(problem, machine, leg, number, s, state), problem.modes_in(leg)
     contact = problem.flight(machine, leg).contact
-    new = after_event(machine, number, s, state, modes, contact)[1]
+    new = after_one_event(machine, number, s, state, modes, contact)[1]
     return excess.x, excess.v, new[mode_number(machine, number)]
 
 

@@ -12,9 +12,9 @@ from ..machine import in_unit, units_of
 from .conditions import in_one_parameter
 from .corrector import Step, orbit_of
 from .equations import Shooting
-from .kinds import DETAILS, GRAZING, REST, grazing_in_words, with_article
+from .kinds import GRAZING, KINDS, REST, SLIDING, starts, with_article
 from .results import Orbit
-from .sliding import SLIDING
+from .words import grazing_in_words
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -127,18 +127,16 @@ class Point:
 
         **Raises:** `ValueError` for other kinds, or if there is no admissible motion beyond.
         """
-        from .switch import STARTS  # imported here: it needs this class
-
         distance = given_number("distance", distance, low=0.0, open_low=True)
-        starts = STARTS.get((self.curve, self.kind), {})
-        if not starts:
-            known = ", ".join(kind for curve, kind in STARTS if curve == self.curve) or "none"
+        here = starts.get((self.curve, self.kind), {})
+        if not here:
+            known = ", ".join(kind for curve, kind in starts if curve == self.curve) or "none"
             owner = "a branch" if self.curve is None else f"a curve of {self.curve}"
             raise ValueError(
                 f"`switch` has nothing to return at {with_article(self.kind)} of {owner}. At these "
                 f"kinds it has: {known}. Elsewhere use `find_orbit`, from a simulated motion."
             )
-        start = starts[next(iter(starts)) if to is None else one_of("to", to, tuple(starts))]
+        start = here[next(iter(here)) if to is None else one_of("to", to, tuple(here))]
         return start(self, distance)
 
     def __repr__(self) -> str:
@@ -155,7 +153,7 @@ def point_at(
 ) -> Point:  # fmt: skip
     """Return a special point of a curve at a solution of its equations; `more` are other fields."""
     if detail is None:
-        detail = grazing_in_words(problem, step, impact) if kind == GRAZING else DETAILS[kind]
+        detail = grazing_in_words(problem, step, impact) if kind == GRAZING else KINDS[kind].detail
     further = further_of(problem, step)
     return Point(kind, detail, *in_one_parameter(problem, step), impact, further, **more)
 

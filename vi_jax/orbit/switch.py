@@ -12,10 +12,9 @@ import numpy as np
 
 from .._types import State
 from ..flow import simulate
-from ..machine import after_event, others_of, with_leaf
+from ..machine import after_one_event, others_of, with_leaf
 from .boundary_events import PERIODS
-from .branch_events import bifurcation_tests
-from .conditions import AbstractCondition, FixedComponent, Special
+from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
 from .corrector import (
     Step,
     advance,
@@ -43,15 +42,17 @@ from .kinds import (
     RESONANCE_4,
     RESONANT,
     REST,
+    SLIDING,
     SYMMETRY,
-    TOGETHER,
     TORUS,
+    starts,
 )
 from .local_map import graze_at
 from .results import Orbit
-from .sliding import SLIDING, change_at, without_part
+from .sliding import change_at, without_part
 from .special import Point, point_at
 from .torus import Torus, torus_near
+from .words import TOGETHER
 
 _ORBIT = "orbit"
 
@@ -144,7 +145,7 @@ def _swapped(point: Point) -> Iterator[State]:
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
         # The section's state is the one just after it.
         for each in (after, event) if event.cycle == 0 else (after,):
-            state, modes = after_event(machine, each.number, clock[i], state, modes)
+            state, modes = after_one_event(machine, each.number, clock[i], state, modes)
         yield state
 
 
@@ -330,9 +331,7 @@ def _locate_change(two: Shooting, x: np.ndarray, distance: float, test: str) -> 
     return None
 
 
-# Functions for `switch`: by the kind of the boundary (`None` for a branch) and that of the point,
-# then by the kind of the result.
-STARTS: dict[tuple[str | None, str], dict[str, Callable[[Point, float], Any]]] = {
+starts |= {
     (None, DOUBLING): {_ORBIT: _doubled_orbit},
     (None, GRAZING): {_ORBIT: _orbit_beyond_grazing},
     (None, CROSSING): {_ORBIT: _crossing_orbit},

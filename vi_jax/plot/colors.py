@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.lines import Line2D
 
+from ..orbit import KINDS
 from ..scans import REGIMES
 
 # The colours of periods 2π, 4π, ... (drive cycles); longer periods have the last one.
@@ -41,46 +42,7 @@ NOT_COMPUTED = "#e6e6e6"
 BLUE, ORANGE, RED, GREEN = "#0072b2", "#e69f00", "#d55e00", "#009e73"
 STOP = GREEN
 
-# Mark and fill; the edge is black.
-MARKS = {
-    "grazing": ("o", "k"),
-    "fold": ("s", "w"),
-    "period-doubling": ("D", "0.7"),
-    "neimark-sacker": ("^", "w"),
-    "branch-point": ("X", "k"),
-    "symmetry-breaking": ("P", "w"),
-    "hopf": ("*", "0.7"),
-    "rest": ("h", "0.7"),
-    "extremum": ("d", "w"),
-    "watched": ("$w$", "k"),
-    "turn": ("<", "w"),
-    "cusp": ("v", "k"),
-    "degenerate-doubling": ("p", "w"),
-    "degenerate-symmetry-breaking": ("H", "w"),
-    "fold-flip": (">", "w"),
-    "resonance-1:1": ("$1$", "k"),
-    "resonance-1:2": ("$2$", "k"),
-    "resonance-1:3": ("$3$", "k"),
-    "resonance-1:4": ("$4$", "k"),
-    "resonant-grazing": ("8", "w"),
-    "crossing-sliding": ("$c$", "k"),
-    "grazing-sliding": ("$g$", "k"),
-    "switching-sliding": ("$s$", "k"),
-    "adding-sliding": ("$a$", "k"),
-}
-DASHES = {
-    "grazing": "-",
-    "grazing-sliding": (0, (3, 1)),
-    "adding-sliding": (0, (8, 1.5)),
-    "crossing-sliding": (0, (3, 1, 1, 1)),
-    "switching-sliding": (0, (8, 1.5, 1, 1.5)),
-    "rest": (0, (2, 2)),
-    "period-doubling": (0, (5, 2)),
-    "fold": (0, (6, 1.5, 1.2, 1.5)),
-    "symmetry-breaking": (0, (1.2, 1.2)),
-    "branch-point": (0, (1.2, 2.4)),
-    "neimark-sacker": (0, (5, 1.5, 1.2, 1.5, 1.2, 1.5)),
-}
+DASHES = {kind: row.dash for kind, row in KINDS.items() if row.dash is not None}
 
 
 def color_of(cycles: int, impacts: float | int | None = None) -> str:
@@ -128,7 +90,7 @@ def mark_of(kind: str, **style: Any) -> Line2D:
 
 def mark_style(kind: str) -> dict[str, Any]:
     """Return options of `Axes.plot` for a special point."""
-    marker, fill = MARKS[kind]
+    marker, fill = KINDS[kind].mark
     size = {"*": 9.0, "X": 7.0, "P": 7.0}.get(marker, 7.0 if "$" in marker else 5.0)
     return {"marker": marker, "mfc": fill, "mec": "k", "mew": 0.8, "ms": size, "ls": "none"}
 

@@ -21,6 +21,7 @@ from ..machine import (
     units_of,
 )
 from ..orbit import (
+    KINDS,
     Boundary,
     Branch,
     Grazing,
@@ -31,7 +32,7 @@ from ..orbit import (
 )
 from ..robust import Manifold
 from ..scans import REGIMES, Sweep
-from .colors import BLUE, DASHES, IRREGULAR, MARKS, RED, color_of, mark_style, once, thick
+from .colors import BLUE, DASHES, IRREGULAR, RED, color_of, mark_style, once, thick
 from .motion import new_axes
 
 # Names of lines in a legend, and the order of dots: above lines and below marks.
@@ -143,7 +144,7 @@ def _array(found: Branch | Sweep, argument: str, name: str) -> np.ndarray:
 def _legend(ax: Axes) -> None:
     """Draw a legend: branches first, then their lines, then the marks."""
     named = list(zip(*ax.get_legend_handles_labels(), strict=True))
-    named.sort(key=lambda x: 2 if x[1] in MARKS else x[1] in (_STABLE, _UNSTABLE))
+    named.sort(key=lambda x: 2 if x[1] in KINDS else x[1] in (_STABLE, _UNSTABLE))
     if named:
         handles, labels = zip(*named, strict=True)
         ax.legend(handles, labels, fontsize="small", frameon=False)
