@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from .._checks import instance_of, one_of
 from ..flow import Run
 from ..machine import components, in_brackets, unit_of, units_of, without_modes
-from ..orbit import Torus, TorusBranch
-from .colors import BLUE, MARKS, ORANGE, mark_style, once, thick
+from ..orbit import KINDS, Torus, TorusBranch
+from .colors import BLUE, ORANGE, mark_style, once, thick
 from .motion import new_axes
 from .orbit import axis_name
 
@@ -70,7 +70,7 @@ def _draw_family(family: TorusBranch, ax: Axes, name: str, style: dict[str, Any]
             word = once(ax, "window of locking")
             ax.axvspan(window.low, window.high, color=ORANGE, lw=thick(1.0), label=word)
     for end, i in zip(family.ends, (0, -1), strict=True):
-        if end in MARKS:
+        if end in KINDS:
             for value in np.atleast_1d(values[i]):
                 mark = {**mark_style(end), "zorder": 4, "label": once(ax, end)}
                 ax.plot(family.parameter[i], value, **mark)
