@@ -222,7 +222,8 @@ def _placed(machine: "AbstractMachine", state: State, Y: Scalar, V: Scalar) -> S
 
 def _default_coordinate(machine: "AbstractMachine") -> Coordinate:
     """Return the coordinate of a state with fields `Y` and `V`, or of a machine without stops."""
-    return Coordinate(*(partial(function, machine) for function in (_position, _velocity, _placed)))
+    position, velocity, placed = (partial(x, machine) for x in (_position, _velocity, _placed))
+    return Coordinate(position, velocity, placed)
 
 
 class AbstractMachine(Shown):

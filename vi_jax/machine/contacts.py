@@ -200,7 +200,8 @@ def contact_constraints(
     switches first; `contact`, as in `EventContext`; empty for no rest."""
     limited = limited_in(machine) if contact else []
     coordinates: Any = machine.coordinates if limited else ()
-    stops, switches = stops_of(machine) if contact else (), switches_of(machine)
+    stops: Any = stops_of(machine) if contact else ()
+    switches = switches_of(machine)
     frictions = [(i, x) for i, x in enumerate(switches) if contact and x.friction_stop is not None]
     numbers = [*limited, *(x.along for _, x in frictions)]
     by_number = {k: row_of(coordinates[k], s, state) for k in numbers}

@@ -255,7 +255,8 @@ def _before_impacts(
         list(bodies.values()), list(rows.values()), at_event, [x.push for x in rows.values()]
     )
     gains = jnp.stack([jnp.stack([gains[i][j] for j in places]) for i in places])
-    outward = np.asarray([*(-float(x.sign) for x in stops), *(1.0 for _ in of)])
+    signs = [*(-float(x.sign) for x in stops), *(1.0 for _ in of)]
+    outward = jnp.asarray(np.asarray(signs), s.dtype)
     touches, slow = [], []
     for number, stop in enumerate(stops):
         k = stop.coordinate
