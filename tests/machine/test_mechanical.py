@@ -383,7 +383,7 @@ def test_invalid_starts_raise():
     with pytest.raises(ValueError, match=r"prescribed v\.left = 0\.5 at time 0, but has 0\.4"):
         vi.simulate(Driven(size=0.5), Driven().at(right=1.0), 1)
     vi.simulate(Driven(), vi.simulate(Driven(), cycles=2).last, 1)  # equal to rounding
-    with pytest.raises(ValueError, match=r"phi beyond the end of a turn, but it is 0\.71"):
+    with pytest.raises(ValueError, match=r"phi before the end of a turn, but it is 0\.71"):
         vi.simulate(SliderCrank(), SliderCrank().at(phi=7.0, v=dict(phi=15.0)), 1)
 
 

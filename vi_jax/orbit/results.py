@@ -243,7 +243,7 @@ class Orbit(Summarized):
 
     @property
     @by_numpy_if_known
-    def successful(self) -> Bool[Array, "..."]:
+    def successful(self) -> Any:
         """True if an orbit was found, of the given period or a smaller one."""
         return (self.result == ORBIT_RESULTS.successful) | (
             self.result == ORBIT_RESULTS.smaller_period
@@ -251,7 +251,7 @@ class Orbit(Summarized):
 
     @property
     @by_numpy_if_known
-    def stable(self) -> Bool[Array, "..."]:
+    def stable(self) -> Any:
         """True if all multipliers lie inside the unit circle, by more than rounding; false also if
         they are not known (see `stability`)."""
         return self.stability == STABILITY.stable
@@ -271,7 +271,7 @@ class Orbit(Summarized):
 
     @property
     @by_numpy_if_known
-    def slowest_impact(self) -> Float[Array, "..."]:
+    def slowest_impact(self) -> Any:
         """Smallest V⁻, the distance to a grazing at which an impact is lost; infinite without
         impacts. The distance to other grazings is `clearance`."""
         array = array_module(self.impact_speed)
@@ -280,7 +280,7 @@ class Orbit(Summarized):
 
     @property
     @by_numpy_if_known
-    def admissible(self) -> Bool[Array, "..."]:
+    def admissible(self) -> Any:
         """True if the motion stays inside the gap and every impact approaches its stop."""
         slack = 1e4 * jnp.finfo(self.y_max.dtype).eps
         size = array_module(self.y_max).maximum(abs(self.y_min), abs(self.y_max))

@@ -68,8 +68,6 @@ class Attractor(NamedTuple):
     """Impacts in a period."""
     sections: dict[str, np.ndarray]
     """Its section states, arrays of shape (period,)."""
-    modes: tuple[np.ndarray, ...]
-    """The machine's own modes there, arrays of shape (period,)."""
     starts: int
     """Number of starts that ended on it."""
     fraction: float
@@ -77,6 +75,8 @@ class Attractor(NamedTuple):
     error: float
     """Standard error of `fraction` for random starts, √(p(1 - p)/N); on a grid it is an upper
     estimate."""
+    modes: tuple[np.ndarray, ...] = ()
+    """The machine's own modes on its sections, arrays of shape (period,)."""
 
     def __repr__(self) -> str:
         return in_words(self)
