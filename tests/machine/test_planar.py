@@ -162,3 +162,21 @@ def test_a_rod_that_slides_into_the_ground_jams():
     for i, push, drag in ((4, 2.41739128, -1.6), (5, 12.5028225, 0.8)):
         np.testing.assert_allclose(turning[i] / times, 3 * push * (drag * s - c), rtol=1e-3)
     assert bool((gain[~jams] < 1e-12).all())
+
+
+@pytest.mark.slow
+def test_two_corners_hold_a_block_together(blocks):
+    """The corners have linearly dependent tangents, so their forces are not unique. With friction
+    0.3 they hold the block up to a force of 2.943 N; one of them would reach its bound at 1.4 N."""
+    pushes, speeds = (2.0, 2.9, 2.95, 2.0, 4.0), (0.0, 0.0, 0.0, 0.5, -0.5)
+    cases = [(dict(push=f, cycle=0.6), (v, 0, 0)) for f, v in zip(pushes, speeds, strict=True)]
+    run, _ = blocks(*cases)
+    bound = 0.3 * 9.81
+    slides, stops = 0.6 * (2.95 - bound), 0.5 / (bound - 2)
+    turns = 0.5 / (bound + 4)
+    expected = [0.0, 0.0, 0.5 * 0.6 * slides, 0.5 * 0.5 * stops]
+    expected += [-0.25 * turns + 0.5 * (4 - bound) * (0.6 - turns) ** 2]
+    assert bool(run.successful.all())
+    np.testing.assert_allclose(run.last.x[:5], expected, atol=1e-11)
+    np.testing.assert_allclose(run.last.tilt[:5], 0.0, atol=1e-14)
+    np.testing.assert_allclose(run.last.v.x[:4], [0, 0, slides, 0], atol=1e-12)

@@ -213,7 +213,7 @@ def contact_constraints(
         rests = contact[stop.coordinate] == 1.0 + friction.friction_stop
         # The stop pushes the body away, and friction acts against the slip.
         ratio = by_number[stop.coordinate].mass / by_number[friction.along].mass
-        ratio = modes[i] * friction.level * stop.sign * ratio
+        ratio = jnp.round(modes[i]) * friction.level * stop.sign * ratio
         share = jnp.where(rests, ratio, 0.0)
         pushes[row] = added(pushes[row], (share,), (by_number[friction.along].push,))
         acts = [*acts, rests & (modes[i] == 0)]

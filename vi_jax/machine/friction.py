@@ -45,7 +45,12 @@ from .state import with_components
 
 
 class Friction(AbstractSwitch):
-    """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0)."""
+    """Coulomb friction: a body slides forward or backward (mode +1, -1), or sticks (mode 0).
+
+    Of frictions that hold a body together, such as those of two corners on a floor, some keep their
+    largest force (mode ±¾) or none (mode ±¼). The others have the rest, which is unique. When it
+    gets too large, all are settled anew.
+    """
 
     roundings: ClassVar[int]
     """A slip below this number of roundings of its size counts as zero."""
@@ -119,6 +124,7 @@ class Friction(AbstractSwitch):
 
     def sides(self, machine, s, state, mode, *, around: EventContext | None = None):
         slip_guard = -mode * self.speed_of_slip(machine, s, state)
+        slip_guard = jnp.where((mode != 0) & (jnp.abs(mode) < 1), -1.0, slip_guard)
         if around is None or not self.is_known(around):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
         touches = self.touches(machine, around.contact)
@@ -251,7 +257,7 @@ class DryFriction(Friction):
     def push_in(self, machine, s, state, mode):
         """Return the change of the slip by the force on a body that slides, and its push."""
         row = self.row(machine, s, state)
-        return -mode * self.sliding(machine, s, state, mode) / row.mass, row.push
+        return -jnp.round(mode) * self.sliding(machine, s, state, mode) / row.mass, row.push
 
     def stopped(self, machine, s, state, mode, around):
         if self.slip is None and self.push is None:
@@ -381,7 +387,7 @@ def settled_modes(
         ratio = friction.static_share(machine, s, state)
         slip = friction.slip_sign(machine, s, state, flow)
         if released is not None:  # the slip of a sticking body is rounding
-            slip = jnp.where(modes[i] == 0, 0.0, slip)
+            slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
             begins = released.get(i, jnp.zeros((), bool))
             ratio = jnp.where(begins, 1 - _RELEASED, ratio)
         slips.append(slip)
@@ -400,7 +406,7 @@ def pressed_contacts(
     """Return the contacts (as in `EventContext`) without those that the forces of this state open,
     in these modes of frictions."""
     indices, switches = frictions_in(machine), switches_of(machine)
-    slips = tuple(modes[i] for i in indices)
+    slips = tuple(jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
     solve: Any = _settled
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)

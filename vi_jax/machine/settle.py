@@ -68,7 +68,7 @@ class Settled(NamedTuple):
     kept: Array
     """True for contacts that stay closed, (n,)."""
     mode: Array
-    """For each friction its slip ±1, or 0 for sticking, (t + d,); 0 also at an open contact."""
+    """For each friction its slip ±1, 0 for sticking, or ±¼ and ±¾ (see `Friction`), (t + d,)."""
     unsolved: Array
     """True if no solution was found."""
 
@@ -254,6 +254,36 @@ def forces_in(
     return solve_modes(matrix, jnp.where(held, -x.rates, known))
 
 
+# A row that depends on others to this share of its gain is redundant: a choice.
+_REDUNDANT = 1e-9
+
+
+def _redundant(gains: Array, pushes: Array, holds: Array, still: Array) -> Array:
+    """Return which rows depend linearly on those that push or hold, or on one before that is
+    `still`."""
+    gains, rows = stop_gradient(gains), np.arange(gains.shape[0])
+    own = jnp.sum(gains * np.eye(len(rows)), 1)
+    zeros = jnp.zeros((len(rows),), gains.dtype)
+    first = jnp.concatenate([pushes, holds])
+    takes = jnp.stack([first, jnp.concatenate([pushes & False, still])])
+
+    def step(state: tuple, given: tuple) -> tuple[tuple, None]:
+        table, found = state
+        row, takes = given
+        here = rows == row
+        column = jnp.sum(jnp.where(here, table, 0.0), 1)
+        pivot = jnp.sum(jnp.where(here, column, 0.0))
+        counts = here & takes & (pivot > _REDUNDANT * own)
+        any_counts = jnp.any(counts)
+        change = column[:, None] * jnp.sum(jnp.where(here[:, None], table, 0.0), 0)
+        change = change / jnp.where(any_counts, pivot, 1.0)
+        return (jnp.where(any_counts, table - change, table), jnp.where(counts, 1.0, found)), None
+
+    order = np.tile(rows, 2) * 1.0, jnp.repeat(takes, len(rows), 0)
+    (table, found), _ = jax.lax.scan(step, (gains, zeros), order)
+    return (found == 0) & (jnp.sum(table * np.eye(len(rows)), 1) <= _REDUNDANT * own)
+
+
 def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) -> Settled:
     """Return which contacts push, stick, slip or open, and their forces. **Arguments:** `of`, the
     number of each tangent's contact; `has_ratios`, whether some `hold` is not 1.
@@ -269,8 +299,13 @@ def settle(x: Contacts, of: tuple[int, ...] = (), *, has_ratios: bool = True) ->
     rate = pushed + x.rates
     size = jnp.max(jnp.abs(x.rates)) + jnp.max(jnp.abs(pushed))
     moves = jnp.where(jnp.abs(rate) > _OPENS * size, jnp.sign(rate), 0.0)
+    still = ~found.holds & (x.slip == 0) & (moves[n:] == 0)
     # A slip without a force goes where it is accelerated.
     mode = jnp.where(~found.holds & (found.mode == 0), moves[n:], found.mode)
+    if x.slip.shape[0] > 1:  # others hold a redundant one, which keeps its largest force, or none
+        known = still & (mode == 0)
+        spare = still & _redundant(x.gains, found.pushes, found.holds, known)[n:]
+        mode = jnp.where(spare, jnp.where(mode == 0, 0.25, 0.75 * mode), mode)
     kept = x.closed & (found.pushes | (moves[:n] <= 0))
     return Settled(found.force, rate, kept, mode, found.code != SOLVED)
 

@@ -37,7 +37,7 @@ def plot_torus(
     - `ax`: by default a new figure.
     - `x`, `y`: for a torus two components of the state, by default the first two; for a family `y`
       is `"rotation"` (the default), `"exponents"`, `"clearance"` or `"slowest_impact"`.
-    - `run`: a `Run`; its sections are drawn as dots beside a torus.
+    - `run`: a simulated motion, with sections drawn as dots for comparison with a torus.
     - options of `Axes.plot`.
     """
     ax = new_axes(ax)

@@ -1,0 +1,147 @@
+"""Bodies with several frictions: on a belt of varying speed, on each other, and struck by a hammer.
+The numbers are those of SciPy, followed from event to event (DOP853, rtol 1e-12)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import vi_jax as vi
+
+
+class Belt(vi.Mechanical):
+    """A body held on a belt by static friction, and one that slides on it."""
+
+    q = ("a", "b")
+    mass = (1.0, 0.8)
+    w: Any = 1.0
+    level: Any = 0.5
+    between: Any = 0.3
+    ratio: Any = 1.3
+    size: Any = 0.2
+    drift: Any = 0.0
+    drive: Any = 0.4
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.w
+
+    def speed(self, t):
+        k, sizes = np.arange(1, 6), np.array([1.0, 0.4, 0.3, 0.2, 0.1])
+        phases = np.array([0.0, np.pi / 2, 1.0, np.pi / 2, 0.0])
+        return self.drift + self.size * jnp.sum(sizes * jnp.sin(k * self.w * t + phases))
+
+    @property
+    def contacts(self):
+        slip = lambda t, z: z.v.a - self.speed(t)
+        return (
+            vi.DryFriction(self.level, slip=slip, on="a", static_ratio=self.ratio),
+            vi.DryFriction(self.between, on=lambda q: q.b - q.a),
+        )
+
+    def force(self, t, q, v):
+        return dict(a=-q.a, b=self.drive * jnp.cos(2 * self.w * t) - 0.6 * q.b)
+
+
+class Blocks(vi.Mechanical):
+    """Three bodies with a full mass matrix and three dry frictions."""
+
+    q = ("a", "b", "c")
+    levels: Any = (0.5893, 0.5271, 0.6868)
+    w: Any = 1.2959
+
+    def mass(self, q):
+        return [[1.0, 0.1, 0.0], [0.1, 0.8, 0.05], [0.0, 0.05, 1.3]]
+
+    @property
+    def cycle(self):
+        return 2 * jnp.pi / self.w
+
+    @property
+    def contacts(self):
+        ons = "a", lambda q: q.b - q.a, "c"
+        return tuple(vi.DryFriction(self.levels[i], on=on) for i, on in enumerate(ons))
+
+    def force(self, t, q, v):
+        left, right = 0.8 * (q.a - q.b), 0.5 * (q.b - q.c)
+        drive = 0.4 * jnp.cos(2 * self.w * t)
+        return dict(a=-q.a - left, b=left - right + drive, c=right - 0.6 * q.c)
+
+
+class Hammer(vi.Mechanical):
+    """A hammer c bounces on a block b; dry friction acts on both."""
+
+    q = ("b", "c")
+    mass = (1.0, 0.5)
+    restitution: Any = 0.6
+    levels: Any = (1.0, 0.2)
+    push: Any = 0.5
+    back: Any = 0.0
+    cycle = 2 * jnp.pi
+
+    @property
+    def contacts(self):
+        stop = vi.RigidStop(0.0, self.restitution, on=lambda q: q.c - q.b)
+        return vi.DryFriction(self.levels[0], on="b"), vi.DryFriction(self.levels[1], on="c"), stop
+
+    def force(self, t, q, v):
+        return dict(b=-self.back, c=self.push)
+
+
+def ends(kind, given, cycles, method="standard", **start):
+    """Return the last positions of many machines, and whether all motions succeeded."""
+
+    def last(given):
+        machine = kind(**given)
+        run = vi.simulate(machine, machine.at(**start), cycles, method=method)
+        return jnp.stack([getattr(run.last, x) for x in machine.q]), run.successful
+
+    places, good = jax.jit(jax.vmap(last))(jax.tree.map(jnp.asarray, given))
+    return np.asarray(places), bool(good.all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["standard", vi.FixedStep(steps_per_cycle=150)])
+def test_static_friction_lets_go_on_a_belt(method):
+    draw, n = np.random.default_rng(0).uniform, 4000
+    ranges = dict(
+        w=(0.4, 1.5), level=(0.1, 1), between=(0.1, 0.8), ratio=(1.05, 1.5), size=(0.1, 0.6),
+        drift=(-0.3, 0.3), drive=(0.2, 1.0),
+    )  # fmt: skip
+    lanes = [461, 1941, 1452, 3, 17]
+    given = {name: draw(*x, n)[lanes] for name, x in ranges.items()}
+    found, good = ends(Belt, given, 3, method, a=0.2, b=0.3)
+    expected = [
+        (-0.753954023666, -13.859165684306), (-0.581680568486, -1.604025587437),
+        (-1.033317703839, -0.965803380918), (-0.623220619603, 4.886438817765),
+        (-0.152515143621, -0.592102703939),
+    ]  # fmt: skip
+    assert good
+    np.testing.assert_allclose(found, expected, atol=2e-8)
+
+
+@pytest.mark.slow
+def test_a_hammer_bounces_to_rest_on_a_block_with_friction():
+    """In these lanes the hammer rests on the block in the end, and both stick."""
+    draw, n = np.random.default_rng(0).uniform, 300
+    k, block, push, back, hammer = (
+        draw(*x, n) for x in ((0.2, 0.8), (0.1, 1.5), (0.2, 1), (0, 1.2), (0.05, 0.5))
+    )
+    lanes = [33, 58, 1, 2, 3, 11]
+    given = dict(restitution=k, levels=np.stack([block, hammer], 1), push=push, back=back)
+    found, good = ends(Hammer, {name: x[lanes] for name, x in given.items()}, 1, c=-0.3)
+    assert good
+    expected = [-0.45600872, -0.68768609, 0.05482670, -0.41444295, 0.05511179, -0.16118163]
+    np.testing.assert_allclose(found, np.repeat(np.array(expected)[:, None], 2, 1), atol=6e-9)
+
+
+@pytest.mark.slow
+def test_three_frictions_with_a_full_mass_matrix():
+    draw, n = np.random.default_rng(0).uniform, 768
+    *levels, w = (draw(*x, n)[:64] for x in ((0.1, 1), (0.1, 0.8), (0.1, 0.8), (0.4, 1.5)))
+    given, start = dict(levels=np.stack(levels, 1), w=w), dict(a=0.2, b=0.1, v=dict(a=0.5, b=-0.3))
+    found, good = ends(Blocks, given, 2, **start)
+    finer, fine = ends(Blocks, given, 2, vi.FixedStep(steps_per_cycle=150), **start)
+    assert good and fine
+    np.testing.assert_allclose(found, finer, atol=1e-8)
