@@ -157,7 +157,7 @@ class Tuple(Machine):
 
 def simulate(machine):
     free = isinstance(machine, Free)
-    return vi.simulate(machine, vi.State(x=0.1, u=0.2) if free else machine.start(), 1)
+    return vi.simulate(machine, vi.State(x=0.1, u=0.2) if free else machine.start(), 2)
 
 
 def refused(call):

@@ -187,7 +187,8 @@ def _after_friction(
     modes = jax.lax.cond(any_event, settled, lambda modes: modes, lane.modes)
     found = jnp.asarray(value, lane.s.dtype)
     for i, (_, here) in events.items():
-        found = jnp.where(here, modes[i], found)
+        held = jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i])  # see `Friction`
+        found = jnp.where(here, held, found)
     return modes, found
 
 
