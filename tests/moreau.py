@@ -20,7 +20,7 @@ def _gradients(functions: Callable[..., Any], q: np.ndarray) -> tuple[np.ndarray
     for i in range(q.shape[1]):
         z = q.astype(complex)
         z[:, i] += 1e-30j
-        columns.append(np.stack(functions(z), 1).imag / 1e-30)
+        columns.append(np.imag(np.stack(functions(z), 1)) / 1e-30)
     return values, np.stack(columns, 2)
 
 

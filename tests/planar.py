@@ -21,7 +21,7 @@ class Block(vi.Mechanical):
     cycle: Any = 0.2
     q = ("x", "y", "tilt")
 
-    def mass(self, q):
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
         return 1.0, 1.0, (self.half_width**2 + self.half_height**2) / 3
 
     @property

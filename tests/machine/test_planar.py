@@ -140,7 +140,7 @@ def test_a_rod_that_slides_into_the_ground_jams():
     below, beyond = limit * (1 - 1e-6), limit * (1 + 1e-6)
 
     def one(mu, slip, turning, cycle):
-        rod = Rod(mu, cycle=cycle)
+        rod = Rod(mu=mu, cycle=cycle)
         start = rod.sliding(1.0, slip, turning)
         run = vi.simulate(rod, start, 1)
         tip = run.last.y - jnp.sin(run.last.theta)
