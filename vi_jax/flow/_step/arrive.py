@@ -559,6 +559,10 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             if lane.contact is not None:
                 away = jnp.where(lane.contact[k] > 0, sign, away)
             direction[k] = jnp.where(impacts[k].contact > 0, away, direction[k])
+            if lane.contact is not None and len(impacts) > 1:  # it may rest without an impact
+                toward, _ = plan.sign_and_gap(k, lane.contact[k])
+                rests = met & (lane.contact[k] > 0)
+                direction[k] = jnp.where(rests, toward, direction[k])
     modes, contact = lane.modes, lane.contact or ()
     if modes and not is_compound(machine):
         for number, here in landed.items():

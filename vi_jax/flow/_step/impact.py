@@ -38,7 +38,7 @@ from ...machine import (
 from ..lane import Lane, add_entry, any_of, select, to_event, with_item
 from ..plan import Plan
 from ..results import EventKind
-from ..smooth import SmoothMachine, hold_contacts, in_modes
+from ..smooth import SmoothMachine, hold_contacts, in_modes, stops_are_exact
 from .event_derivatives import FlowToEvent
 from .roots import force_rate, rates
 from .trial import AppliedStep
@@ -203,6 +203,16 @@ def resolve_impact_sequence(
     struck come to rest against each other.
     """
     machine, stops = plan.machine, stops_of(plan.machine)
+    if lane.contact is not None and not stops_are_exact(machine, at_event):
+        # While bodies rest, their positions are accurate to the method's error only.
+        on, codes = {}, {}
+        for k in limited_in(machine):
+            codes[k] = lane.contact[k]
+            for i, stop in enumerate(stops):
+                if stop.coordinate == k:
+                    codes[k] = jnp.where(landed[i], to_event(i), codes[k])
+            on[k] = codes[k] > 0
+        at_event, _ = stop_bodies(plan, lane.s, at_event, on, codes, moves=True)
     instant = _before_impacts(plan, taken, lane, landed, at_event)
     zero, n = jnp.zeros_like(lane.s), len(stops)
     # A contact without any speed, as between bodies released together, may come to rest.
@@ -383,6 +393,10 @@ def _closing(instant: _Instant, x: _Round) -> Array:
 # single precision. Choices: the error is of second order, 6e-11 of that step in double.
 _BRIEF, _BRIEF_SINGLE = 8e-6, 8e-3
 
+# A contact is nearly closed at this share of the motion's size: a choice, above the height of hops
+# that take a brief time.
+_NEAR = 1e-6
+
 # A contact whose bodies separate with less than this share of their speed of approach stays closed
 # while the forces on it are computed: a choice, far above rounding.
 _CLOSED = 1e-9
@@ -410,8 +424,35 @@ def bring_to_rest(
         times = {k: time}
     else:
         lane = lane._replace(contact=_remaining_contacts(step.plan, lane, at_event, met, impacts))
-        rests, times = _resting_bodies(step.plan, lane, impacts)
+        near, distances = _near_contacts(step.plan, lane, met, impacts)
+        rests, times = _resting_bodies(step.plan, lane, near, distances)
+        impacts = near
     return _hold_resting(step.plan, step.taken, lane, rests, impacts, times)
+
+
+def _near_contacts(
+    plan: Plan, lane: Lane, met: Flag, impacts: dict[int, ImpactResult]
+) -> tuple[dict[int, ImpactResult], dict[int, Scalar]]:
+    """Return the impacts of an instant with those contacts that are nearly closed, and the distance
+    of each coordinate from its stop. Two corners of a body that comes to rest strike in turn, ever
+    faster: at each instant one is struck, and the other is a little way off."""
+    assert lane.contact is not None
+    found, distances = dict(impacts), {}
+    for k, impact in impacts.items():
+        body, nearest = plan.machine.coordinates[k], jnp.full_like(lane.s, jnp.inf)
+        place, contact = body.position(lane.state), jnp.zeros_like(lane.s)
+        for i, stop in enumerate(stops_of(plan.machine)):
+            if stop.coordinate == k:
+                distance = stop_gradient(-stop.beyond(place))
+                contact = jnp.where(distance < nearest, to_event(i), contact)
+                nearest = jnp.minimum(distance, nearest)
+        size = plan.extent(k) + jnp.abs(plan.sign_and_gap(k, contact)[1])
+        is_near = met & (impact.contact == 0) & (lane.contact[k] == 0) & (nearest <= _NEAR * size)
+        speed = jnp.abs(body.velocity(lane.state))
+        at_stop = ImpactResult(contact, speed, jnp.zeros_like(lane.s))
+        found[k] = select(is_near, at_stop, impact)
+        distances[k] = jnp.where(is_near, jnp.maximum(nearest, 0.0), 0.0)
+    return found, distances
 
 
 def _hold_resting(
@@ -488,13 +529,15 @@ def _without_rebounds(
 
 
 def stop_bodies(
-    plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], contacts: dict[int, Scalar]
-) -> tuple[State, Scalar]:
+    plan: Plan, s: Scalar, state: State, rests: dict[int, Flag], contacts: dict[int, Scalar],
+    *, moves: bool = False,
+) -> tuple[State, Scalar]:  # fmt: skip
     """Return the state with those coordinates that rest put on their stops (`contacts`, as in
-    `Lane.contact`), without velocity, all at once; and the energy lost."""
+    `Lane.contact`), without velocity, all at once; and the energy lost. If the body `moves`, its
+    velocities stay."""
     bodies = {k: plan.machine.coordinates[k] for k in rests}
     velocities = [body.velocity(state) for body in bodies.values()]
-    deltas, shifts = [-V for V in velocities], []
+    deltas, shifts = [(0.0 if moves else -1.0) * V for V in velocities], []
     for k, body in bodies.items():
         sign, gap = plan.sign_and_gap(k, contacts[k])
         shifts.append(sign * gap - body.position(state))
@@ -508,7 +551,7 @@ def stop_bodies(
         place, speed = body.position(new) + shift, body.velocity(new) + change
         if len(rests) == 1:
             sign, gap = plan.sign_and_gap(k, contacts[k])
-            place, speed = sign * gap, jnp.zeros_like(V)
+            place, speed = sign * gap, V if moves else jnp.zeros_like(V)
         moved = body.placed(new, place, speed)
         new = moved if len(rests) == 1 else select(rests[k], moved, new)
         lost = lost - body.mass_at(s, state) * change * 0.5 * V
@@ -517,10 +560,11 @@ def stop_bodies(
 
 def _remaining_chatter(
     plan: Plan, free: SmoothMachine, k: int, impact: ImpactResult, speed: Scalar, lane: Lane,
-    growth: Scalar | None = None,
+    growth: Scalar | None = None, distance: Scalar | float = 0.0,
 ) -> tuple[Flag, Scalar]:  # fmt: skip
     """Return whether an impact is one of the endless last ones before rest, and the time they take.
-    `speed` is that of the rebound with respect to s; `growth` is the rate of the force."""
+    `speed` is that of the rebound with respect to s; `growth` is the rate of the force; `distance`
+    is that from the stop, if the contact is only nearly closed."""
     s, state, body = lane.s, lane.state, plan.machine.coordinates[k]
     sign, gap = plan.sign_and_gap(k, impact.contact)
     # The force on a body at rest, which has no damping by its velocity.
@@ -542,6 +586,7 @@ def _remaining_chatter(
     brief = (_BRIEF if s.dtype == jnp.float64 else _BRIEF_SINGLE) * limit
     ends = stop_gradient(time) <= jnp.where(flat, 0.1 * limit, brief)
     ends = ends & (flat | ~not_yet | (hop <= brief))
+    ends = ends & (distance <= (0.5 * jnp.maximum(pressing, 0.0) * brief + speed) * brief)
     if plan.s_counts_cycles(lane.state):
         ends = ends & (stop_gradient(s + time) < stop_gradient(plan.end(lane.part)))
     return ends, time
@@ -577,11 +622,12 @@ def _remaining_contacts(
 
 
 def _resting_bodies(
-    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult]
+    plan: Plan, lane: Lane, impacts: dict[int, ImpactResult], distances: dict[int, Scalar]
 ) -> tuple[dict[int, Flag], dict[int, Scalar]]:
-    """Return for each coordinate that was struck whether it comes to rest, and the time until then.
-    A body may be pressed on by another that comes to rest at the same instant. Therefore each is
-    tested while the others that rest so far are held, until none changes."""
+    """Return for each coordinate that was struck, or is nearly, whether it comes to rest, and the
+    time until then. `distances` are those from the stops. A body may be pressed on by another that
+    comes to rest at the same instant. Therefore each is tested while the others that rest so far
+    are held, until none changes."""
     s, state, contact = lane.s, lane.state, lane.contact
     assert contact is not None
     free = in_modes(plan.machine, lane.modes)
@@ -589,9 +635,8 @@ def _resting_bodies(
     closed = list(contact)
     for k, hit in impacts.items():
         sign, _ = plan.sign_and_gap(k, hit.contact)
-        speeds[k] = jnp.maximum(
-            -sign * rates(free.field, plan.machine.coordinates[k], s, state).v, 0.0
-        )
+        rate = -sign * rates(free.field, plan.machine.coordinates[k], s, state).v
+        speeds[k] = jnp.where(distances[k] > 0, jnp.abs(rate), jnp.maximum(rate, 0.0))
         stays = (hit.contact > 0) & (stop_gradient(hit.share) <= _CLOSED)
         closed[k] = jnp.where(stays, hit.contact, contact[k])
 
@@ -600,7 +645,9 @@ def _resting_bodies(
         new, times = list(contact), []
         for k, hit in impacts.items():
             free_k = hold_contacts(plan.machine, lane.modes, closed, but=k)
-            ends, time = _remaining_chatter(plan, free_k, k, hit, speeds[k], lane)
+            ends, time = _remaining_chatter(
+                plan, free_k, k, hit, speeds[k], lane, distance=distances[k]
+            )
             ends = (hit.contact > 0) & ends
             new[k] = jnp.where(ends, hit.contact, contact[k])
             times.append(jnp.where(ends, time, 0.0))
