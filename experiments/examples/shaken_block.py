@@ -35,6 +35,6 @@ axes = {"hertz": jnp.linspace(0.5, 6, 40), "peak": jnp.linspace(0.05, 1.6, 40)}
 means = lambda block, run: {x: jnp.nanmax(run.averages[x]) for x in ("rocks", "rises")}
 d = vi.scan(Block(), axes, measure=means, start=Block().at(y=0.5), settle=0, cycles=10)
 kind = (0 * d.rocks + (d.rocks > 1e-6) + (d.rises > 0.1 * d.rocks + 1e-6)).where(d.outcome < 0, 3)
-picture = kind.plot(x="hertz", levels=[-0.5, 0.5, 1.5, 2.5, 3.5], cmap="viridis", size=4)
+picture = kind.plot(x="hertz", levels=[-0.5, 0.5, 1.5, 2.5, 3.5], cmap="viridis", figsize=(8, 4))
 picture.colorbar.set_ticks(range(4), labels=["stands", "rocks", "hops", "overturns"])
 picture.figure.savefig("shaken_block.png")
