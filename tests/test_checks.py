@@ -29,6 +29,7 @@ def test_invalid_calls_raise_with_a_reason():
     assert found["wrong"] == {} and found["calls"] > 100
 
 
+@pytest.mark.slow
 def test_annotations_hold_in_every_verb():
     """Annotations are checked from the import of a module on, so this needs another process."""
     root = Path(__file__).parents[1]
