@@ -19,7 +19,7 @@ def number_field(name: str, default: float | None, allowed: Range = REAL, unit: 
 
 
 def stops_at(
-    gap: Scalar, restitution: Scalar, *, two_sided: bool = True, **others: Any
+    gap: Any, restitution: Any, *, two_sided: bool = True, **others: Any
 ) -> tuple[RigidStop, ...]:
     """Return equal stops at this distance from zero: on the right, and if two-sided on the left."""
     sides = ("right", "left") if two_sided else ("right",)

@@ -118,7 +118,7 @@ def eigenvalues(half: Any, determinant: Any) -> Any:
     return array.stack([half + root, half - root], axis=-1)
 
 
-def stability_of(multipliers: Complex[Array, "*batch n"]) -> STABILITY:
+def stability_of(multipliers: Complex[Array | np.ndarray, "*batch n"]) -> STABILITY:
     array = array_module(multipliers)
     place = array.argmax(abs(multipliers), axis=-1, keepdims=True)
     largest = array.take_along_axis(multipliers, place, axis=-1)[..., 0]

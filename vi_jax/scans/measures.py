@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int, Num
 
 from .._checks import count, require
 from .._types import Flag, Number, State
@@ -76,7 +76,7 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
 
 def least_period(
     sections: State,
-    exact: Float[Array, "rows cycles"],
+    exact: Num[Array, "rows cycles"],
     *,
     longest: int,
     tolerance: Number | None = None,
