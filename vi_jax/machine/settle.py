@@ -156,9 +156,9 @@ def solve_modes(matrix: Array, right: Array) -> Array:
     return jnp.sum(jnp.where(place[None, :] == rows[:, None], table[None, :, -1], 0.0), 1)
 
 
-def _scaled(x: Contacts) -> tuple[Contacts, Array]:
-    """Return the question with rows in units of their gain, and rates in units of the largest; and
-    that unit."""
+def _scaled(x: Contacts) -> tuple[Contacts, Array, Array]:
+    """Return the question with rows in units of their gain, and rates in units of the largest; the
+    units of the rows; and that of the rates."""
     n, t = x.closed.shape[0], x.friction.shape[0]
     own = jnp.sum(x.gains * np.eye(x.rates.shape[0]), 1)
     unit = 1 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
@@ -169,7 +169,7 @@ def _scaled(x: Contacts) -> tuple[Contacts, Array]:
         gains=x.gains * unit[:, None] * unit, rates=x.rates * unit / top,
         level=x.level / (unit[n + t :] * top),
     )  # fmt: skip
-    return scaled, top
+    return scaled, unit, top
 
 
 def _normals(x: Contacts, of: tuple[int, ...]) -> np.ndarray:
@@ -194,12 +194,10 @@ class _Decided(NamedTuple):
 def _decide(x: Contacts, of: tuple[int, ...]) -> _Decided:
     x = stop_gradient(x)
     n, t, all_t = x.closed.shape[0], len(of), x.slip.shape[0]
-    own = jnp.sum(x.gains * np.eye(n + all_t), 1)
-    unit = 1 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
     normal_of, dtype = _normals(x, of), x.rates.dtype
+    x, unit, top = _scaled(x)
     ratio = normal_of @ unit[:n] / unit[n:] if n else jnp.zeros((all_t,), dtype)
     friction = jnp.concatenate([x.friction, jnp.zeros((all_t - t,), dtype)]) * ratio
-    x, top = _scaled(x)
     coupling = normal_of * friction[:, None]
     touches = (normal_of @ jnp.where(x.closed, 1.0, 0.0))[:t] > 0
     touches = touches if x.touches is None else touches & x.touches
@@ -428,7 +426,6 @@ def _strike_one(x: Strike, of: tuple[int, ...]) -> Blow:
         return zeros.at[:n].set(here * pair[0]).at[n:].set(along * pair[1])
 
     inelastic, full = (in_rows(impulses(f * restitution, f * kept)) for f in (0.0, 1.0))
-    # Where a push along the slip closes the contact (Painlevé), only sticking is left.
     return _without_gain(x, inelastic, full, code)
 
 

@@ -332,9 +332,8 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     weak, retry = goes_on & (fastest <= _WEAK * most), sequence.retry > 0
     hits = goes_on & ~weak & (stop_gradient(closing) >= (1 - _EQUAL) * fastest)
     speed = jnp.where(hits, closing, 0.0)
-    rebounds = jnp.stack([
-        -stop.sign * stop.velocity_after(stop.sign * speed[i]) for i, stop in enumerate(stops)
-    ])  # fmt: skip
+    after_law = [stop.velocity_after(stop.sign * speed[i]) for i, stop in enumerate(stops)]
+    rebounds = jnp.stack([-stop.sign * V for stop, V in zip(stops, after_law, strict=True)])
     share = jnp.where(weak | retry, 0.0, rebounds / jnp.where(speed > 0, speed, 1.0))
     # In the limit the contacts that are still being struck come to rest.
     slow = (sequence.struck > 0) & (jnp.abs(stop_gradient(V[:n])) <= _STILL * fastest)
@@ -357,11 +356,7 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     new = instant.after(total) if any(x.modes is not None for x in stops) else None
     for i, stop in enumerate(stops):
         hit = hits[i] & acted
-        lane = lane.end_if(
-            hit,
-            gains_speed(stop, speed[i], stop.velocity_after(stop.sign * speed[i])),
-            "bad_impact",
-        )
+        lane = lane.end_if(hit, gains_speed(stop, speed[i], after_law[i]), "bad_impact")
         lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, i, speed[i])
         if stop.modes is not None:
             given = plan.machine, lane.s, instant.after(sequence.impulse), new, lane.modes
