@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scans import _basins
+from vi_jax.orbit.results import MotionSections
 from vi_jax.scans.measures import least_period
 
 from kicked import Ring, at, rotation_of
@@ -94,7 +94,7 @@ def test_periods_of_artificial_sections():
     judged = jax.jit(partial(least_period, longest=64))
 
     def period(sections, impacts=one, wander=0.0, **options):
-        return int(judged({"Y": sections}, impacts, wander=wander, **options))
+        return int(judged({"Y": sections}, impacts[None], wander=wander, **options))
 
     none, split = vi.REGIMES.unsettled, 1e-7 * (-1.0) ** n
     spiral = 3e-5 * 0.999**n * jnp.cos(2 * jnp.pi * n / 7)
@@ -131,8 +131,8 @@ def test_the_comparison_of_motions_scales_with_their_size(monkeypatch):
     """In any unit of length, motions with two frequencies are unsettled. Two wells are two motions,
     found with few comparisons."""
     lengths, options = [1.0, 1e-6, 1e-9, 1e6], {"settle": 60, "progress": False}
-    compared, shares, distance = [], [], _basins.distance
-    monkeypatch.setattr(_basins, "distance", lambda *a: compared.append(a) or distance(*a))
+    compared, shares, passes = [], [], MotionSections.passes
+    monkeypatch.setattr(MotionSections, "passes", lambda *a: compared.append(a) or passes(*a))
     data = vi.scan(
         Small(1.0, 0.0, 0.0), {"length": lengths}, measure=vi.Regime(longest=8), **options
     )
