@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
-from .declared import limited_in, stops_of, switches_of
+from .declared import friction_on, limited_in, stops_of, switches_of
+from .settle import Strike
 from .state import like
 
 # A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other
@@ -118,54 +120,51 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     return state
 
 
-class FrictionImpulse(NamedTuple):
-    """The state after an impact with friction, and its impulses."""
+class Impact(NamedTuple):
+    """The equations of an impact on some stops, in the state before it. Arrays have a number for
+    each stop, then for each friction on one of them."""
 
-    state: State
-    pushed: Scalar
-    """The amount of the stop's push; `dragged` is that of the push along the stop."""
-    dragged: Scalar
+    before: State
+    rows: list[Row]
+    outward: Array
+    """The sign of the velocity that opens a contact; 1 for a friction."""
+    strike: Strike
+    """Without restitution across the stops."""
+    of: tuple[int, ...]
+    """The stop of each friction, by its place among these stops."""
 
-
-def with_friction_impulse(
-    machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
-) -> FrictionImpulse:
-    """Return the result of an impact on stop `number` with Coulomb friction, from the states before
-    it and after one without friction, whose normal velocity is kept. The body sticks if the
-    required impulse is at most `level` times that of the stop: its velocity along the stop is
-    reversed and scaled by the tangential restitution. Otherwise it slips against `level` times the
-    stop's impulse."""
-    stop = stops_of(machine)[number]
-    body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
-    rows = [row_of(x, s, before) for x in (body, along)]
-    push, drag = (row.push for row in rows)
-    gains = push_gains((body, along), rows, before, (push, drag))
-    normal, slip = body.velocity(before), along.velocity(before)
-    wanted = body.velocity(after) - normal
-    active = jnp.ones((), bool)
-    sticking = forces(gains, (active, active), (wanted, -(1 + friction.restitution) * slip))
-    ratio = rows[0].mass / rows[1].mass
-    level, outward = friction.level * ratio, -float(stop.sign)
-    slips = jnp.abs(sticking[1]) > level * jnp.maximum(outward * sticking[0], 0.0)
-    # Friction acts against the slip after the impact, which the stop's push changes, too.
-    forward = _slipping(gains, wanted, -outward * level)
-    backward = _slipping(gains, wanted, outward * level)
-    slip_after = slip + gains[1][0] * forward[0] + forward[1]
-    is_forward = slip_after > -friction.restitution * slip
-    pushed, dragged = (
-        jnp.where(slips, jnp.where(is_forward, x, y), z)
-        for x, y, z in zip(forward, backward, sticking, strict=True)
-    )
-    place, speed = body.position(after), body.velocity(after)
-    state = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
-    return FrictionImpulse(state, pushed, dragged)
+    def after(self, impulse: Array) -> State:
+        """Return the state after these impulses."""
+        amounts = self.outward * impulse / jnp.stack([1.0 * x.mass for x in self.rows])
+        return added(self.before, list(amounts), [row.push for row in self.rows])
 
 
-def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the amounts of the stop's push and of the push along it, for the change `wanted` of
-    the normal velocity. The latter is `ratio` times as large."""
-    pushed = wanted / (1 + ratio * gains[0][1])
-    return pushed, ratio * pushed
+def impact_on(machine: Any, numbers: Sequence[int], s: Scalar, before: State) -> Impact:
+    """Return the equations of an impact on the stops of these numbers."""
+    stops = [stops_of(machine)[i] for i in numbers]
+    frictions = [friction_on(machine, i) for i in numbers]
+    of = tuple(place for place, x in enumerate(frictions) if x is not None)
+    on = [*(x.coordinate for x in stops), *(frictions[i].along for i in of)]
+    bodies = {k: machine.coordinates[k] for k in dict.fromkeys(on)}
+    rows = {k: row_of(body, s, before) for k, body in bodies.items()}
+    each = list(bodies.values()), list(rows.values())
+    found = push_gains(*each, before, [x.push for x in each[1]])
+    at, zero = [list(bodies).index(k) for k in on], jnp.zeros_like(s)
+    gains = jnp.stack([jnp.stack([found[i][j] for j in at]) for i in at])
+    signs = [*(-float(x.sign) for x in stops), *(1.0 for _ in of)]
+    outward = jnp.asarray(np.asarray(signs), s.dtype)
+    masses = jnp.stack([jnp.asarray(1.0 * rows[k].mass, s.dtype) for k in on])
+    velocity = outward * jnp.stack([bodies[k].velocity(before) for k in on])
+
+    def of_frictions(value_of: Callable[[Any], Any]) -> Array:
+        return jnp.stack([value_of(frictions[i]) + zero for i in of]) if of else velocity[:0]
+
+    strike = Strike(
+        outward[:, None] * gains * outward / masses, velocity,
+        of_frictions(lambda x: x.level), jnp.zeros((len(stops),), s.dtype),
+        of_frictions(lambda x: x.restitution), jnp.ones((len(stops),), bool),
+    )  # fmt: skip
+    return Impact(before, [rows[k] for k in on], outward, strike, of)
 
 
 class ContactConstraints(NamedTuple):

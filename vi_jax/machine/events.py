@@ -19,11 +19,20 @@ from jax.lax import stop_gradient
 
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
-from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
-from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
+from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
+from .declared import (
+    declared_modes,
+    friction_on,
+    has_own_modes,
+    others_of,
+    stops_of,
+    switches_of,
+    with_static,
+)
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import frictions_in, settled_modes
 from .numbers import Shown, size_of
+from .settle import strike
 from .state import changed
 
 
@@ -91,17 +100,17 @@ def after_one_event(
 
 
 def _with_friction(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
-    friction = friction_on(machine, number)
-    if friction is None:
+    """Return the state after an impact with friction, from that after one without it."""
+    if friction_on(machine, number) is None:
         return after
-    return with_friction_impulse(machine, number, friction, s, before, after).state
-
-
-def friction_on(machine: Machine, number: int) -> Any:
-    """Return the friction on stop number `number`, or `None`."""
-    if number >= len(stops_of(machine)):
-        return None
-    return next((x for x in switches_of(machine) if x.friction_stop == number), None)
+    body = machine.coordinates[stops_of(machine)[number].coordinate]
+    impact = impact_on(machine, [number], s, before)
+    speed = impact.strike.velocity[:1]
+    rebound = impact.outward[0] * body.velocity(after)
+    restitution = -rebound / jnp.where(speed == 0, 1.0, speed)
+    blow = strike(impact.strike._replace(restitution=restitution), impact.of)
+    new = impact.after(blow.impulse)
+    return body.placed(new, body.position(after), body.velocity(new))
 
 
 def has_contact_friction(machine: Machine) -> bool:

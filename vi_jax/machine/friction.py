@@ -37,7 +37,7 @@ from .contacts import (
     velocity_change,
 )
 from .coordinates import Row
-from .declared import hashable, limited_in, stops_of, switches_of
+from .declared import at_stop, hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
 from .settle import Contacts, Settled, settle
@@ -473,10 +473,7 @@ def _question(
     n = first - len(of)
     outward, closed = [one] * len(held.rows), []
     for row, k in enumerate(limited_in(machine) if contact else ()):
-        for number, stop in enumerate(stops_of(machine)):
-            if stop.coordinate == k:
-                on = contact[k] == 1.0 + number
-                outward[row] = jnp.where(on, -float(stop.sign), outward[row])
+        outward[row] = at_stop(machine, k, contact[k], lambda stop: -float(stop.sign), one)
         closed.append(contact[k] > 0)
     rates = [velocity_change(body, state, flow) for body in held.coordinates[:first]]
     rates += [switches[i].slip_rate(machine, s, state, flow) for i in held.dry]

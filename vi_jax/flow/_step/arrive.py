@@ -35,7 +35,13 @@ from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .event_derivatives import FlowToEvent
 from .guards import JUMPED, Crossing, furthest_landing
-from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
+from .impact import (
+    bring_to_rest,
+    is_compound,
+    on_its_stops,
+    resolve_impact,
+    resolve_impact_sequence,
+)
 from .roots import Rates, guard_rates, offset_to_turn, rates
 from .trial import AppliedStep, Release, Trial
 
@@ -493,7 +499,7 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
     if not stops_are_exact(plan.machine, state):
-        on_stops = on_its_stops(plan, lane._replace(state=state))
+        on_stops = on_its_stops(plan, lane.s, state, contact)
         if not is_affine(plan.machine.coordinates[k].position, state):
             on_stops = _just_inside(plan, k, contact[k], on_stops)
         state = select(contact[k] > 0, on_stops, state)
@@ -515,14 +521,6 @@ def _just_inside(plan: Plan, k: int, contact: Scalar, state: State) -> State:
     slack, slow = plan.rounding_bounds(k, state)
     sign, gap = plan.sign_and_gap(k, contact)
     return plan.machine.coordinates[k].placed(state, sign * (gap - slack), -sign * slow)
-
-
-def on_its_stops(plan: Plan, lane: Lane) -> State:
-    """Return the state with the bodies that rest, at least one, exactly on their stops. While they
-    are held, their positions are accurate to the method's error only."""
-    assert lane.contact is not None
-    codes = {k: lane.contact[k] for k in limited_in(plan.machine)}
-    return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in codes.items()}, codes)[0]
 
 
 def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:
