@@ -87,8 +87,9 @@ def random_blocks(rng, lanes):
 
 @pytest.mark.slow
 def test_random_blocks_on_a_shaken_floor():
-    """Blocks and rods with two corners. Half of the motions are not completed: corners that strike
-    alternately end as `chatter`."""
+    """Blocks and rods with two corners. If a corner strikes while the other one rests, the scheme
+    solves for both at once, while here the faster one is struck first. So a rod may slide on by
+    1e-4 m more, whatever the step of the scheme is."""
     lanes = 24
     given, q, v = random_blocks(np.random.default_rng(1), lanes)
     a, h, mu = given["half_width"], given["half_height"], np.repeat(given["mu"][:, None], 2, 1)
@@ -102,7 +103,7 @@ def test_random_blocks_on_a_shaken_floor():
     mass = np.stack([np.ones(lanes), np.ones(lanes), (a * a + h * h) / 3], 1)
     pull = lambda x, y: np.stack([x, y, 0 * x], 1)
     error, refined, good = compared(ShakenBlock, given, gaps, places, mass, mu, q, v, pull)
-    assert good.sum() >= 12
-    # The reference is not exact: halving its step changes it by up to 2e-4.
-    assert (refined[good] < 3e-4).all() and (error[good] < 1e-3).all()
-    assert np.median(error[good]) < 1e-4
+    assert good.all()
+    # The reference is not exact: halving its step changes it by up to 3e-4.
+    assert (refined < 3e-4).all() and (error < 1e-3).all()
+    assert np.median(error) < 1e-4

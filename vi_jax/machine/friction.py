@@ -343,7 +343,9 @@ class ContactFriction(Friction):
 
     def held(self, machine, s, state, contact, found):
         force, pressing, mass = found
-        return force, self.level * pressing, mass
+        # Without friction the force along the stop is rounding of that across it.
+        level = self.level + 64 * float(jnp.finfo(pressing.dtype).eps)
+        return force, level * pressing, mass
 
     def push_in(self, machine, s, state, mode):
         """Return `None`: the force is solved for together with the stop's (`constrained_rate`)."""

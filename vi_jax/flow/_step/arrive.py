@@ -285,7 +285,19 @@ def _update_after(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State
     when = jumps if has_velocity(plan.machine, lane.state) else happens
     if others_of(plan.machine) or when is happens:
         lane = lane._replace(direction=_directions_after_event(plan, lane, when, old))
+    if is_compound(plan.machine) and switches_of(plan.machine):
+        # In the new modes a body may go on that was about to turn.
+        lane = lane._replace(direction=_along_velocities(plan, lane, happens))
     return lane
+
+
+def _along_velocities(plan: Plan, lane: Lane, when: Flag) -> Scalars:
+    direction = list(lane.direction)
+    for k, body in enumerate(plan.machine.coordinates):
+        v, (_, slow) = body.velocity(lane.state), plan.rounding_bounds(k, lane.state)
+        v = stop_gradient(v)
+        direction[k] = jnp.where(when & (jnp.abs(v) > slow), jnp.sign(v), direction[k])
+    return tuple(direction)
 
 
 def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
