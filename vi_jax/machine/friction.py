@@ -86,6 +86,10 @@ class Friction(AbstractSwitch):
         """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
+    def largest_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+        """Return the size of the rate of the slip along a flow."""
+        return jnp.abs(self.slip_rate(machine, s, state, flow))
+
     def slip_sign(
         self, machine: Machine, s: Scalar, state: State, flow: State | None = None
     ) -> Scalar:
@@ -94,7 +98,7 @@ class Friction(AbstractSwitch):
         slip, sizes = self.speed_of_slip(machine, s, state), jtu.tree_map(jnp.abs, state)
         size = size_of(lambda x: self.speed_of_slip(machine, s, x), state, sizes)
         if flow is not None:
-            rate = jnp.abs(self.slip_rate(machine, s, state, flow))
+            rate = self.largest_rate(machine, s, state, flow)
             size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
         least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
@@ -324,6 +328,12 @@ class ContactFriction(Friction):
 
     def speed_of_slip(self, machine, s, state):
         return machine.coordinates[self.along].velocity(state)
+
+    def largest_rate(self, machine, s, state, flow):
+        # The stop's force resists the motion into it, and friction is in proportion to that.
+        body = machine.coordinates[stops_of(machine)[self.stop].coordinate]
+        pressing = jnp.abs(velocity_change(body, state, flow))
+        return super().largest_rate(machine, s, state, flow) + pressing
 
     def stopped(self, machine, s, state, mode, around):
         # The correction must not change the velocity at the stop.
