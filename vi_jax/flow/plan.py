@@ -15,6 +15,7 @@ from ..machine import (
     clock_of,
     events_of,
     is_autonomous,
+    is_compound,
     mode_number,
     others_of,
     own_modes,
@@ -250,7 +251,8 @@ class Plan(eqx.Module):
             impact_speed=zero if self.records_motion else None,
             impact_energy=zero if self.records_motion else None,
             rests=zero if self.records_motion and self.rests else None,
-            log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
+            reduced=zero if self.records_motion and is_compound(self.machine) else None,
+            log=jnp.full((5, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.records_motion and self.log else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )

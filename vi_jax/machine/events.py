@@ -24,6 +24,7 @@ from .declared import (
     declared_modes,
     friction_on,
     has_own_modes,
+    limited_in,
     others_of,
     stops_of,
     switches_of,
@@ -116,6 +117,11 @@ def _with_friction(machine: Machine, number: int, s: Scalar, before: State, afte
 def has_contact_friction(machine: Machine) -> bool:
     """Return whether there is friction on a stop."""
     return any(x.friction_stop is not None for x in switches_of(machine))
+
+
+def is_compound(machine: Machine) -> bool:
+    """Return whether several velocities change in an impact, across stops or along them; static."""
+    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
 
 
 def mode_number(machine: Machine, number: int) -> int:

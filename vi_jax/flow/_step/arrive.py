@@ -18,6 +18,7 @@ from ...machine import (
     guard_of,
     has_velocity,
     holds_anywhere,
+    is_compound,
     limited_in,
     others_of,
     outcomes_of,
@@ -37,7 +38,6 @@ from .event_derivatives import FlowToEvent
 from .guards import JUMPED, Crossing, furthest_landing
 from .impact import (
     bring_to_rest,
-    is_compound,
     on_its_stops,
     resolve_impact,
     resolve_impact_sequence,

@@ -18,7 +18,6 @@ from jaxtyping import Array
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import (
-    AbstractMachine,
     Impact,
     RigidStop,
     added,
@@ -61,11 +60,6 @@ class ImpactResult(NamedTuple):
     """The share of that speed that is left."""
 
 
-def is_compound(machine: AbstractMachine) -> bool:
-    """Return whether several velocities change in an impact, across stops or along them; static."""
-    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
-
-
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
     """Return whether an impact leaves faster than it came, or goes on into the stop; `None` if the
     law is one number, whose range is checked."""
@@ -77,16 +71,18 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 
 
 def log_impact(
-    plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar
-) -> Lane:
+    plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar,
+    impulse: Scalar, drag: Scalar | float = 0.0,
+) -> Lane:  # fmt: skip
     """Return the lane with an impact counted and logged, if a stop is `hit` by a step that is
-    taken, in the state `at_event`."""
+    taken, in the state `at_event`. Its impulse away from the stop is `impulse`, that along it
+    `drag`."""
     clock, record = plan.clock(lane.s, at_event), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
     if log is not None:
-        log = add_entry(log, hit, impacts, clock, approach, number)
+        log = add_entry(log, hit, impacts, clock, approach, number, impulse, drag)
     impacts = impacts + jnp.where(hit, 1.0, 0.0)
     lane = lane.update_record(impact_speed=speed, log=log, impacts=impacts)
     return lane.log_event(hit, clock, EventKind.impact, number, approach)
@@ -109,12 +105,14 @@ def resolve_impact(
         rebound = stop.velocity_after(stop.sign * approach, coefficient)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
-        lane = log_impact(plan, lane._replace(state=state), at_event, taken & met, number, approach)
+        impulse, lost = (1 + coefficient) * approach, stop.loss(approach, coefficient)
+        if not (isinstance(body.mass, float) and body.mass == 1.0):
+            mass = body.mass_at(lane.s, at_event)
+            impulse, lost = mass * impulse, mass * lost
+        arguments = at_event, taken & met, number, approach, impulse
+        lane = log_impact(plan, lane._replace(state=state), *arguments)
         energy = lane.record.impact_energy
         if energy is not None:
-            lost = stop.loss(approach, coefficient)
-            if not (isinstance(body.mass, float) and body.mass == 1.0):
-                lost = body.mass_at(lane.s, at_event) * lost
             lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, coefficient)
         result = new if len(landed) == 1 else select(met, new, result)
@@ -317,10 +315,16 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     for i, stop in enumerate(stops):
         hit = hits[i] & acted
         lane = lane.end_if(hit, gains_speed(stop, speed[i], after_law[i]), "bad_impact")
-        lane = log_impact(plan, lane, instant.impact.before, instant.taken & hit, i, speed[i])
+        drag = blow.impulse[n + instant.impact.of.index(i)] if i in instant.impact.of else 0.0
+        arguments = instant.taken & hit, i, speed[i], blow.impulse[i], drag
+        lane = log_impact(plan, lane, instant.impact.before, *arguments)
         if stop.modes is not None:
             given = plan.machine, lane.s, instant.impact.after(sequence.impulse), new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
+    reduced = lane.record.reduced
+    if reduced is not None:
+        count = jnp.sum(jnp.where(hits & acted & (blow.share < 1), 1.0, 0.0))
+        lane = lane.update_record(reduced=reduced + jnp.where(instant.taken, count, 0.0))
     return _Round(
         lane, after, total, lost,
         jnp.where(hits & acted, sequence.rounds + 1.0, sequence.struck),
