@@ -60,7 +60,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._quantities import average_names, check_units, quantity_names
-from .history import check_delays, with_history
+from .history import check_delays, with_memory
 from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,
@@ -157,7 +157,7 @@ def make_plan(
     require_session("start", start)
     if has_delays(machine):
         check_delays(machine, method)
-        machine, memory = with_history(machine, as_floats(machine, start), history)
+        machine, memory = with_memory(machine, as_floats(machine, start), history)
     method.check(machine)
     if samples and is_autonomous(machine, start):
         raise ValueError(

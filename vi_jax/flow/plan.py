@@ -102,8 +102,6 @@ class Plan(eqx.Module):
     history: Any = None
     """The history of a machine with delays at the start, and in `memory` its constants."""
     memory: Any = None
-    view: Any = None
-    """The part of the history that the current step reads."""
 
     sizes: State | None = None
     """The size of each number of the state (see `sizes.sizes_of`), at most 1."""

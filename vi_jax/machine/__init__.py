@@ -28,10 +28,10 @@ from .declared import (
     outcomes_of, overridden, section_in, stops_of, stops_on, switches_of, with_earlier_clock,
 )
 from .delay import (
-    FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
-    recorded_numbers, with_fixed_past, with_some_past, without_past,
+    Past, delays_valid, has_delays, history_before, lags_of, longest_delay, reading,
+    recorded_numbers, with_some_past, without_past,
 )
-from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
+from .delay_chain import delay_chain, history_in, machine_of_chain
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
     SliderCrank,

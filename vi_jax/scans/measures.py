@@ -379,10 +379,11 @@ class Regime(AbstractMeasure):
     `period`.
 
     The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
-    both halves agree to many digits (see `Rotation`) and the exponent is zero to the accuracy of
-    that time, chaotic with few digits and a positive exponent, else unsettled. Quasi-periodic
-    motions close to a resonance, or with more than two frequencies, and those of machines without
-    losses are mostly called unsettled.
+    both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
+    time, and no section is the first one again; chaotic with few digits and a positive exponent;
+    else unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
+    a resonance, or with more than two frequencies, and those of machines without losses are mostly
+    called unsettled.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
     later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass,
@@ -476,7 +477,10 @@ class Regime(AbstractMeasure):
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
         growth = seen.per_cycle * averaged
-        is_torus = seen.successful & (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
+        # A motion without losses that repeats after many cycles has digits and no growth, too.
+        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
+        is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
+        is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
         is_chaos = seen.successful & (seen.digits < _FEW) & (growth > _GROWS)
         torus = jnp.where(is_chaos, REGIMES.chaotic, torus)

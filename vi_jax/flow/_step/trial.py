@@ -167,7 +167,7 @@ def try_step(
     h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
     is_clear = None if clear is None else free & (h <= clear)
     s1, last, may_end = lane.s + h, jnp.zeros_like(free), free
-    if plan.view is not None:
+    if plan.memory is not None:
         h, s1, may_end = end_of_step(plan, lane, free, h, bound)
     if plan.s_counts_cycles(lane.state):
         # The margin avoids an extra step for a remainder of rounding.
@@ -212,7 +212,7 @@ def try_step(
     guard_error = guards_error(plan, inner, stages, h, longest)
     error = error if guard_error is None else jnp.maximum(error, guard_error)
     piece = None
-    if plan.view is not None:
+    if plan.memory is not None:
         piece = new_piece(plan, lane, smooth, s1, new, h)
         error = jnp.maximum(error, piece_error(plan, piece, h)) if method.adaptive else error
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
