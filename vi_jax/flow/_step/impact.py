@@ -7,7 +7,8 @@ The series is completed at once when its remaining time is short.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,17 +73,16 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 
 def log_impact(
     plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar,
-    impulse: Scalar, drag: Scalar | float = 0.0,
+    impulses: Callable[[], tuple[Any, Any]],
 ) -> Lane:  # fmt: skip
     """Return the lane with an impact counted and logged, if a stop is `hit` by a step that is
-    taken, in the state `at_event`. Its impulse away from the stop is `impulse`, that along it
-    `drag`."""
+    taken, in the state `at_event`. `impulses()` are those away from the stop and along it."""
     clock, record = plan.clock(lane.s, at_event), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
     if log is not None:
-        log = add_entry(log, hit, impacts, clock, approach, number, impulse, drag)
+        log = add_entry(log, hit, impacts, clock, approach, number, *impulses())
     impacts = impacts + jnp.where(hit, 1.0, 0.0)
     lane = lane.update_record(impact_speed=speed, log=log, impacts=impacts)
     return lane.log_event(hit, clock, EventKind.impact, number, approach)
@@ -105,14 +105,15 @@ def resolve_impact(
         rebound = stop.velocity_after(stop.sign * approach, coefficient)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
-        impulse, lost = (1 + coefficient) * approach, stop.loss(approach, coefficient)
-        if not (isinstance(body.mass, float) and body.mass == 1.0):
-            mass = body.mass_at(lane.s, at_event)
-            impulse, lost = mass * impulse, mass * lost
-        arguments = at_event, taken & met, number, approach, impulse
-        lane = log_impact(plan, lane._replace(state=state), *arguments)
+        is_one = isinstance(body.mass, float) and body.mass == 1.0
+        mass = 1.0 if is_one else body.mass_at(lane.s, at_event)
+        arguments = at_event, taken & met, number, approach
+        impulses = lambda e=coefficient, V=approach, m=mass: ((1 + e) * m * V, 0.0)
+        lane = log_impact(plan, lane._replace(state=state), *arguments, impulses)
         energy = lane.record.impact_energy
         if energy is not None:
+            lost = stop.loss(approach, coefficient)
+            lost = lost if is_one else mass * lost
             lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, coefficient)
         result = new if len(landed) == 1 else select(met, new, result)
@@ -315,9 +316,11 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     for i, stop in enumerate(stops):
         hit = hits[i] & acted
         lane = lane.end_if(hit, gains_speed(stop, speed[i], after_law[i]), "bad_impact")
-        drag = blow.impulse[n + instant.impact.of.index(i)] if i in instant.impact.of else 0.0
-        arguments = instant.taken & hit, i, speed[i], blow.impulse[i], drag
-        lane = log_impact(plan, lane, instant.impact.before, *arguments)
+        arguments = instant.impact.before, instant.taken & hit, i, speed[i]
+        row = n + instant.impact.of.index(i) if i in instant.impact.of else None
+        drag = 0.0 if row is None else blow.impulse[row]
+        impulses = lambda i=i, drag=drag: (blow.impulse[i], drag)
+        lane = log_impact(plan, lane, *arguments, impulses)
         if stop.modes is not None:
             given = plan.machine, lane.s, instant.impact.after(sequence.impulse), new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
