@@ -44,7 +44,9 @@ from .events import (
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )
-from .friction import ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes
+from .friction import (
+    ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
+)
 from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (

@@ -54,18 +54,20 @@ def section_number(machine: Machine) -> int:
 
 
 def guard_of(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> Scalar:
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
+    loads: Any = None,
+) -> Scalar:  # fmt: skip
     """Return the guard of an event, which rises through zero where the event happens."""
-    event, part, keywords = event_of(machine, number, modes, contact)
+    event, part, keywords = event_of(machine, number, modes, contact, loads)
     return event.guard(machine, s, state, *modes[part], **keywords)
 
 
 def sides_of(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> Scalars:
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
+    loads: Any = None,
+) -> Scalars:  # fmt: skip
     """Return smooth functions whose maximum is the guard of an event."""
-    event, part, keywords = event_of(machine, number, modes, contact)
+    event, part, keywords = event_of(machine, number, modes, contact, loads)
     return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[part], **keywords)))
 
 
@@ -135,15 +137,15 @@ def own_modes(machine: Machine, modes: Modes) -> Modes:
 
 
 def event_of(
-    machine: Machine, number: int, modes: Modes, contact: Scalars
+    machine: Machine, number: int, modes: Modes, contact: Scalars, loads: Any = None
 ) -> tuple[AbstractEvent, slice, dict[str, EventContext]]:
     """Return an event, the slice of the modes that its methods receive, and their keywords."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
     index = mode_number(machine, number)
-    keywords = {"around": EventContext(modes, index, contact)} if event.needs_all_modes else {}
-    return event, slice(index, index + 1), keywords
+    context = {"around": EventContext(modes, index, contact, loads)}
+    return event, slice(index, index + 1), context if event.needs_all_modes else {}
 
 
 def begin_modes(

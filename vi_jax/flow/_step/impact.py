@@ -478,13 +478,8 @@ def _without_rebounds(
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
     amounts = held.amounts(state, [-velocity for velocity in before])
-    new, pushed = added(state, amounts, held.pushes), list(amounts)
-    for row, (_, _, index, drag) in enumerate(
-        held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
-    ):
-        pushed[row] = pushed[row] + drag * amounts[index]
-    lost = zero
-    for body, amount, V in zip(bodies, pushed, before, strict=True):
+    new, lost = added(state, amounts, held.pushes), zero
+    for body, amount, V in zip(bodies, amounts, before, strict=True):
         lost = lost - body.mass_at(s, state) * amount * 0.5 * (V + body.velocity(new))
     return new, lost
 
