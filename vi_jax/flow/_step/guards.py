@@ -28,6 +28,7 @@ from ...machine import (
     guard_of,
     limited_in,
     section_number,
+    shared_loads,
     sides_of,
     size_of,
     stops_of,
@@ -137,12 +138,12 @@ def inner_guards(
         return found
 
     def guards(s: Scalar, state: State) -> dict[int, tuple[Scalar, ...]]:
-        found = {}
+        found, loads = {}, shared_loads(machine, s, state, *arguments)
         for number in checked:
             if number < len(stops_of(machine)):
                 found[number] = (_distance(machine, lane, number, state),)
             else:
-                found[number] = sides_of(machine, number, s, state, *arguments)
+                found[number] = sides_of(machine, number, s, state, *arguments, loads)
         return found
 
     has_states = stages[0].state is not None
@@ -399,10 +400,11 @@ def _other_events(
 
     def guards(s: Scalar, x: State) -> list[list[Scalar]]:
         """Return for each event its guard, or its sides; and the clock relative to its end."""
+        loads = shared_loads(machine, s, x, *arguments)
         values = [
-            sides_of(machine, i, s, x, *arguments)
+            sides_of(machine, i, s, x, *arguments, loads)
             if len(inner.events.get(i, ())) > 1
-            else [guard_of(machine, i, s, x, *arguments)]
+            else [guard_of(machine, i, s, x, *arguments, loads)]
             for i in numbers
         ]
         if (clock := clock_of(machine, x)) is not None:
