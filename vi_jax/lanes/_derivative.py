@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from itertools import islice, pairwise
+from itertools import compress, islice, pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad
 
-from ._program import DependentParts, LaneProgram, Widening, dependent_parts, rewritten, shape_of
+from ._program import DependentParts, LaneProgram, Part, Widening, dependent_parts, rewritten
 from .elementary import elementwise_primitive
 
 # Division with a derivative that divides once for all directions.
@@ -83,10 +83,13 @@ def forward(program: LaneProgram, varied: tuple[bool, ...]) -> Derived:
     both, rows = (*varied, *depend.carry), depend.rows
     wanted, groups = (*depend.carry, False, False, *rows), (n, 2, len(rows))
     before = program.tangents or (False,) * len(varied)
+    parts = (
+        _with_derivatives(program.begin, varied, wanted, groups),
+        _with_derivatives(program.step, both, wanted, groups, len(varied)),
+        _with_derivatives(program.end, both, depend.outs, (len(depend.outs),), len(varied)),
+    )
     derived = LaneProgram(
-        begin=_with_derivatives(program.begin, varied, wanted, groups),
-        step=_with_derivatives(program.step, both, wanted, groups, len(varied)),
-        end=_with_derivatives(program.end, both, depend.outs, (len(depend.outs),), len(varied)),
+        parts=parts,
         rows=program.rows,
         tangents=(*before, *(True for m in varied if m)),
         varied=varied,
@@ -125,12 +128,11 @@ def _with_derivatives(
     wanted: tuple[bool, ...],
     groups: tuple[int, ...],
     split: int | None = None,
-) -> ClosedJaxpr:
-    """Return a jaxpr of values and derivatives. Flags mark the arguments with a tangent and the
+) -> Part:
+    """Return a function of values and derivatives. Flags mark the arguments with a tangent and the
     results whose derivatives are `wanted`. Each of the `groups` of results is followed by its
     derivatives. The tangents of the first `split` arguments precede the other arguments (`None`:
     all)."""
-    function = jaxpr_as_fun(with_quotients(closed))
     ends = [0, len(varied) if split is None else split, len(varied)]
 
     def both(*args):
@@ -141,8 +143,12 @@ def _with_derivatives(
             primals += [next(remaining) for _ in varied[begin:end]]
             tangents += [next(remaining) for flag in varied[begin:end] if flag]
 
-        values, slopes = map(iter, values_and_slopes(function, varied, wanted, primals, tangents))
-        flags, out = iter(wanted), []
+        function = jaxpr_as_fun(with_quotients(closed))
+        values, slopes = values_and_slopes(function, varied, wanted, primals, tangents)
+        return grouped(values, slopes)
+
+    def grouped(values: Sequence[Any], slopes: Sequence[Any]) -> list[Any]:
+        (values, slopes, flags), out = map(iter, (values, slopes, wanted)), []
         for size in groups:
             out += islice(values, size)
             out += islice(slopes, sum(islice(flags, size)))
@@ -150,9 +156,10 @@ def _with_derivatives(
 
     shapes: list[Any] = []
     for begin, end in pairwise(ends):
-        part = [shape_of(a) for a in closed.in_avals[begin:end]]
+        part = closed.in_avals[begin:end]
         shapes += part + [s for s, m in zip(part, varied[begin:end], strict=True) if m]
-    return jax.make_jaxpr(both)(*shapes)
+    results = closed.out_avals
+    return Part(both, shapes, grouped(results, list(compress(results, wanted))))
 
 
 def values_and_slopes(
@@ -181,24 +188,44 @@ def widened(
     """Return the program with `number` values of its `batched` inputs in one lane, and flags of its
     parts with such a leading axis. Other parts are computed once, so that several directions of a
     derivative share one motion."""
-    depend = dependent_parts(program, batched, smooth=False)
+    depend = _parts_that_tangents_widen(program, batched)
+    depend = depend or dependent_parts(program, batched, smooth=False)
     return _widened(Widening(program, batched, number, depend)), depend
+
+
+def _parts_that_tangents_widen(
+    program: LaneProgram, batched: tuple[bool, ...]
+) -> DependentParts | None:
+    """Return flags of the derivatives in the parts of a program, if exactly the tangents of all its
+    varied inputs are batched; else `None`. No trace of the program is needed."""
+    base, varied = program.base, program.varied
+    if (
+        base is None
+        or not varied
+        or batched != (*(False for _ in base.in_avals), *filter(None, varied))
+    ):
+        return None
+    depend = dependent_parts(base, varied, smooth=True)
+    of = lambda flags: (*(False for _ in flags), *(True for flag in flags if flag))
+    return DependentParts(of(depend.carry), False, of(depend.rows), of(depend.outs))
 
 
 def _widened(widening: Widening) -> LaneProgram:
     program, batched, number, _ = widening
 
-    def over(name: str) -> ClosedJaxpr:
-        closed, (inputs, results) = getattr(program, name), widening.axes(name)
+    def over(name: str, part: Part) -> Part:
+        axes = inputs, results = widening.axes(name)
         shapes = [
-            jax.ShapeDtypeStruct((number, *v.shape) if wide else v.shape, v.dtype)
-            for v, wide in zip(closed.in_avals, inputs, strict=True)
+            [
+                jax.ShapeDtypeStruct((number, *v.shape) if wide else v.shape, v.dtype)
+                for v, wide in zip(avals, flags, strict=True)
+            ]
+            for avals, flags in zip((part.in_avals, part.out_avals), axes, strict=True)
         ]
-        function = jaxpr_as_fun(closed)
-        return jax.make_jaxpr(lambda *args: widening.over(function, args, inputs, results))(*shapes)
+        return Part(lambda *args: widening.over(part.function, args, inputs, results), *shapes)
 
     base = program.base
     if base is not None and any(batched[: len(base.in_avals)]):
         base = None
-    parts: dict[str, Any] = {name: over(name) for name in ("begin", "step", "end")}
-    return dataclasses.replace(program, **parts, varied=(), base=base, widening=widening)
+    parts = tuple(map(over, ("begin", "step", "end"), program.parts))
+    return dataclasses.replace(program, parts=parts, varied=(), base=base, widening=widening)

@@ -9,9 +9,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import eval_jaxpr
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from .elementary import horner
+
+
+class Part:
+    """One of a lane's functions as a jaxpr, traced when asked for. That of a derivative in one
+    direction is not needed if several are carried along."""
+
+    def __init__(self, function: Callable[..., Any], in_avals: Sequence, out_avals: Sequence):
+        self.function, self.in_avals, self.out_avals = function, [*in_avals], [*out_avals]
+
+    @classmethod
+    def of(cls, closed: ClosedJaxpr) -> "Part":
+        part = cls(jaxpr_as_fun(closed), closed.in_avals, closed.out_avals)
+        part.closed = closed
+        return part
+
+    @functools.cached_property
+    def closed(self) -> ClosedJaxpr:
+        return jax.make_jaxpr(self.function)(*map(shape_of, self.in_avals))
 
 
 class LaneProgram(eqx.Module):
@@ -22,9 +40,8 @@ class LaneProgram(eqx.Module):
     number of rows of a lane. Shapes are those of one lane, without batch axes.
     """
 
-    begin: ClosedJaxpr = eqx.field(static=True)
-    step: ClosedJaxpr = eqx.field(static=True)
-    end: ClosedJaxpr = eqx.field(static=True)
+    parts: tuple[Part, Part, Part] = eqx.field(static=True)
+    """`begin`, `step` and `end`."""
     rows: int = eqx.field(static=True)
 
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())
@@ -45,24 +62,36 @@ class LaneProgram(eqx.Module):
     __eq__ = object.__eq__
 
     @property
+    def begin(self) -> ClosedJaxpr:
+        return self.parts[0].closed
+
+    @property
+    def step(self) -> ClosedJaxpr:
+        return self.parts[1].closed
+
+    @property
+    def end(self) -> ClosedJaxpr:
+        return self.parts[2].closed
+
+    @property
     def jaxprs(self) -> tuple[ClosedJaxpr, ...]:
         return self.begin, self.step, self.end
 
     @property
     def in_avals(self) -> list[Any]:
-        return self.begin.in_avals
+        return self.parts[0].in_avals
 
     @property
     def carry_avals(self) -> list[Any]:
-        return self.step.in_avals[len(self.in_avals) :]
+        return self.parts[1].in_avals[len(self.in_avals) :]
 
     @property
     def out_avals(self) -> list[Any]:
-        return self.end.out_avals
+        return self.parts[2].out_avals
 
     @property
     def row_avals(self) -> list[Any]:
-        return self.begin.out_avals[len(self.carry_avals) + 2 :]
+        return self.parts[0].out_avals[len(self.carry_avals) + 2 :]
 
     @property
     def result_avals(self) -> list[Any]:

@@ -20,7 +20,7 @@ from jax.extend.core import ClosedJaxpr
 
 from . import _backward as _backward  # registers the reverse mode of `lanes_p`
 from ._primitive import lanes_p
-from ._program import LaneProgram, shape_of
+from ._program import LaneProgram, Part, shape_of
 from ._shared import Recent, set_within
 
 BACKENDS = ("auto", "xla")
@@ -230,7 +230,7 @@ def _traced(functions: Functions, treedef: Any, leaves: list[Any], rows: int) ->
     both = [*leaves, *map(shape_of, carried)]
     jaxprs = [begin, jax.make_jaxpr(stepped)(*both), jax.make_jaxpr(ended)(*both)]
     (begin, step, end), consts = _consts_as_inputs(jaxprs, n)
-    program = LaneProgram(begin=begin, step=step, end=end, rows=rows)
+    program = LaneProgram(parts=(Part.of(begin), Part.of(step), Part.of(end)), rows=rows)
     return Traced(program, consts, structures["out"], structures["row"])
 
 
