@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import vi_jax as vi
 
-from delayed import by_steps
+from delayed import by_steps, struck_by_steps
 
 
 class Linear(vi.AbstractMachine):
@@ -252,6 +252,54 @@ class Masses(vi.Mechanical):
 def test_machine_of_masses():
     run = vi.simulate(Masses(), cycles=5)
     np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=1e-9)
+
+
+class Rubbing(Fed):
+    """`Fed` with dry friction."""
+
+    level: float = 0.3
+    history_size = 301
+
+    @property
+    def contacts(self):
+        return super().contacts, vi.DryFriction(self.level, on="u", mass=1.0)
+
+
+def compare_with_steps(machine, cycles, kinds, modes):
+    """Compare the last state, and the instants of some kinds of events, which end these modes."""
+    names = ("omega", "gain", "delay", "gap", "restitution")
+    m = {name: getattr(machine, name) for name in names} | {"level": getattr(machine, "level", 0)}
+    run = vi.simulate(machine, cycles=cycles, event_log=40, method="reference")
+    end, events = struck_by_steps(m, cycles)
+    np.testing.assert_allclose([run.last.x, run.last.u], end, rtol=0, atol=1e-11)
+    log, length = run.event_log, 2 * np.pi / m["omega"]
+    instants = np.asarray(log.phase) + length * np.arange(cycles)[:, None]
+    found = instants[np.isin(np.asarray(log.kind), [vi.EVENTS.index(x) for x in kinds])]
+    wanted = [t for t, mode in events if mode in modes]
+    assert len(found) == len(wanted) > cycles - 2
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11)
+
+
+def test_impacts_and_friction():
+    machine = Rubbing(omega=0.5, delay=5.0, gap=0.4, restitution=0.6)
+    compare_with_steps(machine, 2, ("impact", "mode"), (-1, 0, 1))
+
+
+class Resting(Fed):
+    history_size = 501
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "machine",
+    [
+        Resting(omega=0.5, gap=0.2, restitution=0.0, delay=17.0),
+        Resting(omega=0.45, gain=0.2, gap=0.25, restitution=0.4, delay=7.0),
+        Resting(omega=0.4, gap=0.3, restitution=0.5),
+    ],
+)
+def test_rests(machine):
+    compare_with_steps(machine, 4, ("release",), (2,))
 
 
 class Kicked(Linear):

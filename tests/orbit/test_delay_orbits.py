@@ -1,5 +1,6 @@
 """Periodic motions of machines with delays, beside closed forms and values by collocation."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -81,11 +82,35 @@ def test_chain_of_nodes():
 
 
 @pytest.mark.slow
+def test_boundary_in_two_parameters():
+    orbit = vi.find_orbit(vi.delay_chain(Fed(gain=0.15, delay=3.06), 10))
+    branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.1, 0.3), progress=False)
+    curve = vi.boundary(
+        branch.special[0], parameter="delay", bounds=((0.2, 0.28), (3.0, 3.12)), progress=False
+    )
+    assert curve.kind == "neimark-sacker" and len(curve.parameter) > 20
+    gain, delay = (np.asarray(curve.parameters[name]) for name in ("gain", "delay"))
+    square = np.sqrt(np.maximum(gain**2 - 0.01 - 0.01 * gain, 0.0))
+    a = gain + np.array([-1, 1])[:, None] * square  # of g = (a² + 4ζ²(1 + a))/2a
+    print(a)
+
+
+@pytest.mark.slow
 def test_exponents():
+    """By the chain, beside the multipliers, and beside tangents through the whole history."""
     found = vi.lyapunov(Fed(delay=3.0), cycles=64, settle=64).exponents
     chain = vi.find_orbit(Fed(delay=3.0))
     largest = np.log(np.abs(chain.multipliers[0])) / float(chain.duration)
     np.testing.assert_allclose(found[0], largest, rtol=0, atol=2e-3)
+    found = vi.lyapunov(Struck(), cycles=256, settle=64).exponents[:2]
+    run = lambda x: vi.simulate(Struck(), vi.State(x=x, u=0.0), cycles=24).sections.x
+    moved = np.asarray(jax.jit(lambda x: jax.jvp(run, (x,), (1.0,))[1])(0.0))[12:]
+    # A pair μ: each tangent is 2 Re μ times the last minus |μ|² times the one before.
+    rows = np.stack([moved[1:-1], moved[:-2]], axis=1)
+    square = -np.linalg.lstsq(rows, moved[2:], rcond=None)[0][1]
+    np.testing.assert_allclose(square**0.5, 0.3903983, rtol=0, atol=1e-6)
+    print(np.log(square) / 2 / (2 * np.pi / 0.8), found)
+    np.testing.assert_allclose(found.sum(), np.log(square) / (2 * np.pi / 0.8), atol=2e-3)
 
 
 class Undelayed(vi.AbstractMachine):
