@@ -83,16 +83,19 @@ def test_chain_of_nodes():
 
 @pytest.mark.slow
 def test_boundary_in_two_parameters():
-    orbit = vi.find_orbit(vi.delay_chain(Fed(gain=0.15, delay=3.06), 10))
-    branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.1, 0.3), progress=False)
+    orbit = vi.find_orbit(vi.delay_chain(Fed(gain=0.2, delay=3.06), 10))
+    branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.18, 0.3), progress=False)
     curve = vi.boundary(
-        branch.special[0], parameter="delay", bounds=((0.2, 0.28), (3.0, 3.12)), progress=False
-    )
-    assert curve.kind == "neimark-sacker" and len(curve.parameter) > 20
-    gain, delay = (np.asarray(curve.parameters[name]) for name in ("gain", "delay"))
-    square = np.sqrt(np.maximum(gain**2 - 0.01 - 0.01 * gain, 0.0))
-    a = gain + np.array([-1, 1])[:, None] * square  # of g = (a² + 4ζ²(1 + a))/2a
-    print(a)
+        branch.special[0], parameter="delay", bounds=((0.2, 0.28), (3.0, 3.12)), step=0.2,
+        max_step=0.4, progress=False,
+    )  # fmt: skip
+    assert curve.kind == "neimark-sacker" and len(curve.parameter) > 4
+    gain, delay = np.asarray(curve.parameters).T
+    half = gain - 2 * 0.05**2
+    a = half + np.sqrt(half**2 - 4 * 0.05**2)  # by g = (a² + 4ζ²Ω²)/2a
+    omega = np.sqrt(1 + a)
+    exact = (np.arctan2(-2 * 0.05 * omega, 1 + gain - omega**2) + 2 * np.pi) / omega
+    np.testing.assert_allclose(delay, exact, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -103,13 +106,12 @@ def test_exponents():
     largest = np.log(np.abs(chain.multipliers[0])) / float(chain.duration)
     np.testing.assert_allclose(found[0], largest, rtol=0, atol=2e-3)
     found = vi.lyapunov(Struck(), cycles=256, settle=64).exponents[:2]
-    run = lambda x: vi.simulate(Struck(), vi.State(x=x, u=0.0), cycles=24).sections.x
-    moved = np.asarray(jax.jit(lambda x: jax.jvp(run, (x,), (1.0,))[1])(0.0))[12:]
+    run = lambda x: vi.simulate(Struck(), vi.State(x=x, u=0.0), cycles=32).sections.x
+    moved = np.asarray(jax.jit(lambda x: jax.jvp(run, (x,), (1.0,))[1])(0.0))[22:]
     # A pair μ: each tangent is 2 Re μ times the last minus |μ|² times the one before.
     rows = np.stack([moved[1:-1], moved[:-2]], axis=1)
     square = -np.linalg.lstsq(rows, moved[2:], rcond=None)[0][1]
-    np.testing.assert_allclose(square**0.5, 0.3903983, rtol=0, atol=1e-6)
-    print(np.log(square) / 2 / (2 * np.pi / 0.8), found)
+    np.testing.assert_allclose(square**0.5, 0.3904017, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.sum(), np.log(square) / (2 * np.pi / 0.8), atol=2e-3)
 
 
