@@ -1,5 +1,6 @@
 """Machines with delays beside exact values, and beside SciPy by the method of steps."""
 
+import importlib
 import math
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax import lanes
 
 from delayed import by_steps, struck_by_steps
 
@@ -343,6 +345,48 @@ def test_traced_delays_out_of_range_end_their_lanes():
     lane = lambda delay: vi.simulate(Fed(delay=delay), cycles=2).result.number
     found = jax.jit(jax.vmap(lane))(jnp.array([4.0, -1.0, 1e-3]))
     assert found.tolist() == [0, 1, 1]
+
+
+class Plain(vi.AbstractMachine):
+    cycle = 2 * np.pi / 0.8
+    contacts = vi.RigidStop(0.6, 0.7, on=("x", "u"))
+
+    def field(self, t, z):
+        return dict(x=z.u, u=jnp.cos(0.8 * t) - z.x - 0.1 * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Empty(Plain):
+    delays = property(lambda self: {})
+
+
+def program(machine):
+    """Return the equations of a simulation and its derivatives, those of all loops included."""
+    end = lambda x: vi.simulate(machine, vi.State(x=x, u=0.0), cycles=3).last.x
+    with lanes.backend("xla"):
+        return str(jax.make_jaxpr(lambda x: jax.jvp(end, (x,), (1.0,)))(0.1))
+
+
+def test_machines_without_delays_have_no_more_operations(monkeypatch):
+    programs = [program(machine) for machine in (Plain(), Empty(), Fed())]
+    sizes = [text.count(" = ") for text in programs]
+    assert sizes[0] == sizes[1] > 1000 and sizes[2] > 1.2 * sizes[0]
+
+    def fails(*args, **kwargs):
+        raise AssertionError("only for machines with delays")
+
+    # Without the functions of histories: every name that a step, a loop or a plan imports.
+    for name in ("arguments", "loop", "_step.hybrid", "_step.trial", "_step.arrive"):
+        module = importlib.import_module(f"vi_jax.flow.{name}")
+        for key, value in list(vars(module).items()):
+            if getattr(value, "__module__", None) == "vi_jax.flow.history":
+                monkeypatch.setattr(module, key, fails)
+    jax.clear_caches()
+    assert program(Plain()).count(" = ") == sizes[0]
+    with pytest.raises(AssertionError, match="only for machines with delays"):
+        program(Fed())
 
 
 class Renewed(Fed):
