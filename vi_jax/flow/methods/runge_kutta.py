@@ -336,7 +336,10 @@ class Adaptive(_RungeKutta):
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     def with_sizes(self, sizes):
-        return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
+        if self.atol is not None:
+            return self
+        # Not `replace`, whose checks refuse a number of steps that is traced.
+        return eqx.tree_at(lambda x: x.sizes, self, sizes, is_leaf=lambda x: x is None)
 
     @property
     def is_limited_by_decay(self):
