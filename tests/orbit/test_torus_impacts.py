@@ -196,10 +196,15 @@ def test_a_torus_from_a_neimark_sacker_point(family):
     )
     (point,) = (point for point in branch.special if point.kind == "neimark-sacker")
     assert point.parameter == pytest.approx(1.010619167160, abs=1e-11)
-    near, far = (point.switch(distance=distance) for distance in (0.03, 0.3))
-    assert near.successful and far.successful
-    # Amplitude² and rate of attraction grow in proportion to the distance from the point.
-    assert near.rotation == pytest.approx(0.152023165123, abs=1e-5)
+    close, near, far = (point.switch(distance=distance) for distance in (0.015, 0.03, 0.3))
+    assert close.successful and near.successful and far.successful
+    # Both change in proportion to the amplitude², which at the point is zero.
+    for of, wanted in (
+        (lambda torus: torus.rotation, 0.152023165123),
+        (lambda torus: float(torus.machine.omega), point.parameter),
+    ):
+        assert abs(of(near) - wanted) < 1e-4
+        assert (4 * of(close) - of(near)) / 3 == pytest.approx(wanted, abs=2e-8)
     omega = float(far.machine.omega)
     assert far.rotation == pytest.approx(family.at(omega).rotation, abs=1e-11)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
-from vi_jax.scans import _basins
+from vi_jax.orbit import MotionSections
 from vi_jax.scans.measures import least_period
 
 from kicked import Ring, at, rotation_of
@@ -32,10 +32,18 @@ def test_periodic_chaotic_and_unsettled_motions():
     period = dict(zip(zetas, np.asarray(data.period).tolist(), strict=True))
     assert period[0.9] == 2 and period[1.1] == 1
     assert period[0.7] == period[0.97] == vi.REGIMES.chaotic
-    # An undamped motion without impacts has two frequencies, and is not periodic.
-    free = vi.Scene.ideal(frequency_ratio=0.77, gap=None)
-    quiet = vi.scan(free, {"start.Y": [0.3]}, measure="regime", settle=10)
-    assert int(quiet.period[0]) == vi.REGIMES.unsettled
+
+
+@pytest.mark.slow
+def test_an_undamped_motion_has_two_frequencies():
+    """Its section turns by 1/ratio in each cycle: at 0.77 it repeats after 77 cycles."""
+    free, ratios = vi.Scene.ideal(frequency_ratio=0.77, gap=None), [0.77, 1 / np.sqrt(3)]
+    options = {"measure": ("regime", "rotation"), "settle": 10, "progress": False}
+    data = vi.scan(free, {"drive.frequency_ratio": ratios, "start.Y": [0.3]}, **options)
+    assert data.period.values.tolist() == [[vi.REGIMES.unsettled], [vi.REGIMES.quasiperiodic]]
+    np.testing.assert_allclose(data.rotation.values[:, 0], [23 / 77, 2 - np.sqrt(3)], atol=1e-9)
+    longer = vi.scan(free, {"start.Y": [0.3]}, **options | {"measure": vi.Regime(longest=80)})
+    assert longer.period.values.tolist() == [77]
 
 
 def test_chaotic_transients_differ_from_chaos():
@@ -94,7 +102,7 @@ def test_periods_of_artificial_sections():
     judged = jax.jit(partial(least_period, longest=64))
 
     def period(sections, impacts=one, wander=0.0, **options):
-        return int(judged({"Y": sections}, impacts, wander=wander, **options))
+        return int(judged({"Y": sections}, impacts[None], wander=wander, **options))
 
     none, split = vi.REGIMES.unsettled, 1e-7 * (-1.0) ** n
     spiral = 3e-5 * 0.999**n * jnp.cos(2 * jnp.pi * n / 7)
@@ -128,11 +136,12 @@ class Small(vi.AbstractMachine):
 
 @pytest.mark.slow
 def test_the_comparison_of_motions_scales_with_their_size(monkeypatch):
-    """In any unit of length, motions with two frequencies are unsettled. Two wells are two motions,
-    found with few comparisons."""
+    """In any unit of length, motions that repeat after 77 cycles are unsettled. Two wells are two
+    motions, found with few comparisons."""
     lengths, options = [1.0, 1e-6, 1e-9, 1e6], {"settle": 60, "progress": False}
-    compared, shares, distance = [], [], _basins.distance
-    monkeypatch.setattr(_basins, "distance", lambda *a: compared.append(a) or distance(*a))
+    compared, shares, passes = [], [], MotionSections.passes
+    counted = lambda *a, **options: compared.append(a) or passes(*a, **options)
+    monkeypatch.setattr(MotionSections, "passes", counted)
     data = vi.scan(
         Small(1.0, 0.0, 0.0), {"length": lengths}, measure=vi.Regime(longest=8), **options
     )

@@ -175,7 +175,7 @@ def make_plan(
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
     check_units(machine, start, averages + quantity_names(machine, start))
-    columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
+    columns = 12 + 5 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warn(

@@ -208,12 +208,13 @@ def lyapunov(
 
 
 def _observed_map(
-    machine: AbstractMachine, start: State, method: MethodLike, rests: bool | None
-) -> tuple[CycleMap, State]:
+    machine: AbstractMachine, start: State, method: MethodLike, rests: bool | None,
+    on_section: bool = False,
+) -> tuple[CycleMap, State]:  # fmt: skip
     """Return the map whose exponents are computed, and the start in its form."""
     machine = machine_of(machine)
     start = machine.start() if start is None else start
-    if is_autonomous(machine, without_modes(start)):
+    if not on_section and is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(
                 "Argument `machine` must not have both a section and a `renewed`, as a "
@@ -236,6 +237,8 @@ class Growth(NamedTuple):
     per_cycle: Scalar
     digits: Scalar
     """See `agreement`."""
+    nearest: Scalar
+    """The least distance of a later section from the first, relative to the spread of all."""
     successful: Array
 
 
@@ -244,8 +247,9 @@ def observe_growth(
     rests: bool | None,
 ) -> Growth:  # fmt: skip
     """Compute the greatest exponent as `lyapunov` does, over a number of cycles that may be traced,
-    a multiple of 4. Sums replace lists of sections, so one program serves any number."""
-    the_map, start = _observed_map(machine, start, method, rests)
+    a multiple of 4; on an autonomous machine's own section, without the 0 along the motion. Sums
+    replace lists of sections, so one program serves any number."""
+    the_map, start = _observed_map(machine, start, method, rests, on_section=True)
     angles = angles_in(the_map.machine, without_modes(start))
     window, half = 2, jnp.asarray(cycles // 2, float)
     observe = _observer(the_map, start, window, rows=True)
@@ -257,32 +261,35 @@ def observe_growth(
         return jnp.where(inside, jnp.exp(-1 / (safe * (1 - safe))), 0.0)
 
     def step(i, state):
-        carry, (rate, time, duration), (total, squares, first, second) = state
+        carry, (rate, time, duration), (total, squares, first, second), near = state
         carry, (rates, durations, _, rows) = observe(carry, None)
         place = window * i + 0.5 + jnp.arange(window)
         weight = bump(place / (2 * half))
         lost = jnp.any(rates == -jnp.inf)  # where a weight underflows, 0 · ∞ is NaN
         rate = jnp.where(lost, -jnp.inf, rate + weight @ jnp.where(lost, 0.0, rates.ravel()))
-        seen = without_angles(rows, angles)
+        seen = without_angles(rows / sizes, angles)
         values = jnp.concatenate([seen, seen**2], axis=1)
         parts = (bump(place / half) @ values, bump(place / half - 1) @ values)
         sums = (total + values.sum(0), squares + (values**2).sum(0))
         sums = (*sums, first + parts[0], second + parts[1])
-        return carry, (rate, time + weight @ durations, duration + durations.sum()), sums
+        near = jnp.minimum(near, jnp.min(jnp.linalg.norm(seen - origin, axis=1)))
+        return carry, (rate, time + weight @ durations, duration + durations.sum()), sums, near
 
-    row = raveled(without_modes(start))[0]
-    zeros = jnp.zeros(2 * without_angles(row[None], angles).size, row.dtype)
-    zero = jnp.zeros((), row.dtype)
-    state = (carry, (zero, zero, zero), (zeros, zeros, zeros, zeros))
-    carry, (rate, time, duration), sums = jax.lax.fori_loop(0, half.astype(int), step, state)
-    total, squares, first, second = sums
+    sizes = row_sizes(the_map.machine, start)  # those of angles are 1
+    origin = without_angles((carry[0][0] / sizes)[None], angles)
+    zeros = jnp.zeros(2 * origin.size, origin.dtype)
+    zero = jnp.zeros((), origin.dtype)
+    state = (carry, (zero, zero, zero), (zeros, zeros, zeros, zeros), zero + jnp.inf)
+    found = jax.lax.fori_loop(0, half.astype(int), step, state)
+    carry, (rate, time, duration), (total, squares, first, second), near = found
     mean = total / (2 * half)
     spread = jnp.sqrt(jnp.maximum(squares / (2 * half) - mean**2, 0.0))
     unit = bump((jnp.arange(_NODES) + 0.5) / _NODES).mean() * half
     digits = digits_of((first - second) / unit, spread, mean)
+    near = near / jnp.linalg.norm(spread[: origin.size])
     good = carry[-1] == RESULTS.successful
     exponent = jnp.where(good, rate / time, jnp.nan)
-    return Growth(exponent, exponent * duration / (2 * half), digits, good)
+    return Growth(exponent, exponent * duration / (2 * half), digits, near, good)
 
 
 @compiled

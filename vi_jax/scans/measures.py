@@ -24,7 +24,6 @@ from ..machine import (
     components,
     frequency_ratio,
     in_rows,
-    is_autonomous,
     nearest_images,
     without_modes,
 )
@@ -155,6 +154,11 @@ class AbstractMeasure(eqx.Module):
     @property
     def instants(self) -> int:
         """The number of samples in a cycle that it needs (`Run.samples`), or 0."""
+        return 0
+
+    @property
+    def listed(self) -> int:
+        """The number of impacts in a cycle that it needs one by one (`Run.impact_log`), or 0."""
         return 0
 
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
@@ -374,10 +378,11 @@ class Regime(AbstractMeasure):
     `period`.
 
     The others are observed for another `averaged` cycles. They are quasi-periodic if averages over
-    both halves agree to many digits (see `Rotation`) and the exponent is zero to the accuracy of
-    that time, chaotic with few digits and a positive exponent, else unsettled. Quasi-periodic
-    motions close to a resonance, or with more than two frequencies, and those of machines without
-    losses are mostly called unsettled.
+    both halves agree to many digits (see `Rotation`), the exponent is zero to the accuracy of that
+    time, and no section is the first one again; chaotic with few digits and a positive exponent;
+    else unsettled, such as a motion with a period above `longest`. Quasi-periodic motions close to
+    a resonance, or with more than two frequencies, and those of machines without losses are mostly
+    called unsettled.
 
     A chaotic transient looks like chaos while it lasts, so a motion called chaotic may still settle
     later. A longer `lasting` makes this rarer and chaotic lanes costlier; 0 omits the second pass,
@@ -462,16 +467,17 @@ class Regime(AbstractMeasure):
         it is quasi-periodic."""
         before = jnp.asarray(found["period"])
         is_last, again = self._is_last(pass_number), jnp.asarray(pass_number) > 0
-        # The exponent of an autonomous machine is 0 on any motion that does not rest.
-        averaged = 0 if is_autonomous(machine, without_modes(state)) else self.averaged
-        observed = jnp.where(is_last, averaged // 4 * 4, self.observed)
+        observed = jnp.where(is_last, self.averaged // 4 * 4, self.observed)
         settle = jnp.where(again & ~is_last, self.observed + self.lasting, 0)
         seen = observe_growth(machine, state, observed, settle=settle, method=method, rests=rests)
         # A lane that cannot be continued is unchanged.
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
-        growth = seen.per_cycle * averaged
-        is_torus = seen.successful & (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
+        growth = seen.per_cycle * self.averaged
+        # A motion without losses that repeats after many cycles has digits and no growth, too.
+        moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
+        is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
+        is_torus = seen.successful & is_neutral & moves_on
         torus = jnp.where(is_torus, REGIMES.quasiperiodic, before)
         is_chaos = seen.successful & (seen.digits < _FEW) & (growth > _GROWS)
         torus = jnp.where(is_chaos, REGIMES.chaotic, torus)
@@ -480,8 +486,8 @@ class Regime(AbstractMeasure):
 
 # Results of a run for each cycle, not for an instant.
 COLUMNS = (
-    "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "duration",
-    "frequency_ratio",
+    "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "reduced",
+    "duration", "frequency_ratio",
 )  # fmt: skip
 
 

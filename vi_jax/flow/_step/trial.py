@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import is_alive, stops_of, switches_of
+from ...machine import at_stop, is_alive, stops_of, switches_of
 from ..history import end_of_step, new_piece, piece_error
 from ..lane import FREE, Lane, any_of, to_event, to_release, to_turn_of, total
 from ..methods import Foreseen, stages_to_step_to
@@ -290,7 +290,7 @@ def _path(
         # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
         rests = lane.contact[k] > 0
-        place = plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x)
+        place = at_stop(plan.machine, k, lane.contact[k], lambda stop: stop.place, begin.x)
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)
