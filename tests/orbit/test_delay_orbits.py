@@ -128,3 +128,30 @@ class Undelayed(vi.AbstractMachine):
 def test_machines_without_delays_are_refused():
     with pytest.raises(ValueError, match="must have `delays`"):
         vi.delay_chain(Undelayed())
+
+
+class Cutting(vi.AbstractMachine):
+    """A tool with dry friction, whose `recorded` has a mode."""
+
+    cycle = 8.0
+    delays = property(lambda self: dict(turn=8.0))
+    before = vi.State(surface=0.0)
+    contacts = vi.DryFriction(0.05, on="u", mass=1.0)
+    events = vi.Switch(lambda m, t, z, past: 1 + past.turn.surface - z.x)
+
+    def recorded(self, t, z, past, cuts):
+        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + 1))
+
+    def field(self, t, z, past, cuts):
+        force = jnp.where(cuts > 0, 0.3 * (1 + past.turn.surface - z.x), 0.0)
+        return dict(x=z.u, u=force - z.x - 0.06 * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+@pytest.mark.slow
+def test_chain_with_friction_and_a_switch():
+    whole = vi.simulate(Cutting(), cycles=3, method="reference").last
+    chain = vi.simulate(vi.delay_chain(Cutting(), 16, elements=2), cycles=3).last
+    np.testing.assert_allclose([chain.x, chain.u], [whole.x, whole.u], rtol=0, atol=2e-6)
