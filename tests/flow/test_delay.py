@@ -399,6 +399,10 @@ class Blind(Linear):
         return dict(x=-z.x)
 
 
+class WithoutPast(Turning):
+    events = vi.Switch(lambda m, t, z: -z.x)
+
+
 class NoBefore(Turning):
     before = None
 
@@ -417,3 +421,7 @@ def test_refusals_name_what_is_wrong():
     ):
         with pytest.raises(ValueError, match=words):
             vi.simulate(machine, **options)
+    with pytest.raises(TypeError, match="must take the machine, `s`, the state, the past"):
+        vi.simulate(WithoutPast())
+    with pytest.raises(TypeError, match=r"needs the chain as its machine, .* `orbit.machine`"):
+        vi.simulate(Fed(), vi.delay_chain(Fed()).start())
