@@ -12,11 +12,14 @@ from scipy.integrate import solve_ivp
 def by_steps(
     rate: Callable[..., Any], start: Sequence[float], before: Callable[[float], Any],
     delays: Sequence[float], end: float, *, guard: Callable[..., float] | None = None,
-    jump: Callable[..., Any] | None = None, levels: int = 7,
+    jump: Callable[..., Any] | None = None, levels: int = 7, mode: Any = None,
+    quiet: Callable[..., float] = lambda y: 0.02,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the state at `end`, and the instants of events. `rate(t, y, pasts)` and
     `guard(t, y, pasts)` receive the state one delay ago, for each delay; `jump(y, pasts)` is the
-    state after an event, where the guard rises through zero."""
+    state after an event, where the guard rises through zero. With a `mode`, at first this one, they
+    receive it last, `jump(t, y, pasts, mode)` the time, too, and it returns state and mode. No
+    event follows another within the time `quiet(y)`."""
     begins, pieces, events = [0.0], [], []
 
     def past(t: float, side: float) -> list[Any]:
@@ -28,7 +31,7 @@ def by_steps(
             found.append(before(place) if old else pieces[min(number, len(pieces) - 1)](place))
         return found
 
-    waiting = [(end, levels)]
+    waiting, modes = [(end, levels)], () if mode is None else (mode,)
 
     def wait_for_images(t: float, level: int) -> None:
         if level < levels:
@@ -41,19 +44,19 @@ def by_steps(
         while waiting[0][0] <= t + 1e-11:
             wait_for_images(*heapq.heappop(waiting))
         stop, begin = min(waiting[0][0], t + min(delays)), t
-        armed = armed or (guard is not None and guard(t, y, past(t, 1e-11)) < -1e-9)
-        stop = stop if armed else min(stop, t + 0.02)
+        armed = armed or (guard is not None and guard(t, y, past(t, 1e-11), *modes) < -1e-12)
+        stop = stop if armed else min(stop, t + quiet(y))
 
         def side(s: float, begin: float = begin, stop: float = stop) -> float:
             return 1e-11 if s < 0.5 * (begin + stop) else -1e-11
 
         meets = None
         if guard is not None and armed:
-            meets = lambda s, y, side=side: guard(s, y, past(s, side(s)))
+            meets = lambda s, y, side=side, m=modes: guard(s, y, past(s, side(s)), *m)
             meets.terminal, meets.direction = True, 1
         found = solve_ivp(
-            lambda s, y, side=side: rate(s, y, past(s, side(s))), (t, stop), y, method="DOP853",
-            rtol=1e-12, atol=1e-14, max_step=0.1, events=meets, dense_output=True,
+            lambda s, y, side=side, m=modes: rate(s, y, past(s, side(s)), *m), (t, stop), y,
+            method="DOP853", rtol=1e-12, atol=1e-14, max_step=0.1, events=meets, dense_output=True,
         )  # fmt: skip
         begins[len(pieces) :] = [t]
         pieces.append(found.sol)
@@ -61,6 +64,49 @@ def by_steps(
         if found.status == 1:
             events.append(t)
             armed = False  # until the guard has been negative
-            y = np.asarray(jump(y, past(t, -1e-11)))
+            if modes:
+                y, *modes = jump(t, y, past(t, -1e-11), *modes)
+            else:
+                y = jump(y, past(t, -1e-11))
+            y = np.asarray(y)
             wait_for_images(t, 0)
     return y, np.asarray(events)
+
+
+def struck_by_steps(m: dict[str, float], cycles: int) -> tuple[np.ndarray, list[tuple[float, int]]]:
+    """Return the last state of `Fed` with dry friction `level`, from the origin, and its events:
+    the instant, and the mode that ends there. Modes are the direction of sliding, 0 in which
+    friction holds the body, and 2 in which it rests on the stop."""
+    level, gap, events = m["level"], m["gap"], []
+
+    def force(t, y, past):
+        pull = m["gain"] * (past[0][0] - y[0])
+        return np.cos(m["omega"] * t) - y[0] - 0.1 * y[1] + pull
+
+    def rate(t, y, past, mode):
+        return [0, 0] if mode in (0, 2) else [y[1], force(t, y, past) - level * mode]
+
+    def guard(t, y, past, mode):
+        if mode in (0, 2):
+            pulls = force(t, y, past)
+            return (-pulls if mode else abs(pulls)) - level
+        return max(y[0] - gap, -mode * y[1]) if level or mode > 0 else y[0] - gap
+
+    def jump(t, y, past, mode):
+        events.append((t, mode))
+        pulls, x = force(t, y, past), y[0]
+        if mode == 2:
+            return [x, 0.0], -1
+        if not level or (x > gap - 1e-9 and y[1] > 1e-12):
+            speed = m["restitution"] * y[1]
+            if speed > 3e-5:  # the rest of a chatter hardly moves the body
+                return [gap, -speed], -1
+            return [gap, 0.0], 2 if pulls > 0 else -1
+        return [x, 0.0], 0 if mode and abs(pulls) <= level else int(np.sign(pulls))
+
+    end, _ = by_steps(
+        rate, [0.0, 0.0], lambda t: [0.0, 0.0], [m["delay"]], cycles * 2 * np.pi / m["omega"],
+        guard=guard, jump=jump, mode=1 if level else -1,
+        quiet=lambda y: min(0.02, 0.2 * abs(y[1]) or 0.02),
+    )  # fmt: skip
+    return end, events

@@ -12,9 +12,9 @@ from differences import some
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 STUDIES = sorted([*FOLDER.glob("studies/*.py"), *FOLDER.glob("benchmarks/*.py")])
-WITHOUT_FIGURE = {"gpu", "first_calls"}
-# These need the extra `bench`.
-RUN_ELSEWHERE = {"peers", "chains"}
+WITHOUT_FIGURE = {"gpu", "first_calls", "delays"}
+# These need the extra `bench`, or JiTCDDE.
+RUN_ELSEWHERE = {"peers", "chains", "delays"}
 # These run with the slow tests, the others before a release; Pyright checks their calls.
 # `test_headlines.py` tests the headline numbers.
 SLOW = {"basins_map"}

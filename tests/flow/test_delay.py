@@ -1,5 +1,6 @@
 """Machines with delays beside exact values, and beside SciPy by the method of steps."""
 
+import importlib
 import math
 
 import jax
@@ -7,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax import lanes
 
-from delayed import by_steps
+from delayed import by_steps, struck_by_steps
 
 
 class Linear(vi.AbstractMachine):
@@ -254,6 +256,54 @@ def test_machine_of_masses():
     np.testing.assert_allclose(run.last.x, -0.3721662410390, rtol=0, atol=1e-9)
 
 
+class Rubbing(Fed):
+    """`Fed` with dry friction."""
+
+    level: float = 0.3
+    history_size = 301
+
+    @property
+    def contacts(self):
+        return super().contacts, vi.DryFriction(self.level, on="u", mass=1.0)
+
+
+def compare_with_steps(machine, cycles, kinds, modes):
+    """Compare the last state, and the instants of some kinds of events, which end these modes."""
+    names = ("omega", "gain", "delay", "gap", "restitution")
+    m = {name: getattr(machine, name) for name in names} | {"level": getattr(machine, "level", 0)}
+    run = vi.simulate(machine, cycles=cycles, event_log=40, method="reference")
+    end, events = struck_by_steps(m, cycles)
+    np.testing.assert_allclose([run.last.x, run.last.u], end, rtol=0, atol=1e-11)
+    log, length = run.event_log, 2 * np.pi / m["omega"]
+    instants = np.asarray(log.phase) + length * np.arange(cycles)[:, None]
+    found = instants[np.isin(np.asarray(log.kind), [vi.EVENTS.index(x) for x in kinds])]
+    wanted = [t for t, mode in events if mode in modes]
+    assert len(found) == len(wanted) > cycles - 2
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11)
+
+
+def test_impacts_and_friction():
+    machine = Rubbing(omega=0.5, delay=5.0, gap=0.4, restitution=0.6)
+    compare_with_steps(machine, 2, ("impact", "mode"), (-1, 0, 1))
+
+
+class Resting(Fed):
+    history_size = 501
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "machine",
+    [
+        Resting(omega=0.5, gap=0.2, restitution=0.0, delay=17.0),
+        Resting(omega=0.45, gain=0.2, gap=0.25, restitution=0.4, delay=7.0),
+        Resting(omega=0.4, gap=0.3, restitution=0.5),
+    ],
+)
+def test_rests(machine):
+    compare_with_steps(machine, 4, ("release",), (2,))
+
+
 class Kicked(Linear):
     """A reset whose guard and jump read the past."""
 
@@ -297,6 +347,48 @@ def test_traced_delays_out_of_range_end_their_lanes():
     assert found.tolist() == [0, 1, 1]
 
 
+class Plain(vi.AbstractMachine):
+    cycle = 2 * np.pi / 0.8
+    contacts = vi.RigidStop(0.6, 0.7, on=("x", "u"))
+
+    def field(self, t, z):
+        return dict(x=z.u, u=jnp.cos(0.8 * t) - z.x - 0.1 * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+class Empty(Plain):
+    delays = property(lambda self: {})
+
+
+def program(machine):
+    """Return the equations of a simulation and its derivatives, those of all loops included."""
+    end = lambda x: vi.simulate(machine, vi.State(x=x, u=0.0), cycles=3).last.x
+    with lanes.backend("xla"):
+        return str(jax.make_jaxpr(lambda x: jax.jvp(end, (x,), (1.0,)))(0.1))
+
+
+def test_machines_without_delays_have_no_more_operations(monkeypatch):
+    programs = [program(machine) for machine in (Plain(), Empty(), Fed())]
+    sizes = [text.count(" = ") for text in programs]
+    assert sizes[0] == sizes[1] > 1000 and sizes[2] > 1.2 * sizes[0]
+
+    def fails(*args, **kwargs):
+        raise AssertionError("only for machines with delays")
+
+    # Without the functions of histories: every name that a step, a loop or a plan imports.
+    for name in ("arguments", "loop", "_step.hybrid", "_step.trial", "_step.arrive"):
+        module = importlib.import_module(f"vi_jax.flow.{name}")
+        for key, value in list(vars(module).items()):
+            if getattr(value, "__module__", None) == "vi_jax.flow.history":
+                monkeypatch.setattr(module, key, fails)
+    jax.clear_caches()
+    assert program(Plain()).count(" = ") == sizes[0]
+    with pytest.raises(AssertionError, match="only for machines with delays"):
+        program(Fed())
+
+
 class Renewed(Fed):
     def renewed(self, state):
         return state.replace(x=0.0)
@@ -305,6 +397,10 @@ class Renewed(Fed):
 class Blind(Linear):
     def field(self, t, z, past):
         return dict(x=-z.x)
+
+
+class WithoutPast(Turning):
+    events = vi.Switch(lambda m, t, z: -z.x)
 
 
 class NoBefore(Turning):
@@ -325,3 +421,7 @@ def test_refusals_name_what_is_wrong():
     ):
         with pytest.raises(ValueError, match=words):
             vi.simulate(machine, **options)
+    with pytest.raises(TypeError, match="must take the machine, `s`, the state, the past"):
+        vi.simulate(WithoutPast())
+    with pytest.raises(TypeError, match=r"needs the chain as its machine, .* `orbit.machine`"):
+        vi.simulate(Fed(), vi.delay_chain(Fed()).start())

@@ -1,5 +1,6 @@
 """Periodic motions of machines with delays, beside closed forms and values by collocation."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -81,11 +82,37 @@ def test_chain_of_nodes():
 
 
 @pytest.mark.slow
+def test_boundary_in_two_parameters():
+    orbit = vi.find_orbit(vi.delay_chain(Fed(gain=0.2, delay=3.06), 10))
+    branch = vi.continue_orbit(orbit, parameter="gain", bounds=(0.18, 0.3), progress=False)
+    curve = vi.boundary(
+        branch.special[0], parameter="delay", bounds=((0.2, 0.28), (3.0, 3.12)), step=0.2,
+        max_step=0.4, progress=False,
+    )  # fmt: skip
+    assert curve.kind == "neimark-sacker" and len(curve.parameter) > 4
+    gain, delay = np.asarray(curve.parameters).T
+    half = gain - 2 * 0.05**2
+    a = half + np.sqrt(half**2 - 4 * 0.05**2)  # by g = (a² + 4ζ²Ω²)/2a
+    omega = np.sqrt(1 + a)
+    exact = (np.arctan2(-2 * 0.05 * omega, 1 + gain - omega**2) + 2 * np.pi) / omega
+    np.testing.assert_allclose(delay, exact, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
 def test_exponents():
+    """By the chain, beside the multipliers, and beside tangents through the whole history."""
     found = vi.lyapunov(Fed(delay=3.0), cycles=64, settle=64).exponents
     chain = vi.find_orbit(Fed(delay=3.0))
     largest = np.log(np.abs(chain.multipliers[0])) / float(chain.duration)
     np.testing.assert_allclose(found[0], largest, rtol=0, atol=2e-3)
+    found = vi.lyapunov(Struck(), cycles=256, settle=64).exponents[:2]
+    run = lambda x: vi.simulate(Struck(), vi.State(x=x, u=0.0), cycles=32).sections.x
+    moved = np.asarray(jax.jit(lambda x: jax.jvp(run, (x,), (1.0,))[1])(0.0))[22:]
+    # A pair μ: each tangent is 2 Re μ times the last minus |μ|² times the one before.
+    rows = np.stack([moved[1:-1], moved[:-2]], axis=1)
+    square = -np.linalg.lstsq(rows, moved[2:], rcond=None)[0][1]
+    np.testing.assert_allclose(square**0.5, 0.3904017, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.sum(), np.log(square) / (2 * np.pi / 0.8), atol=2e-3)
 
 
 class Undelayed(vi.AbstractMachine):
@@ -101,3 +128,30 @@ class Undelayed(vi.AbstractMachine):
 def test_machines_without_delays_are_refused():
     with pytest.raises(ValueError, match="must have `delays`"):
         vi.delay_chain(Undelayed())
+
+
+class Cutting(vi.AbstractMachine):
+    """A tool with dry friction, whose `recorded` has a mode."""
+
+    cycle = 8.0
+    delays = property(lambda self: dict(turn=8.0))
+    before = vi.State(surface=0.0)
+    contacts = vi.DryFriction(0.05, on="u", mass=1.0)
+    events = vi.Switch(lambda m, t, z, past: 1 + past.turn.surface - z.x)
+
+    def recorded(self, t, z, past, cuts):
+        return dict(surface=jnp.where(cuts > 0, z.x, past.turn.surface + 1))
+
+    def field(self, t, z, past, cuts):
+        force = jnp.where(cuts > 0, 0.3 * (1 + past.turn.surface - z.x), 0.0)
+        return dict(x=z.u, u=force - z.x - 0.06 * z.u)
+
+    def start(self):
+        return vi.State(x=0.0, u=0.0)
+
+
+@pytest.mark.slow
+def test_chain_with_friction_and_a_switch():
+    whole = vi.simulate(Cutting(), cycles=3, method="reference").last
+    chain = vi.simulate(vi.delay_chain(Cutting(), 16, elements=2), cycles=3).last
+    np.testing.assert_allclose([chain.x, chain.u], [whole.x, whole.u], rtol=0, atol=2e-6)

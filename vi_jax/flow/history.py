@@ -263,30 +263,25 @@ def with_sizes(plan: Any, s: Scalar, start: State, modes: Scalars) -> Any:
     return dataclasses.replace(plan, memory=memory)
 
 
-def begun(plan: Any, start: State, s: Scalar) -> History:
-    """Return the history of a lane at its start, with the places of its delays."""
+def begun(plan: Any, start: State, s: Scalar) -> tuple[History, Flag]:
+    """Return the history of a lane at its start, with the places of its delays; and whether these
+    are in their range, and the history is long enough."""
     given = plan.history
     if given is None:
         given = _first_history(plan.machine, plan.memory, start, plan.unit)
     order, begins, exists = given.in_order()
-    places, starts = [], []
+    places, starts, covered = [], [], delays_valid(without_past(plan.machine))
     for delay in lags_of(plan.machine):
-        later = begins > stop_gradient(-delay) + slack_of(plan, s)
-        number = jnp.minimum(jnp.sum(later & exists), jnp.sum(exists) - 1)
+        needed = stop_gradient(-delay) + slack_of(plan, s)
+        number = jnp.minimum(jnp.sum((begins > needed) & exists), jnp.sum(exists) - 1)
         places.append(order[number].astype(s.dtype))
         starts.append(s + begins[number])
+        covered = covered & (stop_gradient(begins[number]) <= needed)
     zero = jnp.zeros_like(s)  # a jump at level 0: the start may differ from the history's end
-    return given._replace(
+    history = given._replace(
         newest=s + given.newest, level=zero, slip=zero, places=tuple(places), starts=tuple(starts)
     )
-
-
-def is_covered(plan: Any, history: History, s: Scalar) -> Flag:
-    """Return whether all delays are in their range, and the history at a start is long enough."""
-    covered = delays_valid(without_past(plan.machine))
-    for delay, start in zip(lags_of(plan.machine), history.starts, strict=True):
-        covered = covered & (start <= s - delay + slack_of(plan, s))
-    return covered
+    return history, covered
 
 
 def slack_of(plan: Any, s: Scalar) -> Scalar | float:

@@ -22,7 +22,7 @@ from ..machine import (
 )
 from ._step.hybrid import iterate
 from .begin import initial_lane
-from .history import begun, is_covered, with_sizes, with_view
+from .history import begun, with_sizes, with_view
 from .lane import Lane, Record
 from .machine_checks import (
     check_before_modes,
@@ -115,9 +115,9 @@ def _with_history(plan: Plan, start: State, wanted: Array) -> Lane:
     """Return the initial lane of a machine with delays."""
     zero = jnp.zeros_like(plan.machine.position(start))
     s = zero if plan.begin is None else zero + plan.begin
-    history = begun(plan, start, s)
+    history, covered = begun(plan, start, s)
     lane = initial_lane(with_view(plan, history, s), start, wanted)
-    bad = (lane.fault == 0) & ~stop_gradient(is_covered(plan, history, s))
+    bad = (lane.fault == 0) & ~stop_gradient(covered)
     return lane._replace(history=history, fault=jnp.where(bad, code("bad_start"), lane.fault))
 
 

@@ -143,6 +143,13 @@ def with_some_past(machine: Machine, start: State) -> Machine:
     unchanged without delays."""
     if not has_delays(machine):
         return machine
+    if "history" in getattr(start, "__dict__", {}):
+        kind = type(machine).__name__
+        raise TypeError(
+            f"Argument `start` of a {kind}, which has delays, must not have a component `history`. "
+            "A state of a `delay_chain` needs the chain as its machine, for an orbit "
+            "`orbit.machine`."
+        )
     before = history_before(machine, start)
     form = form_of(machine, start, before)
     past = form.by_name([form.pack(before(-x)) for x in lags_of(machine)])

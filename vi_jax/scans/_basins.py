@@ -526,12 +526,9 @@ def _label_lanes(
 
 def _start_of_lane(data: "xr.Dataset", begin: State, names: list[str], lane: int) -> State:
     """Return the start of a lane of a scan over starts."""
-    period, found = data["period"], {}
-    for name in names:
-        if name in data.coords:
-            row = data[name].broadcast_like(period).transpose(*period.dims)
-            found[name] = float(row.values.ravel()[lane])
-    return start_with(begin, found)
+    period, axes = data["period"], [name for name in names if name in data.coords]
+    rows = {name: data[name].broadcast_like(period).transpose(*period.dims) for name in axes}
+    return start_with(begin, {name: float(x.values.ravel()[lane]) for name, x in rows.items()})
 
 
 # Sections of a motion move less than this share of the region between two values. A choice.
