@@ -168,6 +168,50 @@ def test_quasi_periodic_motions_of_rings():
     turns = data.rotation.values[:, 1]
     np.testing.assert_allclose(turns, rotation_of(a, 0.1), atol=1e-9)
     assert (data.digits.values[:, 1] > 5).all()
+    options = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
+    swept = vi.sweep(Ring(0.2, 0.1), "a", a, measure=vi.Rotation(512), **options)
+    table = swept.to_xarray()
+    np.testing.assert_allclose(table.rotation.values, rotation_of(a, 0.1), atol=1e-8)
+    assert (table.digits.values > 5).all()
+    for measure, words in (("exponent", "Exponent needs more"), ("sections", "arrays are '0'")):
+        with pytest.raises(ValueError, match=words):
+            vi.sweep(Ring(0.2, 0.1), "a", a, measure=measure, **options)
+
+
+class Undriven(vi.AbstractMachine):
+    """The map of `Ring`, at the events that end the cycles of an autonomous machine."""
+
+    a: float
+    b: float = 0.1
+    cycle = 1.0
+
+    @property
+    def events(self):
+        def kick(machine, s, x):
+            u, v = Ring(machine.a, machine.b).kick(x.x, x.y)
+            return vi.State(x=u, y=v, t=0.0)
+
+        return (vi.Reset(lambda machine, s, x: x.t - 1, kick, ends_cycle=True),)
+
+    def field(self, s, x):
+        return vi.State(x=0.0 * x.x, y=0.0 * x.y, t=1.0)
+
+
+@pytest.mark.slow
+def test_motions_of_an_autonomous_machine():
+    """Exponents across the motion are those of the map between its sections."""
+    a, start = np.array([0.21, 0.3819]), vi.State(x=0.3, y=0.1, t=0.0)
+    data = vi.scan(
+        Undriven(0.2), {"a": a, "b": [-0.1, 0.1, 1.4]}, start=start, settle=500,
+        measure=("regime", "rotation"), progress=False,
+    )  # fmt: skip
+    expected = [1, int(vi.REGIMES.quasiperiodic), int(vi.REGIMES.chaotic)]
+    driven = vi.scan(
+        Ring(0.2, 0.1), {"a": a, "b": [-0.1, 0.1, 1.4]}, start=at(0.3, 0.1), settle=500,
+        measure="regime", progress=False,
+    )  # fmt: skip
+    assert (data.period.values == expected).all() and (driven.period.values == expected).all()
+    np.testing.assert_allclose(data.rotation.values[:, 1], rotation_of(a, 0.1), atol=1e-9)
 
 
 @pytest.mark.slow

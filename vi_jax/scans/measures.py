@@ -468,7 +468,10 @@ class Regime(AbstractMeasure):
         # A lane that cannot be continued is unchanged.
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
-        growth = seen.per_cycle * self.averaged
+        growth = seen.per_cycle * observed
+        # Over few cycles the exponent of a torus may be as large: the last pass decides.
+        is_weak = again & bool(self.averaged) & (chaos == REGIMES.chaotic) & (growth < _GROWS)
+        chaos = jnp.where(is_weak, REGIMES.unsettled, chaos)
         # A motion without losses that repeats after many cycles has digits and no growth, too.
         moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
         is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)
