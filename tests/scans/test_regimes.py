@@ -168,6 +168,11 @@ def test_quasi_periodic_motions_of_rings():
     turns = data.rotation.values[:, 1]
     np.testing.assert_allclose(turns, rotation_of(a, 0.1), atol=1e-9)
     assert (data.digits.values[:, 1] > 5).all()
+
+
+@pytest.mark.slow
+def test_rotation_numbers_of_a_sweep():
+    a = np.array([0.1234, 0.21, 0.3819])
     options = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
     swept = vi.sweep(Ring(0.2, 0.1), "a", a, measure=vi.Rotation(512), **options)
     table = swept.to_xarray()
