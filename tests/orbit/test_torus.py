@@ -133,6 +133,8 @@ def test_a_window_of_locking():
     np.testing.assert_allclose(
         [window.low, window.high], [middle - half, middle + half], atol=1e-12
     )
+    few = vi.continue_torus(torus, parameter="a", bounds=(0.31, 0.35), max_nodes=65)
+    assert few.ends == ("bounds", "coarse") and few.parameter[-1] < family.parameter[-1] - 1e-4
     orbit = window.orbit
     assert orbit.successful and orbit.stable and int(orbit.cycles) == 3
     locked: Any = orbit.machine

@@ -39,8 +39,8 @@ _WANDERS, _ROUNDINGS = 10.0, 64.0
 
 
 # A motion is quasi-periodic if averages agree to more digits than the first number and the
-# logarithm of the growth of a perturbation over 2,048 cycles is below the second. Locked lanes had 1
-# and more, tori up to 0.01. A motion is chaotic with fewer digits than the third number and more
+# logarithm of the growth of a perturbation over 2,048 cycles is below the second. Locked lanes had
+# 1 and more, tori up to 0.01. A motion is chaotic with fewer digits than the third number and more
 # growth than the fourth. Chaotic lanes had 8 and more, and those of a machine without losses up to
 # 3: the weighted mean of the rate 1/t of a shear is 2.2. See the page of limits for other lanes.
 _DIGITS, _NEUTRAL, _FEW, _GROWS = 4.4, 0.1, 3.5, 6.0
