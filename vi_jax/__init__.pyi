@@ -108,6 +108,7 @@ from .scans import AllOrbits as AllOrbits
 from .scans import Attractor as Attractor
 from .scans import BasinEntropy as BasinEntropy
 from .scans import Basins as Basins
+from .scans import ContactForces as ContactForces
 from .scans import Density as Density
 from .scans import Escape as Escape
 from .scans import Exponent as Exponent

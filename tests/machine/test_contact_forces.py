@@ -78,3 +78,35 @@ def test_soft_stops_and_dry_friction():
     held = vi.contact_forces(machine, vi.State(x=0.0, u=0.0))
     assert float(held["right soft stop"].normal) == 0.0
     assert float(held["guide"].tangential) == pytest.approx(-0.3, abs=1e-15)
+
+
+class Table(vi.Mechanical):
+    """A ball on a table, and a weight on a soft stop."""
+
+    q = ("x", "y", "w")
+    mass = (2.0, 2.0, 0.5)
+    cycle = 2 * np.sqrt(2 * 0.3 / G)
+    contacts = (
+        vi.RigidStop(0.0, 1.0, "left", on="y", friction=0.1, along="x", name="table"),
+        vi.SoftStop(0.0, 50.0, side="left", on="w", name="spring"),
+    )
+
+    def force(self, t, q, v):
+        return dict(x=1.0, y=-2.0 * G, w=-0.5 * G)
+
+
+def test_forces_as_a_measure():
+    """The weights at rest; and the momentum of a ball that bounces without loss, which a force
+    along the table accelerates from one impact to the next, where it sticks."""
+    table, measure = Table(), vi.ContactForces(samples=16, impacts=8)
+    start = table.at(w=-0.5 * G / 50)
+    axes = {"start.y": [0.0, 0.3]}
+    found = vi.scan(table, axes, start=start, settle=0, cycles=3, measure=measure)
+    rests, bounces = (found.isel({"start.y": i}) for i in range(2))
+    for data in (rests, bounces):
+        assert float(data.spring_normal) == pytest.approx(0.5 * G, rel=1e-9)
+    assert float(rests.table_normal) == pytest.approx(2 * G, rel=1e-12)
+    assert float(rests.table_tangential_max) == pytest.approx(1.0, rel=1e-12)
+    assert float(rests.table_impulse) == float(bounces.table_normal) == 0.0
+    assert float(bounces.table_impulse) == pytest.approx(2 * G * table.cycle, rel=1e-9)
+    assert float(bounces.table_drag) == pytest.approx(-2.5 / 3 * table.cycle, rel=1e-9)

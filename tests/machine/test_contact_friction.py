@@ -166,3 +166,31 @@ def test_an_impact_gains_no_energy():
             expected = full
         np.testing.assert_allclose(after, expected, atol=1e-10)
     assert 0 < limited < 20
+
+
+class Kane(vi.Mechanical):
+    """Coordinates along and across a floor, coupled by their masses (T. R. Kane)."""
+
+    q = ("x", "y")
+    cycle = 1.0
+    contacts = vi.RigidStop(0.0, 1.0, "left", on="y", friction=0.3, along="x")
+
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return [[1 / 0.36, -0.8 / 0.36], [-0.8 / 0.36, 1 / 0.36]]
+
+    def force(self, t, q, v):
+        return dict(x=0.0, y=0.0)
+
+
+def test_an_impact_that_would_gain_energy_is_counted():
+    """The first impact takes a share of the restitution that keeps the energy; its numbers are in
+    closed form, the root of a quadratic equation."""
+    machine = Kane()
+    run = vi.simulate(machine, machine.at(y=0.5, v=dict(x=-1.0, y=-1.0)), 2, impact_log=1)
+    assert run.reduced.tolist() == [1, 0]
+    np.testing.assert_allclose([run.last.v.y, run.last.v.x], [0.801749409, 0.230800893], atol=1e-9)
+    assert float(run.impact_energy[0]) == pytest.approx(0.0, abs=1e-14)
+    # The impulses change the velocities by the inverse of the masses.
+    gains = np.linalg.inv(machine.mass(None))
+    push = [float(run.impact_log.drag[0, 0]), float(run.impact_log.impulse[0, 0])]
+    np.testing.assert_allclose(gains @ push, [1.230800893, 1.801749409], atol=1e-9)

@@ -180,3 +180,27 @@ def test_two_corners_hold_a_block_together(blocks):
     np.testing.assert_allclose(run.last.x[:5], expected, atol=1e-11)
     np.testing.assert_allclose(run.last.tilt[:5], 0.0, atol=1e-14)
     np.testing.assert_allclose(run.last.v.x[:4], [0, 0, slides, 0], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_tall_blocks_rock_to_rest():
+    """Blocks that are dropped on one corner, and rock and bounce. Each rock ends in many impacts of
+    one corner, and the rocks get shorter without end; in 3 s all come to rest."""
+
+    def one(mu, restitution, tilt):
+        block = Block(mu=mu, restitution=restitution, cycle=3.0)
+        lift = block.half_height * jnp.cos(tilt) + block.half_width * jnp.sin(tilt)
+        start = block.at(y=lift + 0.01, tilt=tilt)
+        run = vi.simulate(block, start, 1, max_impacts=5000)
+        lost = block.energy(start) - block.energy(run.last)
+        return run.successful, run.last, lost - run.impact_energy[0]
+
+    cases = [(mu, e, tilt) for mu in (0.0, 0.3, 1.0) for e in (0.0, 0.5) for tilt in (0.02, 0.2)]
+    good, last, slid = jax.jit(jax.vmap(one))(*jnp.array(cases).T)
+    assert bool(good.all())
+    np.testing.assert_allclose(last.y, 0.5, atol=1e-14)
+    np.testing.assert_allclose([last.tilt, last.v.tilt, last.v.y], 0.0, atol=1e-14)
+    # Friction does the rest of the work, and none without friction. The last impacts before each
+    # rest are summed up, with an error of second order in the time that they take.
+    assert bool((slid > -1e-8).all())
+    np.testing.assert_allclose(slid[:4], 0.0, atol=1e-8)

@@ -310,3 +310,30 @@ def test_random_impacts_keep_the_conditions():
         if i % 4 <= 1:
             change = x.gains @ (p - impulses[len(cases) + i])
             np.testing.assert_allclose(change, 0, atol=3e-10 * size)
+
+
+def test_a_rod_strikes_the_ground_with_much_friction():
+    """P. Painlevé's rod with friction beyond his bound, which slides into the ground or away from
+    it: for one direction of slip, a push with its friction would close the contact."""
+    s, c, mu = np.sin(1), np.cos(1), 1.6
+    cases = []
+    for side, speed in itertools.product((1, -1), (0.2, 3, 10, -0.2, -3, -10)):
+        rows = np.array([[0, 1, -side * c], [1, 0, s]])
+        gains = rows @ np.diag([1, 1, 3]) @ rows.T
+        one, two = np.eye(2)[0], np.eye(2)
+        gains = np.kron(gains, np.diag([1, 0])) + np.kron(two, np.diag([0, 1]))
+        cases.append(Strike(gains, np.array([-1, 0, -side * speed, 0]), mu * np.ones(2),
+                            0.5 * np.ones(2), np.zeros(2), one > 0))  # fmt: skip
+    for x, blow in zip(cases, each(BLOWS, cases), strict=True):
+        after = x.velocity + x.gains @ blow.impulse
+        assert not blow.unsolved and blow.impulse[0] > 0
+        assert after[0] == pytest.approx(0.5 * blow.share, abs=1e-12)
+        drag, level = blow.impulse[2], mu * blow.impulse[0]
+        assert abs(drag) <= level + 1e-12
+        # The slip stops, or friction has its bound against it.
+        assert (
+            blow.share < 1
+            or abs(after[2]) < 1e-12
+            or drag == pytest.approx(-level * np.sign(after[2]))
+        )
+        assert blow.impulse @ (after + x.velocity) <= 1e-12

@@ -87,9 +87,8 @@ def random_blocks(rng, lanes):
 
 @pytest.mark.slow
 def test_random_blocks_on_a_shaken_floor():
-    """Blocks and rods with two corners. Half of the motions are not completed: corners that strike
-    alternately end as `chatter`."""
-    lanes = 24
+    """Blocks and rods with two corners."""
+    lanes = 60
     given, q, v = random_blocks(np.random.default_rng(1), lanes)
     a, h, mu = given["half_width"], given["half_height"], np.repeat(given["mu"][:, None], 2, 1)
 
@@ -102,7 +101,28 @@ def test_random_blocks_on_a_shaken_floor():
     mass = np.stack([np.ones(lanes), np.ones(lanes), (a * a + h * h) / 3], 1)
     pull = lambda x, y: np.stack([x, y, 0 * x], 1)
     error, refined, good = compared(ShakenBlock, given, gaps, places, mass, mu, q, v, pull)
-    assert good.sum() >= 12
-    # The reference is not exact: halving its step changes it by up to 2e-4.
-    assert (refined[good] < 3e-4).all() and (error[good] < 1e-3).all()
-    assert np.median(error[good]) < 1e-4
+    # Impacts of two corners in turn may converge to rest so slowly that a lane is given up.
+    assert good.sum() >= lanes - 1
+    # The reference is not exact: halving its step changes some of its motions by up to 2e-3, not in
+    # proportion to the step, since the steps of the impacts change too.
+    assert (error[good] < 5 * refined[good] + 1e-4).all()
+    assert np.median(error[good]) < 5e-5
+
+
+@pytest.mark.slow
+def test_no_motion_on_a_floor_at_rest_gains_energy():
+    given, q, v = random_blocks(np.random.default_rng(2), 120)
+    numbers = jax.tree.map(jnp.asarray, ({**given, "sizes": 0 * given["sizes"]}, q, v))
+
+    def one(given, q, v):
+        machine = ShakenBlock(**given, cycle=END / 16)
+        start = machine.at(
+            **dict(zip(machine.q, q, strict=True)), v=dict(zip(machine.q, v, strict=True))
+        )
+        run = vi.simulate(machine, start, 16, max_impacts=4000)
+        return jax.vmap(machine.energy)(run.sections), run.successful
+
+    energy, good = map(np.asarray, jax.jit(jax.vmap(one))(*numbers))
+    # Rocks and hops that converge slowly may be given up.
+    assert good.sum() >= 118
+    assert (np.diff(energy[good], axis=1) < 1e-9).all()

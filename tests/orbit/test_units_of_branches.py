@@ -46,7 +46,7 @@ class Rubbed(Struck):
 
     @property
     def contacts(self):
-        return (vi.DryFriction(on=("x", "v"), level=self.length / self.time**2 / 3),)
+        return (vi.DryFriction(on="v", level=self.length / self.time**2 / 3),)
 
 
 class Sliding(Struck):

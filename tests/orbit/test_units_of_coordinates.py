@@ -45,7 +45,7 @@ def test_local_map_of_a_grazing():
         machine = Uncoupled(unit=unit)
         found = vi.grazing(grazing_of(machine, "amplitude", (0.1, 2.0), machine.at()), check=False)
         assert found.value == pytest.approx(grazes, rel=1e-11)
-        assert (found.touched, found.outcome) == ("right stop", vi.SCENARIOS.nonsmooth_fold)
+        assert (found.touched, found.outcome) == ("right stop of x", vi.SCENARIOS.nonsmooth_fold)
         kick = -np.sqrt(2.0) * OMEGA * 1.8  # a = 1 by the phase
         by_size = found.kick * [1 / unit, 1, 1 / unit, 1]
         np.testing.assert_allclose(np.sort(by_size[0]), [kick, 0, 0, 0], rtol=1e-8, atol=1e-9)

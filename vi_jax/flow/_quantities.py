@@ -38,7 +38,7 @@ _RESERVED = frozenset(
     """admissible clearance column cycle cycles duration error event exponent exponents extremes
     frequency_ratio history impact impact_energy impact_phase impact_rate impact_speed impact_stop
     impacts iterations lane monodromy multiplier multipliers number parameter period point regime
-    rejected residual rests result row sample sections section stability stable start state
+    reduced rejected residual rests result row sample sections section stability stable start state
     steps y_max y_min""".split()
 )
 

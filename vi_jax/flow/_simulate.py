@@ -218,6 +218,8 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     times = integrals.pop(TIME, None)
 
     def as_counts(values):
+        if values is None:
+            return None
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
 
     period = jnp.broadcast_to(cycle_time(machine), (plan.cycles,)).astype(lane.steps.dtype)
@@ -245,7 +247,8 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
         y_min=per_cycle(records.y_min, jnp.min),
         impacts=as_counts(per_cycle(records.impacts, jnp.sum)),
         impact_speed=per_cycle(records.impact_speed, jnp.max),
-        rests=as_counts(per_cycle(records.rests, jnp.sum)) if records.rests is not None else None,
+        rests=as_counts(per_cycle(records.rests, jnp.sum)),
+        reduced=as_counts(per_cycle(records.reduced, jnp.sum)),
         impact_energy=per_cycle(records.impact_energy, jnp.sum),
         clearance=per_cycle(records.clearance, jnp.min),
         duration=duration,
@@ -296,8 +299,8 @@ def _quantities(plan: Plan, points: State) -> dict[str, Array]:
 
 
 def _impact_log(plan: Plan, entries: Any) -> ImpactLog:
-    phase, speed, stop = _by_cycle(plan, entries, used=2)
-    return ImpactLog(as_logged(plan.machine, phase), speed, _as_integers(stop))
+    phase, speed, stop, *impulses = _by_cycle(plan, entries, used=2)
+    return ImpactLog(as_logged(plan.machine, phase), speed, _as_integers(stop), *impulses)
 
 
 def _event_log(plan: Plan, entries: Any) -> EventLog:

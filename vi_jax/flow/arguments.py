@@ -60,7 +60,7 @@ from ..machine import (
 )
 from ..machine import State as NamedState
 from ._quantities import average_names, check_units, quantity_names
-from .history import check_delays, with_history
+from .history import check_delays, with_memory
 from .machine_checks import (
     INNER_INSTANT,
     check_before_modes,
@@ -157,7 +157,7 @@ def make_plan(
     require_session("start", start)
     if has_delays(machine):
         check_delays(machine, method)
-        machine, memory = with_history(machine, as_floats(machine, start), history)
+        machine, memory = with_memory(machine, as_floats(machine, start), history)
     method.check(machine)
     if samples and is_autonomous(machine, start):
         raise ValueError(
@@ -175,7 +175,7 @@ def make_plan(
     parts, motion = max(1, samples), options.record == "motion"
     averages = average_names(machine, start) if motion else ()
     check_units(machine, start, averages + quantity_names(machine, start))
-    columns = 12 + 3 * options.impact_log + 4 * options.event_log + len(averages)
+    columns = 12 + 5 * options.impact_log + 4 * options.event_log + len(averages)
     fits_records("cycles", cycles * parts, columns)
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         warn(

@@ -11,6 +11,7 @@ from ..machine import (
     frictions_in,
     has_contact_friction,
     holds_anywhere,
+    is_compound,
     is_in_range,
     limited_in,
     on_held_surfaces,
@@ -19,7 +20,6 @@ from ..machine import (
     struck_modes,
     switches_of,
 )
-from ._step.impact import is_compound
 from ._step.roots import Rates, force_rate, rates
 from .lane import Lane, to_event, total
 from .plan import Plan

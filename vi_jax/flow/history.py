@@ -26,19 +26,20 @@ from .._types import Flag, Scalar, Scalars, State, Vector
 from ..machine import (
     AbstractMachine,
     HybridState,
-    Recorded,
-    delays_in,
+    Past,
     delays_valid,
-    form_of,
     has_delays,
     history_before,
     history_of,
+    lags_of,
+    longest_delay,
     modes_of,
     reading,
     recorded_numbers,
     renews,
+    shown_modes,
     size_of,
-    with_fixed_past,
+    with_some_past,
     without_modes,
     without_past,
 )
@@ -65,7 +66,6 @@ _BEFORE = 64
 class Memory(eqx.Module):
     """The constants of a history."""
 
-    form: Recorded
     pieces: int = eqx.field(static=True)
     sizes: Vector
     """The sizes of the recorded numbers, for the error of their polynomials."""
@@ -112,79 +112,57 @@ class Window(NamedTuple):
     """The pieces that a step reads, for one delay."""
 
     delay: Scalar
-    starts: tuple[Scalar, ...]
-    keys: tuple[Scalar, ...]
-    """The instants from which pieces are read: their starts, infinite for a piece that is not read,
-    minus infinite for one that has begun, whatever the rounding of its start."""
-    pieces: tuple[Array, ...]
-    """Coefficients by power: (8, numbers)."""
+    pieces: tuple[tuple[Any, Scalar, Array], ...]
+    """For each piece, the instant from which it is read, its start, and its coefficients by power,
+    (8, numbers). The instant is the start, infinite for a piece that is not read, minus infinite
+    for one that has begun, whatever the rounding of its start."""
     unit: Scalar | float
 
+    def at(self, s: Scalar) -> Vector:
+        place = s - self.delay
+        _, start, piece = self.pieces[0]
+        for instant, later, other in self.pieces[1:]:
+            begun = instant <= stop_gradient(place)
+            start, piece = jnp.where(begun, later, start), jnp.where(begun, other, piece)
+        time = (place - start) / self.unit
+        return functools.reduce(lambda value, x: value * time + x, piece[::-1])
 
-class Windows(eqx.Module):
-    """The past during a step, as a function of `s`."""
 
-    form: Recorded
+class View(Past):
+    """The past during a step."""
+
     windows: tuple[Window, ...]
-
-    def __call__(self, s: Scalar) -> Any:
-        return self.form.by_name([_value(x, s) for x in self.windows])
-
-
-def _value(window: Window, s: Scalar) -> Vector:
-    place = s - window.delay
-    start, piece = window.starts[0], window.pieces[0]
-    for n in range(1, len(window.starts)):
-        here = window.keys[n] <= stop_gradient(place)
-        start = jnp.where(here, window.starts[n], start)
-        piece = jnp.where(here, window.pieces[n], piece)
-    time = place - start
-    time = time if isinstance(window.unit, float) else time / window.unit
-    value = piece[7]
-    for n in range(6, -1, -1):
-        value = value * time + piece[n]
-    return value
-
-
-class View(eqx.Module):
-    """The history as a step sees it."""
-
-    windows: Windows
     reach: Scalar
     """The end of the longest step."""
     image: Scalar
     """The instant of the next image, with its derivative; infinite if it lies beyond `reach`."""
     level: Scalar
     """The level of that image."""
-    slack: Scalar | float
-    """Instants closer than this are one."""
-    places: tuple[Scalar, ...]
-    known: tuple[Scalars, ...]
+    starts: tuple[Scalars, ...]
     """For each delay, the starts of its pieces, also of those that are not read."""
+
+    def __call__(self, machine: Any, s: Scalar, state: State) -> Any:
+        return self.form.by_name([x.at(s) for x in self.windows])
 
 
 # --- before a run
 
 
-def with_history(
+def with_memory(
     machine: AbstractMachine, start: State, given: History | None
 ) -> tuple[AbstractMachine, Memory]:
     """Return a machine with delays with a past bound to it, and the constants of its history. The
     history at the start is `given`, or `None` for `before`. **Raises:** `TypeError` or `ValueError`
     for invalid delays or histories."""
-    machine = without_past(machine)
-    before = history_before(machine, start)
-    form, delays = form_of(machine, start, before), delays_in(machine)
-    dtype = jnp.result_type(float, *jax.tree.leaves(start))
-    lags = [jnp.asarray(x, dtype) for x in delays.values()]
-    pieces = _number_of_pieces(machine, lags) if given is None else given.rows.shape[0]
-    if given is not None and given.rows.shape[1] != _HEAD + 8 * form.size:
+    bound: Any = with_some_past(machine, start)
+    size = bound._past.form.size
+    if given is not None and given.rows.shape[1] != _HEAD + 8 * size:
         raise ValueError(
             f"Argument `start` must have the history of a {type(machine).__name__}, but has that "
             "of another machine."
         )
-    bound = with_fixed_past(machine, form, before)
-    return bound, Memory(form, pieces, jnp.ones(form.size, dtype))
+    pieces = _number_of_pieces(machine) if given is None else given.rows.shape[0]
+    return bound, Memory(pieces, jnp.ones(size, jnp.result_type(float, *jax.tree.leaves(start))))
 
 
 def check_delays(machine: AbstractMachine, method: AbstractMethod) -> None:
@@ -207,14 +185,12 @@ def with_first_history(machine: AbstractMachine, start: State) -> State:
     if not has_delays(machine) or history_of(start) is not None:
         return start
     state = without_modes(start)
-    bound, memory = with_history(machine, state, None)
-    dtype = jnp.result_type(float, *jax.tree.leaves(state))
-    history = _first_history(machine, memory, state, dtype, unit_of(bound))
-    history = jax.tree.map(lambda x: jnp.asarray(x, dtype), history)
+    bound, memory = with_memory(machine, state, None)
+    history = _first_history(bound, memory, state, unit_of(bound))
     return HybridState(state, modes_of(start) or (), history)
 
 
-def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
+def _number_of_pieces(machine: AbstractMachine) -> int:
     """Return the size of a ring: the machine's `history_size`, or from its longest delay."""
     size = getattr(machine, "history_size", None)
     if size is not None:
@@ -224,95 +200,92 @@ def _number_of_pieces(machine: AbstractMachine, lags: list[Any]) -> int:
                 f"the steps in its longest delay, but is {size!r}."
             )
         return size
-    known = [concrete(x) for x in (machine.cycle, *lags)]
-    numbers = [float(x) for x in known if x is not None and x.ndim == 0]
-    if len(numbers) < len(known):
+    cycle, longest = concrete(jnp.asarray(machine.cycle)), concrete(longest_delay(machine))
+    if cycle is None or longest is None:
         return _UNKNOWN
-    cycle, *lengths = numbers
     # An odd number: places of many lanes at multiples of a power of two share the cache's lines.
-    return int(min(_FEWEST + _PER_CYCLE * max(lengths) / cycle, 1e5)) | 1
+    return int(min(_FEWEST + _PER_CYCLE * longest / cycle, 1e5)) | 1
 
 
-def _first_history(
-    machine: AbstractMachine, memory: Memory, start: State, dtype: Any, unit: Any
-) -> History:
+def _first_history(bound: Any, memory: Memory, start: State, unit: Any) -> History:
     """Return the history before a start: one constant piece, or many if it is a function."""
-    before, lags = history_before(machine, start), delays_in(machine).values()
-    longest = functools.reduce(jnp.maximum, [jnp.asarray(x, dtype) for x in lags])
-    number = min(_BEFORE, memory.pieces // 2) if callable(machine.before) else 1
-    record = lambda t: memory.form.pack(before(t))
-    return history_of_function(record, longest, unit, number, len(lags), memory.pieces)
+    machine, form = without_past(bound), bound._past.form
+    before, number = history_before(machine, start), 1
+    if callable(machine.before):
+        number = min(_BEFORE, memory.pieces // 2)
+    record = lambda t: form.pack(before(t)).astype(memory.sizes.dtype)
+    return history_of_function(machine, record, unit, number, memory.pieces)
 
 
 def history_of_function(
-    record: Callable[[Scalar], Vector], longest: Scalar, unit: Any, number: int, delays: int,
-    room: int,
-) -> History:  # fmt: skip
-    """Return the history of the recorded numbers as a function of t ≤ 0, in `number` pieces of
-    equal length over the `longest` of some delays, with room for so many pieces."""
-    length = longest * (1 + 1e-6) / number
+    machine: AbstractMachine, record: Callable[[Scalar], Vector], unit: Any, number: int, room: int
+) -> History:
+    """Return the history of a machine from its recorded numbers as a function of t ≤ 0, in `number`
+    pieces of equal length over the longest delay, with room for so many pieces."""
+    zero = jnp.zeros((), jax.eval_shape(record, jnp.zeros(())).dtype)
+    length = longest_delay(machine).astype(zero.dtype) * (1 + 1e-6) / number
+    one = jnp.ones_like(zero)
 
     def piece(n: Scalar) -> Array:
-        first, last = (_derivatives(record, (n - number + x) * length) for x in (0.0, 1.0))
-        head = jnp.stack([length, -jnp.ones_like(length)])
+        first, last = (
+            _derivatives(record, lambda t: (one,), (n - number + x) * length) for x in (0.0, 1.0)
+        )
+        head = jnp.stack([length, -one])
         return jnp.concatenate([head, _in_time(hermite(first, last, length), length, unit)])
 
-    rows = jax.vmap(piece)(jnp.arange(number, dtype=longest.dtype))
-    rows = jnp.concatenate([rows, jnp.zeros((room - number, rows.shape[1]), rows.dtype)])
-    zero = jnp.zeros_like(longest)
-    nothing = (zero,) * delays
+    rows = jax.vmap(piece)(jnp.arange(number, dtype=zero.dtype))
+    rows = jnp.concatenate([rows, jnp.zeros((room - number, rows.shape[1]), zero.dtype)])
+    nothing = (zero,) * len(lags_of(machine))
     return History(rows, zero + number, -length, zero, zero, nothing, nothing, zero + unit)
 
 
-def _derivatives(function: Any, t: Scalar) -> list[Vector]:
-    found, one = [], jnp.ones_like(t)
-    for _ in range(4):
-        found.append(function(t))
-        function = lambda t, f=function: jax.jvp(f, (t,), (one,))[1]
-    return found
+def _derivatives(function: Any, along: Any, *point: Any) -> tuple[Vector, ...]:
+    """Return a function and three derivatives of it along a vector field."""
+    values = lambda *point: (function(*point),)
+    for _ in range(3):
+        values = functools.partial(_with_rate, values, along)
+    return values(*point)
+
+
+def _with_rate(function: Any, along: Any, *point: Any) -> tuple[Vector, ...]:
+    values, rates = jax.jvp(function, point, along(*point))
+    return (*values, rates[-1])
 
 
 def with_sizes(plan: Any, s: Scalar, start: State, modes: Scalars) -> Any:
     """Return the plan with the sizes of the recorded numbers, at most 1."""
-    memory = plan.memory
-    sizes = [
-        size_of(
-            lambda x, n=n: recorded_numbers(plan.machine, memory.form, s, x, modes)[n],
-            start,
-            plan.sizes,
-        )
-        for n in range(memory.form.size)
-    ]
+    shown = shown_modes(plan.machine, modes)
+    record = lambda x: recorded_numbers(plan.machine, s, x, shown)
+    numbers = range(plan.memory.sizes.size)
+    sizes = [size_of(lambda x, n=n: record(x)[n], start, plan.sizes) for n in numbers]
     known = jnp.stack([jnp.where(x > 0, jnp.minimum(x, 1.0), 1.0) for x in sizes])
-    memory = eqx.tree_at(lambda x: x.sizes, memory, stop_gradient(known))
+    memory = eqx.tree_at(lambda x: x.sizes, plan.memory, stop_gradient(known))
     return dataclasses.replace(plan, memory=memory)
 
 
 def begun(plan: Any, start: State, s: Scalar) -> History:
     """Return the history of a lane at its start, with the places of its delays."""
-    memory, given, machine = plan.memory, plan.history, without_past(plan.machine)
+    given = plan.history
     if given is None:
-        given = _first_history(machine, memory, start, s.dtype, plan.unit)
+        given = _first_history(plan.machine, plan.memory, start, plan.unit)
     order, begins, exists = given.in_order()
     places, starts = [], []
-    for delay in delays_in(machine).values():
-        later = begins > stop_gradient(-jnp.asarray(delay)) + slack_of(plan, s)
+    for delay in lags_of(plan.machine):
+        later = begins > stop_gradient(-delay) + slack_of(plan, s)
         number = jnp.minimum(jnp.sum(later & exists), jnp.sum(exists) - 1)
         places.append(order[number].astype(s.dtype))
         starts.append(s + begins[number])
-    places_and_starts = {"places": tuple(places), "starts": tuple(starts)}
-    # The start may differ from the end of the history.
-    level, slip = jnp.zeros_like(s), jnp.zeros_like(s)
-    newest = s + given.newest
-    return given._replace(newest=newest, level=level, slip=slip, **places_and_starts)
+    zero = jnp.zeros_like(s)  # a jump at level 0: the start may differ from the history's end
+    return given._replace(
+        newest=s + given.newest, level=zero, slip=zero, places=tuple(places), starts=tuple(starts)
+    )
 
 
 def is_covered(plan: Any, history: History, s: Scalar) -> Flag:
     """Return whether all delays are in their range, and the history at a start is long enough."""
-    machine = without_past(plan.machine)
-    covered = delays_valid(machine)
-    for delay, start in zip(delays_in(machine).values(), history.starts, strict=True):
-        covered = covered & (start <= s - jnp.asarray(delay) + slack_of(plan, s))
+    covered = delays_valid(without_past(plan.machine))
+    for delay, start in zip(lags_of(plan.machine), history.starts, strict=True):
+        covered = covered & (start <= s - delay + slack_of(plan, s))
     return covered
 
 
@@ -327,88 +300,59 @@ def slack_of(plan: Any, s: Scalar) -> Scalar | float:
 def opened(plan: Any, lane: Any) -> tuple[Any, Any]:
     """Return plan and lane for a step, with the past that it reads bound to the machine, and
     without the history in the lane."""
-    plan = with_view(plan, lane.history, lane.s)
-    return plan, lane._replace(history=None, slip=jnp.zeros_like(lane.s))
+    opened = lane._replace(history=None, slip=jnp.zeros_like(lane.s))
+    return with_view(plan, lane.history, lane.s), opened
 
 
 def with_view(plan: Any, history: History, s: Scalar) -> Any:
     """Return the plan for a step from `s`, with the past bound to the machine."""
-    view = _view(plan, history, s)
-    return dataclasses.replace(plan, machine=reading(plan.machine, view.windows), view=view)
-
-
-def _view(plan: Any, history: History, s: Scalar) -> View:
-    machine, form = without_past(plan.machine), plan.memory.form
-    slack, windows, known = slack_of(plan, s), [], []
-    reach = image = jnp.full_like(s, jnp.inf)
-    level = -jnp.ones_like(s)
-    delays = delays_in(machine).values()
-    for delay, place, start in zip(delays, history.places, history.starts, strict=True):
-        delay = jnp.asarray(delay, s.dtype)
-        window, starts, its_reach, its_image, its_level = _window(
-            plan, history, s, (delay, place, start), slack
-        )
-        windows.append(window)
-        known.append(starts)
-        reach = jnp.minimum(reach, stop_gradient(its_reach))
-        sooner, same = its_image < image - slack, its_image <= image + slack
-        level = jnp.where(sooner, its_level, jnp.where(same, _least(level, its_level), level))
-        image = jnp.where(its_image < image, its_image, image)
+    slack, lags = slack_of(plan, s), [x.astype(s.dtype) for x in lags_of(plan.machine)]
+    found = [
+        _window(plan, history, s, *x, slack)
+        for x in zip(lags, history.places, history.starts, strict=True)
+    ]
+    windows, starts, reaches, images, levels = zip(*found, strict=True)
+    reach = functools.reduce(jnp.minimum, reaches)
+    image = functools.reduce(lambda a, b: jnp.where(b < a, b, a), images)
+    same = [jnp.where(x <= image + slack, y, jnp.inf) for x, y in zip(images, levels, strict=True)]
+    level = functools.reduce(jnp.minimum, same)
     image = jnp.where(image <= reach, image, jnp.inf)
-    past = Windows(form, tuple(windows))
-    return View(past, reach, image, stop_gradient(level), slack, history.places, tuple(known))
-
-
-def _least(a: Scalar, b: Scalar) -> Scalar:
-    """Return the lower of two levels, of which -1 is none."""
-    return jnp.where((a < 0) | (b < 0), jnp.maximum(a, b), jnp.minimum(a, b))
+    view = View(plan.machine._past.form, windows, reach, image, level, starts)
+    return dataclasses.replace(plan, machine=reading(plan.machine, view))
 
 
 def _window(
-    plan: Any, history: History, s: Scalar, where: tuple[Scalar, Scalar, Scalar], slack: Any
+    plan: Any, history: History, s: Scalar, delay: Scalar, place: Scalar, start: Scalar, slack: Any
 ) -> tuple[Window, Scalars, Scalar, Scalar, Scalar]:
     """Return the pieces of one delay from a place on up to the next jump; the starts of all; the
-    end of the longest step; the next image of a jump and its level, or infinite."""
-    (delay, place, start), size = where, plan.memory.pieces
-    passed = stop_gradient(s - delay) + slack
-    width = history.rows.shape[1]
-    number = jnp.mod(stop_gradient(history.head - place), size)
-    starts, pieces, known = [start], [], [start]
-    keys: list[Any] = [-jnp.inf]
-    closed = jnp.zeros_like(start, bool)
-    image, level, reach = jnp.full_like(start, jnp.inf), -jnp.ones_like(start), s + delay
+    end of the longest step; the next image of a jump, or infinite, and its level."""
+    size, width = history.rows.shape
+    passed, place = stop_gradient(s - delay) + slack, stop_gradient(place)
+    number = jnp.mod(stop_gradient(history.head) - place, size)
+    pieces, starts, closed = [], [], jnp.zeros_like(s, bool)
+    image, level, reach = jnp.full_like(s, jnp.inf), -jnp.ones_like(s), s + delay
     for n in range(_WINDOW + 1):  # of the last, only the start is used
-        exists = n < number
-        at = stop_gradient(place) + n
-        at = jnp.where(at < size, at, at - size).astype(jnp.int32)
+        at = jnp.where(place + n < size, place + n, place + n - size).astype(jnp.int32)
         row = jax.lax.dynamic_slice(history.rows, (at, jnp.zeros_like(at)), (1, width))[0]
-        if n < _WINDOW:
-            pieces.append(row[_HEAD:].reshape(8, -1))
-        if n == 0:
-            continue
-        start = start + row[0]
-        known.append(jnp.where(exists, start, jnp.inf))
-        ahead = stop_gradient(start) > passed
-        its_level = stop_gradient(row[1])
-        jumps = exists & ~closed & ahead & (its_level >= 0)
-        image = jnp.where(jumps, start + (row[1] - its_level) + delay, image)
-        level = jnp.where(jumps, its_level, level)
-        ends = jumps | (exists & ~closed if n == _WINDOW else jumps)
-        reach = jnp.where(ends, start + delay, reach)
-        closed = closed | jumps
-        if n == _WINDOW:
-            break
-        used = exists & ~closed
-        key = jnp.where(ahead, stop_gradient(start), -jnp.inf)
-        starts.append(start)
-        keys.append(jnp.where(used, key, jnp.inf))
-    # A jump where the step begins, of which the piece is not written yet.
-    jumps = (number <= _WINDOW) & ~closed & (stop_gradient(history.level) >= 0)
-    image = jnp.where(jumps, s + history.slip + delay, image)
-    level = jnp.where(jumps, history.level, level)
-    reach = jnp.where(jumps, s + delay, reach)
-    window = Window(delay, tuple(starts), tuple(keys), tuple(pieces), plan.unit)
-    return window, tuple(known), reach, image, level
+        instant: Any = -jnp.inf
+        if n:
+            # At the end is the jump where the step begins, of which no piece is written yet.
+            is_end = n == number
+            start = jnp.where(is_end, s, start + row[0])
+            mark = jnp.where(is_end, history.level + history.slip, row[1])
+            its_level, ahead = stop_gradient(mark), stop_gradient(start) > passed
+            jumps = ~closed & (n <= number) & ahead & (its_level >= 0)
+            image = jnp.where(jumps, start + (mark - its_level) + delay, image)
+            level = jnp.where(jumps, its_level, level)
+            ends = jumps | ~closed & is_end if n < _WINDOW else ~closed & (n <= number)
+            reach = jnp.where(ends, stop_gradient(start + delay), reach)
+            closed = closed | ends
+            instant = jnp.where(ahead, stop_gradient(start), -jnp.inf)
+            instant = jnp.where(closed | (n >= number), jnp.inf, instant)
+        starts.append(jnp.where(n < number, start, jnp.inf) if n else start)
+        pieces.append((instant, start, row[_HEAD:].reshape(8, -1)))
+    window = Window(delay, tuple(pieces[:_WINDOW]), history.unit)
+    return window, tuple(starts), stop_gradient(reach), image, level
 
 
 def end_of_step(
@@ -416,55 +360,40 @@ def end_of_step(
 ) -> tuple[Scalar, Scalar, Flag]:
     """Return length and end of an ordinary step, which ends at the next image of a jump and with
     the pieces that it reads; and whether it may end at `bound` instead."""
-    view = plan.view
+    view = plan.machine._past
     h = jnp.where(free, jnp.minimum(h, stop_gradient(view.reach - lane.s)), h)
-    left = stop_gradient(view.image - lane.s)
-    meets = free & (left <= h * (1 + 1e-6))
+    meets = free & (stop_gradient(view.image - lane.s) <= h * (1 + 1e-6))
     end = jnp.where(meets, jnp.where(meets, view.image, 0.0), lane.s + h)
-    return h, end, free & (stop_gradient(bound) <= stop_gradient(view.image) + view.slack)
+    return (
+        h,
+        end,
+        free & (stop_gradient(bound) <= stop_gradient(view.image) + slack_of(plan, lane.s)),
+    )
 
 
 def new_piece(
     plan: Any, lane: Any, smooth: SmoothMachine, s1: Scalar, state: State, h: Scalar
 ) -> Array:
     """Return the polynomial of what a step records, (8, numbers) by power of the share of it."""
-
-    def values(s: Scalar, state: State) -> tuple[Vector, ...]:
-        return (recorded_numbers(smooth.machine, plan.memory.form, s, state, smooth.modes),)
-
-    for _ in range(3):
-        values = functools.partial(_with_rate, values, smooth)
-    length = jnp.where(stop_gradient(h) > 0, h, 1.0)
-    return hermite(values(lane.s, lane.state), values(s1, state), length)
+    modes = shown_modes(smooth.machine, smooth.modes)
+    record = lambda s, state: recorded_numbers(smooth.machine, s, state, modes)
+    along = lambda s, state: (jnp.ones_like(s), smooth.field(s, state))
+    begin, end = (_derivatives(record, along, *x) for x in ((lane.s, lane.state), (s1, state)))
+    return hermite(begin, end, jnp.where(stop_gradient(h) > 0, h, 1.0))
 
 
-def _with_rate(function: Any, smooth: SmoothMachine, s: Scalar, state: State) -> tuple:
-    along = jnp.ones_like(s), smooth.field(s, state)
-    values, rates = jax.jvp(function, (s, state), along)
-    return (*values, rates[-1])
-
-
-# The last four coefficients of a piece from what the first four leave at its end.
-_POWERS = np.array([[1, 1, 1, 1], [4, 5, 6, 7], [6, 10, 15, 21], [4, 10, 20, 35]])
-_LAST = np.round(np.linalg.inv(_POWERS))
+# The coefficients by power of a polynomial of degree 7 from its derivatives of order n at 0 and at
+# 1, divided by n!.
+_AT_0, _AT_1 = np.eye(4, 8), [[math.comb(k, n) for k in range(8)] for n in range(4)]
+_HERMITE = np.round(np.linalg.inv(np.concatenate([_AT_0, _AT_1])))
 
 
 def hermite(begin: Any, end: Any, h: Scalar) -> Array:
     """Return the polynomial of degree 7 through values and three derivatives at both ends of a
     step, by power of the share of the step: (8, numbers)."""
-    first, last = (
-        [x * (h**n / factor) for n, (x, factor) in enumerate(zip(y, (1, 1, 2, 6), strict=True))]
-        for y in (begin, end)
-    )
-    a, b, c, d = first
-    left = [
-        last[0] - (a + b + c + d),
-        last[1] - (b + 2 * c + 3 * d),
-        last[2] - (c + 3 * d),
-        last[3] - d,
-    ]
-    more = [sum(float(w) * x for w, x in zip(row, left, strict=True)) for row in _LAST]
-    return jnp.stack([*first, *more])
+    given = [x * (h**n / math.factorial(n)) for ends in (begin, end) for n, x in enumerate(ends)]
+    found = [[float(w) * x for w, x in zip(row, given, strict=True) if w] for row in _HERMITE]
+    return jnp.stack([sum(x[1:], x[0]) for x in found])
 
 
 def _in_time(piece: Array, h: Scalar, unit: Scalar | float) -> Vector:
@@ -476,58 +405,49 @@ def piece_error(plan: Any, piece: Array, h: Scalar) -> Scalar:
     """Return the largest error of a piece of length h relative to the tolerance, for an adaptive
     method; 0 for one that is too short to be kept.
 
-    Of the polynomial by powers about the middle of the step, which decrease like those of the
-    motion, the next pair of coefficients is extrapolated from the last two pairs."""
+    Of the polynomial by powers of 2θ - 1, which decrease like those of the motion, the next pair of
+    coefficients is extrapolated from the last two pairs. θ is the share of the step."""
     piece = stop_gradient(piece)
-    about = [sum(w * piece[n] for n, w in enumerate(row) if w) for row in _CENTERED]
-    earlier = jnp.maximum(jnp.abs(about[4]), jnp.abs(about[5]))
-    later = jnp.maximum(jnp.abs(about[6]), jnp.abs(about[7]))
+    about = [
+        jnp.abs(sum(math.comb(n, k) / 2.0**n * piece[n] for n in range(k, 8))) for k in range(4, 8)
+    ]
+    earlier, later = jnp.maximum(about[0], about[1]), jnp.maximum(about[2], about[3])
     error = later * jnp.minimum(1.0, later / jnp.where(earlier > 0, earlier, 1.0))
     size = jnp.maximum(jnp.abs(piece[0]), jnp.abs(jnp.sum(piece, axis=0)))
     rtol, atol, _ = plan.method.tolerances(error[0])
-    error = _SHARE * jnp.max(error / (atol * plan.memory.sizes + rtol * size))
-    return jnp.where(stop_gradient(h) > plan.view.slack, error, 0.0)
-
-
-# Powers of θ = (1 + σ)/2 by powers of σ.
-_CENTERED = np.array(
-    [[math.comb(n, k) / 2.0**n if k <= n else 0.0 for n in range(8)] for k in range(8)]
-)
-
-# The share of the tolerance for the error of a piece is the inverse of this: a choice.
-_SHARE = 1.0
+    error = jnp.max(error / (atol * plan.memory.sizes + rtol * size))
+    return jnp.where(stop_gradient(h) > slack_of(plan, h), error, 0.0)
 
 
 def extended(
     plan: Any, history: History, step: tuple[Any, Any, Flag], arrived: Any, s: Scalar, jumps: Flag
 ) -> History:
-    """Return the history after a step, and whether its ring is full. `step` is the lane before it,
-    the trial, and whether it was taken; `s` is the clock after it, which begins anew with a cycle;
-    `jumps`: an event happened there, so that the motion is not smooth."""
-    (old, trial, taken), view, size = step, plan.view, plan.memory.pieces
-    kept = taken & (stop_gradient(trial.h) > view.slack)
+    """Return the history after a step. `step` is the lane before it, the trial, and whether it was
+    taken; `s` is the clock after it, which begins anew with a cycle; `jumps`: an event happened
+    there, so that the motion is not smooth."""
+    (old, trial, taken), view, slack = step, plan.machine._past, slack_of(plan, s)
+    kept, size = taken & (stop_gradient(trial.h) > slack), plan.memory.pieces
     head = jnp.stack([old.s - history.newest, history.level + history.slip])
-    length = jnp.where(kept, trial.h, plan.unit)
-    row = jnp.concatenate([head, _in_time(trial.piece, length, plan.unit)])[None]
+    length = jnp.where(kept, trial.h, history.unit)
+    row = jnp.concatenate([head, _in_time(trial.piece, length, history.unit)])[None]
     # The place is that of no piece in use. The piece counts if it is kept.
     place = stop_gradient(history.head).astype(jnp.int32)
     rows = jax.lax.dynamic_update_slice(history.rows, row, (place, jnp.zeros_like(place)))
-    met = taken & (jnp.abs(stop_gradient(trial.s - view.image)) <= view.slack)
-    level = jnp.where(met & (view.level + 1 < plan.memory.form.levels), view.level + 1, -1.0)
-    level = jnp.where(taken & jumps, 0.0, level)
-    slip = jnp.where(taken & jumps, arrived.slip, 0.0)
-    waits = ~kept & (history.level >= 0) & ~(taken & jumps)
-    shift, end = arrived.s - s, stop_gradient(arrived.s)
+    met = taken & (jnp.abs(stop_gradient(trial.s - view.image)) <= slack)
+    level = jnp.where(met & (view.level + 1 < view.form.levels), view.level + 1, -1.0)
+    jumps = taken & jumps
+    level, slip = jnp.where(jumps, 0.0, level), jnp.where(jumps, arrived.slip, 0.0)
+    waits = ~kept & (history.level >= 0) & ~jumps
+    shift, end = arrived.s - s, stop_gradient(arrived.s) + slack
     places, starts = [], []
-    delays = delays_in(without_past(plan.machine)).values()
-    for delay, place, known in zip(delays, history.places, view.known, strict=True):
-        start, steps = known[0], jnp.zeros_like(s)
-        for x in known[1:]:
-            begun = taken & (stop_gradient(x) <= end - stop_gradient(delay) + view.slack)
-            start, steps = jnp.where(begun, x, start), steps + jnp.where(begun, 1.0, 0.0)
-        places.append(jnp.mod(place + steps, size))
+    for delay, place, known in zip(lags_of(plan.machine), history.places, view.starts, strict=True):
+        start = known[0]
+        for later in known[1:]:
+            begun = taken & (stop_gradient(later) <= end - stop_gradient(delay))
+            start, place = jnp.where(begun, later, start), place + jnp.where(begun, 1.0, 0.0)
+        places.append(jnp.mod(place, size))
         starts.append(start - shift)
-    return History(
+    return history._replace(
         rows=rows,
         head=jnp.mod(history.head + jnp.where(kept, 1.0, 0.0), size),
         newest=jnp.where(kept, old.s, history.newest) - shift,
@@ -535,7 +455,6 @@ def extended(
         slip=jnp.where(waits, history.slip, slip),
         places=tuple(places),
         starts=tuple(starts),
-        unit=history.unit,
     )
 
 

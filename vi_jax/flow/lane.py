@@ -65,8 +65,10 @@ class Record(NamedTuple):
     impact_energy: Scalar | None
     rests: Scalar | None
     """Number of times that a body came to rest on a stop."""
-    log: Float[Array, "3 size"] | None
-    """Clock, V⁻ and stop of each impact; unused columns are NaN."""
+    reduced: Scalar | None
+    """Number of impacts with less than their restitution, since they would gain energy."""
+    log: Float[Array, "5 size"] | None
+    """Clock, V⁻, stop and impulses of each impact; unused columns are NaN."""
     clearance: Scalar | None
     events: Float[Array, "4 listed"] | None
     """Clock, kind, number and value of each event; unused columns are NaN."""

@@ -11,10 +11,11 @@ from jaxtyping import Array, UInt32
 from .._types import Flag, Scalar, Scalars, State
 from ..machine import (
     AbstractMachine,
-    RigidStop,
+    at_stop,
     clock_of,
     events_of,
     is_autonomous,
+    is_compound,
     mode_number,
     others_of,
     own_modes,
@@ -24,7 +25,7 @@ from ..machine import (
     switches_of,
     with_modes,
 )
-from .lane import Lane, Record, to_event
+from .lane import Lane, Record
 from .methods import AbstractMethod
 from .sizes import rounding_bounds, unit_of
 from .smooth import TIME
@@ -101,8 +102,6 @@ class Plan(eqx.Module):
     history: Any = None
     """The history of a machine with delays at the start, and in `memory` its constants."""
     memory: Any = None
-    view: Any = None
-    """The part of the history that the current step reads."""
 
     sizes: State | None = None
     """The size of each number of the state (see `sizes.sizes_of`), at most 1."""
@@ -250,32 +249,19 @@ class Plan(eqx.Module):
             impact_speed=zero if self.records_motion else None,
             impact_energy=zero if self.records_motion else None,
             rests=zero if self.records_motion and self.rests else None,
-            log=jnp.full((3, self.log), jnp.nan, Y.dtype) if self.log else None,
+            reduced=zero if self.records_motion and is_compound(self.machine) else None,
+            log=jnp.full((5, self.log), jnp.nan, Y.dtype) if self.log else None,
             clearance=jnp.full_like(Y, jnp.inf) if self.records_motion and self.log else None,
             events=jnp.full((4, self.events), jnp.nan, Y.dtype) if self.events else None,
         )
 
-    def at_stop(
-        self, k: int, contact: Scalar, value_of: Callable[[RigidStop], Any], value: Scalar
-    ) -> Scalar:
-        """Return `value_of` of the stop on which coordinate number k rests (see `Lane.contact`), or
-        `value` if it does not rest."""
-        for i, stop in enumerate(stops_of(self.machine)):
-            if stop.coordinate == k:
-                value = jnp.where(contact == to_event(i), value_of(stop), value)
-        return value
-
     def away(self, k: int, contact: Scalar) -> Scalar:
         """Return the sign of the direction away from the stop of coordinate number k, or 0."""
-        return self.at_stop(k, contact, lambda stop: -float(stop.sign), jnp.zeros_like(contact))
+        zero = jnp.zeros_like(contact)
+        return at_stop(self.machine, k, contact, lambda stop: -float(stop.sign), zero)
 
     def sign_and_gap(self, k: int, contact: Scalar) -> tuple[Scalar | float, Scalar]:
         """Return the sign (1 right, -1 left) and the gap of the stop in `contact` of coordinate
         number k; those of its first stop if `contact` names no other."""
-        stops = [(i, stop) for i, stop in enumerate(stops_of(self.machine)) if stop.coordinate == k]
-        (_, first), others = stops[0], stops[1:]
-        sign, gap = float(first.sign), first.gap
-        for i, stop in others:
-            match = contact == to_event(i)
-            sign, gap = jnp.where(match, float(stop.sign), sign), jnp.where(match, stop.gap, gap)
-        return sign, gap
+        sign = at_stop(self.machine, k, contact, lambda stop: float(stop.sign))
+        return sign, at_stop(self.machine, k, contact, lambda stop: stop.gap)

@@ -228,6 +228,8 @@ def _columns(name: str, x: Any) -> dict[str, Any]:
     }
 
 
+_IMPACT = ("phase", "speed", "stop", "impulse", "drag")
+
 # Logs, by their dimension, and the variable that is negative in unused places.
 _LOGS = {"impact": "log_stop", "event": "event_number"}
 
@@ -243,8 +245,8 @@ def run_dataset(
 ) -> "xr.Dataset":
     batch = batch_names(dims, run.steps.ndim)
     cycle, section = (*batch, "cycle"), (*batch, "section")
-    names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "impact_energy", "clearance",
-             "duration", "frequency_ratio")  # fmt: skip
+    names = ("y_max", "y_min", "impacts", "impact_speed", "rests", "reduced", "impact_energy",
+             "clearance", "duration", "frequency_ratio")  # fmt: skip
     variables = states("section", run.sections, section)
     variables |= present({name: getattr(run, name) for name in names} | run.averages, cycle)
     variables |= states("section", run.quantities, section)
@@ -262,7 +264,7 @@ def run_dataset(
         coordinates["sample"] = place.reshape(-1, place.shape[-1])[0]
     if run.impact_log is not None:
         log = (*cycle, "impact")
-        more = {f"log_{name}": getattr(run.impact_log, name) for name in ("phase", "speed", "stop")}
+        more = {f"log_{name}": getattr(run.impact_log, name) for name in _IMPACT}
         variables |= present(more, log)
     if run.event_log is not None:
         names = ("phase", "number", "value")
@@ -439,6 +441,10 @@ class ImpactLog(Summarized):
     """V⁻, speed of approach just before the impact."""
     stop: Int[Array, "cycles size"]
     """Number of the rigid stop."""
+    impulse: Float[Array, "cycles size"]
+    """Impulse of the stop on the body, away from the stop (unit of mass times that of speed)."""
+    drag: Float[Array, "cycles size"]
+    """Impulse of friction along the stop; 0 without friction."""
 
     def summary(self) -> str:
         """Return the impacts of the first cycles: clock, stop and speed."""
@@ -523,6 +529,9 @@ class Run(Summarized):
     rests: Int[Array, " cycles"] | None
     """Number of times that the body came to rest on a stop. Its infinitely many last impacts are
     completed at once, and are not among `impacts`."""
+    reduced: Int[Array, " cycles"] | None
+    """Number of impacts with less than Newton's restitution: with friction or several contacts the
+    whole would gain energy (see `RigidStop`). `None` if no impact can."""
     impact_energy: Float[Array, " cycles"] | None
     """Energy lost in impacts in each cycle: ½(1 - k²)V⁻² for each impact, ½V⁻² where the body came
     to rest, times the mass on which the impact acts."""

@@ -15,8 +15,8 @@ from .clocks import (
 )
 from .contact_forces import contact_forces
 from .contacts import (
-    added, check_takes, constrained_rate, contact_constraints, field_in, forces, on_held_surfaces,
-    push_gains, push_of, row_of, shown_modes, velocity_change, with_friction_impulse,
+    Impact, added, check_takes, constrained_rate, contact_constraints, field_in, forces, impact_on,
+    on_held_surfaces, push_gains, push_of, row_of, shown_modes, velocity_change,
 )
 from .coordinates import (
     Coordinate, Row, angles_in, component, has_component, is_angle, nearest_images, with_component,
@@ -24,14 +24,14 @@ from .coordinates import (
 )
 from .cycles import Turn, counter_of, counts_turns, falling, rising, turn_of
 from .declared import (
-    clock_of, has_own_modes, is_builtin, limited_in, others_of, outcomes_of, overridden, section_in,
-    stops_of, switches_of, with_earlier_clock,
+    at_stop, chosen_stop, clock_of, has_own_modes, is_builtin, limited_in, others_of,
+    outcomes_of, overridden, section_in, stops_of, stops_on, switches_of, with_earlier_clock,
 )
 from .delay import (
-    FixedPast, Recorded, delays_in, delays_valid, form_of, has_delays, history_before, reading,
-    recorded_numbers, with_fixed_past, with_some_past, without_past,
+    Past, delays_valid, has_delays, history_before, lags_of, longest_delay, reading,
+    recorded_numbers, with_some_past, without_past,
 )
-from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
+from .delay_chain import delay_chain, history_in, machine_of_chain
 from .drives import (
     AbstractCrank, AbstractDrive, CosineCrank, IdealDrive, Motor, OscillatorState, Slide,
     SliderCrank,
@@ -39,12 +39,14 @@ from .drives import (
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
     HybridState, Reset, Switch, after_event, after_one_event, begin_modes, begun, constant_modes,
-    event_of, events_of, friction_on, guard_of, has_contact_friction, history_of, holds_anywhere,
-    is_autonomous, jump_of,
+    event_of, events_of, guard_of, has_contact_friction, history_of, holds_anywhere,
+    is_autonomous, is_compound, jump_of,
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
     sides_of, struck_modes, with_modes, without_modes,
 )
-from .friction import ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes
+from .friction import (
+    ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
+)
 from .linear import LinearMachine, ModalMachine, Prepared, StructureState, modal
 from .mechanical import Mechanical, solved
 from .numbers import (
@@ -54,6 +56,6 @@ from .numbers import (
     stated, unit_of, units_of, with_leaf, with_leaves, with_unit, with_units,
 )
 from .scene import Parameters, Scene
-from .settle import Strike, strike
+from .settle import strike
 from .state import State, like
 from .stop import AbstractContactLaw, HuntCrossley, PowerLaw, RigidStop, SoftStop, stop_in_words

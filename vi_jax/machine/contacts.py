@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.lax import stop_gradient
+from jaxtyping import Array
 
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
-from .declared import limited_in, stops_of, switches_of
+from .declared import friction_on, limited_in, stops_of, switches_of
+from .settle import Strike
 from .state import like
 
 # A smaller pivot (each row's begins as 1) is that of a redundant contact, whose velocity the other
@@ -53,16 +55,23 @@ def push_gains(
     bodies: Sequence[Any], rows: Sequence[Row], state: State, pushes: Sequence[State]
 ) -> list[list[Scalar]]:
     """Return the change of each coordinate's velocity (row) by each push (column)."""
-    return [
-        [
-            velocity_change(body, state, push) if row.slopes is None else _product(row.slopes, push)
-            for push in pushes
-        ]
-        for body, row in zip(bodies, rows, strict=True)
-    ]
+
+    def gain(body: Any, row: Row, push: State) -> Any:
+        if push is row.push:
+            return 1.0
+        change = velocity_change(body, state, push) if row.slopes is None else None
+        return _product(row.slopes, push) if change is None else change
+
+    each = list(zip(bodies, rows, strict=True))
+    return [[gain(body, row, push) for push in pushes] for body, row in each]
 
 
-def _product(slopes: State, push: State) -> Scalar:
+def _is(x: Any, value: float) -> bool:
+    """Return whether a number is a Python number equal to `value`, known while tracing."""
+    return isinstance(x, float) and x == value
+
+
+def _product(slopes: State, push: State) -> Any:
     """Return the sum of the products of two trees' numbers, without known zeros."""
     terms = []
     for a, b in zip(jtu.tree_leaves(slopes), jtu.tree_leaves(push), strict=True):
@@ -70,7 +79,7 @@ def _product(slopes: State, push: State) -> Scalar:
             is_one = isinstance(a, np.ndarray) and (a == 1).all()
             term = b if is_one else a * b
             terms.append(jnp.sum(term) if jnp.ndim(term) else term)
-    return jnp.asarray(sum(terms[1:], terms[0]) if terms else 0.0)
+    return jnp.asarray(sum(terms[1:], terms[0])) if terms else 0.0
 
 
 def forces(
@@ -78,15 +87,15 @@ def forces(
 ) -> list[Scalar]:
     """Return the amount of each push that changes the velocities of the `acting` contacts as
     `wanted`, with `gains` from `push_gains`; 0 for the others."""
-    rows = []
-    for j, row in enumerate(gains):
-        both = zip(row, acting, strict=True)
-        row = [
-            jnp.where(acting[j] & other, x, 1.0 if j == k else 0.0)
-            for k, (x, other) in enumerate(both)
-        ]
-        rows.append([*row, jnp.where(acting[j], wanted[j], 0.0)])
-    return _solved(rows)
+
+    def entry(j: int, k: int, x: Any) -> Any:
+        if _is(x, 0.0 if j != k else 1.0):
+            return x
+        return jnp.where(acting[j], x, 1.0 if j == k else 0.0)
+
+    rows = [[entry(j, k, x) for k, x in enumerate(row)] for j, row in enumerate(gains)]
+    sides = [jnp.where(on, x, 0.0) for on, x in zip(acting, wanted, strict=True)]
+    return _solved([[*row, x] for row, x in zip(rows, sides, strict=True)])
 
 
 def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
@@ -94,14 +103,22 @@ def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
     masses of contacts, needs no pivoting."""
     n = len(rows)
     for i in range(n):
-        pivot = rows[i][i]
-        is_independent = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
-        inverse = jnp.where(is_independent, 1 / jnp.where(is_independent, pivot, 1.0), 0.0)
-        rows[i] = [x * inverse for x in rows[i]]
-        for j in range(n):
-            if j != i:
-                rows[j] = [a - rows[j][i] * b for a, b in zip(rows[j], rows[i], strict=True)]
-    return [row[-1] for row in rows]
+        pivot, later = rows[i][i], [k for k in range(i + 1, n + 1) if not _is(rows[i][k], 0.0)]
+        if not _is(pivot, 1.0):
+            is_independent = jnp.abs(stop_gradient(pivot)) > _REDUNDANT
+            inverse = jnp.where(is_independent, 1 / jnp.where(is_independent, pivot, 1.0), 0.0)
+            for k in later:
+                rows[i][k] = rows[i][k] * inverse
+        for row in rows[i + 1 :]:
+            for k in later if not _is(row[i], 0.0) else ():
+                product = row[i] * rows[i][k]
+                row[k] = -product if _is(row[k], 0.0) else row[k] - product
+    found = [row[-1] for row in rows]
+    for i in reversed(range(n)):
+        for j in range(i):
+            if not _is(rows[j][i], 0.0):
+                found[j] = found[j] - rows[j][i] * found[i]
+    return found
 
 
 def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> State:
@@ -118,54 +135,51 @@ def added(state: State, amounts: Sequence[Scalar], changes: Sequence[State]) -> 
     return state
 
 
-class FrictionImpulse(NamedTuple):
-    """The state after an impact with friction, and its impulses."""
+class Impact(NamedTuple):
+    """The equations of an impact on some stops, in the state before it. Arrays have a number for
+    each stop, then for each friction on one of them."""
 
-    state: State
-    pushed: Scalar
-    """The amount of the stop's push; `dragged` is that of the push along the stop."""
-    dragged: Scalar
+    before: State
+    rows: list[Row]
+    outward: Array
+    """The sign of the velocity that opens a contact; 1 for a friction."""
+    strike: Strike
+    """Without restitution across the stops."""
+    of: tuple[int, ...]
+    """The stop of each friction, by its place among these stops."""
 
-
-def with_friction_impulse(
-    machine: Machine, number: int, friction: Any, s: Scalar, before: State, after: State
-) -> FrictionImpulse:
-    """Return the result of an impact on stop `number` with Coulomb friction, from the states before
-    it and after one without friction, whose normal velocity is kept. The body sticks if the
-    required impulse is at most `level` times that of the stop: its velocity along the stop is
-    reversed and scaled by the tangential restitution. Otherwise it slips against `level` times the
-    stop's impulse."""
-    stop = stops_of(machine)[number]
-    body, along = machine.coordinates[stop.coordinate], machine.coordinates[friction.along]
-    rows = [row_of(x, s, before) for x in (body, along)]
-    push, drag = (row.push for row in rows)
-    gains = push_gains((body, along), rows, before, (push, drag))
-    normal, slip = body.velocity(before), along.velocity(before)
-    wanted = body.velocity(after) - normal
-    active = jnp.ones((), bool)
-    sticking = forces(gains, (active, active), (wanted, -(1 + friction.restitution) * slip))
-    ratio = rows[0].mass / rows[1].mass
-    level, outward = friction.level * ratio, -float(stop.sign)
-    slips = jnp.abs(sticking[1]) > level * jnp.maximum(outward * sticking[0], 0.0)
-    # Friction acts against the slip after the impact, which the stop's push changes, too.
-    forward = _slipping(gains, wanted, -outward * level)
-    backward = _slipping(gains, wanted, outward * level)
-    slip_after = slip + gains[1][0] * forward[0] + forward[1]
-    is_forward = slip_after > -friction.restitution * slip
-    pushed, dragged = (
-        jnp.where(slips, jnp.where(is_forward, x, y), z)
-        for x, y, z in zip(forward, backward, sticking, strict=True)
-    )
-    place, speed = body.position(after), body.velocity(after)
-    state = body.placed(added(before, (pushed, dragged), (push, drag)), place, speed)
-    return FrictionImpulse(state, pushed, dragged)
+    def after(self, impulse: Array) -> State:
+        """Return the state after these impulses."""
+        amounts = self.outward * impulse / jnp.stack([1.0 * x.mass for x in self.rows])
+        return added(self.before, list(amounts), [row.push for row in self.rows])
 
 
-def _slipping(gains: list[list[Scalar]], wanted: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the amounts of the stop's push and of the push along it, for the change `wanted` of
-    the normal velocity. The latter is `ratio` times as large."""
-    pushed = wanted / (1 + ratio * gains[0][1])
-    return pushed, ratio * pushed
+def impact_on(machine: Any, numbers: Sequence[int], s: Scalar, before: State) -> Impact:
+    """Return the equations of an impact on the stops of these numbers."""
+    stops = [stops_of(machine)[i] for i in numbers]
+    frictions = [friction_on(machine, i) for i in numbers]
+    of = tuple(place for place, x in enumerate(frictions) if x is not None)
+    on = [*(x.coordinate for x in stops), *(frictions[i].along for i in of)]
+    bodies = {k: machine.coordinates[k] for k in dict.fromkeys(on)}
+    rows = {k: row_of(body, s, before) for k, body in bodies.items()}
+    each = list(bodies.values()), list(rows.values())
+    found = push_gains(*each, before, [x.push for x in each[1]])
+    at, zero = [list(bodies).index(k) for k in on], jnp.zeros_like(s)
+    gains = jnp.stack([jnp.stack([found[i][j] for j in at]) for i in at])
+    signs = [*(-float(x.sign) for x in stops), *(1.0 for _ in of)]
+    outward = jnp.asarray(np.asarray(signs), s.dtype)
+    masses = jnp.stack([jnp.asarray(1.0 * rows[k].mass, s.dtype) for k in on])
+    velocity = outward * jnp.stack([bodies[k].velocity(before) for k in on])
+
+    def of_frictions(value_of: Callable[[Any], Any]) -> Array:
+        return jnp.stack([value_of(frictions[i]) + zero for i in of]) if of else velocity[:0]
+
+    strike = Strike(
+        outward[:, None] * gains * outward / masses, velocity,
+        of_frictions(lambda x: x.level), jnp.zeros((len(stops),), s.dtype),
+        of_frictions(lambda x: x.restitution), jnp.ones((len(stops),), bool),
+    )  # fmt: skip
+    return Impact(before, [rows[k] for k in on], outward, strike, of)
 
 
 class ContactConstraints(NamedTuple):
@@ -175,8 +189,6 @@ class ContactConstraints(NamedTuple):
     coordinates: list[Any]
     """The coordinates whose velocities are held; for a friction the one along the stop."""
     rows: list[Row]
-    pushes: list[State]
-    """The change of the state by each force; for a stop with the friction on a slipping body."""
     acts: list[Flag]
     """True in the rows that hold; a friction holds while the body sticks."""
     stop_frictions: list[tuple[int, Any, int, Scalar]]
@@ -186,9 +198,24 @@ class ContactConstraints(NamedTuple):
     """The indices of the dry frictions among the switches."""
 
     def amounts(self, state: State, wanted: Sequence[Scalar]) -> list[Scalar]:
-        """Return the amount of each push that changes the held velocities as `wanted`."""
+        """Return the amount of each row's push that changes the held velocities as `wanted`. A stop
+        drags a slipping body along, too."""
         gains = push_gains(self.coordinates, self.rows, state, self.pushes)
-        return forces(gains, self.acts, wanted)
+        first = len(self.rows) - len(self.dry) - len(self.stop_frictions)
+        slips = [(i, x[2], x[3]) for i, x in enumerate(self.stop_frictions, start=first)]
+        for i, stop, share in slips:
+            for row in gains:
+                if not _is(row[i], 0.0):
+                    change = share if _is(row[i], 1.0) else share * row[i]
+                    row[stop] = change if _is(row[stop], 0.0) else row[stop] + change
+        amounts = forces(gains, self.acts, wanted)
+        for i, stop, share in slips:
+            amounts[i] = amounts[i] + share * amounts[stop]
+        return amounts
+
+    @property
+    def pushes(self) -> list[State]:
+        return [row.push for row in self.rows]
 
 
 def contact_constraints(
@@ -206,7 +233,7 @@ def contact_constraints(
     numbers = [*limited, *(x.along for _, x in frictions)]
     by_number = {k: row_of(coordinates[k], s, state) for k in numbers}
     rows, acts = [by_number[k] for k in numbers], [contact[k] > 0 for k in limited]
-    pushes, stop_frictions = [row.push for row in rows], []
+    stop_frictions = []
     for i, friction in frictions:
         stop = stops[friction.friction_stop]
         row = limited.index(stop.coordinate)
@@ -215,45 +242,30 @@ def contact_constraints(
         ratio = by_number[stop.coordinate].mass / by_number[friction.along].mass
         ratio = jnp.round(modes[i]) * friction.level * stop.sign * ratio
         share = jnp.where(rests, ratio, 0.0)
-        pushes[row] = added(pushes[row], (share,), (by_number[friction.along].push,))
         acts = [*acts, rests & (modes[i] == 0)]
         stop_frictions.append((i, friction, row, share))
     bodies = [coordinates[k] for k in numbers]
     dry = [i for i, x in enumerate(switches) if x.is_dry] if with_dry else []
     for i in dry:
         row = switches[i].row(machine, s, state)
-        bodies, rows, pushes = (
-            [*bodies, switches[i].as_velocity(machine, s)], [*rows, row], [*pushes, row.push]
-        )  # fmt: skip
+        bodies, rows = [*bodies, switches[i].as_velocity(machine, s)], [*rows, row]
         acts = [*acts, modes[i] == 0]
-    return ContactConstraints(bodies, rows, pushes, acts, stop_frictions, dry)
+    return ContactConstraints(bodies, rows, acts, stop_frictions, dry)
 
 
 def constrained_rate(
     machine: Machine, flow: State, s: Scalar, state: State, modes: Sequence[Scalar],
     contact: Sequence[Scalar],
-) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:  # fmt: skip
+) -> tuple[State, ContactConstraints, list[Scalar]]:  # fmt: skip
     """Return the rate along `flow`, corrected so that resting coordinates keep their velocities.
-    Forces on shared bodies are solved for together. Also return for each friction, by its index
-    among the switches, the force along the surface, the normal force (`None` without a stop), and
-    the effective mass."""
+    Forces on shared bodies are solved for together. Also return the constraints and the amounts of
+    their pushes."""
     held = contact_constraints(machine, s, state, modes, contact)
     first, switches = len(held.rows) - len(held.dry), switches_of(machine)
     wanted = [-velocity_change(body, state, flow) for body in held.coordinates[:first]]
     wanted += [-switches[i].slip_rate(machine, s, state, flow) for i in held.dry]
     amounts = held.amounts(state, wanted)
-    pace, found = machine.pace(s, state), {}
-    for i, row, amount in zip(held.dry, held.rows[first:], amounts[first:], strict=True):
-        force = amount * row.mass
-        found[i] = force if pace is None else force / pace, None, row.mass
-    for number, (i, friction, stop, _) in enumerate(
-        held.stop_frictions, start=first - len(held.stop_frictions)
-    ):
-        sign, masses = stops_of(machine)[friction.friction_stop].sign, (x.mass for x in held.rows)
-        masses = list(masses)
-        pressing = -sign * amounts[stop] * masses[stop]
-        found[i] = amounts[number] * masses[number], pressing, masses[number]
-    return added(flow, amounts, held.pushes), found
+    return added(flow, amounts, held.pushes), held, amounts
 
 
 def on_held_surfaces(

@@ -9,6 +9,8 @@ from operator import attrgetter
 from types import CodeType, FunctionType
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
+
 from .._messages import warn
 from .._types import Machine, Scalar, State
 
@@ -165,6 +167,37 @@ stops_of, switches_of, others_of = map(attrgetter, ("_stops", "_switches", "_oth
 def limited_in(machine: Machine) -> list[int]:
     """Return the numbers of the coordinates that stops limit."""
     return sorted({stop.coordinate for stop in stops_of(machine)})
+
+
+def stops_on(machine: Machine, k: int) -> list[int]:
+    """Return the numbers of the stops that limit coordinate number k."""
+    return [i for i, stop in enumerate(stops_of(machine)) if stop.coordinate == k]
+
+
+def chosen_stop(machine: Machine, k: int, chosen: Mapping[int, Any], contact: Any) -> Any:
+    """Return the contact of coordinate number k (as in `EventContext`) with that of its stops that
+    is `chosen`; else `contact`."""
+    for i in stops_on(machine, k):
+        contact = jnp.where(chosen[i], 1.0 + i, contact)
+    return contact
+
+
+def at_stop(
+    machine: Machine, k: int, contact: Any, value_of: Callable[[Any], Any], value: Any = None
+) -> Any:
+    """Return `value_of` of the stop in `contact` (as in `EventContext`) of coordinate number k. If
+    it is none, return `value`, by default that of the coordinate's first stop."""
+    numbers, stops = stops_on(machine, k), stops_of(machine)
+    if value is None:
+        value, numbers = value_of(stops[numbers[0]]), numbers[1:]
+    for i in numbers:
+        value = jnp.where(contact == 1.0 + i, value_of(stops[i]), value)
+    return value
+
+
+def friction_on(machine: Machine, number: int) -> Any:
+    """Return the friction on stop number `number`, or `None`."""
+    return next((x for x in switches_of(machine) if x.friction_stop == number), None)
 
 
 def clock_of(machine: Machine, state: State) -> Scalar | None:

@@ -7,6 +7,7 @@ the package need not distinguish the two.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,13 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .._checks import concrete
 from .._types import Machine, Scalar, Scalars, State, Vector
 from ..lanes import dependent_results
-from .base import cached_in_trace
-from .contacts import call_checked, check_takes, field_in, shown_modes
-from .declared import overridden, switches_of, with_static
+from .base import AbstractMachine, cached_in_trace
+from .contacts import check_takes, field_in, shown_modes
+from .declared import overridden, with_static
 from .events import Reset, Switch, after_event, begin_modes, guard_of, section_number
 from .state import State as Named
 from .state import like
@@ -30,7 +32,7 @@ _SHORTEST = 1e-3
 
 # The number of delays after which the image of a jump is too smooth to matter for polynomials of
 # degree 7, by the number of integrations from a delayed quantity to itself.
-_LEVELS = {0: 7, 1: 7, 2: 3}
+_LEVELS = (7, 7, 3, 2)
 
 
 def has_delays(machine: Machine) -> bool:
@@ -58,10 +60,21 @@ def delays_in(machine: Machine) -> dict[str, Any]:
     return dict(given)
 
 
+@cached_in_trace
+def lags_of(machine: Machine) -> list[Scalar]:
+    """Return the delays of a machine in any form as numbers."""
+    return [1.0 * jnp.asarray(x) for x in delays_in(without_past(machine)).values()]
+
+
+@cached_in_trace
+def longest_delay(machine: Machine) -> Scalar:
+    return functools.reduce(jnp.maximum, lags_of(machine))
+
+
 def delays_valid(machine: Machine) -> Any:
     """Return whether all delays, which may be traced, are in their range."""
     least = _SHORTEST * jnp.asarray(machine.cycle)
-    flags = [(x >= least) & (x < jnp.inf) for x in map(jnp.asarray, machine.delays.values())]
+    flags = [(x >= least) & (x < jnp.inf) for x in lags_of(machine)]
     return functools.reduce(jnp.logical_and, flags)
 
 
@@ -78,10 +91,8 @@ class Recorded(eqx.Module):
 
     @property
     def size(self) -> int:
-        """The number of numbers that are recorded."""
-        return sum(
-            jnp.zeros(x).size for x, used in zip(self.shapes, self.used, strict=True) if used
-        )
+        """The number of numbers that are used."""
+        return sum(math.prod(x) for x, used in zip(self.shapes, self.used, strict=True) if used)
 
     def pack(self, recorded: Any) -> Vector:
         """Return the numbers that are used, as a vector."""
@@ -89,14 +100,13 @@ class Recorded(eqx.Module):
         return jnp.concatenate([jnp.ravel(x) for x, used in leaves if used])
 
     def unpack(self, numbers: Vector) -> Any:
-        """Return what was recorded; 0 for numbers that no function reads."""
+        """Return what was recorded; 0 for numbers that are not used."""
         leaves, place = [], 0
         for shape, used in zip(self.shapes, self.used, strict=True):
-            leaf = jnp.zeros(shape, numbers.dtype)
-            if used:
-                leaf = numbers[place : place + leaf.size].reshape(shape)
-                place += leaf.size
+            end = place + math.prod(shape) * used
+            leaf = numbers[place:end].reshape(shape) if used else jnp.zeros(shape, numbers.dtype)
             leaves.append(leaf)
+            place = end
         return jtu.tree_unflatten(self.structure, leaves)
 
     def by_name(self, numbers: Any) -> Named:
@@ -104,114 +114,124 @@ class Recorded(eqx.Module):
         return Named(**{x: self.unpack(y) for x, y in zip(self.names, numbers, strict=True)})
 
 
-class FixedPast(eqx.Module):
-    """A past that does not depend on time, for checks before a run."""
+class Past(eqx.Module):
+    """The past in a form of a machine, a function of the clock and the form's state; by default one
+    that does not depend on them, for checks before a run."""
 
-    past: Any
+    form: Any
+    fixed: Any = eqx.field(default=None, kw_only=True)
 
-    def __call__(self, s: Scalar) -> Any:
-        return self.past
+    def __call__(self, machine: Any, s: Scalar, state: State) -> Any:
+        return self.fixed
 
+    def own(self, state: State) -> State:
+        """Return the machine's own state from that of the form."""
+        return state
 
-def with_fixed_past(machine: Machine, form: Recorded, before: Callable[[Scalar], Any]) -> Machine:
-    """Return a machine that reads the history before the start, each delay ago, at all times."""
-    past = [form.pack(before(-jnp.asarray(x, float))) for x in delays_in(machine).values()]
-    return reading(machine, FixedPast(form.by_name(past)))
+    def rates(self, machine: Any, flow: Any, s: Scalar, state: State, modes: Scalars) -> Any:
+        """Return the rates of the form's state from the machine's `flow`."""
+        return flow
+
+    @staticmethod
+    def members(kind: type) -> dict[str, Any]:
+        """Return the members that a form of this class has besides those which read the past."""
+        return {}
 
 
 def with_some_past(machine: Machine, start: State) -> Machine:
-    """Return a machine with its history at the start as its past, for checks; unchanged without
-    delays."""
+    """Return a machine that reads the history before the start, each delay ago, at all times;
+    unchanged without delays."""
     if not has_delays(machine):
         return machine
     before = history_before(machine, start)
-    return with_fixed_past(machine, form_of(machine, start, before), before)
+    form = form_of(machine, start, before)
+    past = form.by_name([form.pack(before(-x)) for x in lags_of(machine)])
+    return reading(machine, Past(form, fixed=past))
 
 
-# --- the form of a machine in which its past is bound to it
-
-
-def reading(machine: Machine, past: Callable[[Scalar], Any]) -> Machine:
-    """Return the form of a machine with delays that reads this past, a function of `s`."""
+def reading(machine: Machine, past: Past) -> Any:
+    """Return the form of a machine with delays that reads this past."""
     machine = without_past(machine)
-    new = object.__new__(_reading_kind(type(machine)))
-    return with_static(new, **values_of(machine), _past=past)
+    new = object.__new__(_reading_kind(type(machine), type(past)))
+    return with_static(new, **_values_of(machine), _past=past)
 
 
 def without_past(machine: Machine) -> Machine:
     """Return the machine as the user defined it."""
-    return original(machine) if hasattr(machine, "_past") else machine
-
-
-def values_of(machine: Machine) -> dict[str, Any]:
-    """Return the values of the machine's own fields."""
-    names = [field.name for field in dataclasses.fields(machine)]
-    return {name: getattr(machine, name) for name in names if name not in _ADDED}
-
-
-# The fields that other forms of a machine have besides its own.
-_ADDED = ("_past", "_chain", "_begin")
+    return _original(machine) if hasattr(machine, "_past") else machine
 
 
 @cached_in_trace
-def original(machine: Machine) -> Machine:
-    """Return the machine as the user defined it, from one of its other forms."""
-    kind = type(machine).__mro__[1]
-    return with_static(object.__new__(kind), **values_of(machine))
+def _original(machine: Machine) -> Machine:
+    return with_static(object.__new__(type(machine).__mro__[1]), **_values_of(machine))
+
+
+def _values_of(machine: Machine) -> dict[str, Any]:
+    names = [field.name for field in dataclasses.fields(machine) if field.name != "_past"]
+    return {name: getattr(machine, name) for name in names}
 
 
 @functools.lru_cache(maxsize=64)
-def _reading_kind(kind: type) -> type:
-    def with_past(name: str) -> Callable[..., Any]:
-        def function(self: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
-            given = s, state, self._past(s), *modes
-            whose = f"`{'force' if hasattr(kind, 'force') else name}` of a {kind.__name__}"
-            call = getattr(original(self), name)
-            check_takes(call, whose, "`s`, the state, the past", given, len(modes))
-            return call(*given)
+def _reading_kind(kind: type, past: type[Past]) -> type:
+    def field(self: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
+        whose = f"`{'force' if hasattr(kind, 'force') else 'field'}` of a {kind.__name__}"
+        flow = _called(without_past(self).field, whose, (), self, s, state, modes)
+        return self._past.rates(self, flow, s, state, modes)
 
-        return function
+    def averages(self: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
+        whose = f"`averages` of a {kind.__name__}"
+        return _called(without_past(self).averages, whose, (), self, s, state, modes)
+
+    def parts(name: str) -> property:
+        return property(lambda self: tuple(map(_given_past, getattr(without_past(self), name))))
 
     body: dict[str, Any] = {
         "__module__": kind.__module__,
         "__qualname__": kind.__qualname__,
         "__annotations__": {"_past": Any},
         "_past": eqx.field(default=None, kw_only=True),
-        "field": with_past("field"),
-        "_switches": property(lambda self: tuple(map(given_past, original(self)._switches))),
-        "_others": property(lambda self: tuple(map(given_past, original(self)._others))),
+        "field": field,
+        "_switches": parts("_switches"),
+        "_others": parts("_others"),
     }
-    if overridden(object.__new__(kind), _base(kind), "averages"):
-        body["averages"] = with_past("averages")
-    return type(kind)(kind.__name__, (kind,), body)
+    if overridden(object.__new__(kind), AbstractMachine, "averages"):
+        body["averages"] = averages
+    return type(kind)(kind.__name__, (kind,), body | past.members(kind))
 
 
-def _base(kind: type) -> type:
-    return next(x for x in kind.__mro__ if x.__name__ == "AbstractMachine")
+def _called(
+    function: Callable[..., Any], whose: str, first: tuple[Any, ...], machine: Any, s: Scalar,
+    state: State, modes: Scalars,
+) -> Any:  # fmt: skip
+    """Return the result of a user's function, which receives the past after the state."""
+    past = machine._past
+    given = *first, s, past.own(state), past(machine, s, state), *modes
+    words = "the machine, `s`, the state, the past" if first else "`s`, the state, the past"
+    check_takes(function, whose, words, given, len(modes))
+    return function(*given)
 
 
 @dataclasses.dataclass(frozen=True)
-class WithPast:
+class _WithPast:
     """A function of an event, which receives the past after the state."""
 
     function: Callable[..., Any]
 
     def __call__(self, machine: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
-        return self.call((without_past(machine), s, state, machine._past(s), *modes))
+        first = (without_past(machine),)
+        found = _called(self.function, "A function of an event", first, machine, s, state, modes)
+        return vars(found) if isinstance(found, Named) else found
 
-    def call(self, given: tuple[Any, ...]) -> Any:
-        return call_checked(self.function, "A function of an event", *given)
 
-
-def given_past(event: Any, wrapper: type = WithPast) -> Any:
-    """Return an event whose functions, if it is a switch or a reset, are wrapped."""
+def _given_past(event: Any) -> Any:
+    """Return an event whose functions, if it is a switch or a reset, receive the past."""
     names = ()
     if isinstance(event, Switch):
         names = ("function",)
     elif isinstance(event, Reset):
         names = ("_guard", "_reset", "_when", "_modes", "_value")
     functions = {name: getattr(event, name) for name in names}
-    return with_static(event, **{k: f and wrapper(f) for k, f in functions.items()})
+    return with_static(event, **{k: f and _WithPast(f) for k, f in functions.items()})
 
 
 # --- what is recorded
@@ -223,14 +243,14 @@ def history_before(machine: Machine, start: State) -> Callable[[Scalar], Any]:
     whose, given = f"`before` of a {type(machine).__name__}", machine.before
     if callable(given):
         return lambda t: as_state(given(t), whose)
-    if given is not None:
-        value = as_state(given, whose)
-        return lambda t: value
-    if overridden(machine, _base(type(machine)), "recorded") is None:
+    if given is None and not overridden(machine, AbstractMachine, "recorded"):
         return lambda t: start
-    zero = jnp.zeros((), float)
-    modes = shown_modes(machine, _modes_at(machine, zero, start))
-    value = as_state(machine.recorded(zero, start, _Unknown(whose), *modes), "`recorded`")
+    if given is None:
+        zero, past = jnp.zeros((), float), _Unknown(whose)
+        bound = reading(machine, Past(None, fixed=past))
+        modes = shown_modes(bound, begin_modes(bound, zero, start))
+        given, whose = machine.recorded(zero, start, past, *modes), "`recorded`"
+    value = as_state(given, whose)
     return lambda t: value
 
 
@@ -240,17 +260,9 @@ class _Unknown:
 
     def __getattr__(self, name: str) -> Any:
         raise ValueError(
-            f"{self._whose} must be given, the history before the start, since its `recorded` "
-            "reads the past: `before = vi.State(...)`."
+            f"{self._whose} must be given, the history before the start, since its `recorded` or "
+            "the modes at the start read the past: `before = vi.State(...)`."
         )
-
-
-def _modes_at(machine: Machine, s: Scalar, state: State) -> Scalars:
-    """Return modes of the right number; their values do not matter."""
-    own = machine.modes(s, state) if callable(machine.modes) else machine.modes
-    own = tuple(own.values()) if isinstance(own, Mapping) else own
-    number = len(switches_of(machine)) + (len(own) if isinstance(own, tuple | list) else 1)
-    return (jnp.ones_like(s),) * number
 
 
 def as_state(found: Any, whose: str) -> Any:
@@ -261,95 +273,60 @@ def as_state(found: Any, whose: str) -> Any:
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(float, x)), found)
 
 
-def recorded_numbers(
-    machine: Machine, form: Recorded, s: Scalar, state: State, modes: Scalars
-) -> Vector:
-    """Return what a machine, with its past bound to it, records in a state."""
-    return form.pack(_recorded(machine, form.structure, form.shapes, s, state, modes))
+def recorded_numbers(machine: Any, s: Scalar, state: State, modes: Scalars) -> Vector:
+    """Return what a machine, with its past bound to it, records in a state; `modes` as its field
+    receives them."""
+    return machine._past.form.pack(_recorded(machine, s, state, modes))
 
 
-def _recorded(
-    machine: Any, structure: Any, shapes: Any, s: Scalar, state: State, modes: Scalars
-) -> Any:
-    original = without_past(machine)
-    whose = f"`recorded` of a {type(machine).__name__}"
-    given = s, state, machine._past(s), *shown_modes(machine, modes)
-    check_takes(original.recorded, whose, "`s`, the state, the past", given, len(modes))
-    empty = jtu.tree_unflatten(structure, [jnp.zeros(x, s.dtype) for x in shapes])
-    found = like(empty, original.recorded(*given), whose)
-    if jtu.tree_structure(found) != structure:
+def _recorded(machine: Any, s: Scalar, state: State, modes: Scalars) -> Any:
+    form, whose = machine._past.form, f"`recorded` of a {type(machine).__name__}"
+    found = _called(without_past(machine).recorded, whose, (), machine, s, state, modes)
+    zeros = [jnp.zeros(x, s.dtype) for x in form.shapes]
+    empty = jtu.tree_unflatten(form.structure, zeros)
+    found = like(empty, found, whose)
+    if jtu.tree_structure(found) != form.structure:
         raise TypeError(f"{whose} must return numbers like `before`: {empty!r}.")
     return found
 
 
 def form_of(machine: Machine, start: State, before: Callable[[Scalar], Any]) -> Recorded:
     """Return the form of what a machine with delays records, from a start and its history."""
-    zero, names = jnp.zeros((), jnp.result_type(float)), tuple(delays_in(machine))
-    first = jax.eval_shape(before, zero)
-    leaves, structure = jtu.tree_flatten(first)
-    shapes = tuple(x.shape for x in leaves)
-    form = Recorded(structure, shapes, (True,) * len(leaves), 7, names)
-    blank = [jnp.zeros((form.size,)) for _ in names]
-    bound = reading(machine, FixedPast(form.by_name(blank)))
-    modes = begin_modes(bound, zero, start)
+    zero, names = jnp.zeros((), float), tuple(delays_in(machine))
+    leaves, structure = jtu.tree_flatten(jax.eval_shape(before, zero))
+    shapes, number = tuple(x.shape for x in leaves), len(leaves)
+    form = Recorded(structure, shapes, (True,) * number, _LEVELS[0], names)
+    blank = form.by_name([jnp.zeros(form.size)] * len(names))
+    modes = begin_modes(reading(machine, Past(form, fixed=blank)), zero, start)
 
-    def at(past: list[Any], state: State, modes: Any) -> tuple[Any, Any, Any]:
-        """Return what reads the past: the flow, all else, and what is recorded."""
-        by_name = Named(**dict(zip(names, past, strict=True)))
-        bound = reading(machine, FixedPast(by_name))
-        flow, others = field_in(bound, zero, state, modes), []
-        for number in range(len(bound._stops), section_number(bound)):
-            others.append(guard_of(bound, number, zero, state, modes))
-            others.append(after_event(bound, number, zero, state, modes))
+    def readers(past: Any, state: State, modes: Any) -> Any:
+        """Return what may read the past: what is recorded, the rates, all else."""
+        bound = reading(machine, Past(form, fixed=past))
+        shown, events = shown_modes(bound, modes), range(len(bound._stops), section_number(bound))
+        others = [f(bound, n, zero, state, modes) for n in events for f in (guard_of, after_event)]
         if "averages" in vars(type(bound)):
-            others.append(bound.averages(zero, state, *shown_modes(bound, modes)))
-        return flow, others, _recorded(bound, structure, shapes, zero, state, modes)
+            others.append(bound.averages(zero, state, *shown))
+        flow = field_in(bound, zero, state, modes)
+        return _recorded(bound, zero, state, shown), flow, others
 
-    given = [form.unpack(x) for x in blank], start, modes
-    traced, shape = jax.make_jaxpr(at, return_shape=True)(*given)
-    pasts, states, rest = (len(jtu.tree_leaves(x)) for x in given)
-    flows, others, _ = (len(jtu.tree_leaves(x)) for x in shape)
-
-    def marks(sources: list[bool]) -> tuple[list[bool], list[bool], list[bool]]:
-        found = dependent_results(traced.jaxpr, sources, smooth=False)
-        return found[:flows], found[flows : flows + others], found[flows + others :]
-
-    each, total = pasts // len(names), pasts + states + rest
-    found = [marks([i < pasts and i % each == leaf for i in range(total)]) for leaf in range(each)]
-    used = [any(flow) or any(other) for flow, other, _ in found]
-    for _ in range(each):  # what is recorded may read other numbers of the past
-        used = [
-            x or any(a and b for a, b in zip(used, record, strict=True))
-            for x, (_, _, record) in zip(used, found, strict=True)
-        ]
-    if not any(used):
+    given, parts = (blank, start, modes), len(jtu.tree_leaves(start))
+    traced = jax.make_jaxpr(readers)(*given).jaxpr
+    one_by_one = np.eye(len(traced.invars), dtype=bool).tolist()
+    # For each argument, which results depend on it.
+    marks = np.array([dependent_results(traced, x, smooth=False) for x in one_by_one])
+    rates, pasts = slice(number, number + parts), number * len(names)
+    past: Any = marks[:pasts].reshape(len(names), number, -1).any(axis=0)
+    state = marks[pasts : pasts + parts]
+    used: Any = past[:, number:].any(axis=1)
+    for _ in leaves:  # what is recorded may read other numbers of the past
+        used |= past[:, :number] @ used
+    if not used.any():
         raise ValueError(
             f"A {type(machine).__name__} has `delays`, but nothing reads its past. Leave them out."
         )
-    flow, _, record = marks([i < pasts and used[i % each] for i in range(total)])
-    driven, gain = {i for i, x in enumerate(flow) if x}, 0
-    if not any(x and y for x, y in zip(record, used, strict=True)):
-        gain = _integrations(marks, pasts, states, rest, driven, used)
-    return Recorded(structure, shapes, tuple(used), _LEVELS.get(gain, 2), names)
-
-
-def _integrations(
-    marks: Callable[[list[bool]], tuple[list[bool], ...]], pasts: int, states: int, rest: int,
-    driven: set[int], used: list[bool],
-) -> int:  # fmt: skip
-    """Return the number of integrations from the past to what is recorded, at most 3. `driven` are
-    the parts of the state whose rates read the past."""
-    of_state = [
-        marks([i == pasts + part for i in range(pasts + states + rest)]) for part in range(states)
-    ]
-    reached = {
-        part
-        for part, (_, _, record) in enumerate(of_state)
-        if any(x and y for x, y in zip(record, used, strict=True))
-    }
-    for gain in (1, 2):
-        if reached & driven:
-            return gain
-        moves = [part for part in range(states) if any(of_state[part][0][i] for i in reached)]
-        reached = reached | set(moves)
-    return 3
+    driven, reached, gain = past[used, rates].any(axis=0), state[:, :number] @ used, 0
+    if not (past[used, :number] & used).any():
+        gain = 1
+        while gain < 3 and not (reached & driven).any():
+            reached, gain = reached | state[:, rates] @ reached, gain + 1
+    return Recorded(structure, shapes, tuple(used.tolist()), _LEVELS[gain], names)

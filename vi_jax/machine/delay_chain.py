@@ -12,35 +12,25 @@ from jaxtyping import Array
 
 from .._checks import count
 from .._types import Scalar, State, Vector
-from .base import AbstractMachine, cached_in_trace
-from .contacts import check_takes
-from .declared import overridden, with_static
+from .base import AbstractMachine
+from .contacts import shown_modes
+from .declared import overridden
 from .delay import (
-    FixedPast,
-    Recorded,
-    WithPast,
+    Past,
     as_state,
-    delays_in,
     form_of,
-    given_past,
     has_delays,
     history_before,
-    original,
+    lags_of,
+    longest_delay,
+    reading,
     recorded_numbers,
-    values_of,
+    without_past,
 )
 from .events import begin_modes, history_of, modes_of, with_modes, without_modes
 from .state import State as Named
 
 _NAME = "history"
-
-
-class ChainForm(eqx.Module):
-    """The constants of a chain."""
-
-    form: Recorded
-    nodes: int = eqx.field(static=True)
-    elements: int = eqx.field(static=True)
 
 
 def delay_chain(
@@ -79,94 +69,95 @@ def delay_chain(
             f"state, but has {start!r}."
         )
     form = form_of(machine, as_state(start, "`start`"), history_before(machine, start))
-    kind = _chain_kind(type(machine))
-    chain = ChainForm(form, nodes, elements)
-    return with_static(object.__new__(kind), **values_of(machine), _chain=chain, _begin=start)
+    return reading(machine, _Chain(form, nodes, elements, start))
 
 
-@functools.lru_cache(maxsize=64)
-def _chain_kind(kind: type) -> type:
-    def with_past(name: str) -> Callable[..., Any]:
-        def function(self: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
-            given = s, without_history(state), past_in(self, state), *modes
-            call = getattr(original(self), name)
-            check_takes(call, f"`{name}`", "`s`, the state, the past", given, len(modes))
-            found = call(*given)
-            return found if name != "field" else _with_rates(self, found, s, state, modes)
+class _Chain(Past):
+    """The past in a state with values at nodes of the longest delay, and the chain's start."""
 
-        return function
+    nodes: int = eqx.field(static=True)
+    elements: int = eqx.field(static=True)
+    start: State
 
-    def without(name: str) -> Callable[..., Any]:
-        return lambda self, s, state, *rest: getattr(original(self), name)(
-            s, without_history(state), *rest
-        )
+    def own(self, state: Any) -> Any:
+        return Named(**{name: x for name, x in vars(state).items() if name != _NAME})
 
-    body: dict[str, Any] = {
-        "__module__": kind.__module__,
-        "__qualname__": kind.__qualname__,
-        "__annotations__": {"_chain": Any, "_begin": Any},
-        "_chain": eqx.field(default=None, kw_only=True),
-        "_begin": eqx.field(default=None, kw_only=True),
-        "delays": property(lambda self: {}),
-        "field": with_past("field"),
-        "start": lambda self: chained(self, self._begin),
-        "chained": lambda self, state: chained(self, state),
-        "_switches": property(lambda self: _events(self, "_switches")),
-        "_others": property(lambda self: _events(self, "_others")),
-    }
-    blank = object.__new__(kind)
-    if overridden(blank, AbstractMachine, "averages"):
-        body["averages"] = with_past("averages")
-    for name in ("quantities", "step_limit", "relaxation", "pace"):
-        if overridden(blank, AbstractMachine, name):
-            body[name] = without(name)
-    if overridden(blank, AbstractMachine, "mirrored"):
-        body["mirrored"] = lambda self, state: None
-    return type(kind)(kind.__name__, (kind,), body)
+    def __call__(self, machine: Any, s: Scalar, state: Any) -> Any:
+        # In the first element the value of now is left out, since it may depend on the past.
+        h, lags = state.history, lags_of(machine)
+        shares = [lag / longest_delay(machine) for lag in lags] if len(lags) > 1 else []
+        return self.form.by_name([self.at(h, x) for x in shares] or [h[-1]])
+
+    def at(self, h: Array, share: Scalar, now: Vector | None = None) -> Vector:
+        """Return the history at a share of the longest delay."""
+        p, place = self.nodes, share * self.elements
+        x = _nodes(p) if now is not None else _nodes(p)[1:]
+        values = h[:p] if now is None else jnp.concatenate([now[None], h[:p]])
+        found = _lagrange(x, 1 - 2 * place) @ values
+        for e in range(1, self.elements):
+            value = _lagrange(_nodes(p), 1 - 2 * (place - e)) @ h[p * e - 1 : p * (e + 1)]
+            found = jnp.where(place < e, found, value)
+        return found
+
+    def rates(self, machine: Any, flow: Any, s: Scalar, state: Any, modes: Any) -> Any:
+        p, h, found = self.nodes, state.history, []
+        scale = 2 * self.elements / longest_delay(machine)
+        first = recorded_numbers(machine, s, state, modes)
+        for end in range(p, len(h) + 1, p):
+            values = jnp.concatenate([first[None], h[end - p : end]])
+            found.append(_differences(p)[1:] @ values * scale)
+            first = h[end - 1]
+        flow = dict(flow) if isinstance(flow, Mapping) else vars(flow)
+        return flow | {_NAME: jnp.concatenate(found)}
+
+    @staticmethod
+    def members(kind: type) -> dict[str, Any]:
+        def without(name: str) -> Callable[..., Any]:
+            return lambda self, s, state, *rest: getattr(without_past(self), name)(
+                s, self._past.own(state), *rest
+            )
+
+        body: dict[str, Any] = {
+            "delays": property(lambda self: {}),
+            "start": lambda self: self.chained(self._past.start),
+            "chained": _chained,
+        }
+        blank = object.__new__(kind)
+        for name in ("quantities", "step_limit", "relaxation", "pace"):
+            if overridden(blank, AbstractMachine, name):
+                body[name] = without(name)
+        if overridden(blank, AbstractMachine, "mirrored"):
+            body["mirrored"] = lambda self, state: None
+        return body
 
 
-class _WithChain(WithPast):
-    def __call__(self, machine: Any, s: Scalar, state: State, *modes: Scalar) -> Any:
-        given = original(machine), s, without_history(state), past_in(machine, state), *modes
-        found = self.call(given)
-        return vars(found) if isinstance(found, Named) else found
-
-
-def _events(machine: Any, name: str) -> tuple[Any, ...]:
-    return tuple(given_past(x, _WithChain) for x in getattr(original(machine), name))
+def _chained(self: Any, state: Any) -> Any:
+    """Return a state of a chain from one of its machine, with `before` or with a history."""
+    chain, machine, modes = self._past, without_past(self), modes_of(state)
+    history, state = history_of(state), as_state(without_modes(state), "Argument `state`")
+    if _NAME in vars(state):
+        return with_modes(state, modes)
+    shares = [e + (1 - x) / 2 for e in range(chain.elements) for x in _nodes(chain.nodes)[1:]]
+    times = -longest_delay(self) * np.array(shares) / chain.elements
+    if history is None:
+        before = history_before(machine, state)
+        values = jax.vmap(lambda t: chain.form.pack(before(t)))(times)
+    else:
+        values = jax.vmap(history.at)(times)
+    return with_modes(Named(**vars(state), **{_NAME: values}), modes)
 
 
 def machine_of_chain(machine: Any) -> Any:
     """Return the machine with delays of a chain, or `None` for another machine."""
-    return original(machine) if hasattr(machine, "_chain") else None
+    return without_past(machine) if isinstance(getattr(machine, "_past", None), _Chain) else None
 
 
-def without_history(state: Any) -> Any:
-    """Return the machine's own part of a state of a chain."""
-    return Named(**{name: x for name, x in vars(state).items() if name != _NAME})
-
-
-def _with_rates(machine: Any, flow: Any, s: Scalar, state: Any, modes: Any) -> Any:
-    """Return the rate of a state of a chain: `flow`, and that of its history by transport."""
-    chain, h, now = machine._chain, state.history, _now(machine, s, state, modes)
-    p, length = chain.nodes, _longest(machine) / chain.elements
-    ends = [now, *(h[p * (e + 1) - 1] for e in range(chain.elements - 1))]
-    rates = []
-    for e, first in enumerate(ends):
-        nodes = jnp.concatenate([first[None], h[p * e : p * (e + 1)]])
-        rates.append(_differences(p)[1:] @ nodes * (2 / length))
-    flow = dict(flow) if isinstance(flow, Mapping) else vars(flow)
-    return flow | {_NAME: jnp.concatenate(rates)}
-
-
-def _now(machine: Any, s: Scalar, state: Any, modes: Any) -> Vector:
-    """Return what a chain's machine records in a state."""
-    held = with_static(machine, _past=FixedPast(past_in(machine, state)))
-    return recorded_numbers(held, machine._chain.form, s, without_history(state), modes)
-
-
-def _longest(machine: Any) -> Any:
-    return functools.reduce(jnp.maximum, map(jnp.asarray, delays_in(original(machine)).values()))
+def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:
+    """Return the history in a state of a chain, as a function of t ≤ 0."""
+    zero, own, longest = jnp.zeros((), float), without_modes(state), longest_delay(machine)
+    modes = shown_modes(machine, begin_modes(machine, zero, own, modes_of(state)))
+    now = recorded_numbers(machine, zero, own, modes)
+    return lambda t: machine._past.at(own.history, -t / longest, now)
 
 
 @functools.lru_cache(maxsize=16)
@@ -174,8 +165,7 @@ def _differences(p: int) -> np.ndarray:
     """Return the matrix that maps values at Chebyshev nodes, from 1 to -1, to derivatives there."""
     x = _nodes(p)
     c = np.r_[2, np.ones(p - 1), 2] * (-1.0) ** np.arange(p + 1)
-    away = x[:, None] - x[None, :] + np.eye(p + 1)
-    matrix = np.outer(c, 1 / c) / away
+    matrix = np.outer(c, 1 / c) / (x[:, None] - x[None, :] + np.eye(p + 1))
     return matrix - np.diag(matrix.sum(axis=1))
 
 
@@ -183,65 +173,7 @@ def _nodes(p: int) -> np.ndarray:
     return np.cos(np.pi * np.arange(p + 1) / p)
 
 
-@cached_in_trace
-def _lags(machine: Any) -> list[Any]:
-    return [jnp.asarray(x) for x in delays_in(original(machine)).values()]
-
-
-def past_in(machine: Any, state: Any) -> Any:
-    """Return the past in a state of a chain. In the first element the newest value, that of now, is
-    left out, since it may depend on the past."""
-    chain, h = machine._chain, state.history
-    lags, longest = _lags(machine), _longest(machine)
-    if len(lags) == 1:
-        return chain.form.by_name([h[-1]])
-    return chain.form.by_name([_between(chain, h, lag / longest) for lag in lags])
-
-
-def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:
-    """Return the history in a state of a chain, as a function of t ≤ 0."""
-    zero, own = jnp.zeros_like(machine.position(state)), without_modes(state)
-    modes = begin_modes(machine, zero, own, modes_of(state))
-    now, longest = _now(machine, zero, own, modes), _longest(machine)
-    return lambda t: _between(machine._chain, own.history, -t / longest, now)
-
-
-def _between(chain: ChainForm, h: Array, share: Scalar, now: Vector | None = None) -> Vector:
-    """Return the history at a share of the longest delay."""
-    p, number = chain.nodes, chain.elements
-    place, found = share * number, h[-1]
-    for e in reversed(range(number)):
-        values, x = h[p * e : p * (e + 1)], _nodes(p)[1:]
-        first = h[p * e - 1] if e else now
-        if first is not None:
-            values, x = jnp.concatenate([first[None], values]), _nodes(p)
-        value = _lagrange(x, 1 - 2 * (place - e)) @ values
-        found = value if e == number - 1 else jnp.where(place < e + 1, value, found)
-    return found
-
-
 def _lagrange(x: np.ndarray, at: Scalar) -> Vector:
     """Return the weights of values at nodes in the polynomial through them, at a place."""
-    away = at - jnp.asarray(x)
-    weights = []
-    for j in range(len(x)):
-        others = np.delete(np.arange(len(x)), j)
-        weights.append(jnp.prod(away[others] / (x[j] - x[others])))
-    return jnp.stack(weights)
-
-
-def chained(machine: Any, state: Any) -> Any:
-    """Return a state of a chain from one of its machine, with `before` or with a history."""
-    chain, modes, history = machine._chain, modes_of(state), history_of(state)
-    state = as_state(without_modes(state), "Argument `state`")
-    if _NAME in vars(state):
-        return with_modes(state, modes)
-    longest, p, number = _longest(machine), chain.nodes, chain.elements
-    places = [(e + (1 - x) / 2) / number for e in range(number) for x in _nodes(p)[1:]]
-    times = -longest * jnp.asarray(places)
-    if history is None:
-        before = history_before(original(machine), state)
-        values = jax.vmap(lambda t: chain.form.pack(before(t)))(times)
-    else:
-        values = jax.vmap(history.at)(times)
-    return with_modes(Named(**vars(state), **{_NAME: values}), modes)
+    others = [np.delete(np.arange(len(x)), j) for j in range(len(x))]
+    return jnp.stack([jnp.prod((at - x[i]) / (x[j] - x[i])) for j, i in enumerate(others)])

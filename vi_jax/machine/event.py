@@ -21,6 +21,8 @@ class EventContext(NamedTuple):
     """The index of the event's mode among them."""
     contact: Scalars
     """For each coordinate, 1 + i while it rests on stop number i, else 0; empty without rests."""
+    loads: Any = None
+    """The forces of all frictions (see `shared_loads`), if they are known."""
 
     def with_mode(self, mode: object) -> Modes:
         """Return all modes, with another one in place of the event's."""

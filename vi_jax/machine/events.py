@@ -19,11 +19,21 @@ from jax.lax import stop_gradient
 
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
-from .contacts import call_checked, field_in, rate_of, shown_modes, with_friction_impulse
-from .declared import declared_modes, has_own_modes, others_of, stops_of, switches_of, with_static
+from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
+from .declared import (
+    declared_modes,
+    friction_on,
+    has_own_modes,
+    limited_in,
+    others_of,
+    stops_of,
+    switches_of,
+    with_static,
+)
 from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
 from .friction import frictions_in, settled_modes
 from .numbers import Shown, size_of
+from .settle import strike
 from .state import changed
 
 
@@ -44,18 +54,20 @@ def section_number(machine: Machine) -> int:
 
 
 def guard_of(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> Scalar:
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
+    loads: Any = None,
+) -> Scalar:  # fmt: skip
     """Return the guard of an event, which rises through zero where the event happens."""
-    event, part, keywords = event_of(machine, number, modes, contact)
+    event, part, keywords = event_of(machine, number, modes, contact, loads)
     return event.guard(machine, s, state, *modes[part], **keywords)
 
 
 def sides_of(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> Scalars:
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
+    loads: Any = None,
+) -> Scalars:  # fmt: skip
     """Return smooth functions whose maximum is the guard of an event."""
-    event, part, keywords = event_of(machine, number, modes, contact)
+    event, part, keywords = event_of(machine, number, modes, contact, loads)
     return tuple(map(jnp.asarray, event.sides(machine, s, state, *modes[part], **keywords)))
 
 
@@ -91,22 +103,27 @@ def after_one_event(
 
 
 def _with_friction(machine: Machine, number: int, s: Scalar, before: State, after: State) -> State:
-    friction = friction_on(machine, number)
-    if friction is None:
+    """Return the state after an impact with friction, from that after one without it."""
+    if friction_on(machine, number) is None:
         return after
-    return with_friction_impulse(machine, number, friction, s, before, after).state
-
-
-def friction_on(machine: Machine, number: int) -> Any:
-    """Return the friction on stop number `number`, or `None`."""
-    if number >= len(stops_of(machine)):
-        return None
-    return next((x for x in switches_of(machine) if x.friction_stop == number), None)
+    body = machine.coordinates[stops_of(machine)[number].coordinate]
+    impact = impact_on(machine, [number], s, before)
+    speed = impact.strike.velocity[:1]
+    rebound = impact.outward[0] * body.velocity(after)
+    restitution = -rebound / jnp.where(speed == 0, 1.0, speed)
+    blow = strike(impact.strike._replace(restitution=restitution), impact.of)
+    new = impact.after(blow.impulse)
+    return body.placed(new, body.position(after), body.velocity(new))
 
 
 def has_contact_friction(machine: Machine) -> bool:
     """Return whether there is friction on a stop."""
     return any(x.friction_stop is not None for x in switches_of(machine))
+
+
+def is_compound(machine: Machine) -> bool:
+    """Return whether several velocities change in an impact, across stops or along them; static."""
+    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
 
 
 def mode_number(machine: Machine, number: int) -> int:
@@ -120,15 +137,15 @@ def own_modes(machine: Machine, modes: Modes) -> Modes:
 
 
 def event_of(
-    machine: Machine, number: int, modes: Modes, contact: Scalars
+    machine: Machine, number: int, modes: Modes, contact: Scalars, loads: Any = None
 ) -> tuple[AbstractEvent, slice, dict[str, EventContext]]:
     """Return an event, the slice of the modes that its methods receive, and their keywords."""
     event = events_of(machine)[number]
     if not event.holds_mode:
         return event, slice(None), {}
     index = mode_number(machine, number)
-    keywords = {"around": EventContext(modes, index, contact)} if event.needs_all_modes else {}
-    return event, slice(index, index + 1), keywords
+    context = {"around": EventContext(modes, index, contact, loads)}
+    return event, slice(index, index + 1), context if event.needs_all_modes else {}
 
 
 def begin_modes(

@@ -37,7 +37,7 @@ from .contacts import (
     velocity_change,
 )
 from .coordinates import Row
-from .declared import hashable, limited_in, stops_of, switches_of
+from .declared import at_stop, hashable, limited_in, stops_of, switches_of
 from .event import AbstractSwitch, EventContext
 from .numbers import size_of
 from .settle import Contacts, Settled, settle
@@ -66,9 +66,9 @@ class Friction(AbstractSwitch):
     @abc.abstractmethod
     def held(
         self, machine: Machine, s: Scalar, state: State, contact: Scalars, found: Any
-    ) -> tuple[Any, Any, Any]:
-        """Return the force that holds a body, the largest possible one, and the effective mass.
-        **Arguments:** `contact`, as in `EventContext`; `found`, from `constrained_rate`."""
+    ) -> tuple[Any, Any]:
+        """Return the force that holds a body, and the largest possible one. **Arguments:**
+        `contact`, as in `EventContext`; `found`, from `_solve_forces`."""
 
     def touches(self, machine: Machine, contact: Scalars) -> Flag:
         """Return whether the body touches the surface; `contact` is as in `EventContext`."""
@@ -86,6 +86,10 @@ class Friction(AbstractSwitch):
         """Return the rate of the slip, with respect to s, along a flow."""
         return rate_of(self.speed_of_slip, machine, s, state, flow)
 
+    def largest_rate(self, machine: Machine, s: Scalar, state: State, flow: State) -> Scalar:
+        """Return the size of the rate of the slip along a flow."""
+        return jnp.abs(self.slip_rate(machine, s, state, flow))
+
     def slip_sign(
         self, machine: Machine, s: Scalar, state: State, flow: State | None = None
     ) -> Scalar:
@@ -94,7 +98,7 @@ class Friction(AbstractSwitch):
         slip, sizes = self.speed_of_slip(machine, s, state), jtu.tree_map(jnp.abs, state)
         size = size_of(lambda x: self.speed_of_slip(machine, s, x), state, sizes)
         if flow is not None:
-            rate = jnp.abs(self.slip_rate(machine, s, state, flow))
+            rate = self.largest_rate(machine, s, state, flow)
             size = size + jnp.asarray(machine.cycle) / (2 * pi) * rate
         least = stop_gradient(self.roundings * float(jnp.finfo(slip.dtype).eps) * size)
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
@@ -129,24 +133,58 @@ class Friction(AbstractSwitch):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
         touches = self.touches(machine, around.contact)
 
-        def forces() -> tuple[Scalar, Scalar]:
-            solve: Any = _solve_forces
-            _, found = solve(machine, s, state, around.with_mode(mode), around.contact)
-            each = found[around.mode_index]
-            force, largest, _ = self.held(machine, s, state, around.contact, each)
+        def sides(loads: Any) -> tuple[Scalar, Scalar]:
+            each = loads[around.mode_index]
+            force, largest = self.held(machine, s, state, around.contact, each)
             return -force - largest, force - largest
+
+        def alone() -> tuple[Scalar, Scalar]:
+            solve: Any = _solve_forces
+            return sides(solve(machine, s, state, around.with_mode(mode), around.contact))
 
         # Without sticking, no force is computed.
         without_forces = jnp.where(touches, slip_guard, -1.0)
-        return jax.lax.cond((mode == 0) & touches, forces, lambda: (without_forces, without_forces))
+        sticks, free = (mode == 0) & touches, (without_forces, without_forces)
+        if around.loads is None:
+            return jax.lax.cond(sticks, alone, lambda: free)
+        both = zip(sides(around.loads), free, strict=True)
+        return tuple(jnp.where(sticks, x, y) for x, y in both)
 
 
 @eqx.filter_jit
 def _solve_forces(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
-) -> tuple[State, dict[int, tuple[Any, Any, Any]]]:
-    """Return `constrained_rate`, jitted: a step calls it often, and JAX differentiates it once."""
-    return constrained_rate(machine, field_in(machine, s, state, modes), s, state, modes, contact)
+) -> dict[int, tuple[Any, Any]]:
+    """Return for each friction, by its index among the switches, the force along the surface and
+    the normal force (0 without a stop); jitted: a step calls it often, and JAX differentiates it
+    once."""
+    flow, pace = field_in(machine, s, state, modes), machine.pace(s, state)
+    _, held, amounts = constrained_rate(machine, flow, s, state, modes, contact)
+    loads = [x * row.mass for x, row in zip(amounts, held.rows, strict=True)]
+    first = len(loads) - len(held.dry)
+    dry = [x if pace is None else x / pace for x in loads[first:]]
+    found = {i: (x, jnp.zeros_like(x)) for i, x in zip(held.dry, dry, strict=True)}
+    tangents = loads[first - len(held.stop_frictions) : first]
+    for (i, friction, row, _), force in zip(held.stop_frictions, tangents, strict=True):
+        found[i] = force, -stops_of(machine)[friction.friction_stop].sign * loads[row]
+    return found
+
+
+def shared_loads(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
+) -> dict[int, tuple[Any, Any]] | None:
+    """Return `_solve_forces` for the guards of several frictions, or zeros if none sticks; `None`
+    with fewer than two frictions."""
+    switches = switches_of(machine)
+    several = [i for i in frictions_in(machine) if switches[i].is_dry or contact]
+    if len(several) < 2:
+        return None
+    sticks = jnp.zeros((), bool)
+    for i in several:
+        sticks = sticks | (modes[i] == 0) & switches[i].touches(machine, contact)
+    solve: Any = _solve_forces
+    none = {i: (jnp.zeros_like(s), jnp.zeros_like(s)) for i in several}
+    return jax.lax.cond(sticks, lambda: solve(machine, s, state, modes, contact), lambda: none)
 
 
 class DryFriction(Friction):
@@ -230,8 +268,7 @@ class DryFriction(Friction):
         return SimpleNamespace(velocity=lambda state: self.speed_of_slip(machine, s, state))
 
     def held(self, machine, s, state, contact, found):
-        force, _, mass = found
-        return force, self.sticking(machine, s, state), mass
+        return found[0], self.sticking(machine, s, state)
 
     def sliding(self, machine: Machine, s: Scalar, state: State, mode: Scalar) -> Any:
         """Return the friction force on a body that slides forward or backward; in mode 0 on one
@@ -325,6 +362,12 @@ class ContactFriction(Friction):
     def speed_of_slip(self, machine, s, state):
         return machine.coordinates[self.along].velocity(state)
 
+    def largest_rate(self, machine, s, state, flow):
+        # The stop's force resists the motion into it, and friction is in proportion to that.
+        body = machine.coordinates[stops_of(machine)[self.stop].coordinate]
+        pressing = jnp.abs(velocity_change(body, state, flow))
+        return super().largest_rate(machine, s, state, flow) + pressing
+
     def stopped(self, machine, s, state, mode, around):
         # The correction must not change the velocity at the stop.
         stop, along = stops_of(machine)[self.stop], machine.coordinates[self.along]
@@ -342,8 +385,10 @@ class ContactFriction(Friction):
         return contact[stops_of(machine)[self.stop].coordinate] == 1.0 + self.stop
 
     def held(self, machine, s, state, contact, found):
-        force, pressing, mass = found
-        return force, self.level * pressing, mass
+        force, pressing = found
+        # Without friction the force along the stop is rounding of that across it.
+        level = self.level + 64 * float(jnp.finfo(pressing.dtype).eps)
+        return force, level * pressing
 
     def push_in(self, machine, s, state, mode):
         """Return `None`: the force is solved for together with the stop's (`constrained_rate`)."""
@@ -473,10 +518,7 @@ def _question(
     n = first - len(of)
     outward, closed = [one] * len(held.rows), []
     for row, k in enumerate(limited_in(machine) if contact else ()):
-        for number, stop in enumerate(stops_of(machine)):
-            if stop.coordinate == k:
-                on = contact[k] == 1.0 + number
-                outward[row] = jnp.where(on, -float(stop.sign), outward[row])
+        outward[row] = at_stop(machine, k, contact[k], lambda stop: -float(stop.sign), one)
         closed.append(contact[k] > 0)
     rates = [velocity_change(body, state, flow) for body in held.coordinates[:first]]
     rates += [switches[i].slip_rate(machine, s, state, flow) for i in held.dry]

@@ -414,8 +414,9 @@ def _strike_one(x: Strike, of: tuple[int, ...]) -> Blow:
         det = jnp.where(det == 0, 1.0, det)
         sticks = (tangent * wanted - gain * stop) / det, (normal * stop - back * wanted) / det
         forward, backward = (wanted / (normal - sign * level * gain) for sign in (1.0, -1.0))
-        # The slip after the impact with the friction against it.
-        is_forward = (back - level * tangent) * forward - stop > 0
+        # The slip after the impact with the friction against it; a push that would close the
+        # contact is none.
+        is_forward = (forward >= 0) & ((back - level * tangent) * forward - stop > 0)
         push = jnp.where(is_forward, forward, backward)
         drag = jnp.where(is_forward, -level, level) * push
         stays = jnp.abs(sticks[1]) <= level * jnp.maximum(sticks[0], 0.0)

@@ -13,13 +13,12 @@ from ..machine import (
     AbstractMachine,
     HybridState,
     delay_chain,
-    delays_in,
     has_delays,
     history_in,
     in_rows,
+    longest_delay,
     machine_of_chain,
     modes_of,
-    without_history,
     without_modes,
 )
 from .results import Orbit, distance
@@ -48,25 +47,24 @@ def as_chain(machine: AbstractMachine, guess: Any) -> tuple[AbstractMachine, Any
 
 def with_delay_error(orbit: Orbit) -> Orbit:
     """Return a single orbit of a chain with its difference from a run with the whole history."""
-    chain, machine = orbit.machine, machine_of_chain(orbit.machine)
+    chain: Any = orbit.machine
+    machine = machine_of_chain(chain)
     if machine is None or isinstance(orbit.residual, Tracer):
         return orbit
     if orbit.residual.ndim or not bool(orbit.successful):
         return orbit
-    state, lags = without_modes(orbit.state), delays_in(machine).values()
-    longest = jnp.asarray(max(float(x) for x in lags))
-    history = history_of_function(
-        history_in(chain, orbit.state), longest, unit_of(machine), _PIECES, len(lags), _ROOM
-    )
-    own, cycles = without_history(state), int(orbit.cycles)
+    state, cycles = without_modes(orbit.state), int(orbit.cycles)
+    past = history_in(chain, orbit.state)
+    history = history_of_function(machine, past, unit_of(machine), _PIECES, _ROOM)
     # The run begins with the polynomial of the nodes, in which kinks are smooth. A stable motion
     # forgets them; from an unstable one the run departs, and one longest delay must do.
     largest = float(jnp.max(jnp.abs(orbit.multipliers)))
-    periods = 1 + int(np.ceil(float(longest) / float(orbit.duration)))
+    periods = 1 + int(np.ceil(float(longest_delay(machine)) / float(orbit.duration)))
     if largest < 1:
         periods += int(min(np.log(_FORGOTTEN) / np.log(max(largest, 1e-3)), _MOST_PERIODS))
+    own = chain._past.own(state)
     start = HybridState(own, modes_of(orbit.state) or (), history)
     run = simulate(machine, start, periods * cycles, method=orbit.method, record="sections")
-    rows, row = in_rows(run.sections)[cycles::cycles], in_rows(own, 0)
-    error = distance(rows[-1], row, row_sizes(chain, state)[: row.size])
+    last, row = in_rows(run.sections)[-1], in_rows(own, 0)
+    error = distance(last, row, row_sizes(chain, state)[: row.size])
     return dataclasses.replace(orbit, delay_error=error)

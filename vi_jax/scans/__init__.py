@@ -9,6 +9,7 @@ from ._geometry import BasinEntropy, Uncertainty
 from ._lyapunov import Lyapunov, lyapunov
 from ._scan import scan
 from ._sweep import Sweep, moved_by_stops, sweep
+from .forces import ContactForces
 from .measures import REGIMES, AbstractMeasure, Exponent, Regime, Rotation, Sections
 from .program import make_program
 from .statistics import Density, Escape, Statistics, escape_rate

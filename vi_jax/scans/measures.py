@@ -156,6 +156,11 @@ class AbstractMeasure(eqx.Module):
         """The number of samples in a cycle that it needs (`Run.samples`), or 0."""
         return 0
 
+    @property
+    def listed(self) -> int:
+        """The number of impacts in a cycle that it needs one by one (`Run.impact_log`), or 0."""
+        return 0
+
     def under(self, method: AbstractMethod) -> "AbstractMeasure":
         """Return this measure for motions computed by a method; by default itself."""
         return self
@@ -484,8 +489,8 @@ class Regime(AbstractMeasure):
 
 # Results of a run for each cycle, not for an instant.
 COLUMNS = (
-    "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "duration",
-    "frequency_ratio",
+    "impacts", "y_min", "y_max", "impact_speed", "impact_energy", "rests", "reduced",
+    "duration", "frequency_ratio",
 )  # fmt: skip
 
 

@@ -361,7 +361,7 @@ def make_program(
     options = dataclasses.replace(
         options, settle=settle, method=method, rests=rests,
         record="motion" if motion else "sections", samples=samples_for(measures),
-        stop=stop,
+        impact_log=max((m.listed for m in measures), default=0), stop=stop,
     ).checked(template)  # fmt: skip
     return ScanProgram(
         machine=_as_arrays(template),

@@ -18,6 +18,7 @@ from ...machine import (
     guard_of,
     has_velocity,
     holds_anywhere,
+    is_compound,
     limited_in,
     others_of,
     outcomes_of,
@@ -35,7 +36,12 @@ from ..sizes import guard_rounding
 from ..smooth import hold_contacts, in_modes, is_affine, stops_are_exact
 from .event_derivatives import FlowToEvent
 from .guards import JUMPED, Crossing, furthest_landing
-from .impact import bring_to_rest, is_compound, resolve_impact, resolve_impact_sequence, stop_bodies
+from .impact import (
+    bring_to_rest,
+    on_its_stops,
+    resolve_impact,
+    resolve_impact_sequence,
+)
 from .roots import Rates, guard_rates, offset_to_turn, rates
 from .trial import AppliedStep, Release, Trial
 
@@ -279,7 +285,19 @@ def _update_after(plan: Plan, lane: Lane, happens: Flag, jumps: Flag, old: State
     when = jumps if has_velocity(plan.machine, lane.state) else happens
     if others_of(plan.machine) or when is happens:
         lane = lane._replace(direction=_directions_after_event(plan, lane, when, old))
+    if is_compound(plan.machine) and switches_of(plan.machine):
+        # In the new modes a body may go on that was about to turn.
+        lane = lane._replace(direction=_along_velocities(plan, lane, happens))
     return lane
+
+
+def _along_velocities(plan: Plan, lane: Lane, when: Flag) -> Scalars:
+    direction = list(lane.direction)
+    for k, body in enumerate(plan.machine.coordinates):
+        v, (_, slow) = body.velocity(lane.state), plan.rounding_bounds(k, lane.state)
+        v = stop_gradient(v)
+        direction[k] = jnp.where(when & (jnp.abs(v) > slow), jnp.sign(v), direction[k])
+    return tuple(direction)
 
 
 def after_jump(plan: Plan, lane: Lane, when: Flag, old: State) -> Lane:
@@ -493,7 +511,7 @@ def _release_body(step: AppliedStep, lane: Lane, k: int, release: Release) -> La
     moving = lane.s, lane.state, lane.record.integrals
     _, state, integrals = flow.extrapolate(offset, moving)
     if not stops_are_exact(plan.machine, state):
-        on_stops = on_its_stops(plan, lane._replace(state=state))
+        on_stops = on_its_stops(plan, lane.s, state, contact)
         if not is_affine(plan.machine.coordinates[k].position, state):
             on_stops = _just_inside(plan, k, contact[k], on_stops)
         state = select(contact[k] > 0, on_stops, state)
@@ -515,14 +533,6 @@ def _just_inside(plan: Plan, k: int, contact: Scalar, state: State) -> State:
     slack, slow = plan.rounding_bounds(k, state)
     sign, gap = plan.sign_and_gap(k, contact)
     return plan.machine.coordinates[k].placed(state, sign * (gap - slack), -sign * slow)
-
-
-def on_its_stops(plan: Plan, lane: Lane) -> State:
-    """Return the state with the bodies that rest, at least one, exactly on their stops. While they
-    are held, their positions are accurate to the method's error only."""
-    assert lane.contact is not None
-    codes = {k: lane.contact[k] for k in limited_in(plan.machine)}
-    return stop_bodies(plan, lane.s, lane.state, {k: x > 0 for k, x in codes.items()}, codes)[0]
 
 
 def _event_offset(step: AppliedStep, c: Crossing) -> Scalar:

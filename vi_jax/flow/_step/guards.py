@@ -28,6 +28,7 @@ from ...machine import (
     guard_of,
     limited_in,
     section_number,
+    shared_loads,
     sides_of,
     size_of,
     stops_of,
@@ -137,12 +138,12 @@ def inner_guards(
         return found
 
     def guards(s: Scalar, state: State) -> dict[int, tuple[Scalar, ...]]:
-        found = {}
+        found, loads = {}, shared_loads(machine, s, state, *arguments)
         for number in checked:
             if number < len(stops_of(machine)):
                 found[number] = (_distance(machine, lane, number, state),)
             else:
-                found[number] = sides_of(machine, number, s, state, *arguments)
+                found[number] = sides_of(machine, number, s, state, *arguments, loads)
         return found
 
     has_states = stages[0].state is not None
@@ -231,6 +232,9 @@ def _distance(machine: AbstractMachine, lane: Lane, number: int, state: State) -
 # Newton's method on a smooth flow needs two or three attempts. If rounding prevents more accuracy,
 # a lane with this many attempts (a choice) accepts a thousand times the tolerance.
 _PATIENCE = 12.0
+
+# By these many attempts a place is bisected to rounding; a lane fails after 64.
+_LAST_ATTEMPTS = 56.0
 
 # A guard above this share of its size (a choice) has jumped: rounding leaves less at an event.
 JUMPED = 1e-9
@@ -399,10 +403,11 @@ def _other_events(
 
     def guards(s: Scalar, x: State) -> list[list[Scalar]]:
         """Return for each event its guard, or its sides; and the clock relative to its end."""
+        loads = shared_loads(machine, s, x, *arguments)
         values = [
-            sides_of(machine, i, s, x, *arguments)
+            sides_of(machine, i, s, x, *arguments, loads)
             if len(inner.events.get(i, ())) > 1
-            else [guard_of(machine, i, s, x, *arguments)]
+            else [guard_of(machine, i, s, x, *arguments, loads)]
             for i in numbers
         ]
         if (clock := clock_of(machine, x)) is not None:
@@ -538,7 +543,10 @@ def _landed(
         jumped = stop_gradient(end.x) > JUMPED * guard.scale
         shortest = 4 * eps * (plan.unit + jnp.abs(stop_gradient(lane.s)))
         shortest = jnp.where(jumped, jnp.maximum(plan.in_units(_SUDDEN), shortest), shortest)
-        sudden = pin_flag(aimed & ~near & (h <= shortest) & beyond(guard), h)
+        # Near an equilibrium on its surface, a guard is rounding and may be zero anywhere.
+        is_rounding = (lane.attempts >= _LAST_ATTEMPTS) & (jnp.abs(end.x) <= 16 * eps * guard.scale)
+        found = (h <= shortest) & beyond(guard) | stop_gradient(is_rounding)
+        sudden = pin_flag(aimed & ~near & found, h)
         landed, offset = landed | sudden, jnp.where(sudden, 0.0, offset)
         # If Newton's method does not converge, the place is bisected.
         again = again & ~sudden & (lane.attempts < _PATIENCE)

@@ -13,8 +13,6 @@ forward and reverse derivatives through an impact are exact (the saltation matri
 they are those at a fixed clock, so that later steps need no derivative of the clock.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -45,7 +43,8 @@ from ..plan import Plan
 from ..results import code
 from ..smooth import TIME, carried, hold_contacts, stops_are_exact
 from .aim import aim_ahead, aim_at
-from .arrive import after_jump, arrive, contacts_after_jump, on_its_stops, release_pulled
+from .arrive import after_jump, arrive, contacts_after_jump, release_pulled
+from .impact import on_its_stops
 from .trial import Trial, try_step
 
 # A lane has failed after this many attempts without landing; with this many impacts in one interval
@@ -87,8 +86,8 @@ def iterate(plan: Plan, lane: Lane) -> tuple[Lane, Flag, Record]:
     reached = completed = pin_flag(completed, lane.s)
     if arrived.contact is not None and not stops_are_exact(plan.machine, arrived.state):
         rests = reached & any_of(reached, (x > 0 for x in arrived.contact))
-        put, kept = partial(on_its_stops, plan), lambda x: x.state
-        arrived = arrived._replace(state=jax.lax.cond(rests, put, kept, arrived))
+        put = lambda x: on_its_stops(plan, x.s, x.state, x.contact)
+        arrived = arrived._replace(state=jax.lax.cond(rests, put, lambda x: x.state, arrived))
     if plan.noise is not None:
         completed = completed & plan.is_record_point(lane.part, lane.done)
     done = lane.done + jnp.where(completed, 1.0, 0.0)

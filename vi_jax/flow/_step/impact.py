@@ -6,7 +6,9 @@ geometric series in k, and end in rest (chatter) after the time Σ 2 kⁿ V⁻/a
 The series is completed at once when its remaining time is short.
 """
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,21 +19,21 @@ from jaxtyping import Array
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
 from ...machine import (
-    AbstractMachine,
+    Impact,
     RigidStop,
-    Row,
-    Strike,
     added,
+    chosen_stop,
     contact_constraints,
     forces,
-    friction_on,
     has_contact_friction,
     holds_anywhere,
+    impact_on,
     limited_in,
     longest_step,
     push_gains,
     row_of,
     stops_of,
+    stops_on,
     strike,
     struck_modes,
 )
@@ -59,11 +61,6 @@ class ImpactResult(NamedTuple):
     """The share of that speed that is left."""
 
 
-def is_compound(machine: AbstractMachine) -> bool:
-    """Return whether several velocities change in an impact, across stops or along them; static."""
-    return len(limited_in(machine)) > 1 or has_contact_friction(machine)
-
-
 def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | None:
     """Return whether an impact leaves faster than it came, or goes on into the stop; `None` if the
     law is one number, whose range is checked."""
@@ -75,16 +72,17 @@ def gains_speed(stop: RigidStop, approach: Scalar, rebound: Scalar) -> Flag | No
 
 
 def log_impact(
-    plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar
-) -> Lane:
+    plan: Plan, lane: Lane, at_event: State, hit: Flag, number: int, approach: Scalar,
+    impulses: Callable[[], tuple[Any, Any]],
+) -> Lane:  # fmt: skip
     """Return the lane with an impact counted and logged, if a stop is `hit` by a step that is
-    taken, in the state `at_event`."""
+    taken, in the state `at_event`. `impulses()` are those away from the stop and along it."""
     clock, record = plan.clock(lane.s, at_event), lane.record
     speed, log, impacts = record.impact_speed, record.log, record.impacts
     if speed is not None:
         speed = jnp.where(hit, jnp.maximum(speed, approach), speed)
     if log is not None:
-        log = add_entry(log, hit, impacts, clock, approach, number)
+        log = add_entry(log, hit, impacts, clock, approach, number, *impulses())
     impacts = impacts + jnp.where(hit, 1.0, 0.0)
     lane = lane.update_record(impact_speed=speed, log=log, impacts=impacts)
     return lane.log_event(hit, clock, EventKind.impact, number, approach)
@@ -107,12 +105,15 @@ def resolve_impact(
         rebound = stop.velocity_after(stop.sign * approach, coefficient)
         lane = lane.end_if(met, gains_speed(stop, approach, rebound), "bad_impact")
         state = select(met, body.placed(at_event, stop.place, rebound), lane.state)
-        lane = log_impact(plan, lane._replace(state=state), at_event, taken & met, number, approach)
+        is_one = isinstance(body.mass, float) and body.mass == 1.0
+        mass = 1.0 if is_one else body.mass_at(lane.s, at_event)
+        arguments = at_event, taken & met, number, approach
+        impulses = lambda e=coefficient, V=approach, m=mass: ((1 + e) * m * V, 0.0)
+        lane = log_impact(plan, lane._replace(state=state), *arguments, impulses)
         energy = lane.record.impact_energy
         if energy is not None:
             lost = stop.loss(approach, coefficient)
-            if not (isinstance(body.mass, float) and body.mass == 1.0):
-                lost = body.mass_at(lane.s, at_event) * lost
+            lost = lost if is_one else mass * lost
             lane = lane.update_record(impact_energy=energy + jnp.where(taken & met, lost, 0.0))
         new = ImpactResult(jnp.where(met, to_event(number), 0.0), approach, coefficient)
         result = new if len(landed) == 1 else select(met, new, result)
@@ -168,15 +169,7 @@ class _Instant(NamedTuple):
     taken: Flag
     met: Flag
     """True if the step landed on any stop."""
-    at_event: State
-    """The state before the impacts."""
-    rows: list[Row]
-    """For each stop, then for each friction on a stop."""
-    outward: Array
-    """The sign of the velocity that opens a contact; 1 for a friction."""
-    strike: Strike
-    """Gains, velocities before the impacts and frictions."""
-    of: tuple[int, ...]
+    impact: Impact
     landed: Array
     touches: Array
     """For each stop, true if its contact is closed."""
@@ -184,11 +177,6 @@ class _Instant(NamedTuple):
     """For each stop, true if an impact acts on it, through closed contacts."""
     slow: Array
     """Bounds of the rounding errors of the velocities."""
-
-    def after(self, impulse: Array) -> State:
-        """Return the state after these impulses."""
-        amounts = self.outward * impulse / jnp.stack([1.0 * x.mass for x in self.rows])
-        return added(self.at_event, list(amounts), [row.push for row in self.rows])
 
 
 def resolve_impact_sequence(
@@ -204,20 +192,13 @@ def resolve_impact_sequence(
     """
     machine, stops = plan.machine, stops_of(plan.machine)
     if lane.contact is not None and not stops_are_exact(machine, at_event):
-        # While bodies rest, their positions are accurate to the method's error only.
-        on, codes = {}, {}
-        for k in limited_in(machine):
-            codes[k] = lane.contact[k]
-            for i, stop in enumerate(stops):
-                if stop.coordinate == k:
-                    codes[k] = jnp.where(landed[i], to_event(i), codes[k])
-            on[k] = codes[k] > 0
-        at_event, _ = stop_bodies(plan, lane.s, at_event, on, codes, moves=True)
+        struck = [chosen_stop(machine, k, landed, x) for k, x in enumerate(lane.contact)]
+        at_event = on_its_stops(plan, lane.s, at_event, tuple(struck), moves=True)
     instant = _before_impacts(plan, taken, lane, landed, at_event)
     zero, n = jnp.zeros_like(lane.s), len(stops)
     # A contact without any speed, as between bodies released together, may come to rest.
     struck = jnp.where(instant.landed, 0.5, zero)
-    velocity = instant.strike.velocity
+    velocity = instant.impact.strike.velocity
     begin = _Round(
         lane, velocity, 0 * velocity, zero, struck, 0 * velocity[:n], zero,
         jnp.where(instant.met, 1.0, zero), zero, zero,
@@ -231,7 +212,7 @@ def resolve_impact_sequence(
     if energy is not None:
         lost = jnp.where(taken & instant.met, end.lost, 0.0)
         lane = lane.update_record(impact_energy=energy + lost)
-    state = select(instant.met, instant.after(end.impulse), lane.state)
+    state = select(instant.met, instant.impact.after(end.impulse), lane.state)
     results = {}
     for k in limited_in(machine):
         body, contact, fastest, latest = machine.coordinates[k], zero, zero, zero
@@ -255,23 +236,12 @@ def _before_impacts(
     plan: Plan, taken: Flag, lane: Lane, landed: dict[int, Flag], at_event: State
 ) -> _Instant:
     machine, s, stops = plan.machine, lane.s, stops_of(plan.machine)
-    frictions = [friction_on(machine, number) for number in range(len(stops))]
-    of = tuple(number for number, x in enumerate(frictions) if x is not None)
-    numbers = [*(x.coordinate for x in stops), *(frictions[i].along for i in of)]
-    bodies = {k: machine.coordinates[k] for k in dict.fromkeys(numbers)}
-    rows = {k: row_of(body, s, at_event) for k, body in bodies.items()}
-    places = [list(bodies).index(k) for k in numbers]
-    gains = push_gains(
-        list(bodies.values()), list(rows.values()), at_event, [x.push for x in rows.values()]
-    )
-    gains = jnp.stack([jnp.stack([gains[i][j] for j in places]) for i in places])
-    signs = [*(-float(x.sign) for x in stops), *(1.0 for _ in of)]
-    outward = jnp.asarray(np.asarray(signs), s.dtype)
+    impact = impact_on(machine, range(len(stops)), s, at_event)
     touches, slow = [], []
     for number, stop in enumerate(stops):
         k = stop.coordinate
-        depth = stop_gradient(stop.beyond(bodies[k].position(at_event)))
-        speed = jnp.abs(stop_gradient(bodies[k].velocity(at_event)))
+        depth = stop_gradient(stop.beyond(machine.coordinates[k].position(at_event)))
+        speed = jnp.abs(stop_gradient(machine.coordinates[k].velocity(at_event)))
         size = plan.extent(k) + jnp.abs(stop_gradient(stop.gap))
         near = 256 * float(jnp.finfo(depth.dtype).eps) * size + plan.in_units(_AT_ONCE) * speed
         closed = landed[number] | (jnp.abs(depth) <= near)
@@ -280,29 +250,18 @@ def _before_impacts(
         touches.append(closed)
         slow.append(plan.rounding_bounds(k, at_event)[1] + jnp.zeros_like(s))
     landed_, touches = jnp.stack(list(landed.values())), jnp.stack(touches)
-    masses = jnp.stack([jnp.asarray(1.0 * rows[k].mass, s.dtype) for k in numbers])
-    velocity = jnp.stack([bodies[k].velocity(at_event) for k in numbers])
-    zero = jnp.zeros_like(s)
-    numbers_of = Strike(
-        outward[:, None] * gains * outward / masses,
-        outward * velocity,
-        jnp.stack([frictions[i].level + zero for i in of]) if of else velocity[:0],
-        jnp.zeros((len(stops),), s.dtype),
-        jnp.stack([frictions[i].restitution + zero for i in of]) if of else velocity[:0],
-        touches,
-    )
-    coupled = _coupled(_acting(gains, of), touches, landed_)
+    coupled = _coupled(_acting(impact.strike.gains, impact.of), touches, landed_)
     return _Instant(
-        plan, taken, jnp.any(landed_), at_event, [rows[k] for k in numbers], outward,
-        numbers_of, of, landed_, touches, coupled, jnp.stack(slow),
-    )  # fmt: skip
+        plan, taken, jnp.any(landed_), impact, landed_, touches, coupled, jnp.stack(slow)
+    )
 
 
 def _acting(gains: Array, of: tuple[int, ...]) -> Array:
     """Return for each pair of stops whether impacts change each other's velocity, also by friction.
-    Products of both changes do not depend on units."""
+    Products of both changes, relative to their own, do not depend on units."""
     n = gains.shape[0] - len(of)
-    both = jnp.abs(gains * gains.T)
+    own = jnp.sum(gains * np.eye(len(gains)), 1)
+    both = jnp.abs(gains * gains.T) / (own[:, None] * own)
     acts = both[:n, :n]
     for row, stop in enumerate(of, start=n):
         here = np.arange(n) == stop
@@ -337,15 +296,15 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     share = jnp.where(weak | retry, 0.0, rebounds / jnp.where(speed > 0, speed, 1.0))
     # In the limit the contacts that are still being struck come to rest.
     slow = (sequence.struck > 0) & (jnp.abs(stop_gradient(V[:n])) <= _STILL * fastest)
-    group = jnp.where(weak, slow, jnp.where(retry, instant.touches, hits))
-    tangential = jnp.where(weak | retry, 0.0, instant.strike.tangential)
+    group = jnp.where(retry, instant.touches, jnp.where(weak, slow, hits))
+    tangential = jnp.where(weak | retry, 0.0, instant.impact.strike.tangential)
     blow = strike(
-        instant.strike._replace(
+        instant.impact.strike._replace(
             velocity=V, restitution=share, tangential=tangential, struck=group
-        ), instant.of,
+        ), instant.impact.of,
     )  # fmt: skip
     impulse = jnp.where(goes_on & ~blow.unsolved, blow.impulse, 0.0)
-    after = V + instant.strike.gains @ impulse
+    after = V + instant.impact.strike.gains @ impulse
     # A struck contact leaves as its law says, without the rounding of the gains.
     alone = jnp.sum(jnp.where(group, 1.0, 0.0)) == 1
     exact = alone & hits & (blow.share == 1) & ~blow.unsolved
@@ -353,20 +312,28 @@ def _next_impacts(instant: _Instant, sequence: _Round) -> _Round:
     lost = sequence.lost - jnp.dot(impulse, 0.5 * (V + after))
     acted = goes_on & ~blow.unsolved
     total = sequence.impulse + impulse
-    new = instant.after(total) if any(x.modes is not None for x in stops) else None
+    new = instant.impact.after(total) if any(x.modes is not None for x in stops) else None
     for i, stop in enumerate(stops):
         hit = hits[i] & acted
         lane = lane.end_if(hit, gains_speed(stop, speed[i], after_law[i]), "bad_impact")
-        lane = log_impact(plan, lane, instant.at_event, instant.taken & hit, i, speed[i])
+        arguments = instant.impact.before, instant.taken & hit, i, speed[i]
+        row = n + instant.impact.of.index(i) if i in instant.impact.of else None
+        drag = 0.0 if row is None else blow.impulse[row]
+        impulses = lambda i=i, drag=drag: (blow.impulse[i], drag)
+        lane = log_impact(plan, lane, *arguments, impulses)
         if stop.modes is not None:
-            given = plan.machine, lane.s, instant.after(sequence.impulse), new, lane.modes
+            given = plan.machine, lane.s, instant.impact.after(sequence.impulse), new, lane.modes
             lane = lane._replace(modes=select(hit, stop.modes_after(*given), lane.modes))
+    reduced = lane.record.reduced
+    if reduced is not None:
+        count = jnp.sum(jnp.where(hits & acted & (blow.share < 1), 1.0, 0.0))
+        lane = lane.update_record(reduced=reduced + jnp.where(instant.taken, count, 0.0))
     return _Round(
         lane, after, total, lost,
         jnp.where(hits & acted, sequence.rounds + 1.0, sequence.struck),
         jnp.where(hits & acted, jnp.maximum(sequence.approach, speed), sequence.approach),
         most,
-        jnp.where(goes_on & ~weak & (sequence.retry + blow.unsolved < 2), 1.0, 0.0),
+        jnp.where(goes_on & jnp.where(blow.unsolved, ~retry, ~weak), 1.0, 0.0),
         jnp.where(goes_on & blow.unsolved, sequence.retry + 1.0, 0.0),
         sequence.rounds + 1.0,
     )  # fmt: skip
@@ -377,7 +344,7 @@ def _closing(instant: _Instant, x: _Round) -> Array:
     Impacts that coincide without acting on each other are two instants for derivatives. Therefore
     only contacts take part that an impact changed, or that act on those of `landed`."""
     n = instant.landed.shape[0]
-    speed, before = -x.velocity[:n], -instant.strike.velocity[:n]
+    speed, before = -x.velocity[:n], -instant.impact.strike.velocity[:n]
     size = stop_gradient(speed)
     changed = jnp.abs(stop_gradient(speed - before)) > _NO_SPEED * x.fastest
     acts = instant.landed | ((changed | instant.coupled) & (size > instant.slow))
@@ -434,13 +401,12 @@ def _near_contacts(
     assert lane.contact is not None
     found, distances = dict(impacts), {}
     for k, impact in impacts.items():
-        body, nearest = plan.machine.coordinates[k], jnp.full_like(lane.s, jnp.inf)
-        place, contact = body.position(lane.state), jnp.zeros_like(lane.s)
-        for i, stop in enumerate(stops_of(plan.machine)):
-            if stop.coordinate == k:
-                distance = stop_gradient(-stop.beyond(place))
-                contact = jnp.where(distance < nearest, to_event(i), contact)
-                nearest = jnp.minimum(distance, nearest)
+        body, stops = plan.machine.coordinates[k], stops_of(plan.machine)
+        place = body.position(lane.state)
+        distance = {i: stop_gradient(-stop.beyond(place)) for i, stop in enumerate(stops)}
+        nearest = functools.reduce(jnp.minimum, [distance[i] for i in stops_on(plan.machine, k)])
+        closest = {i: x == nearest for i, x in distance.items()}
+        contact = chosen_stop(plan.machine, k, closest, jnp.zeros_like(lane.s))
         size = plan.extent(k) + jnp.abs(plan.sign_and_gap(k, contact)[1])
         is_near = met & (impact.contact == 0) & (lane.contact[k] == 0) & (nearest <= _NEAR * size)
         speed = jnp.abs(body.velocity(lane.state))
@@ -512,15 +478,20 @@ def _without_rebounds(
     bodies = held.coordinates
     before = [body.velocity(state) for body in bodies]
     amounts = held.amounts(state, [-velocity for velocity in before])
-    new, pushed = added(state, amounts, held.pushes), list(amounts)
-    for row, (_, _, index, drag) in enumerate(
-        held.stop_frictions, start=len(bodies) - len(held.stop_frictions)
-    ):
-        pushed[row] = pushed[row] + drag * amounts[index]
-    lost = zero
-    for body, amount, V in zip(bodies, pushed, before, strict=True):
+    new, lost = added(state, amounts, held.pushes), zero
+    for body, amount, V in zip(bodies, amounts, before, strict=True):
         lost = lost - body.mass_at(s, state) * amount * 0.5 * (V + body.velocity(new))
     return new, lost
+
+
+def on_its_stops(
+    plan: Plan, s: Scalar, state: State, contact: Scalars, *, moves: bool = False
+) -> State:
+    """Return the state with the bodies that rest exactly on their stops, at least one. While they
+    are held, their positions are accurate to the method's error only. See `stop_bodies`."""
+    codes = {k: contact[k] for k in limited_in(plan.machine)}
+    on = {k: x > 0 for k, x in codes.items()}
+    return stop_bodies(plan, s, state, on, codes, moves=moves)[0]
 
 
 def stop_bodies(

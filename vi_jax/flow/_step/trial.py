@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ..._types import Flag, Scalar, Scalars, State
 from ...lanes import pin, pin_flag
-from ...machine import is_alive, stops_of, switches_of
+from ...machine import at_stop, is_alive, stops_of, switches_of
 from ..history import end_of_step, new_piece, piece_error
 from ..lane import FREE, Lane, any_of, to_event, to_release, to_turn_of, total
 from ..methods import Foreseen, stages_to_step_to
@@ -167,7 +167,7 @@ def try_step(
     h = stop_gradient(jnp.where(free, h if clear is None else jnp.maximum(h, clear), lane.attempt))
     is_clear = None if clear is None else free & (h <= clear)
     s1, last, may_end = lane.s + h, jnp.zeros_like(free), free
-    if plan.view is not None:
+    if plan.memory is not None:
         h, s1, may_end = end_of_step(plan, lane, free, h, bound)
     if plan.s_counts_cycles(lane.state):
         # The margin avoids an extra step for a remainder of rounding.
@@ -212,7 +212,7 @@ def try_step(
     guard_error = guards_error(plan, inner, stages, h, longest)
     error = error if guard_error is None else jnp.maximum(error, guard_error)
     piece = None
-    if plan.view is not None:
+    if plan.memory is not None:
         piece = new_piece(plan, lane, smooth, s1, new, h)
         error = jnp.maximum(error, piece_error(plan, piece, h)) if method.adaptive else error
     good = jnp.isfinite(total(new, jnp.zeros_like(h)))
@@ -290,7 +290,7 @@ def _path(
         # Position and velocity of a resting body are known more accurately than from the state, if
         # the coordinate is a difference. Its force is that on a free body.
         rests = lane.contact[k] > 0
-        place = plan.at_stop(k, lane.contact[k], lambda stop: stop.place, begin.x)
+        place = at_stop(plan.machine, k, lane.contact[k], lambda stop: stop.place, begin.x)
         begin, end = (
             Rates(jnp.where(rests, place, r.x), jnp.where(rests, 0.0, r.v), r.a)
             for r in (begin, end)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -77,7 +78,10 @@ class AbstractMethod(Shown):
 
     def with_sizes(self, sizes: State) -> "AbstractMethod":
         """Return the method for a motion whose numbers have these sizes."""
-        return self
+        if not hasattr(self, "sizes"):
+            return self
+        # Not `replace`: it would check options again, which may be traced by now.
+        return eqx.tree_at(lambda m: m.sizes, self, sizes, is_leaf=lambda x: x is None)
 
     def holds(self, machine: AbstractMachine) -> bool:
         """Return whether a step moves the rest of the machine while a body rests, as with methods

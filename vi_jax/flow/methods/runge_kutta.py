@@ -1,6 +1,5 @@
 """Methods with steps of a diffrax Runge–Kutta solver, sized by their error or of fixed number."""
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Callable
@@ -336,7 +335,7 @@ class Adaptive(_RungeKutta):
         return self.rtol if self.atol is None else jnp.maximum(self.rtol, self.atol)
 
     def with_sizes(self, sizes):
-        return self if self.atol is not None else dataclasses.replace(self, sizes=sizes)
+        return self if self.atol is not None else super().with_sizes(sizes)
 
     @property
     def is_limited_by_decay(self):
@@ -475,9 +474,6 @@ class ImplicitSteps(FixedStep):
     takes_implicit = True
     sizes: Any = eqx.field(kw_only=True, default=None, repr=False)
     """The sizes of the state's numbers, set by `with_sizes`."""
-
-    def with_sizes(self, sizes):
-        return dataclasses.replace(self, sizes=sizes)
 
     @property
     def is_limited_by_decay(self):

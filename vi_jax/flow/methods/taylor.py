@@ -5,7 +5,6 @@ of every variable, each equation gives the next one of its result: by a sum, a c
 recurrence such as e' = a' e.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import factorial, pi
@@ -600,9 +599,6 @@ class Taylor(AbstractMethod):
         count("steps_per_cycle", self.steps_per_cycle, least=5)
         if self.rtol is not None:
             require("rtol", self.rtol, low=0.0, high=1.0, open_low=True)
-
-    def with_sizes(self, sizes):
-        return dataclasses.replace(self, sizes=sizes)
 
     @property
     def wander(self):
