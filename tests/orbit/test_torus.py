@@ -46,7 +46,7 @@ def test_too_few_nodes_are_noticed_by_tail_and_residual():
 
 
 def test_a_family_ends_at_the_neimark_sacker_point(torus):
-    family = vi.continue_torus(torus, parameter="b", bounds=(-0.1, 0.2), max_step=0.2)
+    family = vi.continue_torus(torus, parameter="b", bounds=(-0.1, 0.2), step=0.15)
     assert family.ends == ("neimark-sacker", "bounds"), family
     b = family.parameter
     assert 0 < b[0] < 0.05 and b[-1] == 0.2
