@@ -81,15 +81,32 @@ class Ring(Kicked):
     number a + 0.3 b/2π."""
 
     locking: jax.Array = eqx.field(default=0.0, kw_only=True, converter=jnp.asarray)
+    inwards = 1.0
 
     def kick(self, *state):
         x, y = state
         y = y - SHEAR * x**2
         square, cubic = x**2 + y**2, 3 * x**2 * y - y**3
         turn = 2 * jnp.pi * self.a + TWIST * square + self.locking * cubic
-        growth, c, s = 1 + self.b - square, jnp.cos(turn), jnp.sin(turn)
+        growth, c, s = 1 + self.inwards * (self.b - square), jnp.cos(turn), jnp.sin(turn)
         x, y = growth * (c * x - s * y), growth * (s * x + c * y)
         return x, y + SHEAR * x**2
+
+
+class Repelling(Ring):
+    """With r ← r (1 - b + r²) the curve has the exponent ln(1 + 2b), and its inside attracts."""
+
+    inwards = -1.0
+
+
+class Alternating(Ring):
+    """Two rings around (2, 0) and (-2, 0), from each of which the map of `Ring` leads to the other.
+    In two cycles the motion turns twice as far."""
+
+    def kick(self, x, y):
+        centre = 2.0 * jnp.sign(x)
+        x, y = super().kick(x - centre, y)
+        return x - centre, y
 
 
 def rotation_of(a, b):

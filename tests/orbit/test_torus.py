@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
 from matplotlib.figure import Figure
 
-from kicked import SHEAR, TWIST, Ring, at, rotation_of
+from kicked import SHEAR, TWIST, Alternating, Repelling, Ring, at, rotation_of
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +46,7 @@ def test_too_few_nodes_are_noticed_by_tail_and_residual():
 
 
 def test_a_family_ends_at_the_neimark_sacker_point(torus):
-    family = vi.continue_torus(torus, parameter="b", bounds=(-0.1, 0.2), max_step=0.2)
+    family = vi.continue_torus(torus, parameter="b", bounds=(-0.1, 0.2), step=0.15)
     assert family.ends == ("neimark-sacker", "bounds"), family
     b = family.parameter
     assert 0 < b[0] < 0.05 and b[-1] == 0.2
@@ -61,19 +63,59 @@ def test_a_family_ends_at_the_neimark_sacker_point(torus):
         family.at(0.3)
 
 
-@pytest.mark.slow
-def test_a_torus_from_a_neimark_sacker_point():
-    orbit = vi.find_orbit(Ring(0.21, -0.05), at(0.01, 0.01), throw=True)
+def torus_at(machine, start, cycles=1):
+    """Return the torus at the Neimark–Sacker point of a branch in b, which is at b = 0."""
+    orbit = vi.find_orbit(machine, start, cycles, throw=True)
     branch = vi.continue_orbit(orbit, parameter="b", bounds=(-0.2, 0.2))
     (point,) = (point for point in branch.special if point.kind == "neimark-sacker")
     assert point.parameter == pytest.approx(0, abs=1e-12)
-    for distance in (0.05, 0.1):
-        torus = point.switch(distance=distance)
+    return point.switch(distance=0.1)
+
+
+@pytest.mark.slow
+def test_a_torus_from_a_neimark_sacker_point():
+    torus = torus_at(Ring(0.21, -0.05), at(0.01, 0.01))
+    b = float(torus.machine.b)
+    assert b > 0 and torus.successful, torus
+    assert torus.rotation == pytest.approx(rotation_of(0.21, b), abs=1e-12)
+    np.testing.assert_allclose(torus.exponents, [0, np.log(1 - 2 * b)], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_unstable_torus():
+    torus = torus_at(Repelling(0.21, 0.05), at(0.01, 0.01))
+    family = vi.continue_torus(torus, parameter="b", bounds=(0.001, 0.2))
+    assert family.ends[1] == "bounds" and all(torus.successful for torus in family.tori)
+    b = family.parameter
+    assert b[-1] == 0.2
+    np.testing.assert_allclose(family.rotation, rotation_of(0.21, b), atol=1e-12)
+    np.testing.assert_allclose(family.exponents[:, 0], np.log(1 + 2 * b), atol=1e-9)
+    np.testing.assert_array_equal(family.exponents[:, 1], 0)
+    # A simulation from the curve leaves it, at that rate.
+    last = family.tori[-1]
+    run = vi.simulate(last.machine, jax.tree.map(jnp.asarray, last.at(0.1)), 150)
+    x, y = (np.asarray(a) for a in run.sections)
+    off = np.abs(np.hypot(x, y - SHEAR * x**2) - np.sqrt(0.2))
+    assert off[20] < 1e-10 and np.nanmax(off) > 0.1
+
+
+@pytest.mark.slow
+def test_a_torus_of_two_closed_curves():
+    machine = Alternating(0.21, 0.1)
+    with pytest.raises(ValueError, match="Give the number of `cycles`"):
+        vi.find_torus(machine, at(2.3, 0.1), settle=500)
+    found = vi.find_torus(machine, at(2.3, 0.1), cycles=2, settle=500)
+    branched = torus_at(Alternating(0.21, -0.05), at(2.01, 0.01), cycles=2)
+    family = vi.continue_torus(found, parameter="b", bounds=(0.05, 0.15))
+    for torus in (found, branched, *family.tori):
         b = float(torus.machine.b)
-        assert b > 0 and torus.successful, torus
-        assert torus.rotation == pytest.approx(rotation_of(0.21, b), abs=1e-12)
-        np.testing.assert_allclose(torus.exponents, [0, np.log(1 - 2 * b)], atol=1e-9)
-    assert vi.find_torus(orbit.machine, point).rotation == pytest.approx(0.21, abs=1e-3)
+        assert torus.successful and torus.cycles == 2
+        assert torus.rotation == pytest.approx(2 * rotation_of(0.21, b), abs=1e-12)
+        # Close to a ratio p:q, here to 3:7, averages converge slowly.
+        np.testing.assert_allclose(torus.exponents, [0, np.log(1 - 2 * b)], atol=1e-7)
+        x, y = torus.at(np.linspace(0, 1, 50))
+        x = x - 2 * np.sign(x[0])
+        np.testing.assert_allclose(np.hypot(x, y - SHEAR * x**2), np.sqrt(b), atol=1e-11)
 
 
 @pytest.mark.slow
@@ -91,6 +133,8 @@ def test_a_window_of_locking():
     np.testing.assert_allclose(
         [window.low, window.high], [middle - half, middle + half], atol=1e-12
     )
+    few = vi.continue_torus(torus, parameter="a", bounds=(0.31, 0.35), max_nodes=65)
+    assert few.ends == ("bounds", "coarse") and few.parameter[-1] < family.parameter[-1] - 1e-4
     orbit = window.orbit
     assert orbit.successful and orbit.stable and int(orbit.cycles) == 3
     locked: Any = orbit.machine

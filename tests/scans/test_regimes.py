@@ -1,6 +1,7 @@
 """Regimes of a scan: periodic, chaotic, transient and unsettled motions."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ def test_periodic_chaotic_and_unsettled_motions():
 def test_an_undamped_motion_has_two_frequencies():
     """Its section turns by 1/ratio in each cycle: at 0.77 it repeats after 77 cycles."""
     free, ratios = vi.Scene.ideal(frequency_ratio=0.77, gap=None), [0.77, 1 / np.sqrt(3)]
-    options = {"measure": ("regime", "rotation"), "settle": 10, "progress": False}
+    options: Any = {"measure": ("regime", "rotation"), "settle": 10, "progress": False}
     data = vi.scan(free, {"drive.frequency_ratio": ratios, "start.Y": [0.3]}, **options)
     assert data.period.values.tolist() == [[vi.REGIMES.unsettled], [vi.REGIMES.quasiperiodic]]
     np.testing.assert_allclose(data.rotation.values[:, 0], [23 / 77, 2 - np.sqrt(3)], atol=1e-9)
@@ -138,6 +139,7 @@ class Small(vi.AbstractMachine):
 def test_the_comparison_of_motions_scales_with_their_size(monkeypatch):
     """In any unit of length, motions that repeat after 77 cycles are unsettled. Two wells are two
     motions, found with few comparisons."""
+    options: Any
     lengths, options = [1.0, 1e-6, 1e-9, 1e6], {"settle": 60, "progress": False}
     compared, shares, passes = [], [], MotionSections.passes
     counted = lambda *a, **options: compared.append(a) or passes(*a, **options)
@@ -171,9 +173,58 @@ def test_quasi_periodic_motions_of_rings():
 
 
 @pytest.mark.slow
+def test_rotation_numbers_of_a_sweep():
+    a = np.array([0.1234, 0.21, 0.3819])
+    options: Any = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
+    swept = vi.sweep(Ring(0.2, 0.1), "a", a, measure=vi.Rotation(512), **options)
+    table = swept.to_xarray()
+    np.testing.assert_allclose(table.rotation.values, rotation_of(a, 0.1), atol=1e-8)
+    assert (table.digits.values > 5).all()
+    for measure, words in (("exponent", "Exponent needs more"), ("sections", "arrays are '0'")):
+        with pytest.raises(ValueError, match=words):
+            vi.sweep(Ring(0.2, 0.1), "a", a, measure=measure, **options)
+
+
+class Undriven(vi.AbstractMachine):
+    """The map of `Ring`, at the events that end the cycles of an autonomous machine."""
+
+    a: float
+    b: float = 0.1
+    cycle = 1.0
+
+    @property
+    def events(self):
+        def kick(machine, s, x):
+            u, v = Ring(machine.a, machine.b).kick(x.x, x.y)
+            return vi.State(x=u, y=v, t=0.0)
+
+        return (vi.Reset(lambda machine, s, x: x.t - 1, kick, ends_cycle=True),)
+
+    def field(self, s, x):
+        return vi.State(x=0.0 * x.x, y=0.0 * x.y, t=1.0)
+
+
+@pytest.mark.slow
+def test_motions_of_an_autonomous_machine():
+    """Exponents across the motion are those of the map between its sections."""
+    a, start = np.array([0.21, 0.3819]), vi.State(x=0.3, y=0.1, t=0.0)
+    data = vi.scan(
+        Undriven(0.2), {"a": a, "b": [-0.1, 0.1, 1.4]}, start=start, settle=500,
+        measure=("regime", "rotation"), progress=False,
+    )  # fmt: skip
+    expected = [1, int(vi.REGIMES.quasiperiodic), int(vi.REGIMES.chaotic)]
+    driven = vi.scan(
+        Ring(0.2, 0.1), {"a": a, "b": [-0.1, 0.1, 1.4]}, start=at(0.3, 0.1), settle=500,
+        measure="regime", progress=False,
+    )  # fmt: skip
+    assert (data.period.values == expected).all() and (driven.period.values == expected).all()
+    np.testing.assert_allclose(data.rotation.values[:, 1], rotation_of(a, 0.1), atol=1e-9)
+
+
+@pytest.mark.slow
 def test_a_motion_that_slowly_locks_is_not_quasi_periodic():
     """In the window 1:3 perturbations change by a share of 3 locking b³ᐟ² in a cycle, at most."""
-    options = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
+    options: Any = {"start": at(0.3, 0.1), "settle": 500, "progress": False}
     middle = 1 / 3 - rotation_of(0.0, 0.1)
     data = vi.scan(
         Ring(middle, 0.1), {"locking": [1e-3, 0.0]}, measure=("regime", "rotation"), **options

@@ -95,10 +95,6 @@ class Torus:
     """The equations of the motion from event to event."""
     curve: Curve
     """The solution at the nodes θ = j/N."""
-    size: float
-    """Largest component of Newton's last correction, relative to the size of each unknown."""
-    iterations: int
-    """Number of corrections."""
     like: State
     """A state on the section, with the machine's own modes."""
 
@@ -279,7 +275,7 @@ class Margins(NamedTuple):
         named = ["it touches a stop or a guard", "two events change their order"]
         named += ["a switch goes into another mode", "an event passes the section"]
         named += [f"the {event.name_on(problem.machine)} is missed" for event in problem.events]
-        return f"{named[number]} at θ = {self.angles[number] % 1:.6g}"
+        return f"{named[number]} at θ = {self.angles[number] % 1:.4g}"
 
 
 def _columns(problem: Shooting, x: np.ndarray, observed: Observed) -> tuple[np.ndarray, np.ndarray]:
@@ -365,9 +361,7 @@ def _start_equations(
 
 
 def torus_of(solved: Solved, equations: Equations, like: State) -> Torus:
-    motion = equations.motion(solved.curve.p)
-    curve = solved.curve._replace(rotation=float(solved.curve.rotation), p=np.zeros(0))
-    return Torus(motion, curve, solved.size, solved.iterations, like)
+    return Torus(equations.motion(solved.curve.p), solved.curve._replace(p=np.zeros(0)), like)
 
 
 def find_torus(
@@ -505,7 +499,7 @@ def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> T
     like, machine = orbit.state, orbit.machine
     rows, method = np.asarray(raveled(without_modes(like))[0])[None], torus_method(None, machine)
     motion, x = _start_equations(machine, method, like, int(orbit.cycles), rows, 0.0)
-    equations = Equations(with_parameter(motion, parameter, (width,)))
+    equations = Equations(with_parameter(motion, parameter, width))
     point = Curve(x, 0.0, np.array([float(leaf(machine, parameter))]))
     rotation, mode = equations.rotating_mode(point)
     waves = np.exp(2j * np.pi * np.arange(_FIRST) / _FIRST)[:, None]
@@ -527,13 +521,13 @@ def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> T
     return torus_of(solved, equations, like)
 
 
-def with_parameter(problem: Shooting, name: str, interval: tuple[float, ...]) -> Shooting:
-    """Return the equations with a parameter among the unknowns, with steps enough for both ends of
-    its interval; one number is the width of the scale only."""
-    ends = interval if len(interval) == 2 else (float(leaf(problem.machine, name)),)
-    corners = [with_leaf(problem.machine, name, end) for end in ends]
+def with_parameter(
+    problem: Shooting, name: str, width: float, ends: tuple[float, ...] = ()
+) -> Shooting:
+    """Return the equations with a parameter of this size among the unknowns, with steps enough for
+    these values of it."""
+    corners = [problem.machine, *(with_leaf(problem.machine, name, end) for end in ends)]
     steps = steps_of(problem.method, corners, problem.like, problem.cycles)
-    width = 0.5 * (interval[1] - interval[0]) if len(interval) == 2 else interval[0]
     return dataclasses.replace(
         problem, parameters=(name,), steps=max(problem.steps, steps), widths=jnp.asarray([width])
     )

@@ -187,7 +187,8 @@ def continue_torus(
     bounds = interval("bounds", bounds)
     value = float(leaf(torus.machine, parameter))
     check_parameter(torus.machine, parameter, value, bounds, "torus")
-    equations = Equations(with_parameter(torus.problem, parameter, bounds))
+    width = 0.5 * (bounds[1] - bounds[0])
+    equations = Equations(with_parameter(torus.problem, parameter, width, bounds))
     start = equations.solve_near(torus.curve._replace(p=np.array([value])))
     if start is None:
         raise ValueError("Argument `torus` could not be refined in this parameter.")

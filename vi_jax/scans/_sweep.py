@@ -55,8 +55,8 @@ from ..machine import (
     with_units,
     without_modes,
 )
-from .measures import CODES, REGIMES, Regime, Usual, flags
-from .program import lane_noise_of
+from .measures import CODES, REGIMES, AbstractMeasure, Regime, Usual, flags
+from .program import cycles_for, lane_noise_of, measures_of
 
 # A change is large from this many times the changes at neighbouring values, and this share of the
 # largest position, or of ζ, on: choices. It may be a jump, or a steep change in a coarse sweep.
@@ -97,6 +97,8 @@ class Sweep(Summarized):
     averages: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     """The machine's own averages over the time of the observed cycles, by name (see
     `AbstractMachine.averages`)."""
+    measured: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    """The numbers of the argument `measure`, by name."""
     labels: tuple[str, str] = eqx.field(static=True, kw_only=True)
     """The machine's labels of position and velocity in pictures."""
     periods: tuple[str, ...] = eqx.field(static=True, kw_only=True)
@@ -117,7 +119,8 @@ class Sweep(Summarized):
         (`section_Y`), and `result` is the reason's name. `dims` and `along` are as in
         `Run.to_xarray`; `along` is `"value"`, or `"cycle"` (the sections)."""
         each = (*batch_names(dims, self.values.ndim - 1), "value")
-        variables = present({name: getattr(self, name) for name in COLUMNS} | self.averages, each)
+        variables = present({name: getattr(self, name) for name in COLUMNS}, each)
+        variables |= present(self.averages | self.measured, each)
         variables |= states("section", self.sections, (*each, "cycle"))
         variables["result"] = each, in_names(self.result)
         data = xr.Dataset(variables, {self.parameter: (each, np.asarray(self.values))})
@@ -200,7 +203,8 @@ def sweep(
     *,
     start: State = None,
     settle: int = 200,
-    cycles: int = 32,
+    cycles: int | None = None,
+    measure: Any = (),
     method: MethodLike = None,
     clock: str | None = None,
     tolerance: float | None = None,
@@ -222,7 +226,10 @@ def sweep(
       `"drive.frequency_ratio"`.
     - `values`: its values in the order of the sweep.
     - `start`: state at the first value; by default the machine's `start()`.
-    - `settle`, `cycles`: drive cycles at each value before observation, and observed; static.
+    - `settle`, `cycles`: drive cycles at each value before observation, and observed (by default
+      32 or as many as the measures need); static.
+    - `measure`: measures as for `scan`, such as `vi.Rotation()`, that return one number a motion
+      from its cycles.
     - `method`, `clock`: as for `simulate`; by default the `"standard"` preset.
     - `tolerance`: the largest difference of sections that repeat, as in `Regime`.
     - `max_steps`: the largest number of steps at each value; with more, it counts as failed.
@@ -237,7 +244,14 @@ def sweep(
     """
     machine = machine_of(machine)
     check_leaf(machine, parameter)
-    settle, cycles = count("settle", settle), count("cycles", cycles, least=2)
+    measures = measures_of(measure)
+    for each in measures:
+        if each.instants or type(each).refine is not AbstractMeasure.refine:
+            raise ValueError(
+                "Argument `measure` must be of measures of the observed cycles alone, but a "
+                f"{type(each).__name__} needs more of each motion: use `scan`."
+            )
+    settle, cycles = count("settle", settle), count("cycles", cycles_for(measures, cycles), least=2)
     progress = flag("progress", progress)
     values, numbers = _values(values)
     if max_steps is not None:
@@ -264,7 +278,8 @@ def sweep(
     lane_noise = lane_noise_of(noise, key)
     if lane_noise is not None:
         check_noise(machine, without_modes(start), noise)
-    options = (settle, cycles, method, rests, regime, max_steps, lane_noise, without_modes(start))
+    first = without_modes(start)
+    options = (settle, cycles, method, rests, regime, measures, max_steps, lane_noise, first)
     # With noise, the index of the value is carried along: each has its own path.
     begin = start if lane_noise is None else (start, jnp.uint32(0))
     if values.size <= _AT_ONCE or not is_outermost(machine, values, start, regime, lane_noise):
@@ -315,8 +330,8 @@ def moved_by_stops(machine: AbstractMachine, state: State) -> State:
 
 @compiled
 def _sweep(
-    machine, parameter, values, start, settle, cycles, method, rests, regime, max_steps,
-    lane_noise, first,
+    machine, parameter, values, start, settle, cycles, method, rests, regime, measures,
+    max_steps, lane_noise, first,
 ) -> tuple[State, Sweep]:  # fmt: skip
     """Return the state after the last value, and the results at each; `start`, with noise with the
     index of the first value; `first`, the state at the first value of all."""
@@ -338,6 +353,13 @@ def _sweep(
         next_carry = state if number is None else (state, number + jnp.uint32(1))
         assert run.duration is not None and run.impact_energy is not None
         found = Usual("extremes")(current, run) | regime.begun(first)(current, run)
+        measured = {name: x for each in measures for name, x in each(current, run).items()}
+        rows = [repr(name) for name, x in measured.items() if jnp.ndim(x)]
+        if rows:
+            raise ValueError(
+                "Argument `measure` must be of one number a motion, but arrays are "
+                f"{', '.join(rows)}: use `scan`."
+            )
         return next_carry, Sweep(
             parameter=parameter,
             values=value,
@@ -351,6 +373,7 @@ def _sweep(
             sections=jtu.tree_map(lambda x: x[1:], run.sections),
             result=run.result,
             averages=run.mean_averages(),
+            measured=measured,
             labels=machine.labels,
             units=stated(machine),
             periods=tuple(cycles_in_words(machine, n) for n in range(1, cycles // 2 + 1)),
