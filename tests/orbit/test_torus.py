@@ -80,10 +80,10 @@ def test_a_torus_from_a_neimark_sacker_point():
 def test_a_window_of_locking():
     """On r = √b the angle moves by 2πa + 0.3 b + locking b³ᐟ² sin 3φ: it locks to 1:3 where that is
     2π/3 at some φ."""
-    machine, b = Ring(0.3, 0.1, locking=0.05), 0.1
-    torus = vi.find_torus(machine, at(0.3, 0.1), settle=500)
-    family = vi.continue_torus(torus, parameter="a", bounds=(0.29, 0.35))
-    assert family.ends == ("bounds", "bounds")
+    b = 0.1
+    torus = vi.find_torus(Ring(0.32, 0.1, locking=0.05), at(0.3, 0.1), settle=500)
+    family = vi.continue_torus(torus, parameter="a", bounds=(0.31, 0.35))
+    assert family.ends == ("bounds", "resonance") and "locks to 1:3" in family.details[1]
     (window,) = (window for window in family.windows if window.q == 3)
     middle = 1 / 3 - TWIST * b / (2 * np.pi)
     half = 0.05 * b**1.5 / (2 * np.pi)
@@ -95,6 +95,7 @@ def test_a_window_of_locking():
     assert orbit.successful and orbit.stable and int(orbit.cycles) == 3
     locked: Any = orbit.machine
     assert window.low < float(locked.a) < window.high
+    assert 0 < window.low - family.parameter[-1] < 0.1 * (window.high - window.low)
 
 
 def test_motions_that_are_no_torus_are_refused():

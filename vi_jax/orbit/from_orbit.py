@@ -130,7 +130,7 @@ def _fewest_steps(method: AbstractMethod, machine: AbstractMachine, like: State)
 
 
 # Most events of a cycle that are followed, with switches or a section of the machine: a choice.
-_LISTED = 32
+LISTED = 32
 
 # Steps are doubled until the end of a flight changes by less than the first number (relative to the
 # motion's size; the corrector's tolerance). The second is their largest number: a choice.
@@ -339,10 +339,15 @@ def _follow_events(
         in_flight.append(tuple(float(m) for m in modes))
         s = place
     states.append(np.asarray(fly(modes, s, period, u)))
-    first = found[0][1] if found and found[0][1].cycle == 0 else None
-    if first is not None and (jumps_on_section(machine) or first != section_of(machine, 0)):
+    if found and begins_after_jump(machine, found[0][1]):
         states[0] = states[-1]
     return np.stack(states), tuple(in_flight) or (tuple(float(m) for m in modes),)
+
+
+def begins_after_jump(machine: AbstractMachine, first: Event) -> bool:
+    """Return whether the state on the section differs from that before the first event there."""
+    jumps = jumps_on_section(machine) or first != section_of(machine, 0)
+    return first.cycle == 0 and jumps
 
 
 def events_in(orbit: Orbit) -> list[Placed]:
@@ -360,10 +365,7 @@ def events_in(orbit: Orbit) -> list[Placed]:
         found = other_events if has_other_events else found
     if counts_turns(machine) and found and not renews(machine) and _repeats_each_turn(orbit):
         return found  # these may pass sections, at which nothing happens
-    if section_in(machine, without_modes(orbit.state)) is not None or renews(machine):
-        found += [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
-    # An event that coincides with a section belongs to the cycle that ends there.
-    return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
+    return with_sections(machine, without_modes(orbit.state), begins, found, cycles)
 
 
 # A machine is compared with itself a turn later and at another clock: at so many angles, after this
@@ -400,24 +402,41 @@ def _rates_at(machine: AbstractMachine, state: State, given: Any, clocks: Any, a
 
 def _listed_events(orbit: Orbit) -> tuple[np.ndarray, list[Placed]]:
     """Simulate a motion; return the begins of its cycles, and its impacts, switches and jumps."""
-    machine, cycles = orbit.machine, int(orbit.cycles)
-    run = simulate(machine, orbit.state, cycles, method=orbit.method, event_log=_LISTED + 1)
-    assert run.event_log is not None and run.duration is not None
-    if (np.asarray(run.event_log.kind)[:, -1] >= 0).any():
+    cycles = int(orbit.cycles)
+    run = simulate(orbit.machine, orbit.state, cycles, method=orbit.method, event_log=LISTED + 1)
+    return placed_events(orbit.machine, run, "orbit")
+
+
+def placed_events(
+    machine: AbstractMachine, run: Run, argument: str
+) -> tuple[np.ndarray, list[Placed]]:
+    """Return the begins of a run's cycles, and its impacts, switches and jumps."""
+    assert run.event_log is not None
+    if (np.asarray(run.event_log.kind)[:, LISTED:] >= 0).any():
         raise ValueError(
-            f"Argument `orbit` must have at most {_LISTED} events in a cycle, but has more."
+            f"Argument `{argument}` must have at most {LISTED} events in a cycle, but has more."
         )
-    begins = _cycle_begins(run, machine, is_autonomous(machine, without_modes(orbit.state)))
+    begins = _cycle_begins(run, machine, is_autonomous(machine, without_modes(run.last)))
     found, events = [], events_of(machine)
     for n, s, kind, i in logged_events(machine, run):
         if kind in (EventKind.rest, EventKind.release):
             continue
         if events[i].ends_cycle:
-            later = (n + 1) % cycles
+            later = (n + 1) % (len(begins) - 1)
             found.append((float(begins[later]), Event(i, later)))
         else:
             found.append((float(begins[n] + s), Event(i)))
     return begins, found
+
+
+def with_sections(
+    machine: AbstractMachine, like: State, begins: np.ndarray, found: list[Placed], cycles: int
+) -> list[Placed]:
+    """Return events in order, with the sections if they change the state or the clock."""
+    if section_in(machine, like) is not None or renews(machine):
+        found = found + [(float(begins[n]), section_of(machine, n)) for n in range(cycles)]
+    # An event that coincides with a section belongs to the cycle that ends there.
+    return sorted(found, key=lambda f: (f[0], f[1].cycle is not None))
 
 
 def logged_events(machine: AbstractMachine, run: Run) -> list[tuple[int, float, int, int]]:

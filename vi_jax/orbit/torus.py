@@ -26,36 +26,32 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     angles_in,
-    events_of,
     in_rows,
-    is_autonomous,
     leaf,
     modes_of,
+    nearest_images,
     raveled,
-    renews,
-    section_in,
     with_leaf,
     with_modes,
     without_modes,
-    without_turns,
 )
 from .birkhoff import agreement, rotation_number, weights, without_angles
 from .corrector import on_host
-from .cycle_map import cycle_map, map_state
+from .cycle_map import CycleMap, cycle_map, map_state
 from .equations import ROUNDING, Observed, Shooting
-from .flight import Event, section_of
-from .from_orbit import equations_along, event_numbers, fixed_step_method, steps_of, with_sizes
+from .from_orbit import (
+    LISTED,
+    begins_after_jump,
+    equations_along,
+    fixed_step_method,
+    placed_events,
+    steps_of,
+    with_sections,
+    with_sizes,
+)
 from .results import Orbit
 from .special import Point
-from .torus_equations import (
-    Condition,
-    Curve,
-    Equations,
-    Solved,
-    in_lanes,
-    interpolated,
-    modes,
-)
+from .torus_equations import Curve, Equations, Solved, in_lanes, interpolated, modes
 
 # A torus is resolved if tail and residual are below the first number; nodes are doubled until the
 # tail is below the second. The tail falls by some digits with each doubling. Choices.
@@ -74,9 +70,6 @@ _REPEATS, _LONGEST = 1e-8, 512
 # The curve through a run is near its sections, relative to their sizes: a choice.
 _NEAR = 0.1
 
-# Events of a cycle that are listed: a choice.
-_LISTED = 16
-
 # A curve whose first mode is smaller than this share of its state is a fixed point: a choice, far
 # above the corrector's tolerance. With it any ρ would solve the equations.
 POINT = 1e-7
@@ -86,7 +79,7 @@ POINT = 1e-7
 _STEPS, _SKIPPED, _PAIR = 16384, 512, 10.0
 
 # Places around the least margin, and the number of times that the search closes in on it.
-_PLACES, _CLOSER = 16, 3
+_PLACES, _CLOSER = 16, 5
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -161,9 +154,10 @@ class Torus:
         begin, wanted = (
             self.equations.on_section(self.curve, angles + turn) for turn in (0.0, self.rotation)
         )
-        last = follow(self.machine, self.method, self.like, self.cycles, begin).last
-        sizes = np.asarray(self.problem.sizes)[1:]
-        difference = _without_turns(self.problem, last - wanted) / sizes
+        the_map = cycle_map(self.machine, self.cycles, method=self.method)
+        end = in_lanes(_mapped, (the_map, self.like), begin)
+        end = nearest_images(angles_in(self.machine, self.problem.like), end, wanted)
+        difference = (end - wanted) / np.asarray(self.problem.sizes)[1:]
         return float(np.abs(difference).max()) if np.isfinite(difference).all() else np.inf
 
     @cached_property
@@ -213,7 +207,7 @@ class Torus:
     def reason(self) -> str:
         """The reason why this is not a quasi-periodic motion of the machine; "" if it is one."""
         crossed = self.margins.crossed
-        if np.abs(first_mode(self.equations, self.curve)).max() < POINT:
+        if first_mode(self.equations, self.curve)[1] < POINT:
             return "The curve has shrunk to a periodic motion, which any rotation number solves."
         if self.tail > RESOLVED:
             return (
@@ -270,17 +264,16 @@ class Margins(NamedTuple):
     values: np.ndarray
     """The least clearance, time between two events, agreement of modes and time from the section,
     then the least speed of approach of each event."""
-    units: np.ndarray
-    """The sizes of these along the motion."""
+    shares: np.ndarray
+    """These, relative to their sizes along the motion."""
     angles: np.ndarray
     """The angle of each, in turns."""
 
     @property
     def crossed(self) -> int | None:
         """The number of the most negative margin; `None` if none is negative beyond rounding."""
-        shares = np.nan_to_num(self.values / self.units, posinf=1.0, nan=-1.0)
-        lowest = int(np.argmin(shares))
-        return lowest if shares[lowest] < -ROUNDING else None
+        lowest = int(np.argmin(self.shares))
+        return lowest if not self.shares[lowest] >= -ROUNDING else None
 
     def in_words(self, problem: Shooting, number: int) -> str:
         named = ["it touches a stop or a guard", "two events change their order"]
@@ -290,82 +283,45 @@ class Margins(NamedTuple):
 
 
 def _columns(problem: Shooting, x: np.ndarray, observed: Observed) -> tuple[np.ndarray, np.ndarray]:
-    """Return the margins of motions and their units, (angles, margins)."""
-    count, ones = len(problem.events), np.ones(len(x))
-    section = np.full(len(x), np.inf)
+    """Return the margins of motions, and relative to their sizes, (angles, margins)."""
+    count, section = len(problem.events), np.full(len(x), np.inf)
     if count and not problem.autonomous and problem.events[0].cycle != 0:
         section = np.minimum(x[:, 0], float(problem.period(x[0])) - x[:, count - 1])
-    nearest, radian = observed.nearest, problem.radian * ones
+    nearest, ones = observed.nearest, np.ones(len(x))
     values = [nearest.margin, observed.order_margin, observed.modes_agree, section]
-    units = np.column_stack([nearest.unit, radian, ones, radian, observed.units])
-    return np.column_stack([*values, observed.approach]), units
+    units = [nearest.unit, problem.radian * ones, ones, problem.radian * ones]
+    values = np.column_stack([*values, observed.approach])
+    return values, values / np.column_stack([*units, observed.units])
 
 
 def margins_of(equations: Equations, curve: Curve) -> Margins:
     """Return the margins; a search between the nodes closes in on the least of each."""
     problem = equations.motion(curve.p)
-    values, units = _columns(problem, curve.x, equations.observe(curve))
-    index = np.argmin(values, axis=0)
-    centre, width = index / len(values), 1.0 / len(values)
+    values, shares = _columns(problem, curve.x, equations.observe(curve))
+    centre, width = np.argmin(values, axis=0) / len(values), 1.0 / len(values)
     each = np.arange(values.shape[1])
     for _ in range(_CLOSER):
         angles = centre[:, None] + width * np.linspace(-1, 1, _PLACES)
         flat = angles.ravel()
         found = _columns(problem, interpolated(curve.x, flat), equations.observe(curve, flat))
-        values, units = (a.reshape(len(each), _PLACES, -1)[each, :, each] for a in found)
+        values, shares = (a.reshape(len(each), _PLACES, -1)[each, :, each] for a in found)
         index = np.clip(np.argmin(values, axis=1), 1, _PLACES - 2)
         centre, width = angles[each, index], 2.0 * width / (_PLACES - 1)
-    # The vertex of the parabola through the least three values.
-    low, middle, high = (values[each, index + i] for i in (-1, 0, 1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        depth = (high - low) ** 2 / (8 * (high - 2 * middle + low))
-    is_vertex = np.isfinite(depth) & (middle <= low) & (middle <= high)
-    least = np.where(is_vertex, middle - np.where(is_vertex, depth, 0.0), values.min(axis=1))
-    return Margins(least, units[each, index], centre)
+    return Margins(values.min(axis=1), shares.min(axis=1), centre)
 
 
-def first_mode(equations: Equations, curve: Curve) -> np.ndarray:
-    """Return the first Fourier mode of a curve, in scaled unknowns."""
-    return np.fft.fft(equations.scaled(curve.x), axis=0)[1] / len(curve.x)
-
-
-def _without_turns(problem: Shooting, difference: np.ndarray) -> np.ndarray:
-    angles = angles_in(problem.machine, problem.like)
-    return difference if angles is None else np.where(angles, without_turns(difference), difference)
-
-
-class Followed(NamedTuple):
-    """Motions of a period, by simulation; each field with the lanes first."""
-
-    last: Any
-    """States on the section at its end."""
-    kind: Any
-    """Kind, number and clock of each event of each cycle, as in `EventLog`."""
-    number: Any
-    phase: Any
-    duration: Any
-    """Duration of each cycle by the clock."""
+def first_mode(equations: Equations, curve: Curve) -> tuple[np.ndarray, float]:
+    """Return the first Fourier mode of a curve, in scaled unknowns, and its largest component."""
+    mode = np.fft.fft(curve.x / equations.scale, axis=0)[1] / len(curve.x)
+    return mode, float(np.abs(mode).max())
 
 
 @on_host
-def _simulate(machine: AbstractMachine, method: AbstractMethod, like: State, cycles: int, rows):
-    def follow(row):
-        start = with_modes(raveled(like)[1](row), modes_of(like) or ())
-        run = simulate(machine, start, cycles, method=method, event_log=_LISTED)
-        log = run.event_log
-        assert log is not None and run.duration is not None
-        last = jnp.where(run.successful, raveled(run.last)[0], jnp.nan)
-        return Followed(last, log.kind, log.number, log.phase, run.duration)
-
-    return jax.vmap(follow)(rows)
-
-
-def follow(
-    machine: AbstractMachine, method: AbstractMethod, like: State, cycles: int, rows: np.ndarray
-) -> Followed:
-    """Simulate a period from states on the section, (lanes, states)."""
-    program = lambda machine, rows: _simulate(machine, method, like, cycles, rows)
-    return in_lanes(program, machine, rows)
+def _mapped(map_and_state: tuple[CycleMap, State], rows):
+    """Return the states on the section after the period of a map, from states on it."""
+    the_map, like = map_and_state
+    start = lambda row: with_modes(raveled(like)[1](row), modes_of(like) or ())
+    return jax.vmap(lambda row: raveled(the_map(start(row)))[0])(rows)
 
 
 def _start_equations(
@@ -374,107 +330,44 @@ def _start_equations(
 ) -> tuple[Shooting, np.ndarray]:  # fmt: skip
     """Return the equations of the motions that begin in some states of a curve on the section, and
     their values of the unknowns, (nodes, unknowns)."""
-    found = follow(machine, method, like, cycles, rows)
-    _check_events(found)
-    first = with_modes(raveled(like)[1](jnp.asarray(rows[0])), modes_of(like) or ())
-    autonomous = is_autonomous(machine, without_modes(like))
-    lengths = found.duration if autonomous else np.full_like(found.duration, float(machine.cycle))
-    begins = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(lengths, axis=1)], axis=1)
-    placed = _placed(machine, without_modes(like), found, begins, cycles)
-    order = [(float(clock[0]), event) for clock, event in placed]
-    period = float(begins[0, -1])
-    problem, _ = equations_along(machine, method, first, order, period, cycles, [machine])
-    if not placed:
-        return with_sizes(problem, rows[0], np.abs(rows).max(axis=0)), rows
-    clocks = np.stack([clock for clock, _ in placed], axis=1)
-    states, last = in_lanes(_fly_to_events, problem, clocks, begins[:, -1], rows)
-    if problem.events[0].cycle == 0:  # its state is that before it
-        states[:, 0] = last if len(rows) == 1 else interpolated(
-            last, np.arange(len(rows)) / len(rows) - rotation
-        )  # fmt: skip
-    if autonomous:
-        clocks[:, 0] = begins[:, -1]
-    x = np.concatenate([clocks, states.reshape(len(rows), -1)], axis=1)
+    motions, plain = [], without_modes(like)
+    for row in rows:
+        start = with_modes(raveled(like)[1](jnp.asarray(row)), modes_of(like) or ())
+        run = simulate(machine, start, cycles, method=method, event_log=LISTED + 1)
+        assert run.event_log is not None
+        if np.isin(run.event_log.kind, (EventKind.rest, EventKind.release)).any():
+            raise ValueError(
+                "Argument `start` must settle on a motion in flight, but it rests on a stop. Tori "
+                "of motions that rest are not supported."
+            )
+        begins, found = placed_events(machine, run, "start")
+        found, period = with_sections(machine, plain, begins, found, cycles), float(begins[-1])
+        motions.append(equations_along(machine, method, start, found, period, cycles, [machine]))
+    problem, x = (
+        max((p for p, _ in motions), key=lambda p: p.steps),
+        np.stack([x for _, x in motions]),
+    )
+    for i, (other, _) in enumerate(motions):
+        if (other.events, other.modes) != (problem.events, problem.modes):
+            raise ValueError(
+                "Argument `start` must settle on a motion whose cycles all have the same events in "
+                f"the same order, but those from θ = 0 and from θ = {i / len(rows):.3g} differ: "
+                "the curve grazes between them, or an event passes the section. In the second case "
+                "shift the section."
+            )
+    if problem.events and begins_after_jump(machine, problem.events[0]):
+        # Its state is that before the jump, which ends the motion from θ - ρ.
+        states = slice(problem.legs, problem.legs + problem.states)
+        angles = np.arange(len(rows)) / len(rows)
+        x[:, states] = interpolated(x[:, states], angles - rotation)
     largest = Equations(problem).observe(Curve(x, rotation, np.zeros(0))).largest
     return with_sizes(problem, x[0], largest.max(axis=0)), x
-
-
-def _check_events(found: Followed) -> None:
-    """Raise `ValueError` unless the same events happen in the same order from each node."""
-    count = len(found.kind)
-    if np.isin(found.kind, (EventKind.rest, EventKind.release)).any():
-        raise ValueError(
-            "Argument `start` must settle on a motion in flight, but it rests on a stop. Tori of "
-            "motions that rest are not supported."
-        )
-    if (found.kind[..., -1] >= 0).any():
-        raise ValueError(
-            f"Argument `start` must settle on a motion with fewer than {_LISTED} events in a "
-            "cycle, but it has more."
-        )
-    same = (found.kind == found.kind[0]) & (found.number == found.number[0])
-    differs = np.flatnonzero(~same.reshape(count, -1).all(axis=1))
-    if len(differs):
-        raise ValueError(
-            "Argument `start` must settle on a motion whose cycles all have the same events in the "
-            f"same order, but those from θ = 0 and from θ = {differs[0] / count:.3g} differ: the "
-            "curve grazes between them, or an event passes the section. In the second case shift "
-            "the section."
-        )
-
-
-def _placed(
-    machine: AbstractMachine, like: State, found: Followed, begins: np.ndarray, cycles: int
-) -> list[tuple[np.ndarray, Event]]:
-    """Return the events of a period in order, each with its clock from each node."""
-    events, placed = events_of(machine), []
-    numbers = event_numbers(machine, found.kind[0], found.number[0])
-    for n, j in zip(*np.nonzero(found.kind[0] >= 0), strict=True):
-        i = int(numbers[n, j])
-        if events[i].ends_cycle:
-            later = (n + 1) % cycles
-            placed.append((begins[:, later], Event(i, later)))
-        else:
-            placed.append((begins[:, n] + found.phase[:, n, j], Event(i)))
-    if section_in(machine, like) is not None or renews(machine):
-        placed += [(begins[:, n], section_of(machine, n)) for n in range(cycles)]
-    return sorted(placed, key=lambda p: (float(p[0][0]), p[1].cycle is not None))
-
-
-@on_host
-def _fly_to_events(problem: Shooting, clocks, period, rows):
-    """Return the states just before each event and at the end of the period."""
-    machine = problem.machine
-
-    def fly(clock, period, u):
-        s, states = jnp.zeros_like(period), []
-        for i, event in enumerate(problem.events):
-            if event.cycle == 0:
-                states.append(u)
-                continue
-            u = problem.flight(machine, i - 1).fly(s, clock[i], u, problem.steps)[0]
-            states.append(u)
-            u, s = problem.after(machine, i, clock[i], u), clock[i]
-        end = problem.flight(machine, problem.legs - 1).fly(s, period, u, problem.steps)[0]
-        return jnp.stack(states), end
-
-    return jax.vmap(fly)(clocks, period, rows)
 
 
 def torus_of(solved: Solved, equations: Equations, like: State) -> Torus:
     motion = equations.motion(solved.curve.p)
     curve = solved.curve._replace(rotation=float(solved.curve.rotation), p=np.zeros(0))
     return Torus(motion, curve, solved.size, solved.iterations, like)
-
-
-def _settled(
-    equations: Equations, guess: Curve, nodes: int | None, most: int = MOST
-) -> Solved | None:
-    """Solve near a curve and double its nodes until the tail is small, unless `nodes` are given."""
-    solved = equations.solve_near(guess)
-    if solved is None or nodes is not None:
-        return solved
-    return equations.refined(solved, SETTLED, most)
 
 
 def find_torus(
@@ -524,49 +417,15 @@ def find_torus(
         raise ValueError(f"Argument `nodes` must be odd, but is {nodes}.")
     if rotation is not None:
         rotation = given_number("rotation", rotation, low=0.0, high=1.0)
-    the_map = cycle_map(machine, cycles, method=method)
-    machine = the_map.machine
+    machine = cycle_map(machine, cycles, method=method).machine
     method = torus_method(method, machine)
-    if isinstance(start, Run):
-        start = start.last
+    start = start.last if isinstance(start, Run) else start
     like = map_state(machine, machine.start() if start is None else start, "start")
     if machine.position(without_modes(like)).dtype != jnp.float64:
         raise ValueError(
             "Argument `start` must be of double precision: call "
             '`jax.config.update("jax_enable_x64", True)` first.'
         )
-    begin, rows = _observe_run(machine, method, like, cycles, settle, observed)
-    rotation = _checked_rotation(machine, like, rows, cycles, rotation)
-    number = _FIRST if nodes is None else nodes
-    values, misses = _curve_through(rows, number, rotation)
-    if misses > _NEAR:
-        raise ValueError(
-            "Argument `start` must settle on one closed curve on the section, but the curve with "
-            f"rotation number {rotation:.6g} misses its sections by {misses:.2g} of their spread. "
-            "Give the number of `cycles` after which it returns to the same curve, or `rotation`."
-        )
-    problem, x = _start_equations(machine, method, begin, cycles, values, rotation)
-    equations = Equations(problem)
-    solved = _settled(equations, Curve(x, rotation, np.zeros(0)), nodes)
-    if solved is None:
-        raise ValueError(
-            f"No torus with a rotation number near {rotation:.6g} was found from this run. Observe "
-            "more cycles (`settle`, `observed`), or give more `nodes`."
-        )
-    return torus_of(solved, equations, begin)
-
-
-def torus_method(given: MethodLike, machine: AbstractMachine) -> AbstractMethod:
-    # The default of `continue_orbit` has errors of some 1e-12, which would limit the residual.
-    default = chosen(machine, None, FixedStep(steps_per_cycle=48))
-    return fixed_step_method(given, default, machine)
-
-
-def _observe_run(
-    machine: AbstractMachine, method: AbstractMethod, like: State, cycles: int, settle: int,
-    observed: int,
-) -> tuple[State, np.ndarray]:  # fmt: skip
-    """Return the last state of a run, and the states on the section after each period."""
     run = simulate(
         machine, like, cycles * observed, settle=cycles * settle, method=method, record="sections"
     )
@@ -575,30 +434,50 @@ def _observe_run(
             "Argument `start` must begin a motion that can be simulated, but the run failed: "
             f"{RESULTS[run.result]}"
         )
-    rows, angles = (
-        np.asarray(in_rows(run.sections))[::cycles],
-        angles_in(machine, without_modes(like)),
-    )
-    if angles is not None:
-        rows = rows[0] + np.where(angles, without_turns(rows - rows[0]), rows - rows[0])
-    return run.last, rows
+    rows = np.asarray(in_rows(run.sections))[::cycles]
+    rows = np.asarray(nearest_images(angles_in(machine, without_modes(like)), rows, rows[0]))
+    measured = _measured_rotation(machine, like, rows, cycles)
+    rotation = measured if rotation is None else rotation
+    values, misses = _curve_through(rows, _FIRST if nodes is None else nodes, rotation)
+    if misses > _NEAR:
+        raise ValueError(
+            "Argument `start` must settle on one closed curve on the section, but the curve with "
+            f"rotation number {rotation:.6g} misses its sections by {misses:.2g} of their spread. "
+            "Give the number of `cycles` after which it returns to the same curve, or `rotation`."
+        )
+    problem, x = _start_equations(machine, method, run.last, cycles, values, rotation)
+    equations = Equations(problem)
+    solved = equations.solve_near(Curve(x, rotation, np.zeros(0)))
+    if solved is not None and nodes is None:
+        solved = equations.refined(solved, SETTLED, MOST)
+    if solved is None:
+        raise ValueError(
+            f"No torus with a rotation number near {rotation:.6g} was found from this run. Observe "
+            "more cycles (`settle`, `observed`), or give more `nodes`."
+        )
+    return torus_of(solved, equations, run.last)
 
 
-def _checked_rotation(
-    machine: AbstractMachine, like: State, rows: np.ndarray, cycles: int, given: float | None
+def torus_method(given: MethodLike, machine: AbstractMachine) -> AbstractMethod:
+    # The default of `continue_orbit` has errors of some 1e-12, which would limit the residual.
+    default = chosen(machine, None, FixedStep(steps_per_cycle=48))
+    return fixed_step_method(given, default, machine)
+
+
+def _measured_rotation(
+    machine: AbstractMachine, like: State, rows: np.ndarray, cycles: int
 ) -> float:
     """Return the rotation number of a run that is quasi-periodic, else raise `ValueError`."""
-    angles = angles_in(machine, without_modes(like))
     sizes = sizes_on_host(machine, without_modes(like), rows)
     differences = (np.abs(rows[-1] - rows[-_LONGEST - 1 : -1]) / sizes).max(axis=1)[::-1]
     repeats = np.flatnonzero(differences < _REPEATS)
     if len(repeats):
-        period = cycles * (int(repeats[0]) + 1)
+        period = count_of(cycles * (int(repeats[0]) + 1), "cycle")
         raise ValueError(
             "Argument `start` must settle on a quasi-periodic motion, but this one repeats after "
-            f"{count_of(period, 'cycle')}: find and follow that orbit."
+            f"{period}: find and follow that orbit."
         )
-    seen = without_angles(jnp.asarray(rows), angles)
+    seen = without_angles(jnp.asarray(rows), angles_in(machine, without_modes(like)))
     digits = float(agreement(seen))
     if digits < _DIGITS:
         raise ValueError(
@@ -606,7 +485,7 @@ def _checked_rotation(
             f"halves of the run agree to {digits:.2g} digits only. A slowly settling motion needs "
             "more `settle`; a chaotic one has no torus."
         )
-    return float(rotation_number(seen)) if given is None else given
+    return float(rotation_number(seen))
 
 
 def _curve_through(rows: np.ndarray, nodes: int, rotation: float) -> tuple[np.ndarray, float]:
@@ -623,27 +502,22 @@ def _curve_through(rows: np.ndarray, nodes: int, rotation: float) -> tuple[np.nd
 def torus_near(orbit: Orbit, parameter: str, width: float, distance: float) -> Torus:
     """Return the torus near a Neimark–Sacker point whose first mode has the size `distance`, in
     scaled unknowns; the parameter is an unknown."""
-    like = orbit.state
-    rows = np.asarray(raveled(without_modes(like))[0])[None]
-    machine, cycles = orbit.machine, int(orbit.cycles)
-    motion, x = _start_equations(machine, torus_method(None, machine), like, cycles, rows, 0.0)
-    problem = with_parameter(motion, parameter, (width,))
-    equations = Equations(problem)
-    start = Curve(x, 0.0, np.array([float(leaf(machine, parameter))]))
-    held = equations.at_parameter(start, float(start.p[0]))
-    fixed = equations.solve(start, [held], is_cycle=True)
-    if fixed is None:
-        raise ValueError("The motion of this Neimark–Sacker point could not be refined.")
-    rotation, mode = equations.rotating_mode(fixed.curve)
-    angles = np.arange(_FIRST) / _FIRST
-    waves = np.exp(2j * np.pi * angles)[:, None]
-    x = fixed.curve.x + 2 * distance * np.real(waves * mode) * equations.scale
-    guess = Curve(x, rotation, fixed.curve.p)
-    part = mode[equations.first]
-    row = waves.conj() * part.conj() / (_FIRST * np.vdot(part, part).real)
-    none = np.zeros(1)
-    held = [Condition(row.imag, 0.0, none, 0.0), Condition(row.real, 0.0, none, distance)]
-    solved = equations.solve(guess, held)
+    like, machine = orbit.state, orbit.machine
+    rows, method = np.asarray(raveled(without_modes(like))[0])[None], torus_method(None, machine)
+    motion, x = _start_equations(machine, method, like, int(orbit.cycles), rows, 0.0)
+    equations = Equations(with_parameter(motion, parameter, (width,)))
+    point = Curve(x, 0.0, np.array([float(leaf(machine, parameter))]))
+    rotation, mode = equations.rotating_mode(point)
+    waves = np.exp(2j * np.pi * np.arange(_FIRST) / _FIRST)[:, None]
+    mode = mode / np.linalg.norm(mode)
+    circle = 2 * distance * np.real(waves * mode) * equations.scale
+    # The first mode has this size and phase; ρ and the parameter are free.
+    row = (waves.conj() * mode.conj()).ravel() / np.sqrt(_FIRST)
+    held = [
+        (np.append(part, [0.0, 0.0]), size)
+        for part, size in ((row.imag, 0.0), (row.real, distance))
+    ]
+    solved = equations.solve(Curve(x + circle, rotation, point.p), held)
     solved = None if solved is None else equations.refined(solved, SETTLED, MOST)
     if solved is None:
         raise ValueError(

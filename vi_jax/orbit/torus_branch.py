@@ -1,11 +1,10 @@
 """`continue_torus`: a quasi-periodic motion followed in one parameter of its machine."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterator
 from functools import cached_property
 from math import ceil, floor, gcd
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,17 +27,7 @@ from .torus import (
     torus_of,
     with_parameter,
 )
-from .torus_equations import (
-    Condition,
-    Curve,
-    Equations,
-    Solved,
-    cosine,
-    derivative,
-    interpolated,
-    resampled,
-    unit,
-)
+from .torus_equations import Curve, Equations, Solved, derivative, interpolated
 from .walk import BOUNDS, INTERRUPTED, SAME_CURVE, STALLED, check_walk
 
 # Reasons to end: at a ratio p:q, where the motion locks; the nodes do not suffice; events change
@@ -50,16 +39,16 @@ _LARGEST = 12
 
 # A step with a larger tail has reached another solution of the equations. Steps are shortened to
 # this share of the longest. Choices.
-_SPURIOUS, _SHORTEST = 1e-3, 1e-3
+_SPURIOUS, _SHORTEST = 1e-3, 1e-2
 
-# A ratio is close ahead within so many of the longest steps. It is crossed from one of these tori,
-# counted backwards: one that is farther from the window than half its width. Choices.
-_REACH, _EARLIER = 2.0, (1, 2, 4, 8, 16)
+# A ratio is close ahead within so many of the longest steps. Its window is found from a torus so
+# many steps back, since those close to a window move unevenly. Choices.
+_REACH, _BACK = 2.0, 16
 
-# Angles at which the motions of a window are found, within the q-th part of a turn: at least and at
-# most. They are doubled until the high modes of the parameter are below this share of its range, or
-# rounding. Its extrema, the window's ends, are sought at so many places between them. Choices.
-_ANGLES, _MOST_ANGLES, _SMOOTH, _ROUNDING, _BETWEEN = 16, 128, 1e-7, 1e-14, 4096
+# Angles at which the motions of a window are found, within the q-th part of a turn, odd. The high
+# modes of the parameter must be below this share of its range, or rounding. Its extrema, the
+# window's ends, are sought at so many places. Choices.
+_ANGLES, _SMOOTH, _ROUNDING, _BETWEEN = 33, 1e-6, 1e-14, 8192
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +72,7 @@ class Window:
         if self.cycle is None:
             raise ValueError(f"No periodic motion of the window {self.p}:{self.q} was found.")
         problem = self.equations.motion(self.cycle.p)
-        state = problem.unravel(jnp.asarray(self.equations.begin_of_cycle(self.cycle)))
+        state = problem.unravel(jnp.asarray(self.equations.on_section(self.cycle, np.zeros(1))[0]))
         cycles = self.q * problem.cycles
         return find_orbit(problem.machine, state, cycles, method=problem.method, impact_log=16)
 
@@ -99,7 +88,7 @@ class TorusBranch:
 
     It ends on each side at the "bounds"; by "grazing" (located: a stop is touched or an impact
     lost); by "order" (two events, or an event and the section, change their order); by "resonance"
-    (the motion locks to a ratio p:q in a window too wide to step across); by "coarse" (more nodes
+    (the motion locks to a ratio p:q in a window that a step did not cross); by "coarse" (more nodes
     are needed than allowed, as at a loss of smoothness); by "neimark-sacker" (the curve shrinks to
     a periodic motion); by "stalled", "max_points" or "interrupted".
     """
@@ -141,7 +130,7 @@ class TorusBranch:
             )
         i = int(np.argmax(inside))
         share = (value - parameter[i]) / (parameter[i + 1] - parameter[i])
-        guess = _between(points[i].curve, points[i + 1].curve, share)
+        guess = points[i].curve.towards(points[i + 1].curve, share)
         solved = equations.solve_near(guess, value)
         solved = None if solved is None else equations.refined(solved, SETTLED, most)
         if solved is None:
@@ -161,16 +150,6 @@ class TorusBranch:
             *(f"  window {w.p}:{w.q}: [{w.low:.11g}, {w.high:.11g}]" for w in self.windows),
         ]
         return "\n".join(lines)
-
-
-def _between(one: Curve, other: Curve, share: float) -> Curve:
-    nodes = max(len(one.x), len(other.x))
-    parts: Any = zip(_with_nodes(one, nodes), _with_nodes(other, nodes), strict=True)
-    return Curve(*((1 - share) * a + share * b for a, b in parts))
-
-
-def _with_nodes(curve: Curve, nodes: int) -> Curve:
-    return curve if len(curve.x) == nodes else curve._replace(x=resampled(curve.x, nodes))
 
 
 def continue_torus(
@@ -239,113 +218,107 @@ class _Walk:
         most: int,
     ):  # fmt: skip
         self.equations, self.bounds, self.most = equations, bounds, most
-        self.points, self.windows = [start._replace(tangent=unit(start.tangent, sense))], []
-        self.end = _End(INTERRUPTED)
+        self.points, self.windows, self.end = [start], [], _End(INTERRUPTED)
+        self.ahead = sense * equations.unit(start.tangent)  # the direction, in the last nodes
 
     def walk(
         self, report: ReportProgress, *, step: float, max_step: float, max_points: int
     ) -> None:
-        length = step
-        self.end = _End("max_points")
-        while len(self.points) < max_points:
-            here, window = self.points[-1], None
-            new = self._advance(here, length)
-            if new == TORUS:
-                self.end = _End(TORUS, "the curve shrinks to a periodic motion")
-                return
-            reason = new
+        length, end = step, None
+        while end is None and len(self.points) < max_points:
+            new = self._advance(length)
             if isinstance(new, str):
-                new, window = self._cross(here, max_step)
-            if new is None:
                 length *= 0.4
-                if length < _SHORTEST * max_step:
-                    self.end = self._stalled(here, max_step, str(reason))
-                    return
+                shrinks, short = new == TORUS, length < _SHORTEST * max_step
+                end = _End(TORUS, "the curve shrinks to a periodic motion") if shrinks else None
+                end = self._stalled(max_step, new) if short and end is None else end
                 continue
-            assert isinstance(new, Solved)
-            end, last = self._ending(here, new)
+            end, last = self._ending(new)
             if last is not None:
-                self.windows += self._windows(here.curve, last.curve, window)
-                self.points.append(last)
-            if end is not None:
-                self.end = end
-                return
+                self._append(last)
             report(1)
-            grows = window is None and new.iterations <= 5
-            length = step if window else min(1.4 * length if grows else length, max_step)
+            length = min(1.4 * length if new.iterations <= 5 else length, max_step)
+        self.end = end or _End("max_points")
 
-    def _advance(self, here: Solved, length: float) -> Solved | str:
-        """Return the torus at a distance from one, or the reason why there is none."""
-        equations, tangent = self.equations, here.tangent
-        x = here.curve.x.copy()
-        x[:, equations.first] += length * tangent.rows * equations.scale[equations.first]
-        guess = Curve(
-            x, here.curve.rotation + length * tangent.rotation,
-            here.curve.p + length * tangent.p * equations.widths,
-        )  # fmt: skip
-        held = [equations.phase(here.curve), equations.across(here.curve, tangent, length)]
+    def _advance(self, length: float) -> Solved | str:
+        """Return the torus at a distance ahead, or the reason why there is none."""
+        equations, here = self.equations, self.points[-1].curve
+        ahead = equations.unpack(self.ahead, len(here.x))
+        guess = Curve(*(a + length * b for a, b in zip(here, ahead, strict=True)))  # pyright: ignore
+        held = [equations.phase(here), equations.across(here, ahead, length)]
         new = equations.solve(guess, held)
         if new is None or equations.tail(new.curve) > _SPURIOUS:
             return STALLED if new is None else COARSE
-        before, after = first_mode(equations, here.curve), first_mode(equations, new.curve)
-        if np.vdot(before, after).real <= 0 or np.abs(after).max() < POINT:
+        (before, _), (after, size) = (first_mode(equations, c) for c in (here, new.curve))
+        if np.vdot(before, after).real <= 0 or size < POINT:
             return TORUS
-        if cosine(unit(new.tangent), tangent) < SAME_CURVE:
+        if equations.unit(new.tangent) @ self.ahead < SAME_CURVE:
             return STALLED
         finer = equations.refined(new, SETTLED, self.most)
         if finer is None or equations.tail(finer.curve) > RESOLVED:
             return COARSE
-        return finer._replace(tangent=unit(finer.tangent))
+        return finer
 
-    def _ending(self, here: Solved, new: Solved) -> tuple[_End | None, Solved | None]:
+    def _append(self, new: Solved) -> None:
+        """Add a torus, and the windows that lie before it."""
+        here = self.points[-1].curve
+        for p, q in _ratios(here.rotation, new.curve.rotation):
+            share = (p / q - here.rotation) / (new.curve.rotation - here.rotation)
+            self.windows.append(self._window(here.towards(new.curve, share), p, q))
+        nodes = len(new.curve.x)
+        before = self.equations.unpack(self.ahead, len(here.x)).with_nodes(nodes)
+        ahead = self.equations.unit(new.tangent)
+        self.ahead = ahead * np.sign(ahead @ self.equations.pack(before))
+        self.points.append(new)
+
+    def _ending(self, new: Solved) -> tuple[_End | None, Solved | None]:
         """Return how the family ends before a torus, if it does, and its last torus."""
-        value = float(new.curve.p[-1])
-        before = float(here.curve.p[-1])
+        equations, here, end = self.equations, self.points[-1].curve, None
+        before, value = float(here.p[-1]), float(new.curve.p[-1])
         bound = next((b for b in self.bounds if (value - b) * (before - b) < 0), None)
-        end = None
         if bound is not None:
             share = (bound - before) / (value - before)
-            at = self.equations.solve_near(_between(here.curve, new.curve, share), bound)
+            at = equations.solve_near(here.towards(new.curve, share), bound)
             if at is None:
                 return _End(STALLED), None
             end, new = _End(BOUNDS), at
-        crossed = margins_of(self.equations, new.curve).crossed
+        crossed = margins_of(equations, new.curve).crossed
         if crossed is None:
             return end, new
-        at = self._locate(here, new, crossed)
+        at = self._locate(new, crossed)
         if at is None:
             return _End(STALLED, "an event changes, at a place that was not located"), None
-        problem = self.equations.motion(at.curve.p)
-        words = margins_of(self.equations, at.curve).in_words(problem, crossed)
+        problem = equations.motion(at.curve.p)
+        words = margins_of(equations, at.curve).in_words(problem, crossed)
         return _End(ORDER if crossed in (1, 2, 3) else GRAZING, words), at
 
-    def _locate(self, here: Solved, new: Solved, number: int) -> Solved | None:
-        """Return the torus between two at which a margin is zero."""
+    def _locate(self, new: Solved, number: int) -> Solved | None:
+        """Return the torus at which a margin is zero, between the last one and another."""
+        equations, here = self.equations, self.points[-1].curve
         found: dict[float, Solved] = {}
-        nodes = max(len(here.curve.x), len(new.curve.x))
-        one, other = (_with_nodes(point.curve, nodes) for point in (here, new))
 
         def margin(share: float) -> float:
-            p = (1 - share) * one.p + share * other.p
-            guess = _between(one, other, share)
-            solved = self.equations.solve_near(guess, float(p[-1]))
+            guess = here.towards(new.curve, share)
+            solved = equations.solve_near(guess)
             if solved is None:
                 raise ArithmeticError
             found[share] = solved
-            return float(margins_of(self.equations, solved.curve).values[number])
+            return float(margins_of(equations, solved.curve).values[number])
 
         from scipy.optimize import brentq  # slow to load
 
         try:
-            share = float(brentq(margin, 0.0, 1.0, xtol=1e-12))  # pyright: ignore[reportArgumentType]
-        except (ArithmeticError, ValueError):
+            return found[brentq(margin, 0.0, 1.0, xtol=1e-12)]  # pyright: ignore
+        except (ArithmeticError, ValueError, KeyError):
             return None
-        return found[share] if share in found else None
 
-    def _stalled(self, here: Solved, longest: float, reason: str) -> _End:
-        sense, value = np.sign(here.tangent.p[-1]), float(here.curve.p[-1])
-        base = self.points[-min(_EARLIER[-1], len(self.points))].curve
-        for p, q in self._ahead(here, longest):
+    def _stalled(self, longest: float, reason: str) -> _End:
+        """Return the end where no shorter step helps: at a window of locking close ahead, or for
+        the reason of the last step."""
+        here, base = self.points[-1].curve, self.points[-min(_BACK, len(self.points))].curve
+        ahead = self.equations.unpack(self.ahead, len(here.x))
+        sense, value = np.sign(ahead.p[-1]), float(here.p[-1])
+        for p, q in _ratios(here.rotation, here.rotation + _REACH * longest * ahead.rotation):
             window = self._window(base, p, q)
             near = window.low if sense > 0 else window.high
             if 0 <= sense * (near - value) <= window.high - window.low:
@@ -353,88 +326,35 @@ class _Walk:
                 return _End(RESONANCE, f"the motion locks to {p}:{q}")
         return _End(reason)
 
-    def _ahead(self, here: Solved, longest: float) -> list[tuple[int, int]]:
-        """Return the ratios in reach ahead, that of the strongest locking first."""
-        turn = here.curve.rotation
-        return list(_ratios(turn, turn + _REACH * longest * here.tangent.rotation))
-
-    def _cross(self, here: Solved, longest: float) -> tuple[Solved | None, Window | None]:
-        """Return a torus beyond a window of locking close ahead, and the window. Its guess is a
-        torus that is as far from the window on this side: beyond, the motion passes the same places
-        in the opposite sense of rotation against p:q."""
-        equations, sense = self.equations, np.sign(here.tangent.p[-1])
-        for (p, q), k in itertools.product(self._ahead(here, longest), _EARLIER):
-            if k > len(self.points):
-                break
-            base = self.points[-k].curve
-            window, value = self._window(base, p, q), float(base.p[-1])
-            near, far = (window.low, window.high) if sense > 0 else (window.high, window.low)
-            if not sense * (near - value) > 0.5 * (window.high - window.low):
-                continue
-            beyond = far + (near - value)
-            if not self.bounds[0] <= beyond <= self.bounds[1]:
-                continue
-            guess = base._replace(rotation=2 * p / q - base.rotation)
-            found = equations.solve_near(guess, beyond)
-            found = None if found is None else equations.refined(found, SETTLED, self.most)
-            if found is None or equations.tail(found.curve) > RESOLVED:
-                continue
-            if (found.curve.rotation - p / q) * (p / q - base.rotation) > 0:
-                side = sense * np.sign(found.tangent.p[-1])
-                return found._replace(tangent=unit(found.tangent, float(side))), window
-        return None, None
-
-    def _windows(self, one: Curve, other: Curve, known: Window | None) -> list[Window]:
-        """Return the windows between two tori, the known one included."""
-        found = [] if known is None else [known]
-        for p, q in _ratios(one.rotation, other.rotation):
-            if known is None or (known.p, known.q) != (p, q):
-                share = (p / q - one.rotation) / (other.rotation - one.rotation)
-                found.append(self._window(_between(one, other, share), p, q))
-        return found
-
     def _window(self, curve: Curve, p: int, q: int) -> Window:
         """Return the interval of the parameter of motions that lock to p:q, near a curve."""
-        angles, known = _ANGLES, {}
-        while True:
-            for k in range(angles):
-                place = k / (angles * q)
-                known[place] = known.get(place) or self._locked(curve, p, q, place)
-                if known[place] is None:
-                    return Window(p, q, np.nan, np.nan, self.equations, None)
-            cycles = [known[place] for place in sorted(known)]
-            values = np.array([cycle.p[-1] for cycle in cycles])
-            high = np.abs(np.fft.rfft(values)[angles // 3 :]).max() / angles
-            if high <= _SMOOTH * np.ptp(values) + _ROUNDING * np.abs(values).max():
+        cycles: list[Curve] = []
+        for place in np.arange(_ANGLES) / (_ANGLES * q):
+            cycle = self._locked(curve, p, q, place)
+            if cycle is None:
                 break
-            if angles == _MOST_ANGLES:
-                return Window(p, q, np.nan, np.nan, self.equations, None)
-            angles *= 2
-        mean = values.mean()
-        between = interpolated_even(values - mean, _BETWEEN)
-        middle = 0.5 * (between.min() + between.max())
-        near = np.argsort(np.abs(values - mean - middle))[: angles // 2]
+            cycles.append(cycle)
+        values = np.array([cycle.p[-1] for cycle in cycles])
+        unknown = Window(p, q, np.nan, np.nan, self.equations, None)
+        if len(cycles) < _ANGLES:
+            return unknown
+        middle = values.mean()
+        high = np.abs(np.fft.rfft(values))[_ANGLES // 3 :].max() / _ANGLES
+        if high > _SMOOTH * np.ptp(values) + _ROUNDING * abs(middle):
+            return unknown
+        between = interpolated((values - middle)[:, None], np.arange(_BETWEEN) / _BETWEEN)
+        low, high = middle + between.min(), middle + between.max()
+        near = np.argsort(np.abs(values - 0.5 * (low + high)))[: _ANGLES // 2]
         cycle = min((cycles[i] for i in near), key=self.equations.growth)
-        low, high = (float(mean + end) for end in (between.min(), between.max()))
-        return Window(p, q, low, high, self.equations, cycle)
+        return Window(p, q, float(low), float(high), self.equations, cycle)
 
     def _locked(self, curve: Curve, p: int, q: int, angle: float) -> Curve | None:
         """Return the motion that repeats after q periods and has this angle on a curve."""
-        equations, angles = self.equations, angle + np.arange(q) * p / q
-        x, scale = interpolated(curve.x, angles), equations.scale
-        rows = interpolated(derivative(curve.x / scale), angles)[:, equations.first]
-        rows = rows / np.linalg.norm(rows)
-        value = float(np.sum(rows * equations.scaled(x)))
-        held = Condition(rows, 0.0, np.zeros(1), value)
-        cycle = equations.solve(Curve(x, 0.0, curve.p), [held], is_cycle=True)
+        angles = angle + np.arange(q) * p / q
+        x = interpolated(curve.x, angles)
+        held = self.equations.along(interpolated(derivative(curve.x), angles), x)
+        cycle = self.equations.solve(Curve(x, 0.0, curve.p), [held], is_cycle=True)
         return None if cycle is None else cycle.curve
-
-
-def interpolated_even(values: np.ndarray, number: int) -> np.ndarray:
-    """Return an even number of periodic values, at more places."""
-    spectrum = np.fft.rfft(values)
-    spectrum[-1] *= 0.5
-    return np.fft.irfft(spectrum, number) * (number / len(values))
 
 
 def _ratios(one: float, other: float) -> Iterator[tuple[int, int]]:

@@ -7,10 +7,8 @@ trigonometric interpolation S gives:
 
     F(Xⱼ, (S X)ⱼ, p) = 0,   j = 1 … N.
 
-Events are given, not detected, so the equations stay smooth beyond a grazing. Only clock and state
-of the first event are interpolated; the other unknowns of a row are eliminated before the linear
-system is solved. With a cyclic permutation in place of S the rows are the periods of a motion that
-repeats after N of them.
+Events are given, not detected, so the equations stay smooth beyond a grazing. With a cyclic
+permutation in place of S the rows are the periods of a motion that repeats after N of them.
 """
 
 import dataclasses
@@ -70,6 +68,8 @@ def _observe(problem: Shooting, x, following):
 
 @on_host
 def _rates(problem: Shooting, x):
+    """Return the rate of the state just before the first event."""
+
     def rate(x):
         clock, states = problem.parts(x)
         smooth = problem.flight(problem.at(x), problem.legs - 1).smooth
@@ -80,13 +80,19 @@ def _rates(problem: Shooting, x):
 
 @on_host
 def _on_section(problem: Shooting, x):
+    """Return the state on the section with which a motion begins, else that in which it ends."""
+
     def state(x):
         leg, clock = problem.legs - 1, problem.period(x)
-        if problem.events and problem.events[0].cycle == 0:
+        if begins_on_section(problem):
             leg, clock = 0, problem.parts(x)[0][0]
-        return problem.state_at(x, leg, clock)
+        return ravel_pytree(problem.state_at(x, leg, clock))[0]
 
     return jax.vmap(state)(x)
+
+
+def begins_on_section(problem: Shooting) -> bool:
+    return bool(problem.events) and problem.events[0].cycle == 0
 
 
 def modes(number: int) -> np.ndarray:
@@ -100,10 +106,6 @@ def interpolated(rows: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return (waves @ (np.fft.fft(rows, axis=0) / len(rows))).real
 
 
-def resampled(rows: np.ndarray, number: int) -> np.ndarray:
-    return interpolated(rows, np.arange(number) / number)
-
-
 def derivative(rows: np.ndarray) -> np.ndarray:
     """Return the derivative of a curve with respect to its angle, in turns."""
     waves = 2j * np.pi * modes(len(rows))[:, None]
@@ -111,11 +113,11 @@ def derivative(rows: np.ndarray) -> np.ndarray:
 
 
 def spectral_tail(rows: np.ndarray) -> float:
-    """Return the largest high mode, relative to the largest mode; rows in scaled unknowns."""
+    """Return the largest high mode of a curve, relative to its largest mode."""
     size, number = np.abs(np.fft.fft(rows, axis=0)).max(axis=1), np.abs(modes(len(rows)))
-    high = number > _TAIL * (len(rows) // 2)
     largest = size[number > 0].max(initial=0.0)
-    return float(size[high].max() / largest) if largest > 0 else 1.0
+    high = size[number > _TAIL * (len(rows) // 2)].max()
+    return float(high / largest) if largest > 0 else 1.0
 
 
 def _circulant(number: int, rotation: float) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +131,7 @@ def _circulant(number: int, rotation: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Curve(NamedTuple):
-    """Values of the unknowns."""
+    """Values of the unknowns, or their change along a family."""
 
     x: np.ndarray
     """Unknowns of the motion at each node, (nodes, unknowns)."""
@@ -138,15 +140,18 @@ class Curve(NamedTuple):
     p: np.ndarray
     """Parameters, (parameters,)."""
 
+    def with_nodes(self, number: int) -> "Curve":
+        return self._replace(x=interpolated(self.x, np.arange(number) / number))
 
-class Condition(NamedTuple):
-    """A linear equation between scaled unknowns: rows · u + rotation ρ + p · p = value."""
+    def towards(self, other: "Curve", share: float) -> "Curve":
+        """Return the curve at a share of the way to another one."""
+        nodes = max(len(self.x), len(other.x))
+        parts = zip(self.with_nodes(nodes), other.with_nodes(nodes), strict=True)
+        return Curve(*((1 - share) * a + share * b for a, b in parts))  # pyright: ignore
 
-    rows: np.ndarray
-    """Coefficients of the first event's clock and state at each node, (nodes, firsts)."""
-    rotation: float
-    p: np.ndarray
-    value: float
+
+Condition = tuple[np.ndarray, float]
+"""A linear equation between all unknowns in a row (see `Equations.pack`): coefficients, value."""
 
 
 class Solved(NamedTuple):
@@ -154,19 +159,8 @@ class Solved(NamedTuple):
     size: float
     """The largest scaled component of the last correction."""
     iterations: int
-    tangent: Condition
-    """The change of the unknowns for a change of the last condition's value, its `value` 0."""
-
-
-def cosine(one: Condition, other: Condition) -> float:
-    """Return the product of two tangents; of a unit tangent with itself it is 1."""
-    rows = np.mean(np.sum(resampled(one.rows, len(other.rows)) * other.rows, axis=1))
-    return float(rows + one.rotation * other.rotation + one.p @ other.p)
-
-
-def unit(tangent: Condition, sense: float = 1.0) -> Condition:
-    size = sense / np.sqrt(cosine(tangent, tangent))
-    return Condition(size * tangent.rows, size * tangent.rotation, size * tangent.p, 0.0)
+    tangent: Curve
+    """The change of the unknowns for a change of the last condition's value."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,183 +179,134 @@ class Equations:
     def widths(self) -> np.ndarray:
         return np.asarray(self.problem.widths, float).reshape(-1)
 
-    @cached_property
-    def first(self) -> np.ndarray:
-        """Indices of clock and state of the first event in a row. The clock of an autonomous
-        machine begins there, and its period is not interpolated."""
-        clocks, states = len(self.problem.events), self.problem.states
-        clock = [0] if clocks and not self.problem.autonomous else []
-        return np.array([*clock, *range(clocks, clocks + states)])
+    def pack(self, curve: Curve) -> np.ndarray:
+        """Return scaled unknowns in a row. Its norm is the mean over the nodes."""
+        x = curve.x / self.scale / np.sqrt(len(curve.x))
+        return np.concatenate([x.ravel(), [curve.rotation], curve.p / self.widths])
 
-    @property
-    def begins_on_section(self) -> bool:
-        """True if a row begins with the section, not with an event after it."""
-        events = self.problem.events
-        return not events or events[0].cycle == 0
-
-    def scaled(self, x: np.ndarray) -> np.ndarray:
-        """Return the interpolated part of each row in scaled unknowns, (nodes, firsts)."""
-        return x[:, self.first] / self.scale[self.first]
+    def unpack(self, row: np.ndarray, nodes: int) -> Curve:
+        end = nodes * len(self.scale)
+        x = row[:end].reshape(nodes, -1) * self.scale * np.sqrt(nodes)
+        return Curve(x, float(row[end]), row[end + 1 :] * self.widths)
 
     def tail(self, curve: Curve) -> float:
-        return spectral_tail(self.scaled(curve.x))
-
-    def following(self, curve: Curve) -> np.ndarray:
-        count = len(curve.x)
-        return interpolated(curve.x, np.arange(count) / count + curve.rotation)
-
-    def observe(self, curve: Curve, angles: np.ndarray | None = None) -> Any:
-        """Return `Observed` of the motion from each node, or from other angles, in arrays."""
-        motion = self.motion(curve.p)
-        if angles is None:
-            return in_lanes(_observe, motion, curve.x, self.following(curve))
-        x, after = (interpolated(curve.x, angles + turn) for turn in (0.0, curve.rotation))
-        return in_lanes(_observe, motion, x, after)
-
-    def cocycle(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative over a period and the direction along the curve, at each node. Both
-        are those of the state just before the first event, at a given clock."""
-        matrices, firsts = self.observe(curve).monodromy, derivative(curve.x)[:, self.first]
-        if self.problem.autonomous:
-            ends = np.einsum("jab,jb->ja", matrices, firsts)
-            nodes = np.arange(len(ends)) / len(ends)
-            return matrices, interpolated(ends, nodes - curve.rotation)
-        if not self.problem.events:
-            return matrices, firsts
-        rates = in_lanes(_rates, self.motion(curve.p), curve.x)
-        return matrices, firsts[:, 1:] - firsts[:, :1] * rates
-
-    def on_section(self, curve: Curve, angles: np.ndarray) -> np.ndarray:
-        """Return the states on the section at some angles, (angles, states)."""
-        x = interpolated(curve.x, angles - (0.0 if self.begins_on_section else curve.rotation))
-        return self._section_rows(curve.p, x) if self.problem.events else x
-
-    def begin_of_cycle(self, cycle: Curve) -> np.ndarray:
-        """Return the first state on the section of a periodic motion, a row for each period."""
-        row = cycle.x[0 if self.begins_on_section else -1][None]
-        return (self._section_rows(cycle.p, row) if self.problem.events else row)[0]
-
-    def growth(self, cycle: Curve) -> float:
-        """Return the greatest modulus of a multiplier of a periodic motion."""
-        after = np.roll(cycle.x, -1, axis=0)
-        found = in_lanes(_observe, self.motion(cycle.p), cycle.x, after).monodromy
-        product = np.linalg.multi_dot(found[::-1]) if len(found) > 1 else found[0]
-        return float(np.abs(np.linalg.eigvals(product)).max())
-
-    def _section_rows(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
-        state = in_lanes(_on_section, self.motion(p), x)
-        return np.concatenate([a.reshape(len(x), -1) for a in jax.tree.leaves(state)], axis=1)
+        return spectral_tail(curve.x / self.scale)
 
     def motion(self, p: np.ndarray) -> Shooting:
         """Return the equations of the motion alone at these values of the parameters."""
         blank = np.zeros(len(self.scale))
         return self.problem.motion_at(np.append(blank, p))[0] if len(p) else self.problem
 
+    def observe(self, curve: Curve, angles: np.ndarray | None = None) -> Any:
+        """Return `Observed` of the motion from each node, or from other angles, in arrays."""
+        angles = np.arange(len(curve.x)) / len(curve.x) if angles is None else angles
+        x, after = (interpolated(curve.x, angles + turn) for turn in (0.0, curve.rotation))
+        return in_lanes(_observe, self.motion(curve.p), x, after)
+
+    def cocycle(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivative over a period and the direction along the curve, at each node. Both
+        are those of the state just before the first event, at a given clock."""
+        problem, slopes = self.problem, derivative(curve.x)
+        begin, matrices = len(problem.events), self.observe(curve).monodromy
+        along = slopes[:, begin : begin + problem.states]
+        if problem.autonomous:
+            ends = np.einsum("jab,jb->ja", matrices, along)
+            along = interpolated(ends, np.arange(len(ends)) / len(ends) - curve.rotation)
+        elif problem.events:
+            along = along - slopes[:, :1] * in_lanes(_rates, self.motion(curve.p), curve.x)
+        return matrices, along
+
+    def on_section(self, curve: Curve, angles: np.ndarray) -> np.ndarray:
+        """Return the states on the section at some angles, (angles, states)."""
+        back = 0.0 if begins_on_section(self.problem) else curve.rotation
+        return in_lanes(_on_section, self.motion(curve.p), interpolated(curve.x, angles - back))
+
+    def growth(self, cycle: Curve) -> float:
+        """Return the greatest modulus of a multiplier of a periodic motion, a row for a period."""
+        after = np.roll(cycle.x, -1, axis=0)
+        found = in_lanes(_observe, self.motion(cycle.p), cycle.x, after).monodromy
+        product = np.linalg.multi_dot([np.eye(found.shape[-1]), *found[::-1]])
+        return float(np.abs(np.linalg.eigvals(product)).max())
+
     def solve(
         self, guess: Curve, conditions: Sequence[Condition], *, is_cycle: bool = False
     ) -> Solved | None:
         """Solve the equations and the conditions by Newton's method; `None` if it fails.
 
-        With `is_cycle` the rows are the periods of a periodic motion, and ρ is not an unknown.
+        With `is_cycle` the rows are the periods of a periodic motion, and ρ has its given value.
         """
         curve, before = guess, 1.0
         for count in range(1, _MOST + 1):
-            move, tangent = self._correction(curve, conditions, is_cycle)
-            if move is None or tangent is None:
+            moves = self._newton(curve, conditions, is_cycle)
+            if moves is None:
                 return None
-            size = max(float(np.abs(a).max(initial=0.0)) for a in move)
+            move, tangent = (self.unpack(row, len(curve.x)) for row in moves)
+            size = max(np.abs(move.x / self.scale).max(), *np.abs(moves[0][move.x.size :]))
             share = min(1.0, _LONGEST / size) if size > 0 else 1.0
-            curve = Curve(
-                curve.x + share * move[0] * self.scale, curve.rotation + share * float(move[1]),
-                curve.p + share * move[2] * self.widths,
-            )  # fmt: skip
+            curve = Curve(*(a + share * b for a, b in zip(curve, move, strict=True)))  # pyright: ignore
             if size <= _TOLERANCE or (before <= _ROUNDED and size >= before):
-                return Solved(curve, size, count, tangent)
+                return Solved(curve, float(size), count, tangent)
             before = size
         return None
 
-    def _correction(
+    def _newton(
         self, curve: Curve, conditions: Sequence[Condition], is_cycle: bool
-    ) -> tuple[Any, Condition | None]:
-        """Return the scaled change of x, rotation and p, and the tangent (see `Solved`)."""
-        count, firsts, width = len(curve.x), self.first, len(self.scale)
+    ) -> np.ndarray | None:
+        """Return Newton's correction and the tangent (see `Solved`), as rows of unknowns."""
+        (count, width), row = curve.x.shape, self.pack(curve)
         shift, slope = _circulant(count, curve.rotation)
         if is_cycle:
-            shift, slope = np.roll(np.eye(count), 1, axis=1), None
-        following = shift @ curve.x
-        p = np.tile(curve.p, (count, 1))
-        residual, columns = in_lanes(_linearize, self.problem, curve.x, following, p)
-        if not (np.isfinite(residual).all() and np.isfinite(columns).all()):
-            return None, None
-        columns = columns * np.concatenate([self.scale, self.scale, self.widths])
+            shift, slope = np.roll(np.eye(count), 1, axis=1), 0 * slope
+            conditions = [self._value_of(curve, count * width, curve.rotation), *conditions]
+        arguments = curve.x, shift @ curve.x, np.tile(curve.p, (count, 1))
+        residual, columns = in_lanes(_linearize, self.problem, *arguments)
+        unit = self.scale * np.sqrt(count)
+        columns = columns * np.concatenate([unit, unit, self.widths])
         rows = np.abs(columns).max(axis=2)
         rows = np.where(rows > 0, rows, 1.0)
-        residual, columns = residual / rows, columns / rows[..., None]
-        own, next_part = columns[..., :width], columns[..., width : 2 * width][..., firsts]
-        by_p = columns[..., 2 * width :]
-        rest = np.setdiff1d(np.arange(width), firsts)
-
-        # Combinations of the equations without the unknowns that are not interpolated.
-        basis, triangle = np.linalg.qr(own[..., rest], mode="complete")
-        reduce = np.swapaxes(basis[..., len(rest) :], 1, 2)
-        here, after = reduce @ own[..., firsts], reduce @ next_part
-        k = len(firsts)
+        columns, residual = columns / rows[..., None], residual / rows
+        own, after, by_p = np.split(columns, [width, 2 * width], axis=2)
         matrix = np.einsum("jab,ji->jaib", after, shift)
-        matrix[np.arange(count), :, np.arange(count)] += here
-        blocks = [matrix.reshape(count * k, count * k)]
-        by_rotation = np.zeros((count, width, 0))
-        if slope is not None:
-            turned = slope @ self.scaled(curve.x)
-            by_rotation = np.einsum("jab,jb->ja", next_part, turned)[..., None]
-        others = np.concatenate([by_rotation, by_p], axis=2)
-        blocks.append((reduce @ others).reshape(count * k, -1))
-        left = np.hstack(blocks)
-        given = [self._row(condition, is_cycle) for condition in conditions]
-        left = np.vstack([left, *given]) if given else left
-        turn = [] if is_cycle else [curve.rotation]
-        u = np.concatenate([self.scaled(curve.x).ravel(), turn, curve.p / self.widths])
-        misses = [row @ u - c.value for row, c in zip(given, conditions, strict=True)]
-        right = np.concatenate([(reduce @ residual[..., None]).ravel(), misses])
-        direction = np.zeros_like(right)
-        direction[-1] = 1.0
+        matrix[np.arange(count), :, np.arange(count)] += own
+        by_rotation = np.einsum("jab,jb->ja", after, slope @ (curve.x / unit))
+        total = count * width
+        blocks = matrix.reshape(total, total), by_rotation.reshape(total, 1)
+        left = np.hstack([*blocks, by_p.reshape(total, len(curve.p))])
+        left = np.vstack([left, *(coefficients for coefficients, _ in conditions)])
+        misses = [coefficients @ row - value for coefficients, value in conditions]
+        right = np.append(residual.ravel(), misses)
+        if not (np.isfinite(left).all() and np.isfinite(right).all()):
+            return None
         try:
-            move, along = np.linalg.solve(left, np.stack([-right, direction], axis=1)).T
+            moves = np.linalg.solve(left, np.stack([-right, np.eye(len(right))[-1]], axis=1)).T
         except np.linalg.LinAlgError:
-            return None, None
-        if not np.isfinite(move).all():
-            return None, None
-        x = np.zeros((count, width))
-        x[:, firsts] = move[: count * k].reshape(count, k)
-        if len(rest):
-            remaining = residual + np.einsum("jab,jb->ja", own[..., firsts], x[:, firsts])
-            remaining += np.einsum("jab,jb->ja", next_part, shift @ x[:, firsts])
-            remaining += others @ move[count * k :]
-            lower = np.swapaxes(basis[..., : len(rest)], 1, 2) @ remaining[..., None]
-            x[:, rest] = -np.linalg.solve(triangle[:, : len(rest)], lower)[..., 0]
-        ahead = move[count * k :]
-        turn = 0.0 if is_cycle else ahead[0]
-        tangent = Condition(
-            along[: count * k].reshape(count, k), 0.0 if is_cycle else float(along[count * k]),
-            along[len(along) - len(curve.p) :], 0.0,
-        )  # fmt: skip
-        return (x, turn, ahead[len(ahead) - len(curve.p) :]), tangent
+            return None
+        return moves if np.isfinite(moves).all() else None
 
-    def _row(self, condition: Condition, is_cycle: bool) -> np.ndarray:
-        turn = [] if is_cycle else [condition.rotation]
-        return np.concatenate([condition.rows.ravel(), turn, condition.p])
+    def _value_of(self, curve: Curve, index: int, value: float) -> Condition:
+        """Return the condition that an unknown of the row has a value."""
+        coefficients = np.zeros(curve.x.size + 1 + len(curve.p))
+        coefficients[index] = 1.0
+        return coefficients, value
+
+    def along(self, rows: np.ndarray, x: np.ndarray) -> Condition:
+        """Return the condition that a curve does not move along `rows` against `x`."""
+        none = np.zeros(len(self.widths))
+        direction = self.unit(Curve(rows, 0.0, none))
+        return direction, float(direction @ self.pack(Curve(x, 0.0, none)))
 
     def phase(self, curve: Curve) -> Condition:
         """Return the condition that a curve does not turn in itself against this one."""
-        along = derivative(self.scaled(curve.x))
-        along = along / np.linalg.norm(along)
-        value = float(np.sum(along * self.scaled(curve.x)))
-        return Condition(along, 0.0, np.zeros(len(self.widths)), value)
+        return self.along(derivative(curve.x), curve.x)
 
-    def at_parameter(self, curve: Curve, value: float) -> Condition:
-        """Return the condition that the last parameter has a value."""
-        p = np.zeros(len(self.widths))
-        p[-1] = 1.0
-        return Condition(np.zeros((len(curve.x), len(self.first))), 0.0, p, value / self.widths[-1])
+    def across(self, curve: Curve, tangent: Curve, length: float = 0.0) -> Condition:
+        """Return the condition that a curve lies in the plane across a tangent, at a distance."""
+        direction = self.unit(tangent.with_nodes(len(curve.x)))
+        return direction, float(direction @ self.pack(curve)) + length
+
+    def unit(self, tangent: Curve) -> np.ndarray:
+        row = self.pack(tangent)
+        return row / np.linalg.norm(row)
 
     def solve_near(self, guess: Curve, value: float | None = None) -> Solved | None:
         """Solve at the guess's parameters, or at another value of the last one."""
@@ -369,29 +314,18 @@ class Equations:
         if len(guess.p):
             value = float(guess.p[-1]) if value is None else value
             guess = guess._replace(p=np.append(guess.p[:-1], value))
-            conditions.append(self.at_parameter(guess, value))
+            conditions.append(self._value_of(guess, -1, value / self.widths[-1]))
         return self.solve(guess, conditions)
-
-    def across(self, curve: Curve, tangent: Condition, length: float = 0.0) -> Condition:
-        """Return the condition that a curve lies in the plane across a tangent, at a distance."""
-        nodes, turn = len(curve.x), tangent.rotation
-        rows = resampled(tangent.rows, nodes) / nodes
-        value = np.sum(rows * self.scaled(curve.x)) + turn * curve.rotation
-        value += tangent.p @ (curve.p / self.widths) + length
-        return Condition(rows, turn, tangent.p, float(value))
 
     def refined(self, solved: Solved, tail: float, most: int) -> Solved | None:
         """Double the nodes until the tail is small, or more than `most` were needed; `None` if the
         equations are not solved with more nodes."""
-        while self.tail(solved.curve) > tail and 2 * len(solved.curve.x) - 1 <= most:
-            curve = solved.curve
-            finer = curve._replace(x=resampled(curve.x, 2 * len(curve.x) - 1))
-            held = [self.across(finer, unit(solved.tangent))] if len(curve.p) else []
+        found: Solved | None = solved
+        while found and self.tail(found.curve) > tail and 2 * len(found.curve.x) - 1 <= most:
+            finer = found.curve.with_nodes(2 * len(found.curve.x) - 1)
+            held = [self.across(finer, found.tangent)] if len(finer.p) else []
             found = self.solve(finer, [self.phase(finer), *held])
-            if found is None:
-                return None
-            solved = found
-        return solved
+        return found
 
     def rotating_mode(self, point: Curve) -> tuple[float, np.ndarray]:
         """Return rotation number and complex mode of the infinitesimal curves around a periodic
@@ -399,18 +333,13 @@ class Equations:
         """
         from scipy.linalg import eig  # slow to load
 
-        width, firsts = len(self.scale), self.first
-        _, columns = in_lanes(_linearize, self.problem, point.x, point.x, point.p[None])
-        columns = columns[0] * np.concatenate([self.scale, self.scale, self.widths])
+        width, units = len(self.scale), [self.scale, self.scale, self.widths]
+        columns = in_lanes(_linearize, self.problem, point.x, point.x, point.p[None])[1][0]
+        columns = columns * np.concatenate(units)
         columns = columns / np.abs(columns).max(axis=1, keepdims=True)
-        own, after = columns[:, :width], np.zeros((width, width))
-        after[:, firsts] = columns[:, width : 2 * width][:, firsts]
-        pairs: Any = eig(own, -after)
-        values, vectors = pairs[:2]
-        finite = (
-            np.isfinite(values) & (np.abs(values) < 1 / _ROUNDED) & (np.imag(values) > _ROUNDED)
-        )
-        distance = np.where(finite, np.abs(np.abs(values) - 1), np.inf)
+        pairs: Any = eig(columns[:, :width], -columns[:, width : 2 * width])
+        values = pairs[0]
+        turns = np.isfinite(values) & (np.imag(values) > _ROUNDED)
+        distance = np.where(turns, np.abs(np.abs(values) - 1), np.inf)
         i = int(np.argmin(distance))
-        mode = vectors[:, i]
-        return float(np.angle(values[i]) / (2 * np.pi)), mode / np.linalg.norm(mode[firsts])
+        return float(np.angle(values[i]) / (2 * np.pi)), pairs[1][:, i]

@@ -208,12 +208,13 @@ def lyapunov(
 
 
 def _observed_map(
-    machine: AbstractMachine, start: State, method: MethodLike, rests: bool | None
-) -> tuple[CycleMap, State]:
+    machine: AbstractMachine, start: State, method: MethodLike, rests: bool | None,
+    on_section: bool = False,
+) -> tuple[CycleMap, State]:  # fmt: skip
     """Return the map whose exponents are computed, and the start in its form."""
     machine = machine_of(machine)
     start = machine.start() if start is None else start
-    if is_autonomous(machine, without_modes(start)):
+    if not on_section and is_autonomous(machine, without_modes(start)):
         if renews(machine):
             raise ValueError(
                 "Argument `machine` must not have both a section and a `renewed`, as a "
@@ -246,8 +247,9 @@ def observe_growth(
     rests: bool | None,
 ) -> Growth:  # fmt: skip
     """Compute the greatest exponent as `lyapunov` does, over a number of cycles that may be traced,
-    a multiple of 4. Sums replace lists of sections, so one program serves any number."""
-    the_map, start = _observed_map(machine, start, method, rests)
+    a multiple of 4; on an autonomous machine's own section, without the 0 along the motion. Sums
+    replace lists of sections, so one program serves any number."""
+    the_map, start = _observed_map(machine, start, method, rests, on_section=True)
     angles = angles_in(the_map.machine, without_modes(start))
     window, half = 2, jnp.asarray(cycles // 2, float)
     observe = _observer(the_map, start, window, rows=True)

@@ -24,7 +24,6 @@ from ..machine import (
     components,
     frequency_ratio,
     in_rows,
-    is_autonomous,
     nearest_images,
     without_modes,
 )
@@ -468,15 +467,13 @@ class Regime(AbstractMeasure):
         it is quasi-periodic."""
         before = jnp.asarray(found["period"])
         is_last, again = self._is_last(pass_number), jnp.asarray(pass_number) > 0
-        # The exponent of an autonomous machine is 0 on any motion that does not rest.
-        averaged = 0 if is_autonomous(machine, without_modes(state)) else self.averaged
-        observed = jnp.where(is_last, averaged // 4 * 4, self.observed)
+        observed = jnp.where(is_last, self.averaged // 4 * 4, self.observed)
         settle = jnp.where(again & ~is_last, self.observed + self.lasting, 0)
         seen = observe_growth(machine, state, observed, settle=settle, method=method, rests=rests)
         # A lane that cannot be continued is unchanged.
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
-        growth = seen.per_cycle * averaged
+        growth = seen.per_cycle * self.averaged
         # A motion without losses that repeats after many cycles has digits and no growth, too.
         moves_on = seen.nearest > jnp.maximum(_TOLERANCE, _WANDERS * self.wander)
         is_neutral = (seen.digits > _DIGITS) & (jnp.abs(growth) < _NEUTRAL)

@@ -581,8 +581,5 @@ def _by_newton(lane: Lane, trial: Trial, goal: _Goal) -> _Goal:
             # Attempts may all lie beyond a guard without a slope: then one falls short.
             stuck = goal.event & ~c.again & (lane.attempts >= _PATIENCE)
             stuck = stuck & (goal.target == to_event(c.number)) & (lane.target == goal.target)
-            # Near an equilibrium on its surface, a guard is rounding and may be passed unseen.
-            began_beyond = stop_gradient(c.begin.x > c.slack)
-            share = jnp.where(began_beyond, _BRIEF, _SHORT)
-            goal = goal._replace(length=jnp.where(stuck, share * goal.length, goal.length))
+            goal = goal._replace(length=jnp.where(stuck, _SHORT * goal.length, goal.length))
     return goal
