@@ -133,22 +133,12 @@ class Friction(AbstractSwitch):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
         touches = self.touches(machine, around.contact)
 
-        def sides(loads: Any) -> tuple[Scalar, Scalar]:
-            each = loads[around.mode_index]
-            force, largest = self.held(machine, s, state, around.contact, each)
-            return -force - largest, force - largest
-
-        def alone() -> tuple[Scalar, Scalar]:
-            solve: Any = _solve_forces
-            return sides(solve(machine, s, state, around.with_mode(mode), around.contact))
-
-        # Without sticking, no force is computed.
-        without_forces = jnp.where(touches, slip_guard, -1.0)
-        sticks, free = (mode == 0) & touches, (without_forces, without_forces)
-        if around.loads is None:
-            return jax.lax.cond(sticks, alone, lambda: free)
-        both = zip(sides(around.loads), free, strict=True)
-        return tuple(jnp.where(sticks, x, y) for x, y in both)
+        loads: Any = around.loads
+        if loads is None:
+            loads = shared_loads(machine, s, state, around.with_mode(mode), around.contact)
+        force, largest = self.held(machine, s, state, around.contact, loads[around.mode_index])
+        sticks, free = (mode == 0) & touches, jnp.where(touches, slip_guard, -1.0)
+        return tuple(jnp.where(sticks, x - largest, free) for x in (-force, force))
 
 
 @eqx.filter_jit
@@ -173,17 +163,16 @@ def _solve_forces(
 def shared_loads(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> dict[int, tuple[Any, Any]] | None:
-    """Return `_solve_forces` for the guards of several frictions, or zeros if none sticks; `None`
-    with fewer than two frictions."""
-    switches = switches_of(machine)
-    several = [i for i in frictions_in(machine) if switches[i].is_dry or contact]
-    if len(several) < 2:
+    """Return `_solve_forces` for the guards of frictions, or zeros if none sticks; `None` without
+    frictions that act."""
+    switches, solve = switches_of(machine), cast(Any, _solve_forces)
+    acting = [i for i in frictions_in(machine) if switches[i].is_dry or contact]
+    if not acting:
         return None
     sticks = jnp.zeros((), bool)
-    for i in several:
+    for i in acting:
         sticks = sticks | (modes[i] == 0) & switches[i].touches(machine, contact)
-    solve: Any = _solve_forces
-    none = {i: (jnp.zeros_like(s), jnp.zeros_like(s)) for i in several}
+    none = {i: (jnp.zeros_like(s), jnp.zeros_like(s)) for i in acting}
     return jax.lax.cond(sticks, lambda: solve(machine, s, state, modes, contact), lambda: none)
 
 
