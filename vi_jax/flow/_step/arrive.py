@@ -134,7 +134,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         chosen[number], any_chosen = (due > 0) & ~any_chosen, any_chosen | (due > 0)
         when = event.happens(*before)
         here = chosen[number] if when is None else chosen[number] & when
-        its_state, its_modes = after_event(machine, number, lane.s, old, modes_before, contact)
+        given = machine, number, lane.s, old, modes_before, contact
+        its_state, its_modes = after_event(*given, alone=False)
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
