@@ -126,3 +126,50 @@ def test_no_motion_on_a_floor_at_rest_gains_energy():
     # Rocks and hops that converge slowly may be given up.
     assert good.sum() >= 118
     assert (np.diff(energy[good], axis=1) < 1e-9).all()
+
+
+class Stack(vi.Mechanical):
+    """A body on another one on a shaken floor; bodies slide and hop."""
+
+    mass_2: Any = 1.0
+    mu: Any = None
+    restitution: Any = 0.0
+    sizes: Any = None
+    phases: Any = None
+    cycle: Any = END
+    q = ("x", "y", "x_2", "y_2")
+
+    def mass(self, q):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 1.0, 1.0, self.mass_2, self.mass_2
+
+    @property
+    def contacts(self):
+        above = dict(on=lambda q: q.y_2 - q.y, along=lambda q: q.x_2 - q.x)
+        ground = vi.RigidStop(0.0, self.restitution, "left", on="y", friction=self.mu[0], along="x")
+        between = vi.RigidStop(0.0, self.restitution, "left", friction=self.mu[1], **above)
+        return ground, between
+
+    def force(self, t, q, v):
+        x, y = (floor(t, self.sizes[i], self.phases[i]) for i in range(2))
+        down, masses = -9.81 - y, self.mass(q)
+        return dict(x=-x, y=down, x_2=-masses[2] * x, y_2=masses[2] * down)
+
+
+@pytest.mark.slow
+def test_random_stacks_on_a_shaken_floor():
+    lanes, rng = 40, np.random.default_rng(5)
+    sizes, phases = shaking(rng, lanes, 8.0, 12.0)
+    mass_2, mu = rng.uniform(0.3, 3.0, lanes), rng.uniform(0, 1, (lanes, 2))
+    e = rng.choice([0.0, 0.3, 0.7], lanes)
+    given = dict(mass_2=mass_2, mu=mu, restitution=e, sizes=sizes, phases=phases)
+    zero, drop = np.zeros(lanes), rng.uniform(0, 0.05, (lanes, 2)) * rng.integers(0, 2, (lanes, 2))
+    q = np.stack([zero, drop[:, 0], zero, drop.sum(1)], 1)
+    v = np.stack([rng.uniform(-1, 1, lanes), zero, rng.uniform(-1, 1, lanes), zero], 1)
+    one = np.ones(lanes)
+    mass = np.stack([one, one, mass_2, mass_2], 1)
+    gaps = lambda q: [q[:, 1], q[:, 3] - q[:, 1]]
+    places = lambda q: [q[:, 0], q[:, 2] - q[:, 0]]
+    pull = lambda x, y: np.stack([x, y, mass_2 * x, mass_2 * y], 1)
+    error, refined, good = compared(Stack, given, gaps, places, mass, mu, q, v, pull)
+    assert good.all()
+    assert (error < 5 * refined + 1e-4).all() and np.median(error) < 5e-5

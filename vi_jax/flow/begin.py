@@ -13,7 +13,6 @@ from ..machine import (
     holds_anywhere,
     is_compound,
     is_in_range,
-    limited_in,
     on_held_surfaces,
     pressed_contacts,
     stops_of,
@@ -24,7 +23,7 @@ from ._step.roots import Rates, force_rate, rates
 from .lane import Lane, to_event, total
 from .plan import Plan
 from .results import code
-from .smooth import constant, hold_contacts, in_modes, stops_are_exact
+from .smooth import in_modes, stops_are_exact
 
 
 def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
@@ -49,8 +48,6 @@ def initial_lane(plan: Plan, start: State, wanted: Flag | bool = True) -> Lane:
     if plan.rests:
         jerks = [force_rate(free, x, free, s, start) for x in machine.coordinates]
         contact = _contacts_at(plan, start, current, jerks)
-        if len(limited_in(machine)) > 1:
-            contact = _pressed_together(plan, s, start, modes, contact)
         direction = tuple(
             jnp.where((x.v == 0) & (x.a == 0), jnp.sign(j), sign)
             for x, j, sign in zip(current, jerks, direction, strict=True)
@@ -108,34 +105,19 @@ def _contacts_at(plan: Plan, start: State, current: list[Rates], jerks: list[Sca
     return tuple(found)
 
 
-def _pressed_together(
-    plan: Plan, s: Scalar, start: State, modes: Scalars, contact: Scalars
-) -> Scalars:
-    """Return the contacts with those that press on only since others hold: a body lies on another
-    that would fall faster than it."""
-    bodies = plan.machine.coordinates
-
-    def add_contacts(contact: Scalars, _: None) -> tuple[Scalars, None]:
-        held = constant(hold_contacts(plan.machine, modes, contact))
-        current = [rates(held.field, x, s, start) for x in bodies]
-        jerks = [force_rate(held, x, held, s, start) for x in bodies]
-        more = _contacts_at(plan, start, current, jerks)
-        return tuple(jnp.where(x > 0, x, y) for x, y in zip(contact, more, strict=True)), None
-
-    return jax.lax.scan(add_contacts, contact, None, length=len(limited_in(plan.machine)) - 1)[0]
-
-
 def _rests_on(
     plan: Plan, k: int, current: Rates, jerk: Scalar, slack: Scalar | float, slow: Scalar | float
 ) -> Scalar:
     """Return the stop on which coordinate number k rests at the start, or 0: it is pressed on, or
-    about to be by a force that grows. Its position is known to within `slack`, its velocity to
+    about to be by a force that grows. Of several contacts, `pressed_contacts` decides later which
+    are pressed on. Its position is known to within `slack`, its velocity to
     `slow`, and both to the rounding of a search that ends there."""
     contact, least = jnp.zeros_like(current.x), 4 * jnp.finfo(current.x.dtype).eps * plan.extent(k)
     slack, slow = jnp.maximum(slack, least), jnp.maximum(slow, least / plan.unit)
     for i, stop in enumerate(stops_of(plan.machine)):
         if stop.coordinate == k:
-            pressed = (stop.sign * current.a > 0) | (current.a == 0) & (stop.sign * jerk > 0)
+            pushes = current.a != 0 if is_compound(plan.machine) else stop.sign * current.a > 0
+            pressed = pushes | (current.a == 0) & (stop.sign * jerk > 0)
             rests = (stop.beyond(current.x) >= -slack) & (jnp.abs(current.v) <= slow) & pressed
             contact = jnp.where(rests, to_event(i), contact)
     return contact

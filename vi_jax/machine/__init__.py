@@ -38,7 +38,7 @@ from .drives import (
 )
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    HybridState, Reset, Switch, after_event, after_one_event, begin_modes, begun, constant_modes,
+    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes,
     event_of, events_of, guard_of, has_contact_friction, history_of, holds_anywhere,
     is_autonomous, is_compound, jump_of,
     mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,

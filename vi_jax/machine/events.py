@@ -79,26 +79,19 @@ def jump_of(machine: Machine, number: int, s: Scalar, state: State, modes: Modes
 
 
 def after_event(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> tuple[State, Modes]:
-    """Return state and modes after an event."""
+    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = (),
+    *, alone: bool = True,
+) -> tuple[State, Modes]:  # fmt: skip
+    """Return state and modes after an event. If it happens `alone`, those of all frictions are
+    settled after that of a friction."""
     event, part, keywords = event_of(machine, number, modes, contact)
     new, changed = event.after(machine, s, state, *modes[part], **keywords)
     if event.holds_mode:
         changed = (*modes[: part.start], changed, *modes[part.stop :])
-    return _with_friction(machine, number, s, state, new), constant_modes(changed, s)
-
-
-def after_one_event(
-    machine: Machine, number: int, s: Scalar, state: State, modes: Modes, contact: Scalars = ()
-) -> tuple[State, Modes]:
-    """Return state and modes after an event that happens alone: those of all frictions are settled
-    after that of a friction."""
-    event, part, _ = event_of(machine, number, modes, contact)
-    new, changed = after_event(machine, number, s, state, modes, contact)
-    if event.holds_mode and part.start in frictions_in(machine):
+    new = _with_friction(machine, number, s, state, new)
+    if alone and event.holds_mode and part.start in frictions_in(machine):
         released = {part.start: jnp.asarray(modes[part.start] == 0)}
-        changed = settled_modes(machine, s, new, changed, contact, released)
+        changed = settled_modes(machine, s, new, constant_modes(changed, s), contact, released)
     return new, constant_modes(changed, s)
 
 

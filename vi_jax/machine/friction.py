@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from math import pi
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -104,11 +104,11 @@ class Friction(AbstractSwitch):
         return jnp.where(jnp.abs(slip) <= least, 0.0, jnp.sign(slip))
 
     def begin(self, machine, s, state):
-        return self.slip_sign(machine, s, state)
+        """Return the direction of slip: `settled_modes` decides which bodies stick."""
+        return jnp.sign(self.speed_of_slip(machine, s, state))
 
     def struck(self, machine, s, state, mode, *, around: EventContext | None = None):
-        """Return the direction of slip: `settled_modes` decides which bodies stick."""
-        return self.slip_sign(machine, s, state)
+        return self.begin(machine, s, state)
 
     def after(self, machine, s, state, mode, *, around: EventContext | None = None):
         """Return the state without a slip that vanishes, and the mode unchanged: `settled_modes`
@@ -133,22 +133,12 @@ class Friction(AbstractSwitch):
             return (jnp.where((mode == 0) | (not self.is_dry), -1.0, slip_guard),)
         touches = self.touches(machine, around.contact)
 
-        def sides(loads: Any) -> tuple[Scalar, Scalar]:
-            each = loads[around.mode_index]
-            force, largest = self.held(machine, s, state, around.contact, each)
-            return -force - largest, force - largest
-
-        def alone() -> tuple[Scalar, Scalar]:
-            solve: Any = _solve_forces
-            return sides(solve(machine, s, state, around.with_mode(mode), around.contact))
-
-        # Without sticking, no force is computed.
-        without_forces = jnp.where(touches, slip_guard, -1.0)
-        sticks, free = (mode == 0) & touches, (without_forces, without_forces)
-        if around.loads is None:
-            return jax.lax.cond(sticks, alone, lambda: free)
-        both = zip(sides(around.loads), free, strict=True)
-        return tuple(jnp.where(sticks, x, y) for x, y in both)
+        loads: Any = around.loads
+        if loads is None:
+            loads = shared_loads(machine, s, state, around.with_mode(mode), around.contact)
+        force, largest = self.held(machine, s, state, around.contact, loads[around.mode_index])
+        sticks, free = (mode == 0) & touches, jnp.where(touches, slip_guard, -1.0)
+        return tuple(jnp.where(sticks, x - largest, free) for x in (-force, force))
 
 
 @eqx.filter_jit
@@ -173,17 +163,16 @@ def _solve_forces(
 def shared_loads(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars
 ) -> dict[int, tuple[Any, Any]] | None:
-    """Return `_solve_forces` for the guards of several frictions, or zeros if none sticks; `None`
-    with fewer than two frictions."""
-    switches = switches_of(machine)
-    several = [i for i in frictions_in(machine) if switches[i].is_dry or contact]
-    if len(several) < 2:
+    """Return `_solve_forces` for the guards of frictions, or zeros if none sticks; `None` without
+    frictions that act."""
+    switches, solve = switches_of(machine), cast(Any, _solve_forces)
+    acting = [i for i in frictions_in(machine) if switches[i].is_dry or contact]
+    if not acting:
         return None
     sticks = jnp.zeros((), bool)
-    for i in several:
+    for i in acting:
         sticks = sticks | (modes[i] == 0) & switches[i].touches(machine, contact)
-    solve: Any = _solve_forces
-    none = {i: (jnp.zeros_like(s), jnp.zeros_like(s)) for i in several}
+    none = {i: (jnp.zeros_like(s), jnp.zeros_like(s)) for i in acting}
     return jax.lax.cond(sticks, lambda: solve(machine, s, state, modes, contact), lambda: none)
 
 
@@ -425,24 +414,13 @@ def settled_modes(
     `released`, after events of frictions: for each friction whether its force has just become too
     large.
     """
-    indices, switches = frictions_in(machine), switches_of(machine)
-    slips, holds, flow = [], [], field_in(machine, s, state, modes)
-    for i in indices:
-        friction = switches[i]
-        ratio = friction.static_share(machine, s, state)
-        slip = friction.slip_sign(machine, s, state, flow)
-        if released is not None:  # the slip of a sticking body is rounding
-            slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
-            begins = released.get(i, jnp.zeros((), bool))
-            ratio = jnp.where(begins, 1 - _RELEASED, ratio)
-        slips.append(slip)
-        holds.append(ratio + jnp.zeros_like(s))
-    solve: Any = _settled
-    found, _ = solve(machine, s, state, modes, contact, tuple(slips), tuple(holds))
-    new = list(modes)
-    for i, mode in zip(indices, found, strict=True):
-        new[i] = mode
-    return tuple(new)
+    begins = None
+    if released is not None:
+        none = jnp.zeros((), bool)
+        begins = tuple(released.get(i, none) for i in frictions_in(machine))
+    slip_of, solve = (cast(Any, x) for x in (_slips, _settled))
+    given = slip_of(machine, s, state, modes, begins)
+    return solve(machine, s, state, modes, contact, *given)[0]
 
 
 def pressed_contacts(
@@ -450,12 +428,31 @@ def pressed_contacts(
 ) -> Scalars:
     """Return the contacts (as in `EventContext`) without those that the forces of this state open,
     in these modes of frictions."""
-    indices, switches = frictions_in(machine), switches_of(machine)
+    indices, switches, solve = frictions_in(machine), switches_of(machine), cast(Any, _settled)
     slips = tuple(jnp.where(jnp.abs(modes[i]) < 1, 0.0, modes[i]) for i in indices)
     ratios = (switches[i].static_share(machine, s, state) for i in indices)
-    solve: Any = _settled
     holds = tuple(ratio + jnp.zeros_like(s) for ratio in ratios)
     return solve(machine, s, state, modes, contact, slips, holds)[1]
+
+
+@eqx.filter_jit
+def _slips(
+    machine: Machine, s: Scalar, state: State, modes: Scalars, begins: Sequence[Flag] | None
+) -> tuple[Scalars, Scalars]:
+    """Return for each friction its slip, and the greatest force without slip relative to that of a
+    slipping body; jitted like `_solve_forces`. `begins`: after events of frictions, whether it
+    begins to slip."""
+    slips, holds, flow = [], [], field_in(machine, s, state, modes)
+    for n, i in enumerate(frictions_in(machine)):
+        friction = switches_of(machine)[i]
+        ratio = friction.static_share(machine, s, state)
+        slip = friction.slip_sign(machine, s, state, flow)
+        if begins is not None:  # the slip of a sticking body is rounding
+            slip = jnp.where(jnp.abs(modes[i]) < 1, 0.0, slip)
+            ratio = jnp.where(begins[n], 1 - _RELEASED, ratio)
+        slips.append(slip)
+        holds.append(ratio + jnp.zeros_like(s))
+    return tuple(slips), tuple(holds)
 
 
 @eqx.filter_jit
@@ -463,19 +460,20 @@ def _settled(
     machine: Machine, s: Scalar, state: State, modes: Scalars, contact: Scalars,
     slips: Scalars, holds: Scalars,
 ) -> tuple[Scalars, Scalars]:  # fmt: skip
-    """Return the modes of frictions by their slips, and the contacts that stay closed; jitted like
-    `_solve_forces`."""
-    slip_of = dict(zip(frictions_in(machine), slips, strict=True))
-    if not contact and not any(x.is_dry for x in switches_of(machine)):
-        return slips, contact
+    """Return the modes with those of all frictions, by their slips, and the contacts that stay
+    closed; jitted like `_solve_forces`."""
+    new, kept, switches = list(modes), list(contact), switches_of(machine)
+    for i, slip in zip(frictions_in(machine), slips, strict=True):
+        new[i] = slip
+    if not contact and not any(x.is_dry for x in switches):
+        return tuple(new), contact
     order, touches, answer = settled_forces(machine, s, state, modes, contact, slips, holds)
     for n, i in enumerate(order):
         mode = jnp.where(answer.unsolved, jnp.nan, answer.mode[n])
-        slip_of[i] = jnp.where(touches[n], mode, slip_of[i])
-    kept = list(contact)
+        new[i] = jnp.where(touches[n], mode, new[i])
     for row, k in enumerate(limited_in(machine) if contact else ()):
         kept[k] = jnp.where(answer.kept[row] | answer.unsolved, contact[k], 0.0)
-    return tuple(slip_of.values()), tuple(kept)
+    return tuple(new), tuple(kept)
 
 
 def settled_forces(

@@ -29,7 +29,6 @@ from ..machine import (
     DryFriction,
     Turn,
     after_event,
-    after_one_event,
     angles_in,
     component,
     components,
@@ -379,7 +378,8 @@ class Shooting(eqx.Module):
             if event.use == LEAVES:
                 return u
             before, state = self.flight(machine, leg - 1), self.unravel(u)
-            jumped = after_event(machine, event.number, s, state, before.modes, before.contact)[0]
+            given = machine, event.number, s, state, before.modes, before.contact
+            jumped = after_event(*given, alone=False)[0]
             return ravel_pytree(jumped)[0]
 
         return self._for_event(leg, jumped, s, u) if self.events else u
@@ -754,7 +754,7 @@ class Shooting(eqx.Module):
                 return jnp.ones_like(s)
             j, before = mode_number(machine, event.number), self.flight(machine, leg - 1)
             modes, state = (before.modes, before.contact), self.unravel(u)
-            mode = after_one_event(machine, event.number, s, state, *modes)[1][j]
+            mode = after_event(machine, event.number, s, state, *modes)[1][j]
             wanted = self.modes_in(leg)[j]
             return jnp.where(mode == wanted, 1.0, -1.0).astype(s.dtype)
 

@@ -34,7 +34,7 @@ from ..flow import (
 from ..machine import (
     AbstractMachine,
     Turn,
-    after_one_event,
+    after_event,
     begin_modes,
     check_again,
     component,
@@ -466,7 +466,7 @@ def _fly(blank: Shooting, steps, modes, s0, s1, u):
 @on_host
 def _jump(blank: Shooting, number: int, s, u, modes):
     """Return the state and the modes after the event of this number."""
-    after, modes = after_one_event(blank.machine, number, s, blank.unravel(u), modes)
+    after, modes = after_event(blank.machine, number, s, blank.unravel(u), modes)
     return ravel_pytree(after)[0], modes
 
 
@@ -583,7 +583,7 @@ def _modes_in_legs(
         event, before = problem.events[i], problem.unravel(jnp.asarray(rows[i]))
         if event.use != LEAVES:
             s, contact = jnp.asarray(clocks[i]), problem.flight(machine, i - 1).contact
-            modes = after_one_event(machine, event.number, s, before, modes, contact)[1]
+            modes = after_event(machine, event.number, s, before, modes, contact)[1]
         found[i] = modes
     return tuple(tuple(float(mode) for mode in modes) for modes in found)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ..flow import guard_rates
-from ..machine import after_one_event, events_of, guard_of, jump_of, stops_of
+from ..machine import after_event, events_of, guard_of, jump_of, stops_of
 from .corrector import on_host, since_section, tangent_at
 from .edit_events import with_least_period, with_sections, without_events
 from .equations import Shooting
@@ -113,7 +113,7 @@ def soft_kick(
 
 def _modes_around_switch(problem: Shooting, machine, number, leg, s, u):
     before = problem.modes_in(leg)
-    return before, after_one_event(machine, number, s, problem.unravel(u), before)[1]
+    return before, after_event(machine, number, s, problem.unravel(u), before)[1]
 
 
 @on_host

@@ -23,7 +23,7 @@ from ..machine import (
     AbstractEvent,
     AbstractMachine,
     DryFriction,
-    after_one_event,
+    after_event,
     guard_of,
     mode_number,
 )
@@ -156,7 +156,7 @@ def _excess_at(problem: Shooting, x, leg, number: int, s, at_event: bool):
     state = problem.unravel(states[leg]) if at_event else problem.state_at(x, leg, s)
     excess, modes = excess_rates(problem, machine, leg, number, s, state), problem.modes_in(leg)
     contact = problem.flight(machine, leg).contact
-    new = after_one_event(machine, number, s, state, modes, contact)[1]
+    new = after_event(machine, number, s, state, modes, contact)[1]
     return excess.x, excess.v, new[mode_number(machine, number)]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._types import State
 from ..flow import simulate
-from ..machine import after_one_event, others_of, with_leaf
+from ..machine import after_event, others_of, with_leaf
 from .boundary_events import PERIODS
 from .conditions import AbstractCondition, FixedComponent, Special, bifurcation_tests
 from .corrector import (
@@ -145,7 +145,7 @@ def _swapped(point: Point) -> Iterator[State]:
         state, modes = problem.unravel(states[i]), problem.modes_in(i - 1)
         # The section's state is the one just after it.
         for each in (after, event) if event.cycle == 0 else (after,):
-            state, modes = after_one_event(machine, each.number, clock[i], state, modes)
+            state, modes = after_event(machine, each.number, clock[i], state, modes)
         yield state
 
 

@@ -134,7 +134,8 @@ def _apply_next(plan: Plan, taken: Flag, numbers: tuple[int, ...], x: _DueEvents
         chosen[number], any_chosen = (due > 0) & ~any_chosen, any_chosen | (due > 0)
         when = event.happens(*before)
         here = chosen[number] if when is None else chosen[number] & when
-        its_state, its_modes = after_event(machine, number, lane.s, old, modes_before, contact)
+        given = machine, number, lane.s, old, modes_before, contact
+        its_state, its_modes = after_event(*given, alone=False)
         its_modes = select(here, its_modes, modes_before)
         its_number = number - len(stops_of(machine))
         if event.holds_mode:
@@ -560,11 +561,10 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
     lane, impacts = resolve(plan, step.taken, lane, landed, at_event)
     met = any_of(step.taken, landed.values())
     lane = bring_to_rest(step, lane, at_event, met, impacts)
-    direction = list(lane.direction)
-    for k, body in enumerate(machine.coordinates):
-        if k not in impacts or len(impacts) > 1:  # it may share a body with one that was hit
-            v = stop_gradient(body.velocity(lane.state))
-            direction[k] = jnp.where(met & (v != 0), jnp.sign(v), direction[k])
+    # Coordinates may share a body with one that was hit.
+    shared = is_compound(machine) or len(machine.coordinates) > 1
+    direction = list(_along_velocities(plan, lane, met) if shared else lane.direction)
+    for k in range(len(machine.coordinates)):
         if k in impacts:  # any remaining approach is rounding
             sign, _ = plan.sign_and_gap(k, impacts[k].contact)
             away = -sign
