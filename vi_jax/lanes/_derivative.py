@@ -148,10 +148,10 @@ def _with_derivatives(
         return grouped(values, slopes)
 
     def grouped(values: Sequence[Any], slopes: Sequence[Any]) -> list[Any]:
-        (values, slopes, flags), out = map(iter, (values, slopes, wanted)), []
+        remaining, changes, flags, out = iter(values), iter(slopes), iter(wanted), []
         for size in groups:
-            out += islice(values, size)
-            out += islice(slopes, sum(islice(flags, size)))
+            out += islice(remaining, size)
+            out += islice(changes, sum(islice(flags, size)))
         return out
 
     shapes: list[Any] = []
