@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow import EventKind
 
 from den_hartog import den_hartog
 from differences import check_derivatives
@@ -369,3 +370,31 @@ def test_frictions_on_one_velocity_add():
 
     with pytest.raises(ValueError, match=r"a Opposite must have .* 0 and 1 are mult"):
         vi.simulate(Opposite(), vi.State(x=0.1, u=0.0), 1)
+
+
+class Pressed(vi.AbstractMachine):
+    """A load that swings slowly presses a body, which friction brakes, on its stop."""
+
+    level: float
+    cycle = 4 * np.pi
+
+    @property
+    def contacts(self):
+        stop = vi.RigidStop(0.3, 0.0, on=("x", "u"))
+        return stop, vi.DryFriction(self.level, on="u", mass=1.0)
+
+    def field(self, s, z):
+        return {"x": z.u, "u": jnp.sin(0.5 * s) - z.x - 0.1 * z.u}
+
+
+def test_friction_on_a_stop_does_not_hold_for_ever():
+    """Regression: a body that slid into its stop without speed was held by friction there and
+    never released. It leaves when the load falls below spring and friction."""
+    levels = np.linspace(0.25, 0.6, 60)
+    start = vi.State(x=0.3, u=0.0)
+    run = jax.vmap(lambda level: vi.simulate(Pressed(level), start, 2, event_log=12))(levels)
+    assert bool(run.successful.all())
+    kind, phase = (np.asarray(x)[:, 1] for x in (run.event_log.kind, run.event_log.phase))
+    released = np.array([p[k == int(EventKind.release)] for p, k in zip(phase, kind, strict=True)])
+    leaves = 2 * (np.pi - np.arcsin(0.3 + levels))
+    np.testing.assert_allclose(released[:, 0], leaves, rtol=1e-9)

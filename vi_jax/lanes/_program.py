@@ -27,6 +27,9 @@ class Part:
         part.closed = closed
         return part
 
+    def __repr__(self) -> str:
+        return str(self.closed)
+
     @functools.cached_property
     def closed(self) -> ClosedJaxpr:
         return jax.make_jaxpr(self.function)(*map(shape_of, self.in_avals))

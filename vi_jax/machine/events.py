@@ -158,10 +158,10 @@ def begin_modes(
 
 def struck_modes(
     machine: Machine, s: Scalar, state: State, modes: Modes, own: Sequence[Any] | None = None,
-    contact: Scalars = (), before: State | None = None,
+    contact: Scalars = (), before: State | None = None, released: dict[int, Any] | None = None,
 ) -> Modes:  # fmt: skip
     """Return the modes after a jump to `state`, from `before` if that is known; the machine's own
-    are unchanged, or `own`."""
+    are unchanged, or `own`. `released` as in `settled_modes`."""
     event_modes = []
     for number, event in enumerate(events_of(machine)):
         if event.holds_mode:
@@ -175,7 +175,7 @@ def struck_modes(
     machine_modes = modes[len(event_modes) :] if own is None else own
     modes = constant_modes([*event_modes, *machine_modes], s)
     if frictions_in(machine):
-        modes = constant_modes(settled_modes(machine, s, state, modes, contact), s)
+        modes = constant_modes(settled_modes(machine, s, state, modes, contact, released), s)
     return modes
 
 

@@ -582,7 +582,15 @@ def _apply_impact(step: AppliedStep, lane: Lane, landed: dict[int, Flag], at_eve
             modes = select(here, stops_of(machine)[number].modes_after(*given), modes)
     if modes and (is_compound(machine) or (contact and holds_anywhere(machine))):
         # The force that friction has to hold depends on the bodies that rest now.
-        new = struck_modes(machine, lane.s, lane.state, modes, contact=contact, before=at_event)
+        released = None
+        if contact:
+            # What friction leaves of a force may press a body on its stop by rounding only. If the
+            # friction held the body instead, nothing would ever release it.
+            rests = any_of(met, (x > 0 for x in contact))
+            released = {i: rests & (jnp.abs(modes[i]) >= 1) for i in frictions_in(machine)}
+        new = struck_modes(
+            machine, lane.s, lane.state, modes, contact=contact, before=at_event, released=released
+        )
         modes = select(met, new, modes)
     lane = lane._replace(direction=tuple(direction), modes=modes)
     if lane.contact is None or len(impacts) == 1:
