@@ -217,7 +217,7 @@ def collect(plan: Plan, sampled: bool, lane: Ends, points: State, records: Recor
     integrals = dict(records.integrals)
     times = integrals.pop(TIME, None)
 
-    def as_counts(values):
+    def as_counts(values) -> Any:
         if values is None:
             return None
         return jnp.where(jnp.isfinite(values), values, 0.0).astype(jnp.int32)
