@@ -134,11 +134,13 @@ def _known_sizes(
     direction = tree.unflatten([x * sign for x, sign in zip(leaves, signs, strict=True)])
     change_of_rate = jax.jvp(lambda x: smooth.field(s, x), (start,), (direction,))[1]
 
-    def size(x: Scalar, change: Scalar) -> Scalar:
+    def size(x: Scalar, change: Scalar, rate: Scalar) -> Scalar:
         change = unit * jnp.abs(change)
-        return jnp.where(x > _GROWS * change, x, change)
+        # The rounding of a body at rest, such as an angle of 1e-17, shows no size.
+        rests = (jnp.max(jnp.abs(rate), axis=0) == 0) & (change == 0) & (x <= _ZERO)
+        return jnp.where(rests, 0.0, jnp.where(x > _GROWS * change, x, change))
 
-    return jtu.tree_map(size, sizes, change_of_rate)
+    return jtu.tree_map(size, sizes, change_of_rate, rates)
 
 
 def extents_of(
