@@ -239,8 +239,8 @@ def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, 
 
 def _transposed_back(*_, **__):
     raise NotImplementedError(
-        "A gradient by a tape has no derivative in reverse mode. Use forward mode for every "
-        "derivative after the first: `jax.jacfwd(jax.grad(f))` or `jax.jvp(jax.grad(f), x, v)`."
+        "A gradient that uses a tape has no derivative in reverse mode. Use forward mode for all "
+        "derivatives after the first: `jax.jacfwd(jax.grad(f))` or `jax.jvp(jax.grad(f), x, v)`."
     )
 
 
