@@ -54,8 +54,8 @@ ORDERS = {
     "gradient": lambda f: jax.grad(f),
     "checkpoint": lambda f: jax.grad(jax.checkpoint(f)),
     "forward over reverse": lambda f: lambda p: jax.jvp(jax.grad(f), (p,), (V,))[1],
-    "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(f)),
-    "third": lambda f: jax.grad(lambda p: jax.jvp(jax.grad(f), (p,), (V,))[1] @ W),
+    "hessian": jax.hessian,
+    "third": lambda f: lambda p: jax.jvp(ORDERS["forward over reverse"](f), (p,), (W,))[1],
 }
 
 
@@ -67,6 +67,18 @@ def test_derivatives_of_any_order_agree_with_those_by_columns(by_tape, order):
     taped = jax.jit(ORDERS[order](loss))(P)
     columns = jax.jit(ORDERS[order](lambda p: loss(p, "xla")))(P)
     np.testing.assert_allclose(taped, columns, rtol=1e-12, atol=1e-12 * np.abs(columns).max())
+
+
+@pytest.mark.parametrize(
+    "derivative",
+    [
+        lambda f: jax.jacrev(jax.jacrev(f)),
+        lambda f: jax.grad(lambda p: jax.jvp(jax.grad(f), (p,), (V,))[1] @ W),
+    ],
+)
+def test_reverse_mode_of_a_tape_is_refused(by_tape, derivative):
+    with pytest.raises(NotImplementedError, match=r"Use forward mode .* `jax.jacfwd\(jax.grad"):
+        jax.make_jaxpr(derivative(loss))(P)
 
 
 def gradients(x, r, n):

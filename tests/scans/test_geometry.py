@@ -90,11 +90,9 @@ def test_a_smooth_boundary_has_the_exponent_one():
     for label in (across > 0.1, across**2 + up**2 < 0.6**2, across > 0.3 * up + 0.1):
         found = uncertainty_of(label.astype(int))
         assert found.exponent == pytest.approx(1.0, abs=0.01)
-        low, high = found.interval
-        assert low < 1.0 < high and high - low < 0.2
     assert np.isnan(uncertainty_of((across > 0.1).astype(int)).exponents[1])
     nothing = uncertainty_of(np.zeros((64, 64), int))
-    assert np.isnan(nothing.exponent) and np.isnan(nothing.interval).all()
+    assert np.isnan(nothing.exponent)
 
 
 @pytest.mark.parametrize(("grows", "falls"), [(3, 1.5), (3, 2.0)])
@@ -109,8 +107,6 @@ def test_the_exponent_of_a_boundary_with_known_dimension(grows, falls):
     label = (4 * x - 2 > -waves.sum(axis=1)[:, None]).astype(int)
     found = uncertainty_of(label)
     exact = np.log(falls) / np.log(grows)
-    low, high = found.interval
-    assert low < exact < high and high - low < 0.15
     assert abs(found.exponent - exact) < 0.03
     assert found.exponents[1] == pytest.approx(1.0, abs=0.01)
 
@@ -154,8 +150,6 @@ def test_invalid_requests_raise():
             ask()
     with pytest.raises(ValueError, match="16 starts at least"):
         found.uncertainty()
-    with pytest.raises(ValueError, match="`confidence` must be finite and in"):
-        found.uncertainty(confidence=1.0)
     with pytest.raises(ValueError, match="`box` must be at most 8"):
         found.entropy(box=9)
     with pytest.raises(ValueError, match="`scales` must name"):

@@ -237,51 +237,11 @@ def _by_result(program: ReverseProgram, cotangents: Sequence[Any]) -> dict[int, 
     return {k: x for k, x in zip(places, cotangents, strict=True) if x is not None}
 
 
-def _transposed_back(cotangents, *args, program: ReverseProgram):
-    """Transpose `lanes_backward`. Jᵀc is linear in c, and its transpose is J. The result of `_jvp`
-    is linear in dc and v. Since second derivatives are symmetric, both transposes are of the same
-    kind:
-
-        along w:   J w for dc,   ∂(cᵀJw)/∂x for v.
-    """
-    derived, n = program.program, len(program.program.in_avals)
-    linear = [ad.is_undefined_primal(x) for x in args]
-    base, second = derived, any(linear[:n])
-    if second:
-        if derived.base is None or not derived.varied:
-            raise NotImplementedError(
-                "A gradient with respect to the numbers of a lane that is no tangent's."
-            )
-        base = derived.base
-    varied = program.varied[: len(base.in_avals)]
-    along, _, _, slopes = forward(base, varied)
-    w = [ad.instantiate_zeros(x) for x in cotangents]
-    inputs = [*args[: len(base.in_avals)], *w]
-    weights = [k for k, flag in enumerate(program.given) if flag]
-    found: dict[int, Any] = {}
-    if any(linear[n:]):
-        values = lanes_p.bind(*inputs, program=along, backend="auto")
-        of_value = {forward(base, derived.varied).values[k] if second else k: k for k in slopes}
-        for i, k in enumerate(weights, n):
-            if linear[i] and k in of_value:
-                found[i] = values[slopes[of_value[k]]]
-    if second:
-        result_of = {place: k for k, place in forward(base, derived.varied).slopes.items()}
-        pairs = [(result_of.get(k), args[i]) for i, k in enumerate(weights, n) if not linear[i]]
-        given = {slopes[k]: x for k, x in pairs if k in slopes}
-        places = {i: k for i, k in _tangent_places(derived).items() if linear[k]}
-        flags = tuple(k in given for k in range(len(along.result_avals)))
-        back = reverse(along, tuple(i in places for i in range(len(along.in_avals))), flags)
-        if back is None:
-            raise NotImplementedError("A loop that is taken back by a tape once, but not twice.")
-        tangents = lanes_backward_p.bind(*inputs, *(given[k] for k in sorted(given)), program=back)
-        found |= dict(zip(places.values(), tangents, strict=True))
-    out: list[Any] = [None] * len(args)
-    for i, x in enumerate(args):
-        if linear[i]:
-            lane_aval, zero = program.in_avals[i], jnp.zeros(x.aval.shape, x.aval.dtype)
-            out[i] = _for_argument(found[i], lane_aval, x.aval) if i in found else zero
-    return out
+def _transposed_back(*_, **__):
+    raise NotImplementedError(
+        "A gradient that uses a tape has no derivative in reverse mode. Use forward mode for all "
+        "derivatives after the first: `jax.jacfwd(jax.grad(f))` or `jax.jvp(jax.grad(f), x, v)`."
+    )
 
 
 batching.primitive_batchers[lanes_backward_p] = _batched

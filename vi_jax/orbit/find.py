@@ -119,19 +119,13 @@ _SAMPLES = 8
 _DRIFTS = 0.5
 
 
-def _run(the_map: CycleMap, state: State, impact_log: int) -> Run:
-    """Simulate the motion with its impacts; guess and orbit share a program if equally long."""
+def _run(
+    the_map: CycleMap, state: State, impact_log: int, by: Callable[..., Run] = simulate_states
+) -> Run:
+    """Simulate the motion with its impacts; by default, only the states have derivatives. Guess and
+    orbit share a program if equally long."""
     places = _samples_per_cycle(the_map, state)
-    return simulate(
-        the_map.machine, state, the_map.cycles, method=the_map.method,
-        samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
-    )  # fmt: skip
-
-
-def _follow(the_map: CycleMap, state: State, impact_log: int) -> Run:
-    """Simulate as `_run`, with derivatives of the states alone."""
-    places = _samples_per_cycle(the_map, state)
-    return simulate_states(
+    return by(
         the_map.machine, state, the_map.cycles, method=the_map.method,
         samples=0 if places == 1 else places, impact_log=impact_log, rests=the_map.rests,
     )  # fmt: skip
@@ -139,17 +133,17 @@ def _follow(the_map: CycleMap, state: State, impact_log: int) -> Run:
 
 @forward_jacobian
 def _end_of_motion(the_map: CycleMap, state: State, impact_log: int) -> State:
-    return _follow(the_map, state, impact_log).last
+    return _run(the_map, state, impact_log).last
 
 
 def _with_jacobians(the_map: CycleMap, state: State, impact_log: int) -> tuple[Run, Array]:
-    """Return the run of `_follow` and the derivatives of its sections but the first with respect to
-    the state, by the program that also computes the derivatives of `_end_of_motion`."""
+    """Return the run and the derivatives of its sections but the first with respect to the state,
+    by the program that also computes the derivatives of `_end_of_motion`."""
     x, unravel = raveled(jax.lax.stop_gradient(state))
 
     def along(direction):
         def sections(x):
-            run = _follow(the_map, unravel(x), impact_log)
+            run = _run(the_map, unravel(x), impact_log)
             return in_rows(run.sections)[1:], run
 
         _, columns, run = jax.jvp(sections, (x,), (direction,), has_aux=True)
@@ -187,7 +181,7 @@ def move_section(
         at_phase = dataclasses.replace(the_map, machine=machine.at_section(phase))
         run, _ = _with_jacobians(at_phase, guess, impact_log)
     else:
-        run = _run(the_map, guess, impact_log)
+        run = _run(the_map, guess, impact_log, simulate)
     assert run.samples is not None and run.impact_log is not None
     step, half = machine.cycle / _SAMPLES, machine.cycle / 2
     phase = run.impact_log.phase.ravel() - step * jnp.arange(_SAMPLES)[:, None]
@@ -257,7 +251,7 @@ def observe_arc(arc: CycleMap, state: State, impact_log: int, second: bool) -> O
         jacobians = (
             jacobians_from(arc, state) if second else jnp.zeros((0,), raveled(state)[0].dtype)
         )
-        return _observations(arc, state, _run(arc, state, impact_log), jacobians)
+        return _observations(arc, state, _run(arc, state, impact_log, simulate), jacobians)
 
     found = observe(arc, state)
     if second:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import axes_of, count, fits_records, given_number, require
+from .._checks import axes_of, count, fits_records, given_number
 from .._messages import at_work, count_of, warning_once
 from .._types import State, xr
 from ..flow import (
@@ -180,25 +180,22 @@ class Basins(NamedTuple):
         box = count("box", box, least=2, most=min(label.shape))
         return geometry.entropy_of(label, box=box, is_start=is_start)
 
-    def uncertainty(self, *, confidence: float = 0.95) -> geometry.Uncertainty:
+    def uncertainty(self) -> geometry.Uncertainty:
         """Return the uncertainty exponent of the basins' boundaries: the power of the error of the
         starts with which the share of uncertain starts decreases. It is 1 for smooth boundaries.
 
-        It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its interval is
-        the uncertainty due to the grid: about ±0.05 at 512 starts along each of two axes.
-
-        **Arguments:** `confidence` of the intervals.
+        It is measured between 1 cell and a sixteenth of the grid, 3 cells at least. Its error
+        due to the grid is about 0.05 at 512 starts along each of two axes.
 
         **Raises:** `ValueError` if the starts lie on no grid, or on fewer than 16 along an axis.
         """
-        require("confidence", confidence, low=0.0, high=1.0, open_low=True, open_high=True)
         label, is_start, _ = self._grid()
         if min(label.shape) < 16:
             raise ValueError(
                 "An uncertainty exponent needs 16 starts at least along each axis, but there are "
                 f"{min(label.shape)}."
             )
-        return geometry.uncertainty_of(label, confidence=float(confidence), is_start=is_start)
+        return geometry.uncertainty_of(label, is_start=is_start)
 
     def _grid(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
         """Return labels on the grid, flags of starts not beyond a stop, and names of the axes."""

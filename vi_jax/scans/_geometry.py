@@ -7,9 +7,7 @@ import numpy as np
 
 from ..machine import without_turns
 
-# Tiles along each axis, one of which is left out at a time for the confidence interval, in several
-# dimensions and in one; the number of distances, and the longest as a share of the grid. Choices.
-_TILES, _TILES_OF_A_ROW = 8, 64
+# The number of distances, and the longest as a share of the grid. Choices.
 _DISTANCES, _FARTHEST = 8, 1 / 16
 
 
@@ -42,8 +40,6 @@ class Uncertainty(NamedTuple):
     exponents: np.ndarray
     """The exponent for errors along each axis of the grid, shape (axes,); NaN if fewer than three
     distances meet a boundary."""
-    intervals: np.ndarray
-    """The confidence interval of each exponent; shape (axes, 2)."""
     distances: np.ndarray
     """The errors ε, in cells of the grid; shape (distances,)."""
     fractions: np.ndarray
@@ -53,18 +49,8 @@ class Uncertainty(NamedTuple):
     @property
     def exponent(self) -> float:
         """The smallest of `exponents`."""
-        return float(self.exponents[self._least])
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The confidence interval of `exponent`."""
-        low, high = self.intervals[self._least]
-        return float(low), float(high)
-
-    @property
-    def _least(self) -> int:
-        known = np.where(np.isnan(self.exponents), np.inf, self.exponents)
-        return int(np.argmin(known))
+        known = self.exponents[~np.isnan(self.exponents)]
+        return float(known.min()) if known.size else np.nan
 
 
 class Ball(NamedTuple):
@@ -107,51 +93,36 @@ def _boxes(cells: np.ndarray, box: int) -> np.ndarray:
     return split.transpose([*first, *(i + 1 for i in first)]).reshape(-1, box**cells.ndim)
 
 
-def uncertainty_of(
-    label: np.ndarray, *, confidence: float = 0.95, is_start: np.ndarray | None = None
-) -> Uncertainty:
+def uncertainty_of(label: np.ndarray, *, is_start: np.ndarray | None = None) -> Uncertainty:
     """Return the uncertainty exponents of the boundaries between labels on a grid of any dimension;
     `is_start` is True for cells with a start (all by default); other cells have no outcome.
 
     The distances are eight, in cells, from 1 to a sixteenth of the shortest axis, at least 3. The
     starts are those with neighbours at the largest distance. An exponent is the slope of
-    ln(fraction) over ln(distance) by least squares. Its interval has two parts, added in
-    quadrature. One is the variation of the slope if one tile of the grid at a time is left out
-    (jackknife), due to the position of the region. The other is the scatter about the line.
+    ln(fraction) over ln(distance) by least squares.
     """
     is_start = np.ones(label.shape, bool) if is_start is None else is_start
     farthest = max(int(min(label.shape) * _FARTHEST), 3)
     distances = np.unique(np.geomspace(1, farthest, _DISTANCES).round().astype(int))
     margin = int(distances.max())
-    exponents, intervals, fractions = [], [], []
-    for axis in range(label.ndim):
-        differences = (_labels_differ(label, is_start, axis, d) for d in distances.tolist())
-        sums = [_by_tile(found, is_start, margin) for found in differences]
-        uncertain, starts = np.stack([x for x, _ in sums]), sums[0][1]
-        exponent, half_width = _power(distances, uncertain, starts, confidence)
-        exponents.append(exponent)
-        intervals.append((exponent - half_width, exponent + half_width))
-        fractions.append(uncertain.sum(axis=1) / max(starts.sum(), 1))
-    return Uncertainty(np.array(exponents), np.array(intervals), distances, np.array(fractions))
+    inner = tuple(slice(margin, size - margin) for size in label.shape)
+    starts = max(np.count_nonzero(is_start[inner]), 1)
+    fractions = np.empty((label.ndim, distances.size))
+    for axis, i in np.ndindex(fractions.shape):
+        found = _labels_differ(label, is_start, axis, int(distances[i]))
+        fractions[axis, i] = np.count_nonzero(found[inner]) / starts
+    exponents = np.array([_power(distances, row) for row in fractions])
+    return Uncertainty(exponents, distances, fractions)
 
 
-def _power(
-    distances: np.ndarray, uncertain: np.ndarray, starts: np.ndarray, confidence: float
-) -> tuple[float, float]:
-    """Return the exponent of the growth of uncertain starts (distances, tiles) with distance, and
-    half of its interval."""
-    from scipy.special import stdtrit  # slow to load
-
-    total = uncertain.sum(axis=1)
-    used = total > 0
+def _power(distances: np.ndarray, fractions: np.ndarray) -> float:
+    """Return the exponent of the growth of the fractions with distance."""
+    used = fractions > 0
     if used.sum() < 3:
-        return np.nan, np.nan
-    across, uncertain = np.log(distances[used]), uncertain[used]
-    exponent, scatter = _slope(across, np.log(total[used] / starts.sum()))
-    spread = _jackknife(across, uncertain, starts)
-    tiles = int(np.count_nonzero(starts))
-    quantile = float(stdtrit(max(tiles - 1, 1), 0.5 + 0.5 * confidence))
-    return exponent, quantile * float(np.hypot(spread, scatter))
+        return np.nan
+    across, up = np.log(distances[used]), np.log(fractions[used])
+    x, y = across - across.mean(), up - up.mean()
+    return float(x @ y / (x @ x))
 
 
 def _labels_differ(label: np.ndarray, is_start: np.ndarray, axis: int, distance: int) -> np.ndarray:
@@ -162,39 +133,6 @@ def _labels_differ(label: np.ndarray, is_start: np.ndarray, axis: int, distance:
     found[low] |= differ
     found[high] |= differ
     return found
-
-
-def _by_tile(found: np.ndarray, is_start: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of `found` cells and of starts in each tile, without the margin."""
-    inner = tuple(slice(margin, size - margin) for size in found.shape)
-    found, is_start = found[inner] & is_start[inner], is_start[inner]
-    tiles = _TILES_OF_A_ROW if found.ndim == 1 else _TILES
-    tile = np.zeros(found.shape, int)
-    for axis, size in enumerate(found.shape):
-        row = np.arange(size) * tiles // max(size, 1)
-        tile = tile * tiles + row.reshape([-1 if i == axis else 1 for i in range(found.ndim)])
-    count = tiles**found.ndim
-    return np.bincount(tile[found], minlength=count), np.bincount(tile[is_start], minlength=count)
-
-
-def _slope(across: np.ndarray, up: np.ndarray) -> tuple[float, float]:
-    """Return the slope of a straight line by least squares, and its standard error."""
-    x, y = across - across.mean(), up - up.mean()
-    slope = float(x @ y / (x @ x))
-    residual = y - slope * x
-    return slope, float(np.sqrt(residual @ residual / max(len(x) - 2, 1) / (x @ x)))
-
-
-def _jackknife(across: np.ndarray, uncertain: np.ndarray, starts: np.ndarray) -> float:
-    """Return the standard error of the slope, from its values with each tile left out."""
-    slopes = []
-    for tile in np.flatnonzero(starts):
-        others = uncertain.sum(axis=1) - uncertain[:, tile]
-        if not (others > 0).all():
-            return np.inf  # one tile has all uncertain starts: the spread is unknown
-        slopes.append(_slope(across, np.log(others / (starts.sum() - starts[tile])))[0])
-    count = len(slopes)
-    return float(np.sqrt((count - 1) * np.var(slopes))) if count > 1 else np.inf
 
 
 class Cells(NamedTuple):
