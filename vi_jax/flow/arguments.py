@@ -197,8 +197,8 @@ def make_plan(
         rests=(may_rest(machine) if rests is None else rests) and bool(stops_of(machine)),
         backend=lanes.current_backend(),
         settle=_checked_settle(cycles, options.settle, parts, dtype),
-        max_steps=jnp.asarray(jnp.inf if max_steps is None else max_steps, dtype),
-        max_impacts=jnp.asarray(options.max_impacts, dtype),
+        max_steps=_as_number(np.inf if max_steps is None else max_steps, dtype),
+        max_impacts=_as_number(options.max_impacts, dtype),
         begin=_clock_reading(options.begin, dtype),
         until=_clock_reading(options.until, dtype),
         stop=options.stop,
@@ -224,7 +224,12 @@ def _own_modes(machine: AbstractMachine, start: State, modes: Any, dtype: Any) -
 
 
 def _clock_reading(given: Any, dtype: Any) -> jax.Array | None:
-    return None if given is None else jnp.asarray(given, dtype)
+    return None if given is None else _as_number(given, dtype)
+
+
+def _as_number(given: Any, dtype: Any) -> jax.Array:
+    known = concrete(given)
+    return jnp.asarray(given, dtype) if known is None else from_host(known.astype(dtype))
 
 
 def machine_of(machine: Machine) -> AbstractMachine:
@@ -380,6 +385,8 @@ def _check_turn(machine: AbstractMachine, start: State) -> None:
 def check_prescribed(machine: AbstractMachine, start: State) -> None:
     """**Raises:** `ValueError` if a start does not have the prescribed motion of its machine."""
     if not isinstance(machine, Mechanical) or not isinstance(start, NamedState):
+        return
+    if type(machine).prescribed is Mechanical.prescribed:
         return
     times = 0.0, INNER_INSTANT * machine.cycle
     given, later = (components(machine.with_prescribed(t, start)) for t in times)

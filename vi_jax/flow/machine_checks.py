@@ -209,6 +209,7 @@ def check_values(machine: AbstractMachine, start: State, repeats: bool = True) -
     """Check numbers of a machine around its start. Warn once if the field is not periodic and the
     motion `repeats` its cycle, or if an event's guard is not negative in any of many states.
     Machines of this package and machines with traced numbers are not checked."""
+    machine = getattr(machine, "observed_machine", machine)  # so that it is not checked twice
     kind, leaves = type(machine), jtu.tree_leaves((machine, start))
     if is_builtin(kind) or any(isinstance(x, Tracer) for x in leaves):
         return

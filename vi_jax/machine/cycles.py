@@ -183,6 +183,7 @@ def _observed_kind(kind: type, renews: bool) -> type:
         "observed_interval": eqx.field(default=None, kw_only=True),
         "observed_usual": eqx.field(default=None, kw_only=True),
         "step_limit": step_limit,
+        "observed_machine": property(original),
         "observed_every": lambda self, interval: original(self).observed_every(interval),
         **{name: parts(name) for name in ("_stops", "_switches", "_others")},
     }

@@ -44,8 +44,9 @@ def events_of(machine: Machine) -> tuple[AbstractEvent, ...]:
 
 def is_autonomous(machine: Machine, state: State) -> bool:
     """Return whether an event, not the clock, ends the cycles of a machine."""
-    ends = any(event.ends_cycle for event in events_of(machine)[:-1])
-    return ends or machine._section(state) is not None
+    if any(event.ends_cycle for event in events_of(machine)[:-1]):
+        return True
+    return jax.eval_shape(machine._section, state) is not None
 
 
 def section_number(machine: Machine) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from .._checks import count, require
+from .._checks import count, from_host, require
 from .._messages import warning_once
 from .._types import State
 from ..flow import (
@@ -171,7 +171,7 @@ def cycle_map(
     method.check(machine)
     # Tolerances are numbers: another tolerance must not need another compilation.
     traced_method: AbstractMethod = jtu.tree_map(
-        lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, method
+        lambda x: from_host(x) if isinstance(x, np.ndarray) else x, method
     )
     return CycleMap(machine, traced_method, count("cycles", cycles, least=1), may_rest(machine))
 

@@ -317,7 +317,7 @@ class Orbit(Summarized):
             # Its cycles may differ in length: an interval is a period, or the whole motion.
             period = int(self.cycles)
             each = period if cycles % period == 0 else cycles
-            machine = machine.observed_every(self.duration * (each / period))
+            machine = machine.observed_every(np.asarray(self.duration) * (each / period))
             samples, impact_log, event_log = (each * n for n in (samples, impact_log, event_log))
             cycles //= each
         return simulate(

@@ -186,14 +186,20 @@ def _with_impacts(
     speed = np.asarray(log.speed)[logged]
     stops_hit = [stops[i] for i in stop]
     before = np.array([s.sign for s in stops_hit]) * speed
-    after = [float(s.velocity_after(v)) for s, v in zip(stops_hit, before, strict=True)]
+    hit = [_place_and_rebound(s, v) for s, v in zip(stops_hit, before, strict=True)]
+    places, after = np.reshape(np.array(hit, float), (-1, 2)).T
     added = MotionPath(
         np.repeat(cycles_at, 2),
-        np.repeat([float(s.place) for s in stops_hit], 2),
+        np.repeat(places, 2),
         np.stack([before, after], axis=1).ravel(),
     )
-    places = np.searchsorted(path.cycles, added.cycles)
-    return MotionPath(*(np.insert(a, places, b) for a, b in zip(path, added, strict=True)))
+    index = np.searchsorted(path.cycles, added.cycles)
+    return MotionPath(*(np.insert(a, index, b) for a, b in zip(path, added, strict=True)))
+
+
+@compiled
+def _place_and_rebound(stop: Any, velocity: Any) -> Any:
+    return stop.place, stop.velocity_after(velocity)
 
 
 def counts_by_angle(machine: AbstractMachine | None) -> bool:
@@ -261,7 +267,7 @@ def _without_drive(machine: AbstractMachine | None, samples: Samples) -> bool:
     """Return whether the cycles of a run are no cycles of a drive."""
     if machine is None:
         return False
-    start = jax.tree.map(lambda x: x[0], samples.state)
+    start = jax.tree.map(lambda x: np.asarray(x)[0], samples.state)
     return hasattr(machine, "observed_interval") or is_autonomous(machine, start)
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
@@ -90,7 +91,9 @@ def weighted(weights: np.ndarray, stages: list, base: object = None) -> Any:
     used = [(float(w), stage) for w, stage in zip(weights, stages, strict=False) if w != 0]
 
     def leaf(*leaves: jax.Array) -> jax.Array:
-        return functools.reduce(jnp.add, [w * x for (w, _), x in zip(used, leaves, strict=True)])
+        # Not by operators, which take thrice as long to trace.
+        terms = (lax.mul(x, lax.full_like(x, w)) for (w, _), x in zip(used, leaves, strict=True))
+        return functools.reduce(lax.add, terms)
 
     change = jtu.tree_map(leaf, *(stage for _, stage in used))
     return change if base is None else jtu.tree_map(jnp.add, base, change)
