@@ -1,8 +1,8 @@
 """The boundaries of the paper's discrepancy in the planes (ζ, k) and (ζ, c)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,22 +11,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.interpolate import CubicSpline
 from tools.ideal import births
+from tools.pictures import legend_below
 from vi_jax.machine import Parameters, Scene
-from vi_jax.orbit import (
-    Boundary,
-    Branch,
-    Point,
-    boundary,
-    closed_form_orbits,
-    continue_orbit,
-    find_orbit,
-)
+from vi_jax.orbit import Boundary, Branch, boundary, closed_form_orbits, continue_orbit, find_orbit
 from vi_jax.plot import DASHES, color_of, paler
 
 from .motions import FREQUENCY_RATIO, RESTITUTION, table_damping_ratio
+from .response import BOUNCE as K
+from .response import DAMPING as XI
 from .response import MAX_STEP, RANGE, RATIO
 
-K, XI = "stops.0.restitution", "damping_ratio"
 # At k = 1 without damping the motions are no longer isolated, and the curves end there.
 K_RANGE, C_RANGE = (0.02, 0.999), (0.0, 1.2)
 
@@ -34,6 +28,30 @@ SHORT, LONG = color_of(1, 1), color_of(2, 1)
 # Darker than the filling, to be visible on it.
 LONG_LINE = "#b87f00"
 SHORT_FILL, LONG_FILL = paler(SHORT, 0.2), paler(LONG, 0.4)
+
+# The curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both. The 2π motion
+# has one impact per drive cycle, the 4π motion has one in two cycles. The start of each curve:
+# period in cycles and k of a branch, the kind of its point, and the second parameter. At k = 0.5
+# the 4π motion is stable in its whole range, at k = 0.8 it is not.
+CURVES: dict[str, tuple[int, float, str, str]] = {
+    # The 2π motion is unstable on the side of smaller ζ.
+    "doubling_k": (1, RESTITUTION, "period-doubling", K),
+    # The 4π motion touches the stop a second time; it exists between the curve's two arms. This is
+    # the family of the figures' motion. At higher damping there is another family near the birth.
+    "touch_k": (2, RESTITUTION, "grazing", K),
+    "doubling_c": (1, RESTITUTION, "period-doubling", XI),
+    "touch_c": (2, RESTITUTION, "grazing", XI),
+    # The 2π motion appears. Without damping it does so at ζ = √(1 - 1/d) for every k, because an
+    # impact of zero speed has no effect.
+    "birth_c": (1, RESTITUTION, "grazing", XI),
+    # The 2π motion ends towards large ζ.
+    "fold_k": (1, RESTITUTION, "fold", K),
+    "fold_c": (1, RESTITUTION, "fold", XI),
+    # The 4π motion is unstable between the curve's two arms.
+    "long_doubling_k": (2, 0.8, "period-doubling", K),
+}
+Curves = Mapping[str, Boundary]
+"""Curves by the names of `CURVES`."""
 
 
 def table_damping() -> float:
@@ -46,60 +64,21 @@ def xi_per_c() -> float:
     return table_damping_ratio() / table_damping()
 
 
-class BoundaryCurves(NamedTuple):
-    """Curves in the planes (ζ, k), undamped, and (ζ, ξ), with k = 0.5; d = 2 in both.
-
-    The 2π motion has one impact per drive cycle, the 4π motion has one in two cycles.
-    """
-
-    doubling_k: Boundary
-    """Period doubling of the 2π motion, which is unstable on the side of smaller ζ."""
-    touch_k: Boundary
-    """The 4π motion touches the stop a second time; it exists between the curve's two arms. This
-    is the family of the figures' motion. At higher damping there is another family near the birth.
-    """
-    doubling_c: Boundary
-    touch_c: Boundary
-    birth_c: Boundary
-    """Grazing at which the 2π motion appears. Without damping it is at ζ = √(1 - 1/d) for every k,
-    because an impact of zero speed has no effect."""
-    fold_k: Boundary
-    """Fold at which the 2π motion ends towards large ζ."""
-    fold_c: Boundary
-    long_doubling_k: Boundary
-    """Period doubling of the 4π motion, which is unstable between the curve's two arms."""
-
-
-# The start of each curve: period in cycles and k of a branch, the kind of its point, and the
-# second parameter. At k = 0.5 the 4π motion is stable in its whole range, at k = 0.8 it is not.
-_BEGINNINGS: dict[str, tuple[int, float, str, str]] = {
-    "doubling_k": (1, RESTITUTION, "period-doubling", K),
-    "touch_k": (2, RESTITUTION, "grazing", K),
-    "doubling_c": (1, RESTITUTION, "period-doubling", XI),
-    "touch_c": (2, RESTITUTION, "grazing", XI),
-    "birth_c": (1, RESTITUTION, "grazing", XI),
-    "fold_k": (1, RESTITUTION, "fold", K),
-    "fold_c": (1, RESTITUTION, "fold", XI),
-    "long_doubling_k": (2, 0.8, "period-doubling", K),
-}
-CURVES = tuple(_BEGINNINGS)
-SHORT_CURVES = tuple(name for name, at in _BEGINNINGS.items() if at[0] == 1)
-
-
 def follow_curves(names: Sequence[str], branches: Sequence[Branch] = ()) -> dict[str, Boundary]:
     """Follow the named curves of `CURVES`.
 
     **Arguments:** the names; branches in ζ on which the curves may begin, such as those of the
     undamped response with k = 0.5. A missing branch is followed first.
     """
-    known: dict[tuple[int, float], Branch] = {}
-    for cycles, k, *_ in map(_BEGINNINGS.__getitem__, names):
-        if (cycles, k) not in known:
-            known[cycles, k] = _branch(cycles, k, branches)
+    begins = dict.fromkeys(CURVES[name][:2] for name in names)
+    known = {(cycles, k): _branch(cycles, k, branches) for cycles, k in begins}
 
     def follow(name: str) -> Boundary:
-        cycles, k, kind, parameter = _BEGINNINGS[name]
-        return _follow(_special(known[cycles, k], kind), parameter)
+        cycles, k, kind, parameter = CURVES[name]
+        special = (p for p in known[cycles, k].special if p.kind == kind)
+        point = min(special, key=lambda p: p.parameter)
+        other = K_RANGE if parameter == K else (0.0, C_RANGE[1] * xi_per_c())
+        return boundary(point, parameter=parameter, bounds=(RANGE, other), max_step=0.03)
 
     # Most of the time is compilation, in which two threads are faster than one.
     with ThreadPoolExecutor(2) as threads:
@@ -124,16 +103,6 @@ def _branch(cycles: int, k: float, known: Sequence[Branch]) -> Branch:
     return continue_orbit(orbit, parameter=RATIO, bounds=RANGE, max_step=MAX_STEP)
 
 
-def _special(branch: Branch, kind: str) -> Point:
-    """Return the special point of a kind with the least ζ."""
-    return min((p for p in branch.special if p.kind == kind), key=lambda p: p.parameter)
-
-
-def _follow(point: Point, parameter: str) -> Boundary:
-    other = K_RANGE if parameter == K else (0.0, C_RANGE[1] * xi_per_c())
-    return boundary(point, parameter=parameter, bounds=(RANGE, other), max_step=0.03)
-
-
 def plane_points(curve: Boundary) -> np.ndarray:
     """Return points (ζ, k) or (ζ, c) of a curve, with c in N·s/m."""
     points = curve.parameters.copy()
@@ -142,74 +111,72 @@ def plane_points(curve: Boundary) -> np.ndarray:
     return points
 
 
-def crossings(curve: Boundary, column: int, value: float) -> list[float]:
-    """Return the other coordinate, sorted, of a curve's points with a value in a column.
+def _crossing(curve: Boundary, column: int, value: float, place: int) -> float | None:
+    """Return the other coordinate of a curve's first (0) or last (-1) point with a value.
 
     Column 0 is ζ, column 1 is k or c. Splines interpolate the points; their error is below 1e-5.
+    The result is `None` if the curve does not reach the value.
     """
+    spline = _spline(curve)
+    here = CubicSpline(spline.x, plane_points(curve)[:, column])
+    found = sorted(spline(here.solve(value, extrapolate=False))[:, 1 - column].tolist())
+    return found[place] if found else None
+
+
+def _spline(curve: Boundary) -> CubicSpline:
     points = plane_points(curve)
-    spline = _spline(points)
-    here = CubicSpline(spline.x, points[:, column])
-    places = here.solve(value, extrapolate=False)
-    return sorted(float(x) for x in spline(places)[:, 1 - column])
-
-
-def _spline(points: np.ndarray) -> CubicSpline:
     scaled = points / np.ptp(points, axis=0).clip(1e-9)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(scaled, axis=0), axis=1))])
     keep = np.concatenate([[True], np.diff(length) > 1e-9])
     return CubicSpline(length[keep], points[keep])
 
 
-def _turn(curve: Boundary, pick: Callable[[np.ndarray], np.intp]) -> tuple[float, float]:
-    """Return (ζ, k) or (ζ, c) of a curve at its least or greatest k or c."""
-    points = plane_points(curve)
-    spline = _spline(points)
+def _turn(curve: Boundary, sign: int) -> list[float]:
+    """Return (ζ, k) or (ζ, c) of a curve at its least (-1) or greatest (1) k or c."""
+    spline = _spline(curve)
     fine = spline(np.linspace(spline.x[0], spline.x[-1], 20_001))
-    zeta, other = fine[pick(fine[:, 1])]
-    return float(zeta), float(other)
+    return fine[np.argmax(sign * fine[:, 1])].tolist()
 
 
-def birth_without_damping(curves: BoundaryCurves) -> float:
+def _birth_without_damping(curves: Curves) -> float:
     """Return ζ of the grazing at which the 2π motion appears, the same for every k."""
-    points = plane_points(curves.birth_c)
+    points = plane_points(curves["birth_c"])
     return float(points[np.argmin(points[:, 1]), 0])
 
 
-def describe_boundaries(curves: BoundaryCurves) -> dict[str, float | None]:
+def describe_boundaries(curves: Curves) -> dict[str, float | None]:
     """Return numbers of the curves at the figures' ζ and k, and at Table 1's c.
 
     A number is `None` if the curve does not reach this value, as the 4π curve at Table 1's c.
     """
 
-    def at(curve: Boundary, column: int, value: float, place: int) -> float | None:
-        found = crossings(curve, column, value)
-        return found[place] if found else None
+    def at(curve: str, column: int, value: float, place: int = 0) -> float | None:
+        return _crossing(curves[curve], column, value, place)
 
-    zeta, k = FREQUENCY_RATIO, RESTITUTION
-    top, bottom = _turn(curves.touch_c, np.argmax), _turn(curves.touch_k, np.argmin)
+    zeta, k, c = FREQUENCY_RATIO, RESTITUTION, table_damping()
+    top, bottom = _turn(curves["touch_c"], 1), _turn(curves["touch_k"], -1)
     return {
-        "birth, undamped, ζ": birth_without_damping(curves),
-        "doubling at k = 0.5, undamped, ζ": at(curves.doubling_k, 1, k, 0),
-        "doubling at k = 0.8, undamped, ζ": at(curves.doubling_k, 1, 0.8, 0),
-        "4π motion at k = 0.5, undamped, from ζ": at(curves.touch_k, 1, k, 0),
-        "4π motion at k = 0.5, undamped, to ζ": at(curves.touch_k, 1, k, -1),
+        "birth, undamped, ζ": _birth_without_damping(curves),
+        "doubling at k = 0.5, undamped, ζ": at("doubling_k", 1, k),
+        "doubling at k = 0.8, undamped, ζ": at("doubling_k", 1, 0.8),
+        "4π motion at k = 0.5, undamped, from ζ": at("touch_k", 1, k),
+        "4π motion at k = 0.5, undamped, to ζ": at("touch_k", 1, k, -1),
         "4π motion, undamped, from k": bottom[1],
         "4π motion, undamped, from k, at ζ": bottom[0],
-        "fold at k = 0.5, undamped, ζ": at(curves.fold_k, 1, k, 0),
-        "fold at k = 0.8, undamped, ζ": at(curves.fold_k, 1, 0.8, 0),
-        "doubling at ζ = 0.9, k = 0.5, c": at(curves.doubling_c, 0, zeta, 0),
-        "4π motion at ζ = 0.9, k = 0.5, up to c": at(curves.touch_c, 0, zeta, -1),
+        "fold at k = 0.5, undamped, ζ": at("fold_k", 1, k),
+        "fold at k = 0.8, undamped, ζ": at("fold_k", 1, 0.8),
+        "doubling at ζ = 0.9, k = 0.5, c": at("doubling_c", 0, zeta),
+        "4π motion at ζ = 0.9, k = 0.5, up to c": at("touch_c", 0, zeta, -1),
         "4π motion at k = 0.5, up to c": top[1],
         "4π motion at k = 0.5, up to c, at ζ": top[0],
-        "birth at Table 1's c, k = 0.5, ζ": at(curves.birth_c, 1, table_damping(), 0),
-        "doubling at Table 1's c, k = 0.5, ζ": at(curves.doubling_c, 1, table_damping(), 0),
-        "4π motion at Table 1's c, k = 0.5, from ζ": at(curves.touch_c, 1, table_damping(), 0),
-        "fold at Table 1's c, k = 0.5, ζ": at(curves.fold_c, 1, table_damping(), 0),
+        "birth at Table 1's c, k = 0.5, ζ": at("birth_c", 1, c),
+        "doubling at Table 1's c, k = 0.5, ζ": at("doubling_c", 1, c),
+        "4π motion at Table 1's c, k = 0.5, from ζ": at("touch_c", 1, c),
+        "fold at Table 1's c, k = 0.5, ζ": at("fold_c", 1, c),
     }
 
 
-def draw_boundaries(curves: BoundaryCurves) -> Figure:
+def draw_boundaries(curves: Curves) -> Figure:
     """Draw both planes: on the left the whole plane, on the right the region of the discrepancy.
 
     The upper row is (ζ, k), the lower row (ζ, c).
@@ -220,60 +187,56 @@ def draw_boundaries(curves: BoundaryCurves) -> Figure:
     for row, plane in zip(grid, ("k", "c"), strict=True):
         for ax, zoom in zip(row, (False, True), strict=True):
             _draw(ax, curves, plane, zoom)
+    lines = (
+        (SHORT, "grazing", "2π: born by grazing"),
+        (SHORT, "period-doubling", "2π: period doubling"),
+        (SHORT, "fold", "2π: fold"),
+        (LONG_LINE, "grazing", "4π: touches the stop again"),
+        (LONG_LINE, "period-doubling", "4π: period doubling"),
+    )
+    line = partial(Line2D, [], [])
+    marks = (("*", 11, "Figs. 3 and 4: k = 0.5, ζ = 0.9"), ("P", 9, "the same with Table 1's c"))
     handles = [
         Patch(color=SHORT_FILL, label="2π motion unstable"),
         Patch(color=LONG_FILL, label="4π with one impact, the paper's family"),
-        *(
-            Line2D([], [], color=color, lw=1.8, ls=DASHES[kind], label=label)
-            for color, kind, label in (
-                (SHORT, "grazing", "2π: born by grazing"),
-                (SHORT, "period-doubling", "2π: period doubling"),
-                (SHORT, "fold", "2π: fold"),
-                (LONG_LINE, "grazing", "4π: touches the stop again"),
-                (LONG_LINE, "period-doubling", "4π: period doubling"),
-            )
-        ),
-        Line2D(
-            [], [], color="k", marker="*", ls="none", ms=11, label="Figs. 3 and 4: k = 0.5, ζ = 0.9"
-        ),
-        Line2D([], [], color="k", marker="P", ls="none", ms=9, label="the same with Table 1's c"),
+        *(line(color=color, lw=1.8, ls=DASHES[kind], label=label) for color, kind, label in lines),
+        *(line(color="k", marker=x, ls="none", ms=size, label=label) for x, size, label in marks),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
+    legend_below(figure, handles, 3, fontsize=10)
     figure.suptitle(
         "Where the 2π motion is unstable and the paper's 4π motion exists (ideal, Δ = 2a)"
     )
     return figure
 
 
-def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
-    low, high = K_RANGE if plane == "k" else C_RANGE
+def _draw(ax: Axes, curves: Curves, plane: str, zoom: bool) -> None:
+    in_k = plane == "k"
+    low, high = K_RANGE if in_k else C_RANGE
     levels = np.linspace(low, high, 400)
-    xi = xi_per_c() * levels * (plane == "c")
-    short, long, fold = (getattr(curves, f"{x}_{plane}") for x in ("doubling", "touch", "fold"))
-    birth = plane_points(curves.birth_c)
-    if plane == "k":
-        born = birth_without_damping(curves)
-        birth = np.array([[born, low], [born, high]])
-    doubling, touch = plane_points(short), plane_points(long)
+    birth, doubling, touch, fold = (
+        plane_points(curves[name])
+        for name in ("birth_c", f"doubling_{plane}", f"touch_{plane}", f"fold_{plane}")
+    )
+    if in_k:
+        birth = np.array([[_birth_without_damping(curves), y] for y in (low, high)])
     # Birth and doubling are functions ζ(k) and ζ(c).
     left, right = (_over(points, levels) for points in (birth, doubling))
     ax.fill_betweenx(levels, left, right, color=SHORT_FILL, lw=0, zorder=0)
     ax.fill(*touch.T, color=LONG_FILL, lw=0, zorder=1)
-    upper = np.column_stack([births(xi)[1], levels])
-    for points, color, kind in (
+    upper = np.column_stack([births(xi_per_c() * levels * (not in_k))[1], levels])
+    lines = [
         (birth, SHORT, "grazing"),
         (upper, SHORT, "grazing"),
         (doubling, SHORT, "period-doubling"),
         (touch, LONG_LINE, "grazing"),
-        (curves.long_doubling_k if plane == "k" else None, LONG_LINE, "period-doubling"),
         (fold, SHORT, "fold"),
-    ):
-        if points is not None:
-            points = plane_points(points) if isinstance(points, Boundary) else points
-            ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
-    undamped = RESTITUTION if plane == "k" else 0.0
-    ax.plot(FREQUENCY_RATIO, undamped, "k*", ms=11, clip_on=False, zorder=6)
-    if plane == "c":
+    ]
+    if in_k:
+        lines.insert(4, (plane_points(curves["long_doubling_k"]), LONG_LINE, "period-doubling"))
+    for points, color, kind in lines:
+        ax.plot(*points.T, color=color, lw=1.8, ls=DASHES[kind])
+    ax.plot(FREQUENCY_RATIO, RESTITUTION if in_k else 0.0, "k*", ms=11, clip_on=False, zorder=6)
+    if not in_k:
         ax.axhline(table_damping(), color="k", lw=1.0, ls=":")
         ax.plot(FREQUENCY_RATIO, table_damping(), "kP", ms=9, zorder=6)
         if not zoom:
@@ -282,10 +245,10 @@ def _draw(ax: Axes, curves: BoundaryCurves, plane: str, zoom: bool) -> None:
                 ha="right", va="bottom", fontsize=10,
             )  # fmt: skip
     ax.set_xlim(*((0.68, 1.02) if zoom else RANGE))
-    ax.set_ylim(low, 1.0 if plane == "k" else high)
+    ax.set_ylim(low, 1.0 if in_k else high)
     ax.set_xlabel("frequency ratio ζ")
-    ax.set_ylabel("restitution k" if plane == "k" else "damping c (N·s/m)")
-    described = "without damping" if plane == "k" else f"k = {RESTITUTION:g}"
+    ax.set_ylabel("restitution k" if in_k else "damping c (N·s/m)")
+    described = "without damping" if in_k else f"k = {RESTITUTION:g}"
     ax.set_title(f"{described}, enlarged" if zoom else described, fontsize=11)
     ax.grid(alpha=0.25, lw=0.5)
 

@@ -1,30 +1,38 @@
-"""The paper's claims about Figures 3 and 4, with measurements."""
+"""The claims and assumptions of the paper, each a row with its measurement."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
-from vi_jax.flow import Run
+from tools.ideal import vibration
+from vi_jax.flow import Run, simulate
+from vi_jax.machine import Parameters, Scene, SliderCrank
 
-from .motions import Case, closed_form, half_turn_states, last_minima, run_of, sampled
-
-CONFIRMED, UNDAMPED_ONLY, CONTRADICTED = "confirmed", "confirmed undamped only", "contradicted"
-PARTLY = "confirmed in part"
+from .discrepancy import in_words, shares
+from .motions import (
+    CYCLES,
+    FREQUENCY_RATIO,
+    GAP,
+    RESTITUTION,
+    Case,
+    closed_form,
+    half_turn_states,
+    last_minima,
+    mean_ratio,
+    run_of,
+    sampled,
+)
+from .motors import MotorRun
+from .response import WALL, Response
+from .rows import PARTLY, Claim, claim, listed, verdict
 
 # A motion counts as settled while it stays this close to an orbit (unit: a, a ω): a choice.
 _SETTLED = 1e-3
-
-
-class Claim(NamedTuple):
-    """One claim of the paper."""
-
-    name: str
-    place: str
-    """The place of the claim in the paper."""
-    claimed: str
-    measured: str
-    """One sentence with the numbers."""
-    verdict: str
-    numbers: dict[str, Any]
+# Number of crank angles at the start: each is a multiple of an eighth of a turn.
+_PHASES = 8
+# A start within this distance of the 2π motion counts as near (unit: a): a choice.
+_NEAR = 0.3
 
 
 def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> list[Claim]:
@@ -33,74 +41,61 @@ def check_claims(cases: tuple[Case, Case], panels: list[dict] | None = None) -> 
     **Arguments:** the cases; the panels of Figure 2 (`describe`). Without them the claim about the
     whole figure is tested at ζ = 0.90 only.
     """
-    return [
-        _first_cycles(cases),
-        _near_short(cases),
-        _departure(cases),
-        _rounding(cases),
-        _settles(cases),
-        _agrees(cases),
-        _no_transient(cases),
-        _direct_short(cases),
-        _maximum(cases, panels or []),
-        _minimum(cases),
-    ]
+    checks = (
+        _first_cycles, _near_short, _departure, _rounding, _settles, _agrees, _no_transient,
+        _direct_short, partial(_maximum, panels or []), _minimum,
+    )  # fmt: skip
+    return [check(cases) for check in checks]
 
 
-def _verdict(undamped: bool, damped: bool | None = None) -> str:
-    if not undamped:
-        return CONTRADICTED
-    return UNDAMPED_ONLY if damped is False else CONFIRMED
+def check_figure_2(found: Response, panels: list[dict]) -> list[Claim]:
+    """Measure each claim about the whole of Figure 2.
+
+    **Arguments:** the computed response of the figure; its panels as returned by `describe`.
+    """
+    return [_free(found), *(check(panels) for check in (_everywhere, _reason, _wall))]
 
 
-def _gap(case: Case, run: Run, first: int, last: int, period: int) -> float:
-    """Return the greatest |Y - closed form| over the cycles `first` to `last` - 1 of a run.
+def check_assumptions(case: Case, motors: list[MotorRun]) -> list[Claim]:
+    """Measure the assumptions on the undamped case, and those about the motor on its runs."""
+    return [_crank_phase(case), _cosine(case), _motor(motors), _even_speed(case, motors)]
+
+
+def _each(cases: tuple[Case, Case], measure: Callable[[Case], Any]) -> dict[str, Any]:
+    return {case.name: measure(case) for case in cases}
+
+
+def _off(case: Case, part: slice, period: int) -> float:
+    """Return the greatest |Y - closed form| over a part of the cycles from rest.
 
     `period` is that of the closed form, in cycles.
     """
-    cycles = run.impacts.shape[0]
-    difference = sampled(run)[0] - closed_form(case, cycles, period)
-    return float(np.abs(difference[first:last]).max())
+    Y = sampled(case.from_rest)[0]
+    return float(np.abs(Y - closed_form(case, len(Y), period))[part].max())
 
 
-def _first_cycles(cases) -> Claim:
-    numbers = {
-        case.name: [_gap(case, case.from_rest, i, i + 1, 1) for i in range(4)] for case in cases
-    }
-    listed = {name: ", ".join(f"{x:.2f}" for x in gaps) for name, gaps in numbers.items()}
-    return Claim(
-        "first 4π from rest follow the 2π motion",
-        "Fig. 3 a",
-        "In the first 4π simulation and analysis oscillate with period 2π.",
-        f"Greatest |Y - Y(2π)| in the first, second, third and fourth cycle: {listed['undamped']} "
-        f"(damped {listed['damped']}). The first cycle is a start-up without impact; the 2π motion "
-        "is neared, undamped not reached, in the cycles after it.",
-        _verdict(max(numbers["undamped"][:2]) < 0.5),
-        {"max_difference_cycles_1_to_4": numbers},
-    )
+@claim
+def _first_cycles(cases):
+    off = _each(cases, lambda case: [_off(case, slice(i, i + 1), 1) for i in range(4)])
+    words = {name: listed("{:.2f}", gaps, ", ") for name, gaps in off.items()}
+    return words, verdict(max(off["undamped"][:2]) < 0.5), {"max_difference_cycles_1_to_4": off}
 
 
-def _near_short(cases) -> Claim:
-    minima = {case.name: np.asarray(case.from_rest.y_min)[2:4].tolist() for case in cases}
-    closed = {case.name: float(case.short.y_min[0]) for case in cases}
-    near = {
-        name: bool(np.abs(np.array(minima[name]) - closed[name]).max() < 0.2) for name in minima
-    }
-    low, high = minima["undamped"]
-    return Claim(
-        "begins near the 2π motion",
-        "Fig. 3 a, b",
-        "From rest the motion is first that of period 2π, which is unstable.",
-        f"Minima of the third and fourth cycle {low:.3f} and {high:.3f} around the 2π motion's "
-        f"{closed['undamped']:.4f}; largest |multiplier| of that {_growth(cases[0]):.4f} "
-        f"(damped {_growth(cases[1]):.4f}: stable).",
-        _verdict(near["undamped"] and _growth(cases[0]) > 1, _growth(cases[1]) > 1),
-        {
-            "minima_cycles_3_4": minima,
-            "closed_form_minimum_2pi": closed,
-            "largest_multiplier_2pi": {case.name: _growth(case) for case in cases},
-        },
-    )
+@claim
+def _near_short(cases):
+    minima = _each(cases, lambda case: np.asarray(case.from_rest.y_min)[2:4].tolist())
+    closed = _each(cases, _short_minimum)
+    growth = _each(cases, _growth)
+    near = np.abs(np.array(minima["undamped"]) - closed["undamped"]).max() < 0.2
+    return {}, verdict(bool(near) and growth["undamped"] > 1, growth["damped"] > 1), {
+        "minima_cycles_3_4": minima,
+        "closed_form_minimum_2pi": closed,
+        "largest_multiplier_2pi": growth,
+    }  # fmt: skip
+
+
+def _short_minimum(case: Case) -> float:
+    return float(case.short.y_min[0])
 
 
 def _growth(case: Case) -> float:
@@ -112,71 +107,52 @@ def _deviation(run: Run, orbit: Run) -> np.ndarray:
     return np.linalg.norm(half_turn_states(run) - half_turn_states(orbit)[0], axis=1)
 
 
+def _staying(case: Case, distance: float) -> int | None:
+    """Return the number of cycles from the 2π state within a distance, or `None` for all."""
+    gone = np.nonzero(_deviation(case.on_short, case.on_short) > distance)[0]
+    return int(gone[0]) if gone.size else None
+
+
 def _rate(deviation: np.ndarray) -> float:
     """Return the factor per cycle, from a straight line through the logarithms."""
     return float(np.exp(np.polyfit(np.arange(deviation.size), np.log(deviation), 1)[0]))
 
 
-def nudged_rate(case: Case, *, nudge: float = 1e-8) -> float:
-    """Return the growth per cycle of a deviation of `nudge` in Y from the 2π motion."""
-    start = case.scene.start(Y=case.short.Y[0] - nudge, V=case.short.V[0])
-    cycles = case.from_rest.impacts.shape[0]
-    samples = sampled(case.from_rest)[2]
-    run = run_of(case.scene, start, cycles, samples)
-    deviation = _deviation(run, case.on_short)
+def _nudged_rate(case: Case) -> float:
+    """Return the growth per cycle of a deviation of 1e-8 in Y from the 2π motion."""
+    start = case.scene.start(Y=case.short.Y[0] - 1e-8, V=case.short.V[0])
+    Y = sampled(case.from_rest)[0]
+    run = run_of(case.scene, start, *Y.shape)
     # After 12 cycles the other multiplier's part has decayed, and the deviation is still small.
-    return _rate(deviation[12:36])
+    return _rate(_deviation(run, case.on_short)[12:36])
 
 
-def _departure(cases) -> Claim:
-    rates, from_rest = {}, {}
-    for case in cases:
-        rates[case.name] = nudged_rate(case)
-        from_rest[case.name] = _rate(_deviation(case.from_rest, case.on_short)[3:15])
-    predicted = {case.name: _growth(case) for case in cases}
+@claim
+def _departure(cases):
+    rates, predicted = _each(cases, _nudged_rate), _each(cases, _growth)
     fits = abs(rates["undamped"] - predicted["undamped"]) < 1e-3
-    return Claim(
-        "leaves the 2π motion",
-        "Fig. 3 b",
-        "The slider goes from an unstable to a stable solution.",
-        f"A deviation of 1e-8 grows by {rates['undamped']:.5f} a cycle (multiplier "
-        f"{predicted['undamped']:.5f}); from rest, cycles 4 to 15, by "
-        f"{from_rest['undamped']:.3f}. Damped it shrinks by {rates['damped']:.5f} a cycle "
-        f"(multiplier {predicted['damped']:.5f}).",
-        _verdict(fits and rates["undamped"] > 1, rates["damped"] > 1),
-        {
-            "rate_small_deviation": rates,
-            "rate_from_rest": from_rest,
-            "largest_multiplier_2pi": predicted,
-        },
-    )
+    return {}, verdict(fits and rates["undamped"] > 1, rates["damped"] > 1), {
+        "rate_small_deviation": rates,
+        "rate_from_rest": _each(
+            cases, lambda case: _rate(_deviation(case.from_rest, case.on_short)[3:15])
+        ),
+        "largest_multiplier_2pi": predicted,
+    }  # fmt: skip
 
 
-def _rounding(cases) -> Claim:
-    case = cases[0]
-    from_rest = _deviation(case.from_rest, case.on_short)
+@claim
+def _rounding(cases):
+    case, cycles = cases[0], _staying(cases[0], 0.1)
+    fourth = float(_deviation(case.from_rest, case.on_short)[3])
     on_orbit = _deviation(case.on_short, case.on_short)
-    gone = np.nonzero(on_orbit > 0.1)[0]
-    stays = int(gone[0]) if gone.size else None
-    staying = (
-        f"leaves it (by 0.1) only after {stays} cycles"
-        if stays is not None
-        else f"is within {on_orbit.max():.1g} of it after all {on_orbit.size} cycles"
-    )
-    return Claim(
-        "rounding errors drive the transient",
-        "Results, on Fig. 3 b",
-        "Rounding errors add up and push the motion from the unstable to the stable solution.",
-        f"From rest the motion is {from_rest[3]:.2f} away from the 2π motion in the fourth cycle "
-        "already, which needs no rounding error. Started on the 2π motion to rounding, it "
-        f"{staying}.",
-        CONTRADICTED if from_rest[3] > 1e-6 else CONFIRMED,
-        {
-            "deviation_fourth_cycle": float(from_rest[3]),
-            "cycles_on_2pi_motion_to_rounding": stays,
-            "deviation_last_cycle_from_2pi_start": float(on_orbit[-1]),
-        },
-    )
+    staying = f"is within {on_orbit.max():.1g} of it after all {on_orbit.size} cycles"
+    if cycles is not None:
+        staying = f"leaves it (by 0.1) only after {cycles} cycles"
+    return {"staying": staying}, verdict(fourth <= 1e-6), {
+        "deviation_fourth_cycle": fourth,
+        "cycles_on_2pi_motion_to_rounding": cycles,
+        "deviation_last_cycle_from_2pi_start": float(on_orbit[-1]),
+    }  # fmt: skip
 
 
 def _settling(run: Run, orbit: Run, period: int, shift: int) -> int | None:
@@ -188,146 +164,222 @@ def _settling(run: Run, orbit: Run, period: int, shift: int) -> int | None:
     return settled if settled < len(states) else None
 
 
-def _settles(cases) -> Claim:
+@claim
+def _settles(cases):
     case, damped = cases
     on_long = _settling(case.from_rest, case.from_long, 2, case.long_shift)
     on_short = _settling(damped.from_rest, damped.on_short, 1, 0)
-    minima, last = last_minima(case.from_rest), last_minima(damped.from_rest)
-    return Claim(
-        "settles on the 4π motion",
-        "Fig. 3 b, c",
-        "In the end the motion has the period 4π.",
-        f"Within 1e-3 of the 4π motion from cycle {on_long} on; minima {minima[0]:.4f} and "
-        f"{minima[1]:.4f}. Damped it settles on the 2π motion instead, from cycle {on_short} on, "
-        f"minima {last[0]:.4f}.",
-        _verdict(on_long is not None, on_short is None),
-        {
-            "cycle_settled_on_4pi_undamped": on_long,
-            "cycle_settled_on_2pi_damped": on_short,
-            "last_minima": {"undamped": minima, "damped": last},
-        },
-    )
+    return {}, verdict(on_long is not None, on_short is None), {
+        "cycle_settled_on_4pi_undamped": on_long,
+        "cycle_settled_on_2pi_damped": on_short,
+        "last_minima": _each(cases, lambda case: last_minima(case.from_rest)),
+    }  # fmt: skip
 
 
-def _agrees(cases) -> Claim:
+@claim
+def _agrees(cases):
     case, damped = cases
-    cycles = case.from_rest.impacts.shape[0]
-    worst = _gap(case, case.from_rest, cycles - 2, cycles, 2)
-    short = {each.name: _gap(each, each.from_rest, cycles - 2, cycles, 1) for each in cases}
-    side = "second" if case.long_shift else "first"
-    clearance = float(damped.long.clearance[0])
-    tolerance = 1e-8 if cycles >= 200 else 1e-3
-    return Claim(
-        "simulation and 4π closed form agree",
-        "Fig. 3 c, conclusion",
-        "The 4π analysis and the final numerical motion align perfectly.",
-        f"Over the last 4π |Y - Y(4π)| is at most {worst:.1e}, with the closed form on its {side} "
-        f"section at even cycles. Damped there is no such motion: the closed form passes the stop "
-        f"by {-clearance:.3f}; the run differs from the 2π closed form by at most "
-        f"{short['damped']:.1e}.",
-        _verdict(worst < tolerance, damped.long_exists),
-        {
-            "max_difference_last_4pi_to_4pi_undamped": worst,
-            "max_difference_last_4pi_to_2pi": short,
-            "alignment_section": side,
-            "clearance_4pi_damped": clearance,
-        },
-    )
+    last = slice(-2, None)
+    worst, clearance = _off(case, last, 2), float(damped.long.clearance[0])
+    tolerance = 1e-8 if case.from_rest.impacts.shape[0] >= 200 else 1e-3
+    return {"over": -clearance}, verdict(worst < tolerance, damped.long_exists), {
+        "max_difference_last_4pi_to_4pi_undamped": worst,
+        "max_difference_last_4pi_to_2pi": _each(cases, lambda case: _off(case, last, 1)),
+        "alignment_section": "second" if case.long_shift else "first",
+        "clearance_4pi_damped": clearance,
+    }  # fmt: skip
 
 
-def _no_transient(cases) -> Claim:
+@claim
+def _no_transient(cases):
     case, damped = cases
     states = half_turn_states(case.from_fit)
     worst = float(np.abs(states - states[np.arange(len(states)) % 2]).max())
     left = _settling(damped.from_fit, damped.on_short, 1, 0)
-    return Claim(
-        "no transient from the 4π state",
-        "Fig. 4 a, b, c",
-        "With accurate initial conditions the motion has the period 4π from the start.",
-        f"From initial conditions fitted by gradient, over {len(states)} cycles the states at "
-        "φ = π differ from those of the first two cycles "
-        f"by at most {worst:.1e}. Damped the same start leads to the 2π motion, from cycle {left} "
-        "on.",
-        _verdict(worst < 1e-8, left is None),
-        {"max_deviation_undamped": worst, "cycle_settled_on_2pi_damped": left},
-    )
+    numbers = {"max_deviation_undamped": worst, "cycle_settled_on_2pi_damped": left}
+    return {"cycles": len(states)}, verdict(worst < 1e-8, left is None), numbers
 
 
-def _direct_short(cases) -> Claim:
-    stays, growth = {}, {}
-    for case in cases:
-        off = _deviation(case.on_short, case.on_short)
-        gone = np.nonzero(off > 0.05)[0]
-        stays[case.name] = int(gone[0]) if gone.size else off.size
-        growth[case.name] = _growth(case)
+@claim
+def _direct_short(cases):
     cycles = cases[0].on_short.impacts.shape[0]
-    held = f"{stays['undamped']} cycles" if stays["undamped"] < cycles else f"all {cycles} cycles"
-    return Claim(
-        "direct 2π solutions by initial conditions",
-        "Conclusion",
-        "By varying the initial conditions direct numerical solutions of period 2π were obtained.",
-        f"Started on the closed form's state the motion is of period 2π at once and stays within "
-        f"0.05 of it for {held}. Undamped it is unstable ({growth['undamped']:.4f} a cycle), so "
-        "that rounding ends it at last; with Table 1's damping it is stable. The Results speak of "
-        "4π where the Conclusion says 2π; both can be had.",
-        _verdict(stays["undamped"] >= min(cycles, 100)),
-        {"cycles_within_0.05": stays, "largest_multiplier_2pi": growth, "cycles": cycles},
-    )
+    stays = {name: cycles if x is None else x for name, x in
+             _each(cases, lambda case: _staying(case, 0.05)).items()}  # fmt: skip
+    held = "all " * (stays["undamped"] == cycles) + str(stays["undamped"])
+    return {"held": held}, verdict(stays["undamped"] >= min(cycles, 100)), {
+        "cycles_within_0.05": stays,
+        "largest_multiplier_2pi": _each(cases, _growth),
+        "cycles": cycles,
+    }  # fmt: skip
 
 
-def _maximum(cases, panels: list[dict]) -> Claim:
-    stop = float(cases[0].scene.stops[0].gap)
+@claim
+def _maximum(panels, cases):
+    stop, undamped = float(cases[0].scene.stops[0].gap), cases[0]
+    ends = _each(cases, lambda case: float(np.asarray(case.from_rest.y_max)[-2:].max()))
     top = {
-        "simulation": float(np.asarray(cases[0].from_rest.y_max)[-2:].max()),
-        "closed_form_2pi": float(cases[0].short.y_max[0]),
-        "closed_form_4pi": float(cases[0].long.y_max[0]),
-        "simulation_damped": float(np.asarray(cases[1].from_rest.y_max)[-2:].max()),
+        "simulation": ends["undamped"],
+        "closed_form_2pi": float(undamped.short.y_max[0]),
+        "closed_form_4pi": float(undamped.long.y_max[0]),
+        "simulation_damped": ends["damped"],
     }
     worst = max(abs(y - stop) for y in top.values())
-    listed = (
-        f"differ from the stop by at most {worst:.1g}" if worst else "are the stop to the last bit"
-    )
-    swept = [at for panel in panels for at in panel["sweeps"].values()]
+    off = "are the stop to the last bit"
+    if worst:
+        off = f"differ from the stop by at most {worst:.1g}"
+    swept = _sweeps(panels).values()
     values, struck = (sum(at[name] for at in swept) for name in ("values", "impacting"))
     wide = max((at["maximum_off"] for at in swept), default=0.0)
-    figure_2 = (
-        f" In Figure 2 {struck} of the {values} swept values between BB' and CC', of all panels, "
-        f"have impacts; their maxima are off the stop by at most {wide:.1g}."
-        if swept
-        else " Figure 2 was not computed."
-    )
-    return Claim(
-        "no discrepancy of the maximum",
-        "Results, on Fig. 2",
-        "Both are impact solutions, so the maximum is the stop for both.",
-        f"At ζ = 0.90 the maxima over the period {listed}: simulations and closed forms, undamped "
-        f"and damped.{figure_2}",
-        _verdict(max(worst, wide) < 1e-9 and struck == values),
-        {
-            "stop": stop,
-            "maximum": top,
-            "figure_2_values": values,
-            "figure_2_values_with_impacts": struck,
-            "figure_2_largest_difference": wide if swept else None,
-        },
-    )
+    return {"off": off}, verdict(max(worst, wide) < 1e-9 and struck == values), {
+        "stop": stop,
+        "maximum": top,
+        "figure_2_values": values,
+        "figure_2_values_with_impacts": struck,
+        "figure_2_largest_difference": wide,
+    }  # fmt: skip
 
 
-def _minimum(cases) -> Claim:
-    simulated = {case.name: last_minima(case.from_rest)[0] for case in cases}
-    analysis = {case.name: float(case.short.y_min[0]) for case in cases}
-    apart = {name: abs(simulated[name] - analysis[name]) for name in simulated}
-    return Claim(
-        "discrepancy of the minimum",
-        "Fig. 2, 3 c",
-        "The simulation's minimum lies below that of the 2π analysis.",
-        f"Simulated minimum {simulated['undamped']:.4f}, 2π analysis {analysis['undamped']:.4f}, "
-        f"4π analysis {float(cases[0].long.y_min[0]):.4f}. Damped: simulated "
-        f"{simulated['damped']:.4f}, 2π analysis {analysis['damped']:.4f}.",
-        _verdict(apart["undamped"] > 0.1, apart["damped"] > 0.1),
-        {
-            "simulated": simulated,
-            "closed_form_2pi": analysis,
-            "closed_form_4pi_undamped": float(cases[0].long.y_min[0]),
-        },
+@claim
+def _minimum(cases):
+    simulated = _each(cases, lambda case: last_minima(case.from_rest)[0])
+    analysis = _each(cases, _short_minimum)
+    differ = {name: abs(simulated[name] - analysis[name]) > 0.1 for name in simulated}
+    return {}, verdict(differ["undamped"], differ["damped"]), {
+        "simulated": simulated,
+        "closed_form_2pi": analysis,
+        "closed_form_4pi_undamped": float(cases[0].long.y_min[0]),
+    }  # fmt: skip
+
+
+def _sweeps(panels: list[dict]) -> dict[str, dict]:
+    """Return the sweeps of all panels, by their panel and direction in words."""
+    return {f"{in_words(panel)}, {name}": at for panel in panels for name, at in
+            panel["sweeps"].items()}  # fmt: skip
+
+
+@claim
+def _free(found):
+    off, count = {}, 0
+    for system in found.systems:
+        if not system.damping_ratio:
+            continue  # undamped the free vibration never dies out
+        free = np.abs(vibration(found.ratios, system.damping_ratio))
+        for name, at in system.sweeps.items():
+            quiet = np.asarray(at.impacts) == 0
+            both = np.abs(np.stack([at.y_max - free, at.y_min + free]))[:, quiet]
+            off[f"k = {system.restitution:g}, {name}"] = float(both.max())
+            count += int(quiet.sum())
+    worst = max(off.values())
+    words = {"quiet": count, "worst": worst, "A": 1 / np.abs(1 - np.array([0.6, 1.4]) ** 2)}
+    return words, verdict(worst < 1e-6), {"largest_difference_damped": off}
+
+
+@claim
+def _everywhere(panels):
+    apart = {name: (at["apart"], at["values"]) for name, at in _sweeps(panels).items()}
+    some, full = (sum(x[i] for x in apart.values()) for i in (0, 1))
+    names = "restitution", "damping_ratio", "BB", "CC"
+    lines = listed(
+        "k = {:g}, ξ = {:.3f}: {:.5f} to {:.5f}", [tuple(map(x.get, names)) for x in panels]
     )
+    words = {"some": some, "all": full, "lines": lines}
+    return words, verdict(True, some == full, PARTLY), {"apart_and_values": apart}
+
+
+@claim
+def _reason(panels):
+    parts = [(name, *shares(at)) for name, at in _sweeps(panels).items()]
+    numbers = {name: {"4pi_one_impact": one, "any_4pi": four} for name, one, four in parts}
+    named = any(one for _, one, _ in parts)
+    return {"parts": listed("{} {:.0%} and {:.0%}", parts)}, verdict(named, False, PARTLY), numbers
+
+
+@claim
+def _wall(panels):
+    keys = {"values": "values", "analysis_clear": "analysis_clear_of_the_wall",
+            "sweep_reaches": "sweep_reaches_the_wall"}  # fmt: skip
+    sweeps = {name: {key: at[x] for key, x in keys.items()} for name, at in _sweeps(panels).items()}
+    counts = [(name, x["sweep_reaches"], x["values"]) for name, x in sweeps.items()]
+    clear = all(x["analysis_clear"] == x["values"] for x in sweeps.values())
+    reach = [count for _, count, _ in counts]
+    where = "everywhere" if clear else "not everywhere"
+    words = {"where": where, "parts": listed("{} {} of {}", counts)}
+    judged = verdict(clear and any(reach), all(reach), PARTLY)
+    return words, judged, {"wall": WALL, "sweeps": sweeps}
+
+
+@claim
+def _crank_phase(case):
+    cycles, size = sampled(case.from_rest)[0].shape
+    short = sampled(case.on_short)[0][0]
+    apart, ends = {}, []
+    for i in range(_PHASES):
+        scene = case.scene.at_section(2 * np.pi * i / _PHASES)
+        Y = sampled(run_of(scene, scene.start(), cycles, size))[0]
+        off = np.abs(Y - np.roll(short, -size * i // _PHASES))
+        apart[f"{2 * i / _PHASES:g}"] = off[2:4].max(axis=1).tolist()
+        ends.append(float(Y[-2:].min()))
+    near = [max(x) < _NEAR for x in apart.values()]
+    settled = all(abs(y - float(case.long.y_min[0])) < 1e-2 for y in ends)
+    items = [(*x, name) for name, x in apart.items()]
+    words = {
+        "parts": listed("{:.2f}/{:.2f} at {}π", items, ", "),
+        "settled": "all" if settled else "not all",
+    }
+    numbers = {"max_difference_cycles_3_4_by_phase_over_pi": apart, "last_minima": ends}
+    return words, verdict(near[0], all(near), PARTLY), numbers
+
+
+@claim
+def _cosine(case):
+    exact = Parameters().scene(crank="slider").crank
+    assert isinstance(exact, SliderCrank)
+    scene = Scene.ideal(
+        frequency_ratio=FREQUENCY_RATIO, restitution=RESTITUTION, gap=GAP, crank=exact
+    )
+    start = scene.start(Y=case.long.Y[0], V=case.long.V[0])
+    run = simulate(scene, start, CYCLES, throw=True)
+    Y = np.asarray(run.sections.Y)
+    repeats, impacts = float(np.abs(Y[-1] - Y[-3])), int(np.sum(np.asarray(run.impacts)[-2:]))
+    words = {"cycles": CYCLES, "impacts": impacts}
+    return words, verdict(repeats < 1e-6 and impacts == 1), {
+        "minima_exact": last_minima(run),
+        "minima_cosine": last_minima(case.from_long),
+        "repeats_to": repeats,
+    }  # fmt: skip
+
+
+@claim
+def _motor(motors):
+    numbers = {
+        f"{run.torque:g}": {
+            "kappa": run.kappa,
+            "frequency_ratio": mean_ratio(run.orbit),
+            "minimum": float(run.orbit.y_min),
+            "largest_multiplier": float(abs(complex(run.orbit.multipliers[0]))),
+            "minima_cycles_3_4_from_rest": np.asarray(run.from_rest.y_min)[2:4].tolist(),
+            "last_minima_from_rest": last_minima(run.from_rest),
+        }
+        for run in motors
+    }
+    parts = listed(
+        "T0 = {0} N·m, κ = {1[kappa]:.4f}: minimum {1[minimum]:.3f}, largest multiplier "
+        "{1[largest_multiplier]:.3f}, from rest {1[minima_cycles_3_4_from_rest][0]:.2f} and "
+        "{1[minima_cycles_3_4_from_rest][1]:.2f} in cycles 3 and 4, "
+        "{1[last_minima_from_rest][0]:.3f} in the end",
+        numbers.items(),
+    )
+    same = all(
+        x["largest_multiplier"] < 1 and abs(x["last_minima_from_rest"][0] - x["minimum"]) < 1e-6
+        for x in numbers.values()
+    )
+    return {"parts": parts}, verdict(same), {"by_torque": numbers}
+
+
+@claim
+def _even_speed(case, motors):
+    variation = {f"{run.torque:g}": run.speed_variation for run in motors}
+    parts = listed("{1:.2%} with T0 = {0}", variation.items(), ", ").replace("%", " %")
+    off = max(abs(float(run.orbit.y_min - case.long.y_min[0])) for run in motors)
+    words = {"parts": parts, "off": off}
+    return words, verdict(max(variation.values()) < 0.1), {"variation_by_torque": variation}

@@ -11,8 +11,15 @@ from vi_jax.orbit import Orbit, closed_form_orbits, find_orbit
 from vi_jax.plot import STOP, angle_axis, color_of
 
 from .figures import common_legend
-from .motions import CYCLES, FREQUENCY_RATIO, RESTITUTION, SAMPLES, figure_scene
-from .orbits import TableRow, mean_ratio
+from .motions import (
+    CYCLES,
+    FREQUENCY_RATIO,
+    RESTITUTION,
+    SAMPLES,
+    TableRow,
+    figure_scene,
+    mean_ratio,
+)
 
 # T0 in N·m: a choice around Table 1's 10.
 TORQUES = (2.0, 10.0, 100.0)
@@ -47,15 +54,6 @@ class MotorRun(NamedTuple):
         return float(np.ptp(W) / FREQUENCY_RATIO)
 
 
-class Motors(NamedTuple):
-    """All results for the motors of Table 1."""
-
-    rows: list[TableRow]
-    runs: list[MotorRun]
-    ideal_minimum: float
-    """Smallest Y of the ideal drive's 4π motion."""
-
-
 def _machine(torque: Any, kappa: Any, k: Any, c: Any) -> Scene:
     return Parameters(torque=torque, control=kappa, restitution=k, damping=c).scene()
 
@@ -85,7 +83,7 @@ def _run(torque: float, kappa: float, **start: Any) -> Run:
     return simulate(scene, scene.start(**start), CYCLES, samples=SAMPLES)
 
 
-def simulate_motors() -> Motors:
+def simulate_motors() -> tuple[list[TableRow], list[MotorRun]]:
     """Return the motions of Figures 3 and 4 with each motor of Table 1, and their runs."""
     rows, runs = [], []
     for k, c, words in _MACHINES:
@@ -97,8 +95,7 @@ def simulate_motors() -> Motors:
                 there = {name: float(getattr(orbit.state, name)) for name in "YVW"}
                 from_rest = _run(torque, kappa, Y=0.0, V=0.0, W=kappa)
                 runs.append(MotorRun(torque, kappa, orbit, from_rest, _run(torque, kappa, **there)))
-    ideal = closed_form_orbits(figure_scene(0.0), cycles=2)
-    return Motors(rows, runs, float(ideal.y_min[0]))
+    return rows, runs
 
 
 def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
@@ -130,7 +127,7 @@ def draw_motors(motors: Sequence[MotorRun], ideal: Run) -> Figure:
             ax.grid(alpha=0.25, lw=0.5)
     grid[0, 0].set_ylabel("Y = y/a")
     grid[1, 0].set_ylabel("crank speed dφ/dτ (ω)")
-    common_legend(figure, grid[:, 0], ncols=4)
+    common_legend(figure, grid[:, 0], 4)
     figure.suptitle(
         f"Figures 3 and 4 with the motor: the last 8π of {CYCLES} cycles from rest "
         "(k = 0.50, undamped, Δ = 2a, mean ζ = 0.90)"

@@ -6,38 +6,28 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib.figure import Figure
 from tools.pictures import save_picture
-from vi_jax.machine import Parameters, Scene
+from vi_jax.machine import Parameters
 from vi_jax.orbit import Boundary
 from vi_jax.plot import plot_sketch
 
-from .assumptions import check_assumptions, check_motor
-from .boundaries import (
-    CURVES,
-    SHORT_CURVES,
-    BoundaryCurves,
-    describe_boundaries,
-    draw_boundaries,
-    follow_curves,
-)
-from .claims import Claim, check_claims
-from .discrepancy import describe
+from .boundaries import CURVES, describe_boundaries, draw_boundaries, follow_curves
+from .claims import check_assumptions, check_claims, check_figure_2
+from .discrepancy import describe, in_words, motion_name
 from .faults import check_faults
-from .figure2_claims import check_figure_2
 from .figures import draw_figure
-from .motions import figure_scene, simulate_cases, table_damping_ratio
+from .motions import figure_scene, orbit_table, simulate_cases, table_damping_ratio
 from .motors import draw_motors, simulate_motors
-from .orbits import orbit_table
 from .pages import Findings, as_json, as_markdown
 from .response import response
 from .response_figure import LOOK, draw_response
+from .rows import Claim
 
 KEPT = Path(__file__).parent / "report" / "report.json"
 """The report of an earlier run, with which each run is compared."""
-LONG_CURVES = tuple(name for name in CURVES if name not in SHORT_CURVES)
 # Located points agree to rounding, splines through curves to 1e-5.
 _AGREE = 1e-5
 
@@ -53,16 +43,6 @@ STEPS = (
 )
 
 
-class Figure2(NamedTuple):
-    """The results of Figure 2."""
-
-    panels: dict[str, Any]
-    """The panels as returned by `describe`."""
-    claims: list[Claim]
-    curves: dict[str, Boundary]
-    """The curves of `LONG_CURVES`, which begin on its branches."""
-
-
 def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
     """Draw Figures 1 to 4 and the boundaries of the discrepancy, and write the report.
 
@@ -76,20 +56,14 @@ def reproduce(out: Path, tell: Callable[[str], None]) -> Findings:
     # Ctrl-C ends the other process too, without a traceback.
     end = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
     with ProcessPoolExecutor(1, get_context("spawn"), **end) as second:
-        later = second.submit(figure_2, out)
-        findings = _findings(out, _each(tell), later.result)
+        later = second.submit(_figure_2, out)
+        findings = _findings(out, map(tell, STEPS).__next__, later.result)
     (out / "report.json").write_text(as_json(findings), encoding="utf-8")
     (out / "report.md").write_text(as_markdown(findings), encoding="utf-8")
     return findings
 
 
-def _each(tell: Callable[[str], None]) -> Callable[[], None]:
-    """Return a function that reports the next step."""
-    steps = iter(STEPS)
-    return lambda: tell(next(steps))
-
-
-def _findings(out: Path, begin: Callable[[], None], figure_2: Callable[[], Figure2]) -> Findings:
+def _findings(out: Path, begin: Callable[[], None], figure_2: Callable[[], Any]) -> Findings:
     begin()
     cases = simulate_cases()
     begin()
@@ -101,41 +75,37 @@ def _findings(out: Path, begin: Callable[[], None], figure_2: Callable[[], Figur
     begin()
     faults = check_faults()
     begin()
-    orbits = orbit_table(_table_scenes())
-    begin()
-    motors = simulate_motors()
-    save_picture(draw_motors(motors.runs, cases[0].from_rest), out / "motor.png")
-    begin()
-    curves = follow_curves(SHORT_CURVES)
-    begin()
-    found = figure_2()
-    bounds = BoundaryCurves(**curves, **found.curves)
-    save_picture(draw_boundaries(bounds), out / "boundaries.png")
-    begin()
-    claims = check_claims(cases, found.panels["panels"]) + found.claims
-    claims += check_assumptions(cases[0]) + check_motor(motors)
-    borders = describe_boundaries(bounds)
-    return Findings(cases, claims, faults, orbits + motors.rows, found.panels, borders)
-
-
-def figure_2(out: Path) -> Figure2:
-    """Draw Figure 2 into a folder, measure it, and follow the curves that begin on it."""
-    found = response()
-    save_picture(draw_response(found), out / "fig2.png", **LOOK)
-    panels = describe(found)
-    branches = [branch for system in found.systems for branch in system.branches]
-    curves = follow_curves(LONG_CURVES, branches)
-    return Figure2(panels, check_figure_2(found, panels["panels"]), curves)
-
-
-def _table_scenes() -> dict[str, Scene]:
-    """Return the ideal scenes whose 2π and 4π motions are listed."""
     table = table_damping_ratio()
-    return {
+    orbits = orbit_table({
         "k = 0.5, undamped": figure_scene(0.0),
         "k = 0.5, Table 1's damping": figure_scene(table),
         "k = 0.8, Table 1's damping": figure_scene(table, restitution=0.8),
-    }
+    })  # fmt: skip
+    begin()
+    motor_orbits, motors = simulate_motors()
+    save_picture(draw_motors(motors, cases[0].from_rest), out / "motor.png")
+    begin()
+    curves = follow_curves([name for name, at in CURVES.items() if at[0] == 1])
+    begin()
+    panels, figure_2_claims, long_curves = figure_2()
+    curves |= long_curves
+    save_picture(draw_boundaries(curves), out / "boundaries.png")
+    begin()
+    claims = check_claims(cases, panels["panels"]) + figure_2_claims
+    claims += check_assumptions(cases[0], motors)
+    borders = describe_boundaries(curves)
+    return Findings(cases, claims, faults, orbits + motor_orbits, panels, borders)
+
+
+def _figure_2(out: Path) -> tuple[dict[str, Any], list[Claim], dict[str, Boundary]]:
+    """Draw Figure 2 into a folder; return its panels, its claims, and the curves of 4π motions,
+    which begin on its branches."""
+    found = response()
+    panels = describe(found)
+    save_picture(draw_response(found, panels["panels"]), out / "fig2.png", **LOOK)
+    branches = [branch for system in found.systems for branch in system.branches]
+    curves = follow_curves([name for name, at in CURVES.items() if at[0] == 2], branches)
+    return panels, check_figure_2(found, panels["panels"]), curves
 
 
 def summary(claims: Sequence[Claim]) -> str:
@@ -155,7 +125,7 @@ def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
         for name in {**others, **verdicts}
         if verdicts.get(name) != others.get(name)
     ]
-    places, beside = headline_numbers(new), headline_numbers(kept)
+    places, beside = _headline_numbers(new), _headline_numbers(kept)
     return found + [
         f"{name}: {places.get(name)}, kept: {beside.get(name)}"
         for name in {**beside, **places}
@@ -163,18 +133,15 @@ def differences(new: dict[str, Any], kept: dict[str, Any]) -> list[str]:
     ]
 
 
-def headline_numbers(report: dict[str, Any]) -> dict[str, float]:
+def _headline_numbers(report: dict[str, Any]) -> dict[str, float]:
     """Return the boundaries of a report and the special points of its Figure 2, by name."""
     numbers = {name: x for name, x in report["boundaries"].items() if x is not None}
     for panel in report["figure_2"]["panels"]:
-        damped = "damped" if panel["damping_ratio"] else "undamped"
-        of = f"k = {panel['restitution']:g}, {damped}"
+        of = in_words(panel)
         numbers |= {f"{of}: BB'": panel["BB"], f"{of}: CC'": panel["CC"]}
-        for point in panel["special_points"]:
-            count = point["impacts"]
-            motion = f"{2 * point['cycles']}π, {count} impact{'s' * (count > 1)}"
-            at = point["frequency_ratio"]
-            numbers[f"{of}, {motion}: {point['kind']} {at:.3f}"] = at
+        for x in panel["special_points"]:
+            name, at = motion_name(x["cycles"], x["impacts"]), x["frequency_ratio"]
+            numbers[f"{of}, {name}: {x['kind']} {at:.3f}"] = at
     return numbers
 
 

@@ -4,12 +4,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from tools.ideal import closed_forms, vibration
 from vi_jax.flow import jit
 from vi_jax.machine import Scene, with_leaf
-from vi_jax.orbit import Branch, ClosedFormOrbits, closed_form_orbits, continue_orbit, find_orbit
+from vi_jax.orbit import Branch, ClosedFormOrbits, continue_orbit, find_orbit
 from vi_jax.scans import REGIMES, Sweep, lyapunov, sweep
 
 from .motions import GAP, table_damping_ratio
@@ -28,6 +28,8 @@ WALL = -2.5
 FINE = (0.695, 1.015)
 # The longest period that is detected, in cycles: a choice.
 LONGEST = 12
+# The sweeps of rising and of falling ζ.
+DIRECTIONS = "run-up", "close-down"
 # Lanes of the programs that settle single values again; a fixed number needs only one program.
 _LANES = 128
 
@@ -44,7 +46,7 @@ class System(NamedTuple):
     stretch: tuple[float, float]
     """ζ of BB' and CC': first grazing and period doubling of the 2π impact motion."""
     sweeps: dict[str, Sweep]
-    """The sweeps of rising and of falling ζ, by the names "run-up" and "close-down"."""
+    """The sweeps by the names in `DIRECTIONS`."""
     exponents: dict[str, np.ndarray]
     """Largest Lyapunov exponent per drive cycle if a sweep has no period, else NaN."""
 
@@ -61,42 +63,24 @@ class Response(NamedTuple):
 def response() -> Response:
     """Return closed forms, continued branches and both sweeps, for both k and both ξ."""
     low, high = RANGE
-    ratios = np.concatenate(
-        [
-            np.arange(low, FINE[0], 0.01),
-            np.arange(FINE[0], FINE[1] - 0.001, 0.002),
-            np.arange(FINE[1], high + 0.005, 0.01),
-        ]
-    )
+    steps = (low, FINE[0], 0.01), (FINE[0], FINE[1] - 0.001, 0.002), (FINE[1], high + 0.005, 0.01)
+    ratios = np.concatenate([np.arange(*step) for step in steps])
     scene = Scene.ideal(frequency_ratio=0.9, restitution=0.5, gap=GAP, damping_ratio=0.0)
     numbers = [(k, xi) for k in RESTITUTIONS for xi in (0.0, table_damping_ratio())]
-    grid = jnp.asarray(numbers)
-    closed = {
-        n: jtu.tree_map(np.asarray, _closed_forms(scene, grid, ratios, cycles=n)) for n in (1, 2)
-    }
-    each = [{n: jtu.tree_map(lambda x, i=i: x[i], closed[n]) for n in closed} for i in range(4)]
-    settled = _sweeps(scene, numbers, ratios)
     systems = []
-    for (k, xi), forms, (sweeps, exponents) in zip(numbers, each, settled, strict=True):
-        branches, stretch = _branches(with_numbers(scene, k, xi, 0.9), ratios, forms[1])
-        systems.append(System(k, xi, forms, branches, stretch, sweeps, exponents))
+    for pair, settled in zip(numbers, _sweeps(scene, numbers, ratios), strict=True):
+        points = np.column_stack([ratios, np.tile(pair, (len(ratios), 1))])
+        forms = {n: closed_forms(points, n) for n in (1, 2)}
+        branches = _branches(_with_numbers(scene, *pair, 0.9), ratios, forms[1])
+        systems.append(System(*pair, forms, *branches, *settled))
     return Response(ratios, systems)
 
 
-def with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
+def _with_numbers(scene: Scene, k: object, xi: object, ratio: object) -> Any:
     """Return the scene with this k, this ξ and this ζ."""
     for name, value in ((BOUNCE, k), (DAMPING, xi), (RATIO, ratio)):
         scene = with_leaf(scene, name, value)
     return scene
-
-
-# Without optimisation it compiles in half of the time, and it still runs within milliseconds.
-@partial(jit, static_argnames="cycles", compiler_options={"xla_backend_optimization_level": 0})
-def _closed_forms(scene: Scene, grid, ratios, *, cycles: int) -> ClosedFormOrbits:
-    def one(numbers, ratio):
-        return closed_form_orbits(with_numbers(scene, numbers[0], numbers[1], ratio), cycles=cycles)
-
-    return jax.vmap(lambda numbers: jax.vmap(lambda z: one(numbers, z))(ratios))(grid)
 
 
 def _branches(
@@ -137,7 +121,7 @@ def _carried(scene: Scene, numbers, values, starts, settle: int) -> Sweep:
     """
 
     def one(numbers, values, start):
-        here = with_numbers(scene, numbers[0], numbers[1], values[0])
+        here = _with_numbers(scene, numbers[0], numbers[1], values[0])
         return sweep(
             here, RATIO, values, start=start, settle=settle, cycles=2 * LONGEST, tolerance=1e-9
         )
@@ -150,18 +134,16 @@ def _exponents(scene: Scene, numbers, values, starts):
     """Return the largest Lyapunov exponents per drive cycle."""
 
     def one(numbers, value, start):
-        here = with_numbers(scene, numbers[0], numbers[1], value)
+        here = _with_numbers(scene, numbers[0], numbers[1], value)
         return lyapunov(here, start, 500, settle=0, number=1).per_cycle[0]
 
     return jax.vmap(one)(numbers, values, starts)
 
 
 def _sweeps(
-    scene: Scene,
-    numbers: list[tuple[float, float]],
-    ratios: np.ndarray,
-) -> list[tuple[dict[str, Sweep], dict[str, np.ndarray]]]:
-    """Return run-up and close-down of each system, all computed in one program.
+    scene: Scene, numbers: list[tuple[float, float]], ratios: np.ndarray
+) -> list[tuple[dict[str, Any], ...]]:
+    """Return sweeps and exponents of each system by direction, all computed in one program.
 
     **Arguments:** `numbers`, k and ξ of each system; `ratios`, the sorted values of ζ.
     """
@@ -169,7 +151,7 @@ def _sweeps(
     pairs = np.array([lane[:2] for lane in lanes])
     values = np.stack([ratios if up else ratios[::-1] for *_, up in lanes])
     # Starts on the motion without impacts: without damping, the transient from rest never decays.
-    gain = 1 / (1 - values[:, 0] ** 2 + 2j * pairs[:, 1] * values[:, 0])
+    gain = vibration(values[:, 0], pairs[:, 1])
     begin_Y, begin_V = gain.real, (1j * values[:, 0] * gain).real
     starts = jax.vmap(lambda Y, V: scene.start(Y=Y, V=V))(begin_Y, begin_V)
     found = _carried(scene, pairs, values, starts, 120)
@@ -186,16 +168,18 @@ def _sweeps(
         quiet = (flat.period == REGIMES.unsettled) & (exponents < 0.002)
         _again(scene, flat, pairs, values, np.flatnonzero(quiet))
     exponents[flat.period > 0] = np.nan
-    results = []
-    for i in range(len(numbers)):
-        sweeps, grown = {}, {}
-        for j, name in enumerate(("run-up", "close-down")):
-            rows = slice((2 * i + j) * len(ratios), (2 * i + j + 1) * len(ratios))
-            turn = slice(None, None, -1 if j else 1)
-            sweeps[name] = jtu.tree_map(lambda x, r=rows, t=turn: x[r][t], flat)
-            grown[name] = exponents[rows][turn]
-        results.append((sweeps, grown))
-    return results
+
+    def part(x: np.ndarray, i: int, j: int) -> np.ndarray:
+        x = x.reshape(-1, 2, len(ratios), *x.shape[1:])[i, j]
+        return x[::-1] if j else x
+
+    return [
+        tuple(
+            {name: jtu.tree_map(partial(part, i=i, j=j), of) for j, name in enumerate(DIRECTIONS)}
+            for of in (flat, exponents)
+        )
+        for i in range(len(numbers))
+    ]
 
 
 def _again(scene: Scene, flat: Sweep, pairs: np.ndarray, values: np.ndarray, which) -> None:

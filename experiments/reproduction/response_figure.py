@@ -1,5 +1,6 @@
 """The picture of Figure 2: closed forms, branches, sweeps, and the motions of the sweeps."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,8 @@ from matplotlib.patches import Patch
 from vi_jax.plot import MORE_IMPACTS, STOP, color_of, mark_of, paler, plot_branch
 from vi_jax.scans import REGIMES
 
-from .discrepancy import between, rows
 from .motions import GAP
-from .response import RANGE, RESTITUTIONS, WALL, Response, System
+from .response import DIRECTIONS, RANGE, RESTITUTIONS, WALL, Response, System
 
 # Arguments of `save_picture` for a small file.
 LOOK = {"dpi": 72, "colors": 250}
@@ -29,34 +29,38 @@ _DOWN: dict[str, Any] = {
 }  # fmt: skip
 
 
-def draw_response(found: Response) -> Figure:
-    """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'."""
+def draw_response(found: Response, panels: list[dict]) -> Figure:
+    """Draw Figure 2: above the whole range of ζ, undamped and damped; below from BB' to CC'.
+
+    **Arguments:** the curves and marks; the panels as returned by `describe`.
+    """
     titles = ["undamped, ξ = 0", f"Table 1, ξ = {found.systems[1].damping_ratio:.4f}"]
     figure = Figure(figsize=(15, 17.2))
     figure.set_layout_engine("constrained", w_pad=0.08)
     grid = figure.subplots(4, 2)
-    colors = _colors(found)
+    colors = _colors(panels)
     for column, k in enumerate(RESTITUTIONS):
-        pair = found.systems[2 * column : 2 * column + 2]
-        for row, (system, title) in enumerate(zip(pair, titles, strict=True)):
+        for row, title in enumerate(titles):
+            system, panel = found.systems[2 * column + row], panels[2 * column + row]
             _whole(grid[row, column], found, system)
             name = f"{'ab'[column]}) " if not row else ""
             grid[row, column].set_title(f"{name}k = {k:g}, d = 2, {title}", fontsize=12)
-            _zoom(grid[2 + row, column], found.ratios, system, colors)
+            _zoom(grid[2 + row, column], found.ratios, system, panel, colors)
             grid[2 + row, column].set_title(f"k = {k:g}, {title}, enlarged", fontsize=11)
     for ax, row in zip(grid.T.ravel(), list(range(4)) * 2, strict=True):
         ax.grid(alpha=0.25, lw=0.5)
         ax.set_xlabel("frequency ratio ζ")
         ax.set_ylabel("min Y, max Y (a)" if row < 2 else "min Y (a)")
+    line = partial(Line2D, [], [])
     lines: list[Any] = [
-        Line2D([], [], color="0.4", lw=_BAND, alpha=0.35, label="closed form"),
-        Line2D([], [], color="0.2", lw=1.4, label="continued: stable"),
-        Line2D([], [], color="0.2", lw=1.4, ls="--", label="continued: unstable"),
-        Line2D([], [], color="0.45", lw=1.4, ls="-.", label="free motion, ±1/|1 - ζ² + 2iξζ|"),
-        Line2D([], [], color=STOP, lw=1.8, label="stop"),
-        Line2D([], [], color="k", lw=1.0, ls=":", label="second stop of the paper's drawing?"),
-        Line2D([], [], label="run-up", **{**_UP, "ms": 5}),
-        Line2D([], [], label="close-down", **{**_DOWN, "ms": 3}),
+        line(color="0.4", lw=_BAND, alpha=0.35, label="closed form"),
+        line(color="0.2", lw=1.4, label="continued: stable"),
+        line(color="0.2", lw=1.4, ls="--", label="continued: unstable"),
+        line(color="0.45", lw=1.4, ls="-.", label="free motion, ±1/|1 - ζ² + 2iξζ|"),
+        line(color=STOP, lw=1.8, label="stop"),
+        line(color="k", lw=1.0, ls=":", label="second stop of the paper's drawing?"),
+        line(label="run-up", **{**_UP, "ms": 5}),
+        line(label="close-down", **{**_DOWN, "ms": 3}),
         *(mark_of(kind) for kind in ("period-doubling", "fold", "grazing")),
     ]
     look: dict[str, Any] = {"frameon": False, "fontsize": 10, "alignment": "left"}
@@ -71,7 +75,7 @@ def draw_response(found: Response) -> Figure:
     return figure
 
 
-def _colors(found: Response) -> dict[str, str]:
+def _colors(panels: list[dict]) -> dict[str, str]:
     """Return a colour for each kind of motion in the strips; rare kinds share one."""
     fixed = {
         "2π, 1 impact": color_of(1, 1),
@@ -85,17 +89,22 @@ def _colors(found: Response) -> dict[str, str]:
         "chaotic": color_of(REGIMES.chaotic),
         "no period found": color_of(REGIMES.unsettled),
     }
-    names = set()
-    for system in found.systems:
-        for name in system.sweeps:
-            names |= {r.motion for r in rows(system, name, between(system, found.ratios))}
+    sweeps = [at for panel in panels for at in panel["sweeps"].values()]
+    names = {motion["motion"] for at in sweeps for motion in at["motions"]}
     if names - set(fixed):
         names.add("other period")
     names |= {"2π, 1 impact", "4π, 1 impact", "4π, 2 impacts"}  # of the lines
     return {name: color for name, color in fixed.items() if name in names}
 
 
-def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
+def _curves(
+    ax: Axes, ratios: np.ndarray, system: System, name_at: tuple[float, float], **look: Any
+) -> None:
+    """Draw the curves of one system and its sweeps' least Y, the lines BB' and CC', and the wall.
+
+    **Arguments:** `ratios`, the values of ζ; `name_at`, ζ and Y of the wall's name; options for
+    the branches.
+    """
     for n in (2, 1):
         form = system.closed[n]
         for i in range(2):
@@ -104,74 +113,56 @@ def _closed_curves(ax: Axes, ratios: np.ndarray, system: System) -> None:
                 ratios, y_min, color=color_of(n, 1), lw=_BAND, alpha=0.35,
                 solid_capstyle="butt", zorder=1.5,
             )  # fmt: skip
-
-
-def _sweep_marks(ax: Axes, ratios: np.ndarray, system: System, name: str = "y_min") -> None:
-    """Draw circles for the run-up and dots for the close-down, as in the paper."""
-    up, down = (np.asarray(getattr(system.sweeps[s], name)) for s in ("run-up", "close-down"))
-    ax.plot(ratios, up, **_UP)
-    ax.plot(ratios, down, **_DOWN)
-
-
-def _free(ax: Axes, system: System) -> None:
-    """Draw the motion without impacts, also for ζ at which it would pass the stop."""
+    # The motion without impacts, also for ζ at which it would pass the stop.
     zeta = np.linspace(*RANGE, 1401)
     free = 1 / np.abs(1 - zeta**2 + 2j * system.damping_ratio * zeta + 1e-300)
     for sign in (-1, 1):
         ax.plot(zeta, sign * free, color="0.45", lw=1.4, ls="-.", zorder=1)
-
-
-def _lines(ax: Axes, system: System) -> None:
-    """Draw the lines BB' and CC', and their names."""
-    for letter, place in zip("BC", system.stretch, strict=True):
-        ax.axvline(place, color="0.25", lw=1.0, ls=(0, (6, 3)))
+    for branch in system.branches:
+        plot_branch(branch, ax=ax, legend=False, **look)
+    _sweep_marks(ax, ratios, system, "y_min")
+    ax.axhline(GAP, color=STOP, lw=1.6)
+    ax.axhline(WALL, color="k", lw=1.0, ls=":")
+    ax.text(*name_at, "a stop here?", fontsize=8.5)
+    for letter, line in zip("BC", system.stretch, strict=True):
+        ax.axvline(line, color="0.25", lw=1.0, ls=(0, (6, 3)))
         ax.text(
-            place, 0.985, f" {letter}{letter}'", transform=ax.get_xaxis_transform(), va="top",
+            line, 0.985, f" {letter}{letter}'", transform=ax.get_xaxis_transform(), va="top",
             fontsize=10,
         )  # fmt: skip
 
 
+def _sweep_marks(ax: Axes, ratios: np.ndarray, system: System, name: str) -> None:
+    """Draw circles for the run-up and dots for the close-down, as in the paper."""
+    for sweep, look in zip(DIRECTIONS, (_UP, _DOWN), strict=True):
+        ax.plot(ratios, np.asarray(getattr(system.sweeps[sweep], name)), **look)
+
+
 def _whole(ax: Axes, found: Response, system: System) -> None:
-    _closed_curves(ax, found.ratios, system)
-    _free(ax, system)
-    for branch in system.branches:
-        plot_branch(branch, ax=ax, special=False, legend=False, lw=1.4)
-    _sweep_marks(ax, found.ratios, system)
+    _curves(ax, found.ratios, system, (0.51, WALL + 0.06), special=False, lw=1.4)
     _sweep_marks(ax, found.ratios, system, "y_max")
-    ax.axhline(GAP, color=STOP, lw=1.6)
-    ax.axhline(WALL, color="k", lw=1.0, ls=":")
-    ax.text(0.51, WALL + 0.06, "a stop here?", fontsize=8.5)
-    _lines(ax, system)
     ax.set_xlim(*RANGE)
     ax.set_ylim(min(float(b.y_min.min()) for b in system.branches) - 0.3, 2.7)
 
 
 def _zoom(
-    ax: Axes,
-    ratios: np.ndarray,
-    system: System,
-    colors: dict[str, str],
+    ax: Axes, ratios: np.ndarray, system: System, panel: dict, colors: dict[str, str]
 ) -> None:
     """Draw the range from BB' to CC', with a strip of the motions' colours for each sweep.
 
-    **Arguments:** `ratios`, the values of ζ; `colors` of the motions by name.
+    **Arguments:** `ratios`, the values of ζ; `panel` with the motions; their `colors` by name.
     """
-    _closed_curves(ax, ratios, system)
-    _free(ax, system)
-    for branch in system.branches:
-        plot_branch(branch, ax=ax, legend=False, lw=1.5)
-    _sweep_marks(ax, ratios, system)
-    ax.axhline(WALL, color="k", lw=1.0, ls=":")
-    ax.text(0.658, WALL + 0.05, "a stop here?", fontsize=8.5)
-    _lines(ax, system)
+    _curves(ax, ratios, system, (0.658, WALL + 0.05), lw=1.5)
     ax.set_xlim(0.655, 1.01)
     ax.set_ylim(-4.45, -1.0)
-    for y, name in ((-4.32, "run-up"), (-4.12, "close-down")):
-        for row in rows(system, name, between(system, ratios)):
-            color = colors.get(row.motion, colors.get("other period", "0.5"))
-            ends = _edges(ratios, row.part)
-            ax.fill_between(ends, y - 0.09, y + 0.09, color=color, lw=0)
-            _name(ax, sum(ends) / 2, y, row.motion, ends[1] - ends[0], color)
+    half = np.gradient(ratios) / 2  # a strip ends half a step beyond its values
+    for y, name in zip((-4.32, -4.12), DIRECTIONS, strict=True):
+        for x in panel["sweeps"][name]["motions"]:
+            color = colors.get(x["motion"], colors.get("other period", "0.5"))
+            first = x["from"] - float(np.interp(x["from"], ratios, half))
+            last = x["to"] + float(np.interp(x["to"], ratios, half))
+            ax.fill_between((first, last), y - 0.09, y + 0.09, color=color, lw=0)
+            _name(ax, (first + last) / 2, y, x["motion"], last - first, color)
         ax.text(0.704, y, name, ha="right", va="center", fontsize=8.5)
 
 
@@ -186,10 +177,3 @@ def _name(ax: Axes, x: float, y: float, motion: str, width: float, color: str) -
             look = {"ha": "center", "va": "center", "fontsize": 8, "zorder": 7}
             ax.text(x, y, name, color="w" if dark else "k", **look)
             return
-
-
-def _edges(ratios: np.ndarray, part: np.ndarray) -> tuple[float, float]:
-    """Return the ends of a row's strip, half a step beyond its values."""
-    half = np.gradient(ratios) / 2
-    first, last = part[0], part[-1]
-    return float(ratios[first] - half[first]), float(ratios[last] + half[last])

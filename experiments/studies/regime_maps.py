@@ -28,14 +28,7 @@ from vi_jax.plot.colors import DASHES
 jax.config.update("jax_enable_x64", True)
 
 sys.path.insert(0, str(Path(__file__).parents[1] if "__file__" in globals() else "experiments"))
-from reproduction.boundaries import (
-    CURVES,
-    BoundaryCurves,
-    follow_curves,
-    plane_points,
-    table_damping,
-    xi_per_c,
-)
+from reproduction.boundaries import CURVES, follow_curves, plane_points, table_damping, xi_per_c
 from tools.ideal import births, closed_forms, machine
 from tools.pictures import legend_below, panels
 from tools.study import QUICK, say, write
@@ -56,11 +49,9 @@ Curves = dict[str, list[np.ndarray]]
 
 
 # %%
-def undamped(curves: BoundaryCurves, other: str) -> Curves:
+def undamped(other: str) -> Curves:
     """Return the curves that begin without damping."""
-    return {
-        x: [plane_points(getattr(curves, f"{x}_{other}"))] for x in ("doubling", "touch", "fold")
-    }
+    return {x: [plane_points(followed[f"{x}_{other}"])] for x in ("doubling", "touch", "fold")}
 
 
 def with_damping(xi: float) -> Curves:
@@ -98,14 +89,14 @@ class Plane(NamedTuple):
         return {name: x[place.get(name, np.zeros_like(i))] for name, x in self.axes.items()}
 
 
-followed = BoundaryCurves(**follow_curves(CURVES))
+followed = follow_curves([*CURVES])
 PLANES = [
     Plane("(ζ, k), without damping", {"zeta": ZETA, "k": KS, "c": np.zeros(1)}, "k",
-          undamped(followed, "k")),
+          undamped("k")),
     Plane(f"(ζ, k), c = {TABLE:g} N·s/m (Table 1)",
           {"zeta": ZETA, "k": KS, "c": np.array([TABLE])}, "k", with_damping(TABLE * XI_PER_C)),
     Plane("(ζ, c), k = 0.5", {"zeta": ZETA, "k": np.array([0.5]), "c": CS}, "c",
-          undamped(followed, "c")),
+          undamped("c")),
 ]  # fmt: skip
 for plane in PLANES:
     levels = plane.axes[plane.other]
