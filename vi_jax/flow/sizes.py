@@ -134,7 +134,7 @@ def _known_sizes(
     direction = tree.unflatten([x * sign for x, sign in zip(leaves, signs, strict=True)])
     change_of_rate = jax.jvp(lambda x: smooth.field(s, x), (start,), (direction,))[1]
 
-    def size(x: Scalar, change: Scalar, rate: Scalar) -> Scalar:
+    def size(x: Array, change: Array, rate: Array) -> Array:
         change = unit * jnp.abs(change)
         # The rounding of a body at rest, such as an angle of 1e-17, shows no size.
         rests = (jnp.max(jnp.abs(rate), axis=0) == 0) & (change == 0) & (x <= _ZERO)

@@ -53,7 +53,7 @@ def velocity_change(coordinate: Any, state: State, change: State) -> Scalar:
 
 def push_gains(
     bodies: Sequence[Any], rows: Sequence[Row], state: State, pushes: Sequence[State]
-) -> list[list[Scalar]]:
+) -> list[list[Any]]:
     """Return the change of each coordinate's velocity (row) by each push (column)."""
 
     def gain(body: Any, row: Row, push: State) -> Any:
@@ -83,7 +83,7 @@ def _product(slopes: State, push: State) -> Any:
 
 
 def forces(
-    gains: Sequence[Sequence[Scalar]], acting: Sequence[Flag], wanted: Sequence[Scalar]
+    gains: Sequence[Sequence[Any]], acting: Sequence[Flag], wanted: Sequence[Scalar]
 ) -> list[Scalar]:
     """Return the amount of each push that changes the velocities of the `acting` contacts as
     `wanted`, with `gains` from `push_gains`; 0 for the others."""
@@ -98,7 +98,7 @@ def forces(
     return _solved([[*row, x] for row, x in zip(rows, sides, strict=True)])
 
 
-def _solved(rows: list[list[Scalar]]) -> list[Scalar]:
+def _solved(rows: list[list[Any]]) -> list[Any]:
     """Solve a small linear system whose last column is the right side. Its matrix, of inverse
     masses of contacts, needs no pivoting."""
     n = len(rows)
