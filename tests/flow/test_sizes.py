@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vi_jax as vi
+from vi_jax.flow.sizes import sizes_of
 
 
 class Thermostat(vi.AbstractMachine):
@@ -133,3 +134,23 @@ def test_brief_impacts_of_a_short_cycle_are_not_missed():
 
         found = jax.jit(jax.vmap(impacts))(size, phase, gap)
         assert np.count_nonzero((found == 0) & inside) <= 2
+
+
+class Turned(vi.Mechanical):
+    """A body that shakes, and does not turn."""
+
+    q = ("x", "tilt")
+    mass = (1.0, 1.0)
+    cycle = 2 * np.pi
+
+    def force(self, t, q, v):
+        return dict(x=jnp.cos(t) - q.x, tilt=0.0 * q.x)
+
+
+def test_rounding_of_a_number_at_rest_is_not_its_size():
+    """Regression: a body that came to stand, with an angle of 1e-17, could not go on."""
+    machine, zero = Turned(), jnp.zeros(())
+    for tilt, size in ((0.0, 1.0), (1e-17, 1.0), (1e-3, 1e-3)):
+        start = jax.tree.map(jnp.asarray, machine.at(x=0.5, tilt=tilt))
+        sizes = sizes_of(machine, zero, start, ())
+        assert sizes is not None and float(sizes.tilt) == size
