@@ -38,7 +38,7 @@ assert bool(vi.simulate(valve, valve.start(), 4, method=vi.Taylor()).successful)
 
 @pytest.mark.slow
 def test_the_types_of_the_lanes_are_right(tmp_path):
-    # A folder of its own for bytecode: a file that another process compiled has other checks.
+    # Python would load bytecode that another test compiled with other checks: so in a new folder.
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "-c", CHECKED], capture_output=True, text=True,
         env={**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path)},

@@ -250,7 +250,7 @@ def _checked_settle(cycles: int, settle: Any, parts: int, dtype: Any) -> jax.Arr
                 f"Arguments `settle` and `cycles` must add up to at most {most} cycles (of {parts} "
                 f"interval(s) each), the most that {dtype} can count, but got {settle} + {cycles}."
             )
-        return from_host(np.asarray(settle, dtype))
+        return _as_number(settle, dtype)
     settle = jnp.asarray(settle)
     is_valid = (settle >= 0) & (settle == jnp.round(settle)) & (settle <= most - cycles)
     return jnp.where(is_valid, settle.astype(dtype), jnp.nan)

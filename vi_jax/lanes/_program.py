@@ -44,7 +44,7 @@ class LaneProgram(eqx.Module):
     """
 
     parts: tuple[Part, Part, Part] = eqx.field(static=True)
-    """`begin`, `step` and `end`."""
+    """The functions `begin`, `step` and `end`, each traced when its jaxpr is asked for."""
     rows: int = eqx.field(static=True)
 
     tangents: tuple[bool, ...] = eqx.field(static=True, default=())

@@ -186,7 +186,7 @@ def at_stop(
     machine: Machine, k: int, contact: Any, value_of: Callable[[Any], Any], value: Any = None
 ) -> Any:
     """Return `value_of` of the stop in `contact` (as in `EventContext`) of coordinate number k. If
-    it is none, return `value`, by default that of the coordinate's first stop."""
+    the coordinate touches no stop, return `value`, by default that of its first stop."""
     numbers, stops = stops_on(machine, k), stops_of(machine)
     if value is None:
         value, numbers = value_of(stops[numbers[0]]), numbers[1:]

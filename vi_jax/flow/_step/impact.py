@@ -403,8 +403,9 @@ def _near_contacts(
     for k, impact in impacts.items():
         body, stops = plan.machine.coordinates[k], stops_of(plan.machine)
         place = body.position(lane.state)
-        distance = {i: stop_gradient(-stop.beyond(place)) for i, stop in enumerate(stops)}
-        nearest = functools.reduce(jnp.minimum, [distance[i] for i in stops_on(plan.machine, k)])
+        numbers = stops_on(plan.machine, k)
+        distance = {i: stop_gradient(-stops[i].beyond(place)) for i in numbers}
+        nearest = functools.reduce(jnp.minimum, distance.values())
         closest = {i: x == nearest for i, x in distance.items()}
         contact = chosen_stop(plan.machine, k, closest, jnp.zeros_like(lane.s))
         size = plan.extent(k) + jnp.abs(plan.sign_and_gap(k, contact)[1])
