@@ -414,8 +414,8 @@ def _strike_one(x: Strike, of: tuple[int, ...]) -> Blow:
         det = jnp.where(det == 0, 1.0, det)
         sticks = (tangent * wanted - gain * stop) / det, (normal * stop - back * wanted) / det
         forward, backward = (wanted / (normal - sign * level * gain) for sign in (1.0, -1.0))
-        # The slip after the impact with the friction against it; a push that would close the
-        # contact is none.
+        # Whether the body slips forward after the impact, with the friction against it. The stop
+        # cannot pull: if its push would be negative so, the body slips backward.
         is_forward = (forward >= 0) & ((back - level * tangent) * forward - stop > 0)
         push = jnp.where(is_forward, forward, backward)
         drag = jnp.where(is_forward, -level, level) * push

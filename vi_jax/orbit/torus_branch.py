@@ -242,7 +242,8 @@ class _Walk:
         self.end = end or _End("max_points")
 
     def _advance(self, length: float) -> Solved | str:
-        """Return the torus at a distance ahead, or the reason why there is none."""
+        """Return the next torus, at a distance ahead along the family, or the word for the end of
+        the family if none is found there."""
         equations, here = self.equations, self.points[-1].curve
         ahead = equations.unpack(self.ahead, len(here.x))
         guess = Curve(*(a + length * b for a, b in zip(here, ahead, strict=True)))  # pyright: ignore
