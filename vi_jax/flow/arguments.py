@@ -35,7 +35,6 @@ from .._types import Machine, State
 from ..machine import (
     AbstractMachine,
     Mechanical,
-    Scene,
     Turn,
     begin_modes,
     check_takes,
@@ -59,6 +58,7 @@ from ..machine import (
     without_modes,
 )
 from ..machine import State as NamedState
+from ..machines import Scene
 from ._quantities import average_names, check_units, quantity_names
 from .history import check_delays, with_memory
 from .machine_checks import (

@@ -23,11 +23,9 @@ from ..machine import (
     AbstractMachine,
     Coordinate,
     DryFriction,
-    LinearMachine,
     Mechanical,
     Reset,
     RigidStop,
-    Scene,
     SoftStop,
     begin_modes,
     check_takes,
@@ -53,6 +51,7 @@ from ..machine import (
     switches_of,
 )
 from ..machine import State as NamedState
+from ..machines import LinearMachine, Scene
 
 _TRACER_ERRORS = (
     jax.errors.ConcretizationTypeError,
