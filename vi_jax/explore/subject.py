@@ -348,14 +348,11 @@ def ready() -> dict[str, Callable[[], Subject]]:
         "Scene, ideal drive": lambda: Subject(ideal, _IDEAL),
         "Scene, motor": lambda: Subject(motor, _MOTOR),
     }
-    for name, kind in sorted(vars(machines).items()):
-        if kind in (Scene, machines.LinearMachine):
-            continue
-        if inspect.isclass(kind) and issubclass(kind, AbstractMachine):
-            parameters = inspect.signature(kind).parameters.values()
-            if all(part.default is not part.empty for part in parameters):
-                make: Any = kind
-                found[name] = lambda make=make: Subject(make())
+    for name in sorted(machines.READY):
+        make = getattr(machines, name)
+        parameters = inspect.signature(make).parameters.values()
+        if all(part.default is not part.empty for part in parameters):
+            found[name] = lambda make=make: Subject(make())
     return found
 
 
