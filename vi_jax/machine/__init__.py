@@ -1,4 +1,4 @@
-"""What a machine is: states, coordinates, contacts, events and cycles."""
+"""Machines in general: states, coordinates, contacts, events and cycles."""
 
 # The names that other packages import.
 # ruff: noqa: F401, I001
