@@ -157,6 +157,7 @@ def make_plan(
     require_session("start", start)
     if has_delays(machine):
         check_delays(machine, method)
+        check_finite("start", start)
         machine, memory = with_memory(machine, as_floats(machine, start), history)
     method.check(machine)
     if samples and is_autonomous(machine, start):
@@ -339,6 +340,14 @@ def check_reals(name: str, state: State) -> None:
         require_real(name, part, x)
 
 
+def check_finite(argument: str, state: State) -> None:
+    """**Raises:** `ValueError` that names a part of a state that is not finite."""
+    for part, x in named_leaves(state):
+        numbers = concrete(x)
+        if numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"Argument `{argument}` must be finite, but its {part} is {numbers}.")
+
+
 def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int, ...]:
     """Return the shape of position and velocity in a state, `()` in a single one. **Raises:**
     `TypeError` for an invalid state of this machine."""
@@ -351,6 +360,12 @@ def shape_of(argument: str, machine: AbstractMachine, state: State) -> tuple[int
             words = (
                 f"{name} of shape {shape}" if shape else name for name, shape in wanted.items()
             )
+            other = next((x for x in given if given[x] != wanted.get(x, given[x])), None)
+            if other is not None:
+                raise TypeError(
+                    f"Argument `{argument}` must be one state (use `jax.vmap` for a batch), but "
+                    f"its {other} has shape {given[other]}, not {wanted[other]}."
+                )
             raise TypeError(
                 f"Argument `{argument}` must be a state with {', '.join(words)}, as "
                 f"`machine.at(...)` returns, but got {state!r}."
@@ -422,10 +437,7 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
             'of arrays, `on=("x[0]", "v[0]")`, or `position` and `velocity` of the machine pick '
             "them."
         )
-    for part, x in named_leaves(start):
-        numbers = concrete(x)
-        if numbers is not None and not np.isfinite(numbers).all():
-            raise ValueError(f"Argument `start` must be finite, but its {part} is {numbers}.")
+    check_finite("start", start)
     if isinstance(machine, Scene):
         machine.check_start(start)
     if isinstance(start, eqx.Module):

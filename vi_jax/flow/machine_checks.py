@@ -93,7 +93,8 @@ def check_field(machine: AbstractMachine, s: Scalar, state: State, modes: Scalar
             ) from None
         if isinstance(error, TypeError):  # it says what must be
             raise
-        raise TypeError(f"{label} cannot be computed: {error}") from error
+        names = " In `force`, `q` has the positions and `v` the velocities." * ("mass" in member)
+        raise TypeError(f"{label} cannot be computed: {error}{names}") from error
     if flow is None:
         raise TypeError(
             f"{label} must return the components of its state, but its `return` is missing."

@@ -20,6 +20,7 @@ from .._types import Flag, Number, State
 from ..flow import AbstractMethod, Run, row_sizes
 from ..machine import (
     AbstractMachine,
+    Shown,
     angles_in,
     components,
     frequency_ratio,
@@ -130,7 +131,7 @@ def _dtype(run: Run) -> Any:
     return jtu.tree_leaves(run.sections)[0].dtype
 
 
-class AbstractMeasure(eqx.Module):
+class AbstractMeasure(Shown):
     """A measure: a function of the observed cycles of each lane, computed before the next lanes."""
 
     attributes: ClassVar[About] = {}
