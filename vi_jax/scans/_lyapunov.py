@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._checks import count, flag
 from .._messages import in_parts, warning_once
 from .._programs import compiled, is_outermost
-from .._types import Scalar, State, xr
+from .._types import Number, Scalar, State, xr
 from ..flow import (
     RESULTS,
     MethodLike,
@@ -244,7 +244,7 @@ class Growth(NamedTuple):
 
 def observe_growth(
     machine: AbstractMachine, start: State, cycles: Any, *, settle: Any, method: MethodLike,
-    rests: bool | None,
+    rests: bool | None, wander: Number = 0.0,
 ) -> Growth:  # fmt: skip
     """Compute the greatest exponent as `lyapunov` does, over a number of cycles that may be traced,
     a multiple of 4; on an autonomous machine's own section, without the 0 along the motion. Sums
@@ -267,7 +267,7 @@ def observe_growth(
         weight = bump(place / (2 * half))
         lost = jnp.any(rates == -jnp.inf)  # where a weight underflows, 0 · ∞ is NaN
         rate = jnp.where(lost, -jnp.inf, rate + weight @ jnp.where(lost, 0.0, rates.ravel()))
-        seen = without_angles(rows / sizes, angles)
+        seen = without_angles(rows, sizes, angles)
         values = jnp.concatenate([seen, seen**2], axis=1)
         parts = (bump(place / half) @ values, bump(place / half - 1) @ values)
         sums = (total + values.sum(0), squares + (values**2).sum(0))
@@ -275,8 +275,8 @@ def observe_growth(
         near = jnp.minimum(near, jnp.min(jnp.linalg.norm(seen - origin, axis=1)))
         return carry, (rate, time + weight @ durations, duration + durations.sum()), sums, near
 
-    sizes = row_sizes(the_map.machine, start)  # those of angles are 1
-    origin = without_angles((carry[0][0] / sizes)[None], angles)
+    sizes = row_sizes(the_map.machine, start)
+    origin = without_angles(carry[0][0][None], sizes, angles)
     zeros = jnp.zeros(2 * origin.size, origin.dtype)
     zero = jnp.zeros((), origin.dtype)
     state = (carry, (zero, zero, zero), (zeros, zeros, zeros, zeros), zero + jnp.inf)
@@ -285,7 +285,7 @@ def observe_growth(
     mean = total / (2 * half)
     spread = jnp.sqrt(jnp.maximum(squares / (2 * half) - mean**2, 0.0))
     unit = bump((jnp.arange(_NODES) + 0.5) / _NODES).mean() * half
-    digits = digits_of((first - second) / unit, spread, mean)
+    digits = digits_of((first - second) / unit, spread, mean, wander)
     near = near / jnp.linalg.norm(spread[: origin.size])
     good = carry[-1] == RESULTS.successful
     exponent = jnp.where(good, rate / time, jnp.nan)

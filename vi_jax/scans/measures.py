@@ -342,27 +342,42 @@ class Rotation(AbstractMeasure):
     both ends. Over 1,024 cycles they agree to five digits and more on most quasi-periodic motions
     and to less than four on chaotic ones; the error of the rotation number is then some 1e-9. The
     number is that of turns around the mean of the sections, from 0 to 1/2, as ρ and 1 - ρ are the
-    same curve. It is NaN for a fixed point and has no meaning on chaotic motions. A motion that
-    slowly settles on a periodic one has many digits: `Regime` examines its exponent too.
+    same curve. It is NaN for a fixed point, and where averages agree to less than 3.5 digits, as on
+    chaotic motions. A motion that slowly settles on a periodic one has many digits: `Regime`
+    examines its exponent too. Components that stand still, to the accuracy of the method, do not
+    count.
 
     **Arguments:** `cycles`, the number of observed cycles; static.
     """
 
     cycles: int = eqx.field(static=True, default=1024)  # pyright: ignore
+    wander: Any = eqx.field(default=0.0, kw_only=True)
+    """The error of sections under the method; set by a scan."""
     record = "sections"
     attributes: ClassVar[About] = {
-        "rotation": {"units": "turn/cycle", "long_name": "rotation number"},
+        "rotation": {
+            "units": "turn/cycle",
+            "long_name": "rotation number",
+            "comment": f"NaN for a fixed point, and with less than {_FEW} digits",
+        },
         "digits": {"units": "1", "long_name": "digits to which averages of both halves agree"},
     }
 
     def __check_init__(self):
         count("cycles", self.cycles, least=16)
 
+    def under(self, method):
+        """Return this measure with the error of sections under this method."""
+        return dataclasses.replace(self, wander=method.wander)
+
     def __call__(self, machine, run):
         first = jtu.tree_map(lambda x: x[0], run.sections)
         rows = in_rows(run.sections)[-self.cycles :]
-        rows = without_angles(rows, angles_in(machine, first))
-        return {"rotation": rotation_number(rows), "digits": agreement(rows)}
+        sizes = row_sizes(machine, first, rows)
+        rows = without_angles(rows, sizes, angles_in(machine, first))
+        digits = agreement(rows, self.wander)
+        turns = rotation_number(rows, self.wander)
+        return {"rotation": jnp.where(digits < _FEW, jnp.nan, turns), "digits": digits}
 
 
 class Regime(AbstractMeasure):
@@ -470,7 +485,9 @@ class Regime(AbstractMeasure):
         is_last, again = self._is_last(pass_number), jnp.asarray(pass_number) > 0
         observed = jnp.where(is_last, self.averaged // 4 * 4, self.observed)
         settle = jnp.where(again & ~is_last, self.observed + self.lasting, 0)
-        seen = observe_growth(machine, state, observed, settle=settle, method=method, rests=rests)
+        seen = observe_growth(
+            machine, state, observed, settle=settle, method=method, rests=rests, wander=self.wander
+        )
         # A lane that cannot be continued is unchanged.
         otherwise = jnp.where(seen.successful & again, REGIMES.transient, before)
         chaos = jnp.where(seen.exponent > self.threshold, REGIMES.chaotic, otherwise)
