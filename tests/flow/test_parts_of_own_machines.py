@@ -185,6 +185,16 @@ def test_prints():
     ]  # fmt: skip
 
 
+def test_logs_name_their_stops():
+    class Few(Pair):
+        contacts = Pair.contacts[:3:2]
+
+    run = vi.simulate(Few(), vi.State(a=0.0, b=0.5, u=1.0, v=1.0), 1, impact_log=4, event_log=4)
+    first, second = str(run.event_log), str(run.impact_log)
+    assert "impact (right stop) at " in first and "impact (buffer) at " in first
+    assert "right stop at " in second and "buffer at " in second
+
+
 class Rocking(vi.AbstractMachine):
     """A block that loses energy as it passes the upright, which its torque depends on."""
 
