@@ -11,6 +11,7 @@ import vi_jax as vi
 from vi_jax.flow.machine_checks import check_parts
 from vi_jax.flow.results import code_of_outcome, outcome_of
 from vi_jax.machine import events_of, stop_in_words
+from vi_jax.orbit import multipliers_in_words
 
 
 class Balls(vi.Mechanical):
@@ -177,6 +178,9 @@ def test_prints():
     text = str(vi.simulate(Circuit(), vi.State(volt=50.0, i=1e-30), 1))
     assert "volt in [18.394, 50] V" in text and "i = 0\n" in text
     assert "rtol=1e-09" in str(vi.Adaptive(rtol=1e-9))
+    assert multipliers_in_words([0.5, 1e-3 - 2e-3j, -1e-3 + 1e-17j, 1e-17], 3, 1e-12) == [
+        "0.5", "0.001-0.002i", "-0.001", "0"
+    ]  # fmt: skip
     machine = Pair()
     stops = [x for x in events_of(machine) if isinstance(x, vi.RigidStop | vi.SoftStop)]
     assert [stop_in_words(machine, x) for x in stops] == [

@@ -235,7 +235,7 @@ class HybridState(Shown):
 
     state: Any
     modes: tuple[Any, ...]
-    history: Any = None
+    history: Any = eqx.field(default=None, repr=False)
 
     def __getattr__(self, name: str) -> Any:
         if name in ("state", "modes", "history") or name.startswith("__"):

@@ -72,6 +72,9 @@ class STABILITY(NamedEnumeration):
 # A modulus is 1 within this, in double precision: a choice, ten times `Newton`'s tolerance.
 NEUTRAL = 1e-9
 
+# A multiplier below so many roundings of the largest one, or of 1, is printed as 0: a choice.
+_ROUNDINGS = 16.0
+
 
 def multipliers_of(monodromy: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
     """Return the eigenvalues of monodromy matrices, the largest modulus first, or NaN. They are
@@ -386,7 +389,7 @@ class Orbit(Summarized):
         if listed < count:
             lines.append(f"  only {listed} of {count} impacts: find it with `impact_log={count}`")
         if self.stability != STABILITY.unknown:
-            values = [complex_in_words(m, 7, 1e-12) for m in np.asarray(self.multipliers)]
+            values = multipliers_in_words(self.multipliers, 7, 1e-12)
             lines.append(f"  multipliers: {', '.join(first_few(values))}")
         if np.isfinite(float(self.clearance)):
             room = in_unit(f"{float(self.clearance):.4g}", units, "position")
@@ -445,11 +448,19 @@ def span_in_words(orbit: Orbit, digits: int) -> str:
     return span_of_position(labels, units_of(machine), ends, digits)
 
 
-def complex_in_words(z: complex, digits: int, rounding: float) -> str:
-    """Format a complex number, or a real one if its imaginary part is rounding."""
-    if abs(z.imag) <= rounding * abs(z):
-        return f"{z.real:.{digits}g}"
-    return f"{z.real:.{digits}g}{z.imag:+.{digits}g}i"
+def multipliers_in_words(multipliers: Any, digits: int, rounding: float) -> list[str]:
+    """Format multipliers: as real numbers if the imaginary part is below `rounding`, relative to
+    the modulus, and as 0 below the rounding of their matrix."""
+    values = np.asarray(multipliers)
+    zero = _ROUNDINGS * np.finfo(values.dtype).eps * max(1.0, np.abs(values).max(initial=0.0))
+
+    def word(z: complex) -> str:
+        if abs(z) < zero:
+            return "0"
+        imaginary = f"{z.imag:+.{digits}g}i" if abs(z.imag) > rounding * abs(z) else ""
+        return f"{z.real:.{digits}g}{imaginary}"
+
+    return [word(z) for z in values]
 
 
 def trimmed(orbit: Orbit) -> Orbit:
