@@ -54,6 +54,7 @@ from ..machine import (
     stops_of,
     units_of,
     with_units,
+    without_history,
     without_modes,
 )
 
@@ -369,9 +370,10 @@ class Orbit(Summarized):
             return f"No orbit: {reason} Residual {float(self.residual):.3g}.{_advice(self)}"
         count, cycles, units = int(self.impacts), int(self.cycles), units_of(self.machine)
         period = cycles_in_words(self.machine, cycles)
+        own = without_history(self.machine, without_modes(self.state))
         lines = [
             f"Orbit of period {period} with {hits_in_words(self)}, {STABILITY[self.stability]}",
-            f"  section: {state_in_words(without_modes(self.state), 9, units)}",
+            f"  section: {state_in_words(own, 9, units)}",
             f"  {span_in_words(self, 9)}",
         ]
         if is_autonomous(self.machine, self.state):
