@@ -74,6 +74,18 @@ def flags(codes: Mapping[str, int]) -> dict[str, Any]:
     return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
 
 
+def legends(data: Any) -> dict[str, str]:
+    """Return attributes of a data set with these meanings, as prints of it show no others."""
+    found = {}
+    for name, x in data.data_vars.items():
+        codes = zip(
+            x.attrs.get("flag_values", ()), x.attrs.get("flag_meanings", "").split(), strict=True
+        )
+        words = [f"{value} {meaning}" for value, meaning in sorted(codes, key=lambda c: abs(c[0]))]
+        found |= {f"{name}_codes": ", ".join(words)} if words else {}
+    return found
+
+
 def least_period(
     sections: State,
     exact: Num[Array, "rows cycles"],
