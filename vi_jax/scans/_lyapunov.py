@@ -64,7 +64,7 @@ class Lyapunov(Summarized):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates in time (`unit`; for a `Scene` ω)."""
+    """The spectrum, greatest first: mean growth rates per unit of time (`unit`; for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
     """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. An
     autonomous machine is observed at intervals of its usual `cycle`, which count as cycles."""
@@ -99,8 +99,10 @@ class Lyapunov(Summarized):
         variables |= present(self.averages, batch)
         alone = {"spread": self.spread, "result": in_names(self.result)}
         data = xr.Dataset(variables | present(alone, batch))
-        for name in ("exponents", "spread"):
-            data[name].attrs |= attributes(self.unit)
+        names = "Lyapunov exponents", "difference of the greatest between both halves"
+        for name, words in zip(("exponents", "spread"), names, strict=True):
+            data[name].attrs |= {"long_name": f"{words}, per unit of time", **attributes(self.unit)}
+        data["per_cycle"].attrs |= {"long_name": "Lyapunov exponents", "units": "1/cycle"}
         by_name = {name: name for name in self.averages}
         return tidy(with_units(data, dict(self.units), by_name) if by_name else data, along)
 
@@ -113,7 +115,8 @@ class Lyapunov(Summarized):
         numbers = ", ".join(f"{x:.9g}" for x in self.exponents)
         ended = "" if bool(self.successful) else f"; ended: {RESULTS[self.result]}"
         numbers = with_unit(numbers, self.unit)
-        first = f"Lyapunov exponents {numbers} (halves differ by {self.spread:.1g}){ended}"
+        rate = "" if self.unit else "per unit of time, "
+        first = f"Lyapunov exponents {numbers} ({rate}halves differ by {self.spread:.1g}){ended}"
         lines = (
             f"  mean {name}: {in_unit(f'{float(x):.6g}', dict(self.units), name)}"
             for name, x in self.averages.items()
@@ -169,7 +172,7 @@ def lyapunov(
     - `rests`: as for `simulate`.
     - `progress`: show a bar for more than 1024 cycles, in a terminal or a notebook; not in `jit`.
 
-    **Returns:** a `Lyapunov`.
+    **Returns:** a `Lyapunov`, with exponents per unit of time, and per cycle in `per_cycle`.
 
     **Raises:** as `simulate`; `ValueError` for a machine with both a section and a `renewed`; on
     Ctrl-C, with more than 1024 cycles, `Interrupted`, whose `partial` are the exponents so far.

@@ -321,12 +321,17 @@ class Sections(AbstractMeasure):
 
 
 class Exponent(AbstractMeasure):
-    """`exponent`, the greatest Lyapunov exponent, over `observed` further drive cycles."""
+    """`exponent`, the greatest Lyapunov exponent per unit of time, over `observed` further drive
+    cycles."""
 
     observed: int = eqx.field(static=True, default=128)
     record = "sections"
     attributes: ClassVar[About] = {
-        "exponent": {"unit_of": "rate", "long_name": "greatest Lyapunov exponent"}
+        "exponent": {
+            "unit_of": "rate",
+            "long_name": "greatest Lyapunov exponent",
+            "comment": "per unit of time",
+        }
     }
 
     def __check_init__(self):
