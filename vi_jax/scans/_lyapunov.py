@@ -64,7 +64,7 @@ class Lyapunov(Summarized):
     """Lyapunov exponents of a motion. Under `vmap` batch axes come first."""
 
     exponents: Float[Array, "... states"]
-    """The spectrum, greatest first: mean growth rates per unit of time (`unit`; for a `Scene` ω)."""
+    """The spectrum, greatest first: growth rates per unit of time (`unit`, for a `Scene` ω)."""
     per_cycle: Float[Array, "... states"]
     """The same per drive cycle (dimensionless): ln|multipliers|/n on an orbit of n cycles. An
     autonomous machine is observed at intervals of its usual `cycle`, which count as cycles."""
