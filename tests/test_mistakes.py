@@ -363,6 +363,11 @@ class VelocityInPlaces(Masses):
         return dict(x=-q.v.x)
 
 
+class AveragesOfForces(Masses):
+    def averages(self, t, q, v):
+        return dict(power=v.x**2)
+
+
 class WithoutSpeed(Masses):
     def force(self, t, q):
         return dict(x=-q.x)
@@ -403,6 +408,7 @@ class Spare(Machine):
             "`start` must be one state (use `jax.vmap` for a batch), but its x has shape (2,)",
         ),
         (lambda: simulate(VelocityInPlaces()), "`q` has the positions and `v` the velocities"),
+        (lambda: simulate(AveragesOfForces()), "must take `s`, the state, but takes `t`, `q`, `v`"),
         (lambda: simulate(WithoutSpeed()), "must take `t`, `q`, `v`, but takes `t`, `q`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
         (lambda: simulate(CycleByZero()), "`cycle` of a CycleByZero must be finite, but divides"),
