@@ -222,6 +222,15 @@ def test_a_guess_that_is_nan():
     assert "`guess` must be finite, but its x is nan" in said
 
 
+def test_an_unknown_attribute_of_a_result():
+    run = vi.simulate(SCENE, SCENE.start(), 1)
+    with pytest.raises(
+        AttributeError, match="`Run` has no attribute `impact`; near names: impacts"
+    ):
+        run.impact  # noqa: B018  # pyright: ignore
+    assert vi.RESULTS[1] == vi.RESULTS[vi.RESULTS.bad_start]  # pyright: ignore
+
+
 def test_7_numpy_in_a_field():
     for kind in (ByNumpy, ByMath, FreeByNumpy, RubbedByNumpy, CycleByNumpy, StopByNumpy):
         said = refused(lambda kind=kind: simulate(kind()))
@@ -401,6 +410,8 @@ class Spare(Machine):
         (lambda: Machine(omegga=1.0), "`Machine` has no argument `omegga`; near names: omega"),
         (lambda: Free(omega=1.0), "`Free` has no argument `omega`; it takes none"),
         (lambda: vi.Regime(longst=4), "`Regime` has no argument `longst`; near names: longest"),
+        (lambda: vi.Reset(lambda m, t, z: z.x, modes=1.0), "`modes` of a Reset must be a function"),
+        (lambda: vi.simulate(Harmonic(), {"x": 0.0, "u": 1.0}, 1), "Pass `vi.State(x=0.0, ...)`"),
         (lambda: Masses().at(vx=1.0), "the coordinates x. Give velocities by name in `v`: `at(x"),
         (lambda: Masses().at(w=1.0), "The motion of 'w' is prescribed by the machine"),
         (

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -314,9 +314,10 @@ def _check_flow(argument: str, machine: AbstractMachine, state: State) -> None:
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         if str(error).partition(" must ")[0].endswith(f"of a {type(machine).__name__}"):
             raise
+        hint = ". Pass `vi.State(x=0.0, ...)`." if isinstance(state, Mapping) else ""
         raise TypeError(
             f"Argument `{argument}` must be a state of this machine, but got {state!r}, whose "
-            f"rate cannot be computed: {error}"
+            f"rate cannot be computed: {error}{hint}"
         ) from None
 
 

@@ -95,7 +95,7 @@ else:
             return isinstance(value, _Member) and value.kind is cls
 
         def __getitem__(cls, item):
-            return list(cls._texts.values())[int(item.number)]
+            return list(cls._texts.values())[int(getattr(item, "number", item))]
 
         def __getattr__(cls, name: str) -> Any:
             if name.startswith("_"):
@@ -106,7 +106,7 @@ else:
 
     class NamedEnumeration(metaclass=_Kind):
         """Names with a text each, as class attributes. Members are pytrees, which may be traced and
-        batched, and `RESULTS[item]` is the text of one."""
+        batched, and `RESULTS[item]` is the text of one, or of its number."""
 
         @classmethod
         def where(cls, condition, a, b):

@@ -7,7 +7,7 @@ import inspect
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -315,6 +315,17 @@ class Summarized(eqx.Module):
     def summary(self) -> str:
         """Return a summary: a line of text, then indented lines "name: value"."""
         raise NotImplementedError
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:  # of missing names
+            kind = type(self)
+            if name.startswith("_") or hasattr(kind, name):
+                return object.__getattribute__(self, name)  # its own error
+            names = [*vars(self), *(x for x in dir(kind) if x[0] != "_" and x not in vars(self))]
+            raise AttributeError(
+                f"`{kind.__name__}` has no attribute `{name}`; {near_names(name, names)}."
+            )
 
     def __repr__(self) -> str:
         return on_host(self).summary() if known(self) else super().__repr__()

@@ -39,6 +39,7 @@ from ..flow import (
 from ..lanes import pin
 from ..machine import (
     AbstractMachine,
+    Reset,
     Summarized,
     angles_in,
     clock_word,
@@ -49,6 +50,7 @@ from ..machine import (
     is_autonomous,
     labels_in,
     nearest_images,
+    others_of,
     state_in_words,
     stop_in_words,
     stops_of,
@@ -155,8 +157,7 @@ class ORBIT_RESULTS(NamedEnumeration):
     inadmissible = "The motion found would pass through a stop."
     no_orbit = (
         "The residual did not fall below the tolerance: no orbit was found from this guess; begin "
-        "nearer to one, such as the end of a long simulation. Events that a reset sets off at the "
-        "same instant change the number of cycles (see the event log)."
+        "nearer to one, such as the end of a long simulation, or search with other `cycles`."
     )
     grazing = (
         "No orbit was found: the search ended beside a grazing, where the cycle map has no "
@@ -419,10 +420,18 @@ def check_multipliers(name: str, orbit: Orbit) -> None:
         )
 
 
+_ADVICE_ON_RESETS = (
+    " Events that a reset sets off at the same instant change the number of cycles (see the event "
+    "log)."
+)
+
+
 def _advice(orbit: Orbit) -> str:
-    # A choice: searches from bad starts end with residuals of some 1e-3 and more.
-    if orbit.result != ORBIT_RESULTS.no_orbit or not float(orbit.residual) < 1e-7:
+    if orbit.result != ORBIT_RESULTS.no_orbit:
         return ""
+    # A choice: searches from bad starts end with residuals of some 1e-3 and more.
+    if not float(orbit.residual) < 1e-7:
+        return _ADVICE_ON_RESETS * any(isinstance(x, Reset) for x in others_of(orbit.machine))
     return (
         " So small a residual is mostly the steps' own error: ask for a finer `method`, or for less"
         " by `root_finder=vi.Newton(tolerance=1e-8)`."
