@@ -382,6 +382,10 @@ class WithoutSpeed(Masses):
         return dict(x=-q.x)
 
 
+class CycleInWords(Harmonic):
+    cycle = "1.0"  # pyright: ignore
+
+
 class RowOfForces(Masses):
     def force(self, t, q, v):
         return dict(x=jnp.array([1.0]))
@@ -423,6 +427,10 @@ class Spare(Machine):
         (lambda: simulate(WithoutSpeed()), "must take `t`, `q`, `v`, but takes `t`, `q`"),
         (lambda: simulate(Assigns()), "must return new numbers"),
         (lambda: simulate(CycleByZero()), "`cycle` of a CycleByZero must be finite, but divides"),
+        (
+            lambda: simulate(CycleInWords()),
+            "must be a number, or a property that gives one, but is '",
+        ),
         (lambda: simulate(WithUnits()), "but has 'spede'; near names: speed"),
         (lambda: vi.sweep(SCENE, "start.Y", [1.0]), "its names: damping_ratio, drive.freq"),
         (

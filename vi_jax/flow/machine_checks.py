@@ -591,8 +591,11 @@ def check_parts(machine: AbstractMachine) -> None:
     _check_names(machine)
     with explain_errors(f"`cycle` of a {name}"):
         length = machine.cycle
-    if callable(length):
-        raise TypeError(f"`cycle` of a {name} must be a number, or a property that gives one.")
+    if callable(length) or isinstance(length, str | bool | None):
+        got = "a function" if callable(length) else repr(length)
+        raise TypeError(
+            f"`cycle` of a {name} must be a number, or a property that gives one, but is {got}."
+        )
     if jnp.shape(length):
         raise ValueError(
             f"`cycle` of a {name} must be one number, but has shape {jnp.shape(length)}."
