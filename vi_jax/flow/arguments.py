@@ -466,7 +466,7 @@ def check_start(machine: AbstractMachine, start: State, repeats: bool = True) ->
         if slack is not None and depth > np.max(slack):
             raise ValueError(
                 f"Argument `start` must not lie beyond a stop, but lies {depth:g} beyond stop {i} "
-                f"({stop.name or stop.side}, gap {gap}). A stop is at +gap on the right, at -gap on "
-                "the left."
+                f"({stop.name or stop.side}, gap {gap}). A stop is at +gap on the right, at -gap "
+                "on the left."
             )
     check_values(machine, start, repeats)

@@ -309,7 +309,8 @@ class RESULTS(NamedEnumeration):
     unresolved = "An impact could not be located within the step."
     max_steps = (
         "The number of steps exceeded `max_steps` before the last cycle was complete, or 65,536 "
-        "within one, as where an autonomous machine comes to rest off its section."
+        "within one, as where an autonomous machine comes to rest off its section, or a relay "
+        "without hysteresis switches ever faster."
     )
     switch_unresolved = "The event of a switch could not be located within the step."
     section_unresolved = (
