@@ -24,8 +24,9 @@ def coincidence_in_words(problem: Shooting, at: Step) -> str:
         after = problem.after(machine, leg, s, u)
         sizes.append(problem.guard_sizes(problem.flight(machine, leg), s, after))
     margins = problem.order_margins(machine, clock, problem.lengths(x), states, sizes)
-    least, i, other = min((float(margin), i, number) for margin, i, number in margins)
-    if least < TOGETHER * problem.radian:
+    pairs = ((i, n) for margin, i, n in margins if float(margin) < TOGETHER * problem.radian)
+    i, other = next(pairs, (0, None))  # the first in the motion: the least is so by rounding
+    if other is not None:
         names = [event.name_on(problem.machine) for event in (problem.events[i], Event(other))]
     elif len(problem.landings) == 1:  # the time that is left after its chatter
         landing, i = problem.landings[0], (problem.landings[0] + 1) % problem.legs
