@@ -31,7 +31,7 @@ from .delay import (
     Past, delays_valid, has_delays, history_before, lags_of, longest_delay, reading,
     recorded_numbers, with_some_past, without_past,
 )
-from .delay_chain import delay_chain, history_in, machine_of_chain
+from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
     HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes,

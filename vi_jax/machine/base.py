@@ -43,6 +43,7 @@ from .stop import RigidStop, SoftStop, Wall
 _REQUIRED = {
     "cycle": "write `cycle: float = …` in the class, its length in `s`, or a property",
     "field": "write `def field(self, s, state)`, which returns the rate of each part of the state",
+    "force": "write `def force(self, t, q, v)`, which returns the force on each coordinate by name",
 }
 
 

@@ -152,6 +152,11 @@ def machine_of_chain(machine: Any) -> Any:
     return without_past(machine) if isinstance(getattr(machine, "_past", None), _Chain) else None
 
 
+def without_history(machine: Any, state: Any) -> Any:
+    """Return a state of a chain without its history; of another machine unchanged."""
+    return state if machine_of_chain(machine) is None else machine._past.own(state)
+
+
 def history_in(machine: Any, state: Any) -> Callable[[Scalar], Vector]:
     """Return the history in a state of a chain, as a function of t ≤ 0."""
     zero, own, longest = jnp.zeros((), float), without_modes(state), longest_delay(machine)

@@ -237,7 +237,7 @@ class HybridState(Shown):
 
     state: Any
     modes: tuple[Any, ...]
-    history: Any = None
+    history: Any = eqx.field(default=None, repr=False)
 
     def __getattr__(self, name: str) -> Any:
         if name in ("state", "modes", "history") or name.startswith("__"):
@@ -431,6 +431,13 @@ class Reset(AbstractEvent):
         direction: str = "rising",
         name: str = "",
     ):
+        parts = dict(guard=guard, reset=reset, when=when, modes=modes, value=value)
+        for part, given in parts.items():
+            if not callable(given) and (given is not None or part == "guard"):
+                raise TypeError(
+                    f"Argument `{part}` of a Reset must be a function, as `lambda m, t, z: ...`, "
+                    f"but got {given!r}."
+                )
         self._guard, self._reset, self._when = guard, reset, when
         self._modes, self._value = modes, value
         self.ends_cycle, self.ends, self.name = bool(ends_cycle), str(ends), str(name)

@@ -81,11 +81,16 @@ class Mechanical(AbstractMachine):
                 f"Argument `v` must be velocities by name, dict({names[0]}=...): {v!r}."
             )
         v = dict(vars(v) if isinstance(v, Named) else v)
-        wrong = [x for x in (*places, *v) if x not in names]
-        if wrong:
+        wrong = next((x for x in (*places, *v) if x not in names), None)
+        if wrong in self.q_names:
             raise ValueError(
-                f"{wrong[0]!r} is not one of the coordinates {', '.join(names)}"
-                f"{', which have no prescribed motion' * (len(names) < len(self.q_names))}."
+                f"The motion of {wrong!r} is prescribed by the machine. Leave it out: a state has "
+                f"free values of {', '.join(names)} alone."
+            )
+        if wrong is not None:
+            raise ValueError(
+                f"{wrong!r} is not one of the coordinates {', '.join(names)}. Give velocities by "
+                f"name in `v`: `at({names[0]}=0.1, v=dict({names[0]}=1.0))`."
             )
         zeros = {x: jnp.zeros(shape) if shape else 0.0 for x, shape in self.q_shapes.items()}
         at, rate = zeros | places, zeros | v

@@ -3,10 +3,11 @@ their representation as text and as tables."""
 
 import dataclasses
 import difflib
+import inspect
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -290,13 +291,18 @@ class Shown(eqx.Module):
     """A module whose representation has its numbers, with their units if it has `units`."""
 
     def __new__(cls, *args: Any, **kwargs: Any):
-        fields = {field.name for field in dataclasses.fields(cls)}
-        for name in kwargs:
-            if name not in fields and isinstance(getattr(cls, name, None), int | float):
-                raise TypeError(
-                    f"`{cls.__name__}` has no argument `{name}`: a number is declared with its "
-                    f"type in the class, `{name}: float = {getattr(cls, name)!r}`."
-                )
+        fields = {field.name for field in dataclasses.fields(cls) if field.init}
+        wrong = next((name for name in kwargs if name not in fields), None)
+        if wrong is not None and isinstance(getattr(cls, wrong, None), int | float):
+            raise TypeError(
+                f"`{cls.__name__}` has no argument `{wrong}`: a number is declared with its "
+                f"type in the class, `{wrong}: float = {getattr(cls, wrong)!r}`."
+            )
+        taken = inspect.signature(cls.__init__).parameters if wrong else {}  # also of its own
+        if wrong and wrong not in taken and all(x.kind != x.VAR_KEYWORD for x in taken.values()):
+            names = [name for name in taken if name != "self"]
+            known = near_names(wrong, names) if names else "it takes none"
+            raise TypeError(f"`{cls.__name__}` has no argument `{wrong}`; {known}.")
         return super().__new__(cls)
 
     def __repr__(self) -> str:
@@ -309,6 +315,17 @@ class Summarized(eqx.Module):
     def summary(self) -> str:
         """Return a summary: a line of text, then indented lines "name: value"."""
         raise NotImplementedError
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:  # of missing names
+            kind = type(self)
+            if name.startswith("_") or hasattr(kind, name):
+                return object.__getattribute__(self, name)  # its own error
+            names = [*vars(self), *(x for x in dir(kind) if x[0] != "_" and x not in vars(self))]
+            raise AttributeError(
+                f"`{kind.__name__}` has no attribute `{name}`; {near_names(name, names)}."
+            )
 
     def __repr__(self) -> str:
         return on_host(self).summary() if known(self) else super().__repr__()
