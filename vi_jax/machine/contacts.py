@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._types import Flag, Machine, Scalar, Scalars, State
 from .coordinates import Row
-from .declared import friction_on, limited_in, stops_of, switches_of
+from .parts import friction_on, limited_in, stops_of, switches_of
 from .settle import Strike
 from .state import like
 

@@ -14,7 +14,6 @@ from .._checks import count
 from .._types import Scalar, State, Vector
 from .base import AbstractMachine
 from .contacts import shown_modes
-from .declared import overridden
 from .delay import (
     Past,
     as_state,
@@ -28,6 +27,7 @@ from .delay import (
     without_past,
 )
 from .events import begin_modes, history_of, modes_of, with_modes, without_modes
+from .overrides import overridden
 from .state import State as Named
 
 _NAME = "history"

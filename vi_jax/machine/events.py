@@ -20,7 +20,11 @@ from jax.lax import stop_gradient
 from .._checks import one_of
 from .._types import Machine, Scalar, Scalars, State, Vector
 from .contacts import call_checked, field_in, impact_on, rate_of, shown_modes
-from .declared import (
+from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
+from .friction import frictions_in, settled_modes
+from .leaves import size_of
+from .overrides import with_static
+from .parts import (
     declared_modes,
     friction_on,
     has_own_modes,
@@ -28,11 +32,8 @@ from .declared import (
     others_of,
     stops_of,
     switches_of,
-    with_static,
 )
-from .event import AbstractEvent, AbstractSwitch, EventContext, Modes
-from .friction import frictions_in, settled_modes
-from .numbers import Shown, size_of
+from .printing import Shown
 from .settle import strike
 from .state import changed
 

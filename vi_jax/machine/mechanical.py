@@ -24,8 +24,8 @@ from ..lanes import dependent_results
 from .base import AbstractMachine, cached_in_trace, contacts_in
 from .contacts import check_takes
 from .coordinates import Coordinate, Row, component
-from .declared import overridden
-from .numbers import split_index
+from .leaves import split_index
+from .overrides import overridden
 from .state import State as Named
 from .state import like
 from .stop import Wall
