@@ -30,11 +30,8 @@ from .delay import (
 from .delay_chain import delay_chain, history_in, machine_of_chain, without_history
 from .event import AbstractEvent, AbstractSwitch
 from .events import (
-    HybridState, Reset, Switch, after_event, begin_modes, begun, constant_modes,
-    event_of, events_of, guard_of, has_contact_friction, history_of, holds_anywhere,
-    is_autonomous, is_compound, jump_of,
-    mode_number, modes_at_start, modes_of, own_modes, raveled, replaced, section_number,
-    sides_of, struck_modes, with_modes, without_modes,
+    Reset, Switch, after_event, begin_modes, event_of, guard_of, has_contact_friction,
+    holds_anywhere, is_autonomous, is_compound, jump_of, section_number, sides_of, struck_modes,
 )
 from .friction import (
     ContactFriction, DryFriction, frictions_in, pressed_contacts, settled_modes, shared_loads,
@@ -44,10 +41,14 @@ from .leaves import (
     near_names, size_of, with_leaf, with_leaves,
 )
 from .mechanical import Mechanical, solved
+from .modes import (
+    HybridState, begun, constant_modes, history_of, modes_at_start, modes_of, own_modes, raveled,
+    replaced, with_modes, without_modes,
+)
 from .overrides import is_builtin, overridden
 from .parts import (
-    at_stop, chosen_stop, clock_of, has_own_modes, limited_in, others_of, outcomes_of, section_in,
-    stops_of, stops_on, switches_of, with_earlier_clock,
+    at_stop, chosen_stop, clock_of, events_of, has_own_modes, limited_in, mode_number, others_of,
+    outcomes_of, section_in, stops_of, stops_on, switches_of, with_earlier_clock,
 )
 from .printing import Shown, Summarized, in_words, known, number_in_words, plain, state_in_words
 from .settle import strike

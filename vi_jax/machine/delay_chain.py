@@ -26,7 +26,8 @@ from .delay import (
     recorded_numbers,
     without_past,
 )
-from .events import begin_modes, history_of, modes_of, with_modes, without_modes
+from .events import begin_modes
+from .modes import history_of, modes_of, with_modes, without_modes
 from .overrides import overridden
 from .state import State as Named
 

@@ -1,4 +1,4 @@
-"""What a class replaces of its parent, and parameters of a class that nothing in it reads."""
+"""Members of a class: what it replaces of its parent, and parameters that nothing in it reads."""
 
 import copy
 import dataclasses

@@ -25,6 +25,16 @@ def has_own_modes(machine: Any) -> bool:
 stops_of, switches_of, others_of = map(attrgetter, ("_stops", "_switches", "_others"))
 
 
+def events_of(machine: Machine) -> tuple[Any, ...]:
+    """Return all events by number: stops, switches, other events, and the section."""
+    return (*stops_of(machine), *switches_of(machine), *others_of(machine), machine._end)
+
+
+def mode_number(machine: Machine, number: int) -> int:
+    """Return the index of an event's mode among the machine's modes."""
+    return sum(event.holds_mode for event in events_of(machine)[:number])
+
+
 def limited_in(machine: Machine) -> list[int]:
     """Return the numbers of the coordinates that stops limit."""
     return sorted({stop.coordinate for stop in stops_of(machine)})
