@@ -16,7 +16,7 @@ FILES = sorted(HOUSE.rglob("*.py"))
 
 # Each package may import from those before it.
 ORDER = "lanes machine machines flow orbit scans robust plot explore cli".split()
-LATE = [["machines", "named"], ["explore", "serve"], ["explore", "subject"]]
+LATE = [["explore", "serve"], ["explore", "subject"]]
 TOOLS = {"_checks", "_messages", "_programs", "_types"}
 
 
