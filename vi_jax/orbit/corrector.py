@@ -71,7 +71,7 @@ def on_host(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Array]:
+def scaled_jacobian(function: Callable[..., Any], x: Array) -> tuple[Array, Array, Array]:
     """Return derivative and value, both divided by the largest derivative in each row, and those.
     With loops `jax.jacfwd` gives no common value of its columns."""
 
@@ -95,7 +95,7 @@ def _advance(problem: Shooting, x: Vector, tangent: Vector, scale: Vector, lengt
 
     def newton(carry):
         y, before, count, *_ = carry
-        jacobian, residual, _ = _jacobian(equations, y)
+        jacobian, residual, _ = scaled_jacobian(equations, y)
         right_sides = jnp.stack([residual, jnp.zeros_like(y).at[-1].set(1.0)], axis=-1)
         if problem.is_double:
             move, along = smallest_solution(jacobian, right_sides, _DOUBLE).T
@@ -169,7 +169,7 @@ def state_at(problem: Shooting, x, leg, s):
 
 @on_host
 def _jacobian_at(problem: Shooting, x, scale):
-    jacobian, _, rows = _jacobian(lambda y: problem.residual(y * scale), x / scale)
+    jacobian, _, rows = scaled_jacobian(lambda y: problem.residual(y * scale), x / scale)
     return jacobian, rows
 
 
