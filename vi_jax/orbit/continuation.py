@@ -113,16 +113,12 @@ def continue_orbit(
     bounds = interval("bounds", bounds)
     value = float(leaf(orbit.machine, parameter))
     check_parameter(orbit.machine, parameter, value, bounds, "orbit")
-    if int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit)):
-        problem, x = resting_problem_of(orbit, parameter, bounds, method)
-    else:
-        problem, x = problem_of(orbit, parameter, bounds, method)
+    rests = int(orbit.rests) > 0 or (may_rest(orbit.machine) and lies_on_a_stop(orbit))
+    equations = resting_problem_of if rests else problem_of
+    problem, x = equations(orbit, parameter, bounds, method)
     sought, watched = _check_names("extrema", extrema, problem), _check_watched(watch, orbit)
     problem, x, ranges = _extend(problem, x, free, fixed, bounds, np.asarray(orbit.multipliers))
-    start, old_scale = _first_point(problem, x, orbit), problem.scale
-    problem = with_sizes(problem, start.x, start.observed.largest)
-    (start,) = rescaled([start], old_scale, problem.scale)
-    start = advance(problem, start.x, start.tangent, 0.0)
+    problem, start = _first_point(problem, x, orbit)
     return follow_both_ways(
         lambda: MotionTable(problem, ranges, sought, watched),
         start,
@@ -229,7 +225,15 @@ def _with_widths(problem: Shooting, ranges: Sequence[tuple[float, float]]) -> Sh
     return dataclasses.replace(problem, widths=widths)
 
 
-def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
+def _first_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> tuple[Shooting, Step]:
+    """Return the equations with the sizes of the orbit's motion, and their solution there."""
+    start, old_scale = _refined_point(problem, x, orbit), problem.scale
+    problem = with_sizes(problem, start.x, start.observed.largest)
+    (start,) = rescaled([start], old_scale, problem.scale)
+    return problem, advance(problem, start.x, start.tangent, 0.0)
+
+
+def _refined_point(problem: Shooting, x: np.ndarray, orbit: Orbit) -> Step:
     """Refine the orbit as a solution of its equations from event to event, at its parameter. At a
     fold it is refined across the branch instead, which needs another compiled program."""
     start, distance = _refine(problem, x, np.eye(problem.size)[-1])
